@@ -1,0 +1,1 @@
+"""The daemon: recording, station, provisioning, audit, command line. Knows the metrology and the drivers."""

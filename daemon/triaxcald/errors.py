@@ -1,0 +1,31 @@
+"""The daemon's errors. Each knows the exit code that the command line owes it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class DaemonError(Exception):
+    """Root of what this package raises on purpose; the message is one line."""
+
+    exit_code: ClassVar[int] = 2
+
+
+class InputError(DaemonError):
+    """A file or an option given by the user is wrong: file, line, field, what was expected."""
+
+    exit_code = 2
+
+
+class RecordingError(InputError):
+    """A recording cannot be read or does not hold what is asked of it."""
+
+
+class StationError(DaemonError):
+    """The station or a device on it failed while at work."""
+
+    exit_code = 4
+
+
+class ProvisionError(StationError):
+    """Writing to the device failed; the message says what state it was left in."""

@@ -1,0 +1,1 @@
+"""Hardware: profiles, drivers and decoders. Knows no metrology and no daemon."""

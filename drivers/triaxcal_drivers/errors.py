@@ -1,0 +1,44 @@
+"""What can go wrong between the profile, the bus and the device.
+
+The leaf names whose fault it is; the message is one line that says what, where, and what was expected.
+"""
+
+
+class DriverError(Exception):
+    """Root of everything this package raises on purpose."""
+
+
+class ProfileError(DriverError):
+    """The profile, or a file it names (DBC, EDS), is wrong."""
+
+
+class DriverMissing(DriverError):
+    """No driver of that name is installed, or it cannot be imported."""
+
+
+class BusError(DriverError):
+    """The bus cannot be opened or has failed."""
+
+
+class DeviceAbsent(DriverError):
+    """Nothing answers at the device's address."""
+
+
+class DeviceSilent(DriverError):
+    """The device answered before and does not any more, or its stream has stopped."""
+
+
+class RegisterRefused(DriverError):
+    """The device refused to read or write a register.
+
+    ``register`` is the profile's name of it, ``code`` the device's own code (SDO abort, Modbus exception).
+    """
+
+    def __init__(self, message: str, *, register: str, code: int) -> None:
+        super().__init__(message)
+        self.register = register
+        self.code = code
+
+
+class RegisterValueError(DriverError):
+    """A value does not fit the register's type or limits; nothing was sent."""

@@ -1,0 +1,135 @@
+"""The one interface behind which every device stands, be it on CAN, on Modbus or in a recording.
+
+A driver is code for one transport. It validates its own part of a profile, opens devices, and makes decoders.
+A decoder is pure: raw batches in, samples out, no I/O, the same from a live bus and from a recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from triaxcal_drivers.profile import Bundle, Profile
+
+
+class RawFlag(IntFlag):
+    """What the receiver knew about a raw record besides its bytes."""
+
+    EXTENDED_ID = 1
+    REMOTE = 2
+    ERROR = 4  # CAN error frame; Modbus exception reply
+    FD = 8
+    LOST_BEFORE = 16  # the receiver dropped records just before this one
+    INVALID = 32  # reply of the wrong length, function or address
+
+
+@dataclass(frozen=True)
+class RawBatch:
+    """Records as they came off the bus, undecoded.
+
+    ``time_ns`` (n,) int64 host receive time since the epoch; ``source`` (n,) uint32 CAN identifier, or for
+    Modbus ``function << 16 | first address``; ``flags`` (n,) uint8 of `RawFlag`; ``length`` (n,) uint16 bytes
+    of each record; ``payload`` the records' bytes, one after the other (CAN data; Modbus register bytes as on
+    the wire, most significant first).
+    """
+
+    time_ns: NDArray[np.int64]
+    source: NDArray[np.uint32]
+    flags: NDArray[np.uint8]
+    length: NDArray[np.uint16]
+    payload: bytes
+
+    def __post_init__(self) -> None:
+        n = len(self.time_ns)
+        if not (len(self.source) == len(self.flags) == len(self.length) == n):
+            raise ValueError("RawBatch: columns differ in length")
+        if int(self.length.sum()) != len(self.payload):
+            raise ValueError("RawBatch: payload is not as long as its records")
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    @staticmethod
+    def of(records: Sequence[tuple[int, int, int, bytes]]) -> RawBatch:
+        """From (time_ns, source, flags, data) records."""
+        return RawBatch(
+            np.array([r[0] for r in records], dtype=np.int64),
+            np.array([r[1] for r in records], dtype=np.uint32),
+            np.array([r[2] for r in records], dtype=np.uint8),
+            np.array([len(r[3]) for r in records], dtype=np.uint16),
+            b"".join(r[3] for r in records),
+        )
+
+
+@dataclass(frozen=True)
+class SampleBlock:
+    """Decoded samples of one stream, in order.
+
+    ``time_ns`` (n,) int64: the device's own time base (its time stamp, else counter times period, else host
+    receive time), laid on the host epoch at the first sample. ``counter`` (n,) int64, unwrapped.
+    ``readings``
+    (n,3) in the profile's output unit (for a corrected stream: g). ``channels`` the auxiliary ones, each (n,).
+    The counts are of this block: samples missing by the counter, repeated samples dropped, samples that could
+    not be put together from their parts, records with an error flag.
+    """
+
+    time_ns: NDArray[np.int64]
+    counter: NDArray[np.int64]
+    readings: NDArray[np.float64]
+    channels: Mapping[str, NDArray[np.float64]]
+    missing: int = 0
+    duplicates: int = 0
+    incomplete: int = 0
+    errors: int = 0
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+class Decoder(Protocol):
+    """Turns one stream's raw records into samples; keeps what it needs between batches.
+
+    The samples are the same however the records are cut into batches.
+    """
+
+    def feed(self, batch: RawBatch) -> SampleBlock: ...
+
+
+class Device(Protocol):
+    """An opened unit. Registers go by their names in the profile, as raw bytes in the order on the wire."""
+
+    async def open(self) -> None:
+        """Raises BusError, DeviceAbsent."""
+
+    async def close(self) -> None: ...
+
+    def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+        """Raw records of the named streams until the iterator is closed.
+
+        Raises DeviceSilent when nothing has come for the profile's ``silence_timeout_s``.
+        """
+
+    async def read(self, register: str) -> bytes:
+        """Raises RegisterRefused, DeviceSilent."""
+
+    async def write(self, register: str, raw: bytes) -> None:
+        """Raises RegisterRefused, DeviceSilent."""
+
+
+class Driver(Protocol):
+    """What an entry point of group ``triaxcal.drivers`` names: a class with these."""
+
+    profile_model: type[Profile]
+    bus_model: type[BaseModel]
+
+    def device(self, bundle: Bundle, bus: Any) -> Device:
+        """``bus`` is an instance of ``bus_model``: where the unit is."""
+
+    def decoder(self, bundle: Bundle, stream: str) -> Decoder:
+        """Raises ProfileError where the profile's files do not hold what it names."""

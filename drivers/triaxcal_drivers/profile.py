@@ -1,0 +1,354 @@
+"""A device as data: the TOML profile, its validation and the files it names.
+
+The parts every device has stand here; a driver subclasses `Profile` and narrows ``streams`` and ``registers``
+to its transport. An unknown key is an error that names the nearest right one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import re
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from triaxcal_drivers.errors import ProfileError
+
+AXES = ("x", "y", "z")
+READINGS, CORRECTED = "readings", "corrected"
+M = TypeVar("M", bound=BaseModel)
+
+
+class Strict(BaseModel):
+    """No unknown keys, no later changes, no numbers read out of text."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class Identity(Strict):
+    vendor: str
+    product: str
+    serial_register: Annotated[str | None, Field(description="register that holds the serial number")] = None
+    expect: Annotated[
+        dict[str, int], Field(description="registers that must hold these raw numbers: product code, vendor…")
+    ] = {}
+
+
+class Output(Strict):
+    unit: Annotated[str, Field(description="unit of the decoded readings: V, counts, m/s²…")]
+    nominal_scale_factor: Annotated[
+        tuple[float, float, float] | None,
+        Field(description="output per g, with its sign; guides the operator and gives the signs"),
+    ] = None
+
+    @model_validator(mode="after")
+    def _not_zero(self) -> Self:
+        if self.nominal_scale_factor and 0.0 in self.nominal_scale_factor:
+            raise ValueError("nominal_scale_factor must not be zero")
+        return self
+
+
+class Sampling(Strict):
+    rate_hz: Annotated[float, Field(gt=0, description="samples a second that the device delivers")]
+    silence_timeout_s: Annotated[float, Field(gt=0)] = 2.0
+    reply_timeout_s: Annotated[float, Field(gt=0)] = 1.0
+
+
+RawType = Literal[
+    "int16", "uint16", "int24", "uint24", "int32", "uint32", "int64", "uint64", "float32", "float64"
+]
+"""Types of raw values. 24-bit ones take three bytes on CAN; on Modbus use int32."""
+
+
+class Register(Strict):
+    """A number in the device. ``role`` says what it is to a calibration.
+
+    Roles: ``scale_factor.x`` [output unit/g], ``misalignment.x`` [rad], ``bias.x`` [g], any effect's
+    coefficient (``second_order_nonlinearity.x``, ``temperature_bias.y``…), ``reference_temperature`` [°C],
+    ``calibration_date`` (days since 1970-01-01), ``calibration_crc``, ``serial_number``, ``write_counter``.
+    The value is ``raw * scale + offset``.
+    """
+
+    type: RawType
+    role: str | None = None
+    access: Literal["ro", "rw", "wo"] = "rw"
+    unit: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    minimum: float | None = None
+    maximum: float | None = None
+    description: str = ""
+
+    @model_validator(mode="after")
+    def _sound(self) -> Self:
+        if self.scale == 0:
+            raise ValueError("scale must not be zero")
+        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
+            raise ValueError(f"minimum {self.minimum} is above maximum {self.maximum}")
+        return self
+
+
+class WriteStep(Strict):
+    write: Annotated[str, Field(description="register to write")]
+    value: Annotated[int | float, Field(description="value in the register's unit")]
+
+
+class WaitStep(Strict):
+    wait_s: Annotated[float, Field(ge=0, le=60)]
+
+
+class PollStep(Strict):
+    poll: Annotated[str, Field(description="register to read until it holds `until`")]
+    until: int | float
+    timeout_s: Annotated[float, Field(gt=0, le=120)] = 2.0
+
+
+class ReconnectStep(Strict):
+    reconnect: Annotated[
+        Literal[True], Field(description="close and open the connection, trying until it answers")
+    ]
+    timeout_s: Annotated[float, Field(gt=0, le=120)] = 5.0
+
+
+Step = WriteStep | WaitStep | PollStep | ReconnectStep
+
+
+class Sequences(Strict):
+    """What to do before writing, to make it permanent, after writing, and to start the device afresh."""
+
+    unlock: tuple[Step, ...] = ()
+    store: tuple[Step, ...] = ()
+    lock: tuple[Step, ...] = ()
+    reset: tuple[Step, ...] = ()
+
+
+class Crc(Strict):
+    """A checksum over the calibration registers' raw bytes, as on the wire, in the order given."""
+
+    register_name: Annotated[str, Field(alias="register")]
+    algorithm: Literal["crc-16/modbus", "crc-32"]
+    over: Annotated[tuple[str, ...], Field(min_length=1)]
+
+
+class Profile(Strict):
+    """The part of a profile that every device has."""
+
+    format: Literal["triaxcal.profile/1"]
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
+    title: str = ""
+    driver: str
+    identity: Identity
+    output: Output
+    sampling: Sampling
+    streams: Mapping[str, Any]
+    registers: Mapping[str, Any] = {}
+    sequences: Sequences = Sequences()
+    crc: Crc | None = None
+
+    @model_validator(mode="after")
+    def _names_resolve(self) -> Self:
+        if READINGS not in self.streams:
+            raise ValueError(f"streams.{READINGS} is missing")
+        named = (
+            [("identity.serial_register", self.identity.serial_register)]
+            if self.identity.serial_register
+            else []
+        )
+        named += [("identity.expect", n) for n in self.identity.expect]
+        for label in ("unlock", "store", "lock", "reset"):
+            for step in getattr(self.sequences, label):
+                if isinstance(step, WriteStep):
+                    named.append((f"sequences.{label}", step.write))
+                elif isinstance(step, PollStep):
+                    named.append((f"sequences.{label}", step.poll))
+        if self.crc:
+            named += [("crc", n) for n in (self.crc.register_name, *self.crc.over)]
+        for where, name in named:
+            if name not in self.registers:
+                raise ValueError(f"{where}: no register named '{name}'{_nearest(name, self.registers)}")
+        roles = [r.role for r in self.registers.values() if r.role]
+        for role in sorted({r for r in roles if roles.count(r) > 1}):
+            raise ValueError(f"registers: role '{role}' is given twice")
+        return self
+
+    def files(self) -> tuple[str, ...]:
+        """Names of the files this profile refers to (DBC, EDS), relative to it."""
+        return ()
+
+    def by_role(self, role: str) -> str | None:
+        """The name of the register with that role."""
+        return next((name for name, r in self.registers.items() if r.role == role), None)
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A validated profile with its own text and the bytes of every file it names.
+
+    A recording carries one, so that a replay decodes with what the station decoded with.
+    """
+
+    profile: Profile
+    text: bytes
+    files: Mapping[str, bytes] = field(default_factory=dict)
+
+    def digest(self) -> str:
+        """SHA-256 over profile and files, hex."""
+        h = hashlib.sha256(self.text)
+        for name in sorted(self.files):
+            h.update(name.encode() + b"\0" + len(self.files[name]).to_bytes(8, "big") + self.files[name])
+        return h.hexdigest()
+
+
+def parse_bundle(
+    text: bytes, files: Mapping[str, bytes] | None, *, where: str, folder: Path | None = None
+) -> Bundle:
+    """Validate a profile's text. Files come from ``files`` where given, else from ``folder``.
+
+    Raises ProfileError (one line: where, line, field, what was expected), DriverMissing.
+    """
+    from triaxcal_drivers.catalogue import driver_named
+
+    data = parse_toml(text, where=where)
+    name = data.get("driver")
+    if not isinstance(name, str):
+        raise ProfileError(f'{where}: driver: expected the name of a driver, as in driver = "can"')
+    model = driver_named(name, where=where).profile_model
+    profile = validate(model, data, text, where=where)
+    held: dict[str, bytes] = {}
+    for file in profile.files():
+        if files is not None:
+            if file not in files:
+                raise ProfileError(f"{where}: the file '{file}' that it names is missing")
+            held[file] = files[file]
+        elif folder is not None:
+            try:
+                held[file] = (folder / file).read_bytes()
+            except OSError as e:
+                raise ProfileError(f"{where}: the file '{file}' that it names: {e.strerror}") from e
+    return Bundle(profile, text, held)
+
+
+def load_bundle(path: Path) -> Bundle:
+    """The profile at ``path``, or a built-in one where ``path`` is a bare name such as ``triax-ref-can``."""
+    if not path.exists() and path.suffix in ("", ".toml") and path.parent == Path():
+        built_in = BUILT_IN / (path.stem + ".toml")
+        if built_in.exists():
+            path = built_in
+    try:
+        text = path.read_bytes()
+    except OSError as e:
+        known = sorted(p.stem for p in BUILT_IN.glob("*.toml"))
+        raise ProfileError(f"{path}: {e.strerror}; built-in profiles: {', '.join(known)}") from e
+    return parse_bundle(text, None, where=str(path), folder=path.parent)
+
+
+BUILT_IN = Path(__file__).parent / "profiles"
+
+
+def parse_toml(text: bytes, *, where: str) -> dict[str, Any]:
+    """Raises ProfileError with the line at fault."""
+    try:
+        return tomllib.loads(text.decode("utf-8"))
+    except UnicodeDecodeError as e:
+        raise ProfileError(f"{where}: not UTF-8 text (byte {e.start})") from e
+    except tomllib.TOMLDecodeError as e:
+        raise ProfileError(f"{where}: not TOML: {e}") from e
+
+
+def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str) -> M:
+    """``data`` as ``model``; the first fault as a ProfileError of one line."""
+    try:
+        # As JSON, because strict mode takes a TOML array for a tuple only there.
+        return model.model_validate_json(json.dumps(data, default=str))
+    except ValidationError as e:
+        errors = e.errors()
+        first = next((x for x in errors if x["type"] == "extra_forbidden"), errors[0])
+        path = [str(p) for p in first["loc"] if not _is_tag(p, data, first["loc"])]
+        line = _line_of(text, path)
+        message = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "extra_forbidden":
+            message = f"unknown key{_nearest(path[-1], _keys_at(model, first['loc'][:-1]))}"
+        elif first["type"] == "missing":
+            message = "missing"
+        else:
+            given = first.get("input")
+            if isinstance(given, (str, int, float, bool)):
+                message += f", not {given!r}"
+        at = f", line {line}" if line else ""
+        raise ProfileError(
+            f"{where}{at}: {'.'.join(path) or 'profile'}: {message[0].lower()}{message[1:]}"
+        ) from e
+
+
+def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:
+    """Whether a part of pydantic's location is the name of a union member rather than a key of the data."""
+    at = data
+    for p in loc:
+        inside = (isinstance(at, Mapping) and p in at) or (
+            isinstance(at, (list, tuple)) and isinstance(p, int)
+        )
+        if p is part and not inside:
+            return p is not loc[-1]
+        if inside:
+            at = at[p]
+    return False
+
+
+def _nearest(name: str, known: Any) -> str:
+    close = difflib.get_close_matches(name, [str(k) for k in known], n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean '{close[0]}'?"
+    names = sorted(str(k) for k in known)
+    return f"; known: {', '.join(names[:12])}" if names else ""
+
+
+def _keys_at(annotation: Any, loc: tuple[int | str, ...]) -> set[str]:
+    """The keys that ``annotation`` allows at ``loc``, all union members together."""
+    if typing.get_origin(annotation) is Annotated:
+        return _keys_at(typing.get_args(annotation)[0], loc)
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return set().union(*(_keys_at(a, loc) for a in typing.get_args(annotation)))
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        fields = {f.alias or n: f.annotation for n, f in annotation.model_fields.items()}
+        if not loc:
+            return set(fields)
+        if loc[0] in fields:
+            return _keys_at(fields[str(loc[0])], loc[1:])
+        return _keys_at(annotation, loc[1:])  # a union member's tag
+    arguments = typing.get_args(annotation)
+    if arguments and loc:
+        return _keys_at(arguments[-1] if arguments[-1] is not Ellipsis else arguments[0], loc[1:])
+    return set()
+
+
+def _line_of(text: bytes, path: list[str]) -> int | None:
+    """The line of the last key of ``path`` that the text shows, found by table headers and keys."""
+    table: list[str] = []
+    best: tuple[int, int] | None = None
+    counts: dict[str, int] = {}
+    for number, line in enumerate(text.decode("utf-8", "replace").splitlines(), 1):
+        bare = line.strip()
+        if header := re.match(r"\[(\[?)([^\]]+)\]", bare):
+            table = [p.strip().strip("\"'") for p in header[2].split(".")]
+            if header[1]:
+                counts[header[2]] = counts.get(header[2], -1) + 1
+                table.append(str(counts[header[2]]))
+            keys = table
+        elif assigned := re.match(r"([A-Za-z0-9_.\"'-]+)\s*=", bare):
+            keys = table + [p.strip("\"'") for p in assigned[1].split(".")]
+        else:
+            continue
+        depth = len(keys)
+        if keys == path[:depth]:
+            inline = sum(1 for p in path[depth:] if re.search(rf"\b{re.escape(p)}\b", bare))
+            if best is None or depth + inline > best[0]:
+                best = (depth + inline, number)
+    return best[1] if best else None
