@@ -1,0 +1,25 @@
+"""Output that bends with the square of the input (IEEE Std 1293: K2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import Coefficient, per_axis, per_axis_slope, xyz
+
+
+@dataclass(frozen=True)
+class SecondOrderNonlinearity:
+    """``e_i = q_i s_i²``."""
+
+    name: str = "second_order_nonlinearity"
+    coefficients: tuple[Coefficient, ...] = xyz("g/g²")
+    needs: tuple[str, ...] = ()
+    remedy: str = "Correct it with the second-order coefficients, in the device or in the host."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return per_axis(s**2)
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return per_axis_slope(2 * s)

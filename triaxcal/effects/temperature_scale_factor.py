@@ -1,0 +1,27 @@
+"""Scale factor that changes in proportion to temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import Coefficient, per_axis, per_axis_slope, xyz
+
+
+@dataclass(frozen=True)
+class TemperatureScaleFactor:
+    """``e_i = q_i (T − T_ref) s_i``."""
+
+    name: str = "temperature_scale_factor"
+    coefficients: tuple[Coefficient, ...] = xyz("1/K")
+    needs: tuple[str, ...] = ("temp_c",)
+    remedy: str = "Correct the scale factor by the logged temperature, or hold the temperature steadier."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return per_axis(s * conditions["temp_c"][:, None])
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return per_axis_slope(np.repeat(conditions["temp_c"][:, None], 3, axis=1))

@@ -1,0 +1,24 @@
+"""What the metrology refuses, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class TriaxcalError(Exception):
+    """Root of everything this package raises on purpose."""
+
+
+class InvalidData(TriaxcalError):
+    """Numbers that cannot be what they are said to be: shapes, NaN, times that run backwards."""
+
+
+class Refused(TriaxcalError):
+    """The data cannot carry the answer.
+
+    ``wanted`` names the poses that would mend it (labels of `triaxcal.plan`), best first.
+    """
+
+    def __init__(self, message: str, *, wanted: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.wanted = tuple(wanted)

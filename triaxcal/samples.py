@@ -1,0 +1,37 @@
+"""The raw stream of one triad."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.errors import InvalidData
+
+
+@dataclass(frozen=True)
+class Samples:
+    """``time_ns`` (n,) strictly increasing; ``readings`` (n,3) output units; ``channels`` name → (n,)."""
+
+    time_ns: Ints
+    readings: Floats
+    channels: Mapping[str, Floats] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.time_ns)
+        if self.readings.shape != (n, 3):
+            raise InvalidData(f"readings: expected shape ({n}, 3), not {self.readings.shape}")
+        for name, values in self.channels.items():
+            if values.shape != (n,):
+                raise InvalidData(f"channel {name}: expected {n} values, not {values.shape}")
+        backwards = np.flatnonzero(np.diff(self.time_ns) <= 0)
+        if len(backwards):
+            raise InvalidData(f"time does not increase at sample {int(backwards[0]) + 1}")
+        bad = np.flatnonzero(~np.isfinite(self.readings).all(axis=1))
+        if len(bad):
+            raise InvalidData(f"reading {int(bad[0])} is not a finite number")
+
+    def __len__(self) -> int:
+        return len(self.time_ns)

@@ -1,0 +1,85 @@
+"""The model of a triad and its inverse: ``u = K (R a + b + e(R a))`` (paper, eq. 1; METHOD notation).
+
+``a`` (n,3) specific force in g, in the sensor's own orthogonal frame; ``u`` (n,3) output units;
+``R = [[1, az, ay], [0, 1, ax], [0, 0, 1]]`` (eq. 5) with ``misalignment = (ax, ay, az)`` in radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import Effect
+
+SOLVE_TOLERANCE = 1e-13
+"""Relative step, of the reference vector, at which the inverse of a nonlinear model counts as found."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Coefficients of one triad.
+
+    ``scale_factor`` (3,) output/g, signed; ``misalignment`` (3,) rad; ``bias`` (3,) g; ``effects`` pairs each effect
+    with its coefficients (p,), in the effect's own order.
+    """
+
+    scale_factor: Floats
+    misalignment: Floats
+    bias: Floats
+    effects: Sequence[tuple[Effect, Floats]] = ()
+
+    @property
+    def axes(self) -> Floats:
+        """R (3,3)."""
+        ax, ay, az = self.misalignment
+        return np.array([[1.0, az, ay], [0.0, 1.0, ax], [0.0, 0.0, 1.0]])
+
+    @property
+    def matrix(self) -> Floats:
+        """A = (K R)⁻¹ (3,3), upper triangular: ``a = A (u − c)`` where there are no effects (eq. 4)."""
+        return np.linalg.inv(self.scale_factor[:, None] * self.axes)
+
+    @property
+    def centre(self) -> Floats:
+        """c = K b (3,), output units."""
+        return self.scale_factor * self.bias
+
+    def output(self, a: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        """u (n,3) for specific force (n,3); ``conditions`` are deviations from their references, each (n,)."""
+        s = a @ self.axes.T
+        return self.scale_factor * (s + self.bias + self.departure(s, conditions))
+
+    def departure(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        """e (n,3) in g."""
+        e = np.zeros_like(s)
+        for effect, coefficients in self.effects:
+            e += effect.basis(s, conditions) @ coefficients
+        return e
+
+    def departure_slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        """∂e/∂s (n,3,3)."""
+        slope = np.zeros((*s.shape, 3))
+        for effect, coefficients in self.effects:
+            slope += effect.slope(s, conditions) @ coefficients
+        return slope
+
+    def along_axes(self, u: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        """s = R a (n,3): the inverse up to the axes, by Newton's method where there are effects."""
+        v = u / self.scale_factor - self.bias
+        if not self.effects:
+            return v
+        s = v.copy()
+        for _ in range(50):
+            miss = s + self.departure(s, conditions) - v
+            step = np.linalg.solve(np.eye(3) + self.departure_slope(s, conditions), miss[..., None])[..., 0]
+            s -= step
+            if np.max(np.abs(step), initial=0.0) <= SOLVE_TOLERANCE * np.max(np.abs(v), initial=1.0):
+                break
+        return s
+
+    def specific_force(self, u: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        """a (n,3) in g, sensor frame."""
+        return np.linalg.solve(self.axes, self.along_axes(u, conditions).T).T
