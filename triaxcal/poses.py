@@ -121,7 +121,8 @@ def _mend_along_the_radius(
     along = ratio[:, 0] / count * _Inflation(series).of(count)[:, 0] * predicted**2
     now = np.maximum(np.einsum("ki,kij,kj->k", out, covariance, out), 1e-300)
     across = np.einsum("kij,kj->ki", covariance, out) / now[:, None]
-    return covariance + (along - now)[:, None, None] * across[:, :, None] * across[:, None, :]
+    mended: Floats = covariance + (along - now)[:, None, None] * across[:, :, None] * across[:, None, :]
+    return mended
 
 
 def _creep(s: Span, deviation: Floats, scatter: Floats) -> Floats:

@@ -1,0 +1,138 @@
+"""A sensor whose truth is known: attitude path, environment, noise and any effect of the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import TIME
+from triaxcal.poses import Pose
+from triaxcal.sensor import Sensor
+
+STANDARD_GRAVITY = 9.80665
+
+
+@dataclass(frozen=True)
+class Tumble:
+    """A path from pose to pose, for ever: ``hold_s`` still in each direction, then ``move_s`` on the shortest arc.
+
+    ``directions`` (k,3) of up in the sensor's frame, unit vectors. The move follows a minimum-jerk profile; the sensor
+    sits ``lever_m`` off the axis it turns about and feels the tangential and the centripetal acceleration.
+    """
+
+    directions: Floats
+    hold_s: float
+    move_s: float
+    lever_m: float = 0.1
+
+    @property
+    def step_s(self) -> float:
+        return self.hold_s + self.move_s
+
+    @property
+    def round_s(self) -> float:
+        """Seconds until the path is back at its first pose."""
+        return self.step_s * len(self.directions)
+
+    def specific_force(self, t_s: Floats) -> Floats:
+        """a (n,3) in g at times (n,) from the start."""
+        step = np.floor_divide(t_s, self.step_s).astype(int)
+        here = self.directions[step % len(self.directions)]
+        there = self.directions[(step + 1) % len(self.directions)]
+        x = np.clip((t_s - step * self.step_s - self.hold_s) / self.move_s, 0.0, 1.0)
+        angle = np.arccos(np.clip(np.sum(here * there, axis=1), -1.0, 1.0))
+        across = _square(here, there)
+        turned = angle * (10 * x**3 - 15 * x**4 + 6 * x**5)
+        rate = angle * (30 * x**2 - 60 * x**3 + 30 * x**4) / self.move_s
+        acceleration = angle * (60 * x - 180 * x**2 + 120 * x**3) / self.move_s**2
+        along = np.cos(turned)[:, None] * here + np.sin(turned)[:, None] * across
+        tangent = -np.sin(turned)[:, None] * here + np.cos(turned)[:, None] * across
+        lever_g = self.lever_m / STANDARD_GRAVITY
+        return along * (1 - lever_g * rate**2)[:, None] + tangent * (lever_g * acceleration)[:, None]
+
+
+def _square(here: Floats, there: Floats) -> Floats:
+    """Unit vectors at right angles to ``here``, towards ``there``; any where the two are opposite."""
+    across = there - np.sum(here * there, axis=1, keepdims=True) * here
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    spare = np.cross(here, np.where(np.abs(here[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    spare /= np.linalg.norm(spare, axis=1, keepdims=True)
+    return np.where(length > 1e-9, across / np.maximum(length, 1e-300), spare)
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Temperature: a start value, a steady ramp, and a slow swing about both."""
+
+    temperature_c: float = 25.0
+    ramp_c_per_s: float = 0.0
+    swing_c: float = 0.0
+    swing_period_s: float = 600.0
+
+    def temperature(self, t_s: Floats) -> Floats:
+        swing = self.swing_c * np.sin(2 * np.pi * t_s / self.swing_period_s)
+        return np.asarray(self.temperature_c + self.ramp_c_per_s * t_s + swing)
+
+
+@dataclass
+class SyntheticUnit:
+    """A sensor on its path. ``noise_g`` (3,) is white, of one sample; effects count from ``channel_reference``."""
+
+    sensor: Sensor
+    path: Tumble
+    noise_g: Floats
+    environment: Environment = field(default_factory=Environment)
+    channel_reference: Mapping[str, float] = field(default_factory=lambda: {"temp_c": 25.0, TIME: 0.0})
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng(self.seed)
+
+    def sample(self, t_s: Floats) -> tuple[Floats, Floats]:
+        """Outputs (n,3) and temperature (n,) at times (n,). The noise goes on from call to call."""
+        t_s = np.asarray(t_s, dtype=float)
+        temperature = self.environment.temperature(t_s)
+        held = {"temp_c": temperature, TIME: t_s}
+        conditions = {n: v - self.channel_reference[n] for n, v in held.items() if n in self.channel_reference}
+        clean = self.sensor.output(self.path.specific_force(t_s), conditions)
+        noise = self._rng.standard_normal((len(t_s), 3)) * self.noise_g * self.sensor.scale_factor
+        return clean + noise, temperature
+
+
+def noisy_poses(
+    sensor: Sensor,
+    directions: Floats,
+    standard_error_g: float | Floats,
+    rng: np.random.Generator,
+    *,
+    channels: Mapping[str, Sequence[float] | Floats] | None = None,
+    channel_reference: Mapping[str, float] | None = None,
+    hold_s: float = 10.0,
+) -> list[Pose]:
+    """Pose means as a perfect detector would give them, one after the other, ``hold_s`` apart.
+
+    ``standard_error_g`` of a mean: one number, (3,) by axis, or (n,3). Conditions count from ``channel_reference``
+    (0 where not given).
+    """
+    n = len(directions)
+    error = np.broadcast_to(np.asarray(standard_error_g, dtype=float), (n, 3)) * np.abs(sensor.scale_factor)
+    t_s = (np.arange(n) + 0.5) * hold_s
+    held = {name: np.asarray(v, dtype=float) for name, v in (channels or {}).items()}
+    reference = channel_reference or {}
+    conditions = {name: v - reference.get(name, 0.0) for name, v in {**held, TIME: t_s}.items()}
+    u = sensor.output(directions, conditions) + rng.standard_normal((n, 3)) * error
+    return [
+        Pose(
+            start_s=i * hold_s,
+            end_s=(i + 1) * hold_s,
+            samples=1000,
+            mean=u[i],
+            covariance=np.diag(error[i] ** 2),
+            dof=1e6,
+            channels={name: float(v[i]) for name, v in held.items()},
+        )
+        for i in range(n)
+    ]
