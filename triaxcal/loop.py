@@ -382,6 +382,6 @@ def _advice(
         out.append("something is left that no candidate explains: look at the lead, and record more poses")
     if blind:
         out.append(
-            f"this recording cannot show {', '.join(blind)}" + (" (no such channel, too few poses)" if seen else "")
+            f"these poses cannot show {', '.join(blind)}: too few directions, or no such channel, or it stood still"
         )
     return out

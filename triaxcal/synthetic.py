@@ -51,7 +51,8 @@ class Tumble:
         along = np.cos(turned)[:, None] * here + np.sin(turned)[:, None] * across
         tangent = -np.sin(turned)[:, None] * here + np.cos(turned)[:, None] * across
         lever_g = self.lever_m / STANDARD_GRAVITY
-        return along * (1 - lever_g * rate**2)[:, None] + tangent * (lever_g * acceleration)[:, None]
+        a: Floats = along * (1 - lever_g * rate**2)[:, None] + tangent * (lever_g * acceleration)[:, None]
+        return a
 
 
 def _square(here: Floats, there: Floats) -> Floats:

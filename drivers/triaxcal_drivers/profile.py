@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import ProfileError
 
 AXES = ("x", "y", "z")
@@ -108,6 +109,7 @@ class WaitStep(Strict):
 class PollStep(Strict):
     poll: Annotated[str, Field(description="register to read until it holds `until`")]
     until: int | float
+    mask: Annotated[int | None, Field(gt=0, description="the bits of an integer register that count")] = None
     timeout_s: Annotated[float, Field(gt=0, le=120)] = 2.0
 
 
@@ -131,7 +133,10 @@ class Sequences(Strict):
 
 
 class Crc(Strict):
-    """A checksum over the calibration registers' raw bytes, as on the wire, in the order given."""
+    """A checksum over the calibration registers' raw bytes in the order given.
+
+    Each most significant byte first, whatever the order on the wire.
+    """
 
     register_name: Annotated[str, Field(alias="register")]
     algorithm: Literal["crc-16/modbus", "crc-32"]
@@ -186,6 +191,15 @@ class Profile(Strict):
     def by_role(self, role: str) -> str | None:
         """The name of the register with that role."""
         return next((name for name, r in self.registers.items() if r.role == role), None)
+
+    def encode(self, name: str, value: float) -> bytes:
+        """``value`` as the bytes of register ``name`` on the wire: most significant first, where the
+        transport's profile does not say otherwise. Raises RegisterValueError."""
+        return codec.encode(self.registers[name], value, order="big", name=name)
+
+    def decode(self, name: str, raw: bytes) -> float:
+        """The inverse of `encode`. Raises RegisterValueError on a wrong length."""
+        return codec.decode(self.registers[name], raw, order="big", name=name)
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from typing import Literal
+from typing import Literal, Protocol
 
 from triaxcal_drivers.errors import RegisterValueError
-from triaxcal_drivers.profile import Register
 
 ByteOrder = Literal["big", "little"]
 _FORMATS = {
@@ -17,7 +16,24 @@ _FORMATS = {
 SIZES = {"int24": 3, "uint24": 3} | {name: struct.calcsize(code) for name, code in _FORMATS.items()}
 
 
-def encode(register: Register, value: float, *, order: ByteOrder, name: str) -> bytes:
+class Format(Protocol):
+    """What a register's bytes mean; `triaxcal_drivers.profile.Register` is one."""
+
+    @property
+    def type(self) -> str: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def offset(self) -> float: ...
+    @property
+    def minimum(self) -> float | None: ...
+    @property
+    def maximum(self) -> float | None: ...
+
+
+def encode(register: Format, value: float, *, order: ByteOrder, name: str) -> bytes:
     """``value`` in the register's unit as raw bytes, most or least significant first.
 
     Raises RegisterValueError where it is outside the register's limits or type.
@@ -47,7 +63,7 @@ def encode(register: Register, value: float, *, order: ByteOrder, name: str) -> 
     return data if order == "big" else data[::-1]
 
 
-def decode(register: Register, raw: bytes, *, order: ByteOrder, name: str) -> float:
+def decode(register: Format, raw: bytes, *, order: ByteOrder, name: str) -> float:
     """Raw bytes as a value in the register's unit. Raises RegisterValueError on a wrong length."""
     if len(raw) != SIZES[register.type]:
         raise RegisterValueError(

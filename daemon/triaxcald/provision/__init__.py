@@ -1,0 +1,1 @@
+"""Provisioning: a calibration into a device's registers, verified, or the old one put back."""

@@ -1,0 +1,207 @@
+"""The certificate: everything that follows from a recording, its profile and its station file, and nothing else.
+
+A station writes it once; an audit computes it again from the recording alone and must get the same bytes. So no clock,
+no path and no random number enters here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from triaxcal.calibration import Calibration, channels_of
+from triaxcal.effects import Effect
+from triaxcal.fit import fit
+from triaxcal.loop import Loop, diagnose
+from triaxcal.poses import Pose
+from triaxcal.sensor import Sensor
+from triaxcal_drivers.profile import Bundle, Profile
+from triaxcald.documents import Document, loop_document, number
+from triaxcald.pipeline import Pipeline
+from triaxcald.provision.image import RegisterImage, build_image
+from triaxcald.recording.schema import RawDigest
+from triaxcald.station.config import Limits, StationFile
+
+DAY_S = 86_400
+REFERENCE_TEMPERATURE = "reference_temperature"
+TEMPERATURE = "temp_c"
+
+
+@dataclass(frozen=True)
+class Certified:
+    """A certificate, what it stands on, and the registers that it asks for (None where the device has none)."""
+
+    document: Document
+    loop: Loop
+    image: RegisterImage | None
+    within_limits: bool
+
+
+def certify(
+    bundle: Bundle,
+    station: StationFile,
+    station_text: bytes,
+    pipeline: Pipeline,
+    poses: list[Pose],
+    digest: RawDigest,
+    *,
+    unit_name: str,
+    serial: str | None,
+    signs: tuple[int, int, int],
+) -> Certified:
+    """Raises Refused where the poses cannot carry the answer, RegisterValueError where the registers cannot."""
+    loop = diagnose(poses, signs=signs, reference=station.reference)
+    profile = bundle.profile
+    measured_ns = pipeline.first_host_ns or 0
+    held = _held_by_device(profile, loop.after, poses, signs, station.reference)
+    image = _image(profile, held, measured_ns // (DAY_S * 1_000_000_000)) if held else None
+    outside = _outside(loop, station.limits)
+    document: Document = {
+        "format": "triaxcal.certificate/1",
+        "unit": {
+            "name": unit_name,
+            "vendor": profile.identity.vendor,
+            "product": profile.identity.product,
+            "serial": serial,
+        },
+        "station": {"name": station.name, "sha256": hashlib.sha256(station_text).hexdigest()},
+        "profile": {"name": profile.name, "sha256": bundle.digest()},
+        "recording": {
+            "raw_sha256": digest.hexdigest(),
+            "started": datetime.fromtimestamp(measured_ns // 1_000_000_000, UTC).isoformat(),
+            **pipeline.counts,
+        },
+        "software": software(),
+        "settings": {"signs": list(signs), "reference": number(station.reference)},
+        "limits": {k: number(v) for k, v in station.limits.model_dump().items() if v is not None},
+        "verdict": "outside limits" if outside else "within limits" if _judged(station.limits) else "not judged",
+        "outside": outside,
+        "result": loop_document(loop, data_quality=pipeline.data_quality(), output_unit=profile.output.unit),
+        "registers": _registers_document(image, held, loop, poses) if image and held else None,
+    }
+    return Certified(document, loop, image, not outside)
+
+
+def software() -> dict[str, str]:
+    """Versions of what computes the numbers."""
+    return {
+        "triaxcal": version("triaxcal"),
+        "numpy": version("numpy"),
+        "scipy": version("scipy"),
+        "python": platform.python_version(),
+    }
+
+
+def roles(sensor: Sensor, channel_reference: Mapping[str, float]) -> dict[str, float]:
+    """A sensor's coefficients by register role."""
+    out = {
+        f"{name}.{axis}": float(values[i])
+        for name, values in (
+            ("scale_factor", sensor.scale_factor),
+            ("misalignment", sensor.misalignment),
+            ("bias", sensor.bias),
+        )
+        for i, axis in enumerate("xyz")
+    }
+    for effect, values in sensor.effects:
+        out |= {f"{effect.name}.{c.name}": float(v) for c, v in zip(effect.coefficients, values, strict=True)}
+    if TEMPERATURE in channel_reference:
+        out[REFERENCE_TEMPERATURE] = channel_reference[TEMPERATURE]
+    return out
+
+
+def _held_by_device(
+    profile: Profile, full: Calibration, poses: list[Pose], signs: tuple[int, int, int], reference: float
+) -> Calibration | None:
+    """The calibration with those effects alone that the device has registers for.
+
+    Refitted, not cut: without an effect the other coefficients have other best values.
+    """
+    if any(profile.by_role(f"scale_factor.{axis}") is None for axis in "xyz"):
+        return None
+    kept = [
+        effect
+        for effect, _ in full.sensor.effects
+        if all(profile.by_role(f"{effect.name}.{c.name}") for c in effect.coefficients)
+    ]
+    if len(kept) == len(full.sensor.effects):
+        return full
+    return fit(poses, signs=signs, reference=reference, effects=kept)
+
+
+def _image(profile: Profile, held: Calibration, date_days: int) -> RegisterImage:
+    wanted = {r: v for r, v in roles(held.sensor, held.channel_reference).items() if profile.by_role(r)}
+    return build_image(profile, wanted, date_days=date_days)
+
+
+def _registers_document(image: RegisterImage, held: Calibration, loop: Loop, poses: list[Pose]) -> Document:
+    host = [name for name in loop.after.terms if name not in held.terms]
+    return {
+        "terms": list(held.terms),
+        "left_to_host": host,
+        "rms_g": number(held.residual.rms_g),
+        "rounding_rms_g": number(rounding_cost(image, held, poses)),
+        "words": [
+            {
+                "register": w.register,
+                "role": w.role,
+                "raw": w.raw.hex(),
+                "wanted": number(w.value),
+                "held": number(w.held),
+                "unit": w.unit,
+            }
+            for w in image.words
+        ],
+    }
+
+
+def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) -> float:
+    """rms change of |a| in the poses, in g, that rounding the coefficients to their registers makes."""
+    rounded = {w.role: w.held for w in image.words}
+    sensor = held.sensor
+
+    def triple(name: str, values: Any) -> Any:
+        return np.array([rounded.get(f"{name}.{axis}", float(values[i])) for i, axis in enumerate("xyz")])
+
+    def of_effect(effect: Effect, values: Any) -> Any:
+        pairs = zip(effect.coefficients, values, strict=True)
+        return np.array([rounded.get(f"{effect.name}.{c.name}", float(v)) for c, v in pairs])
+
+    worse = Sensor(
+        triple("scale_factor", sensor.scale_factor),
+        triple("misalignment", sensor.misalignment),
+        triple("bias", sensor.bias),
+        tuple((effect, of_effect(effect, values)) for effect, values in sensor.effects),
+    )
+    u = np.array([p.mean for p in poses])
+    channels = channels_of(poses)
+    reference = dict(held.channel_reference)
+    conditions = {n: channels[n] - v for n, v in reference.items()}
+    if TEMPERATURE in reference and REFERENCE_TEMPERATURE in rounded:
+        reference[TEMPERATURE] = rounded[REFERENCE_TEMPERATURE]
+    shifted = {n: channels[n] - v for n, v in reference.items()}
+    exact = np.linalg.norm(sensor.specific_force(u, conditions), axis=1)
+    return float(np.sqrt(np.mean((np.linalg.norm(worse.specific_force(u, shifted), axis=1) - exact) ** 2)))
+
+
+def _judged(limits: Limits) -> bool:
+    return limits.residual_rms_g is not None or limits.cross_validated_rms_g is not None
+
+
+def _outside(loop: Loop, limits: Limits) -> list[str]:
+    residual = loop.after.residual
+    out = []
+    for name, value, limit in (
+        ("residual rms_g", residual.rms_g, limits.residual_rms_g),
+        ("cross_validated_rms_g", residual.cross_validated_rms_g, limits.cross_validated_rms_g),
+    ):
+        if limit is not None and (value is None or value > limit):
+            out.append(f"{name} {'unknown' if value is None else f'{value:.3g}'} is above the limit {limit:.3g}")
+    return out

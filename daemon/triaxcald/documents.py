@@ -1,0 +1,215 @@
+"""The JSON documents that others script against (`triaxcal.poses/1`, `.calibration/1`, `.loop/1`, `.verify/1`).
+
+Numbers are rounded to twelve significant digits: far below any noise, and enough to hide the last bits in which
+linear algebra libraries differ.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from triaxcal.calibration import Calibration, Residual
+from triaxcal.effects import effect_named
+from triaxcal.loop import Loop
+from triaxcal.poses import Pose
+from triaxcal.sensor import Sensor
+from triaxcald.errors import InputError
+
+Document = dict[str, Any]
+DIGITS = 12
+
+
+def number(value: float | None) -> float | None:
+    """A float as it stands in a document; None where there is none."""
+    if value is None or not math.isfinite(value):
+        return None
+    return float(f"{value:.{DIGITS}g}")
+
+
+def numbers(values: Any) -> list[Any]:
+    """An array of any shape as nested lists."""
+    array = np.asarray(values, dtype=float)
+    return [number(float(v)) for v in array] if array.ndim == 1 else [numbers(row) for row in array]
+
+
+def to_text(document: Mapping[str, Any]) -> str:
+    """The document as it is written and compared: UTF-8, two spaces, one key a line, a newline at the end."""
+    return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def poses_document(poses: Sequence[Pose]) -> Document:
+    return {
+        "format": "triaxcal.poses/1",
+        "poses": [
+            {
+                "start_s": number(p.start_s),
+                "end_s": number(p.end_s),
+                "samples": p.samples,
+                "mean": numbers(p.mean),
+                "standard_error": numbers(p.standard_error),
+                "channels": {name: number(v) for name, v in p.channels.items()},
+            }
+            for p in poses
+        ],
+    }
+
+
+def residual_document(residual: Residual) -> Document:
+    return {
+        "rms_g": number(residual.rms_g),
+        "max_abs_g": number(residual.max_abs_g),
+        "cross_validated_rms_g": number(residual.cross_validated_rms_g),
+        "noise_floor_g": number(residual.noise_floor_g),
+        "lack_of_fit_p": number(residual.lack_of_fit_p),
+    }
+
+
+def calibration_document(c: Calibration, *, output_unit: str = "", reference_unit: str = "g") -> Document:
+    """``reference_unit`` names the unit of the reference vector; keys keep their ``_g`` whatever it is."""
+    errors = dict(zip(c.parameters, c.standard_errors, strict=True))
+    unit = output_unit or "output"
+
+    def group(name: str) -> list[Any]:
+        return numbers([errors[f"{name}.{axis}"] for axis in "xyz"])
+
+    return {
+        "format": "triaxcal.calibration/1",
+        "terms": list(c.terms),
+        "units": {
+            "output": output_unit,
+            "reference": reference_unit,
+            "scale_factor": f"{unit}/{reference_unit}",
+            "misalignment": "rad",
+            "bias": reference_unit,
+        },
+        "reference": number(c.reference),
+        "channel_reference": {name: number(v) for name, v in c.channel_reference.items()},
+        "scale_factor": numbers(c.sensor.scale_factor),
+        "misalignment": numbers(c.sensor.misalignment),
+        "bias": numbers(c.sensor.bias),
+        "matrix": numbers(c.sensor.matrix),
+        "centre": numbers(c.sensor.centre),
+        "effects": {
+            effect.name: {
+                k.name: {
+                    "value": number(float(value)),
+                    "standard_error": number(float(errors[f"{effect.name}.{k.name}"])),
+                    "unit": k.unit.replace("g", reference_unit),
+                }
+                for k, value in zip(effect.coefficients, values, strict=True)
+            }
+            for effect, values in c.sensor.effects
+        },
+        "standard_error": {name: group(name) for name in ("scale_factor", "misalignment", "bias")},
+        "residual": residual_document(c.residual),
+        "poses": [
+            {
+                "start_s": number(p.pose.start_s),
+                "end_s": number(p.pose.end_s),
+                "mean": numbers(p.pose.mean),
+                "direction": numbers(p.direction),
+                "residual_g": number(p.residual_g),
+                "standard_error_g": number(p.standard_error_g),
+                "studentized": number(p.studentized),
+                "leverage": number(p.leverage),
+                "used": p.used,
+            }
+            for p in c.poses
+        ],
+        "condition": number(c.condition),
+        "dilution": number(c.dilution),
+        "blind_to": list(c.blind_to),
+        "warnings": list(c.warnings),
+    }
+
+
+def loop_document(
+    loop: Loop, *, data_quality: Sequence[str] = (), output_unit: str = "", reference_unit: str = "g"
+) -> Document:
+    calibration = calibration_document(loop.after, output_unit=output_unit, reference_unit=reference_unit)
+    for pose, before in zip(calibration["poses"], loop.before.poses, strict=True):
+        pose["before_residual_g"] = number(before.residual_g)
+    held = loop.held_out
+    return {
+        "format": "triaxcal.loop/1",
+        "before": residual_document(loop.before.residual),
+        "after": residual_document(loop.after.residual),
+        **(
+            {
+                "held_out": {
+                    "before_rms_g": number(held.before_rms_g),
+                    "after_rms_g": number(held.after_rms_g),
+                    "noise_floor_g": number(held.noise_floor_g),
+                    "poses": held.poses,
+                }
+            }
+            if held
+            else {}
+        ),
+        "findings": [
+            {
+                "effect": f.effect,
+                "verdict": f.verdict,
+                "p_value": number(f.p_value),
+                "coefficients": {
+                    name: {
+                        "value": number(value),
+                        "standard_error": number(error),
+                        "unit": unit.replace("g", reference_unit),
+                    }
+                    for name, (value, error, unit) in f.coefficients.items()
+                },
+                "alternatives": list(f.alternatives),
+                "reason": f.reason,
+                "remedy": f.remedy,
+            }
+            for f in loop.findings
+        ],
+        "unexplained": {
+            "significant": loop.unexplained.significant,
+            "p_value": number(loop.unexplained.p_value),
+            "rms_g": number(loop.unexplained.rms_g),
+            "lead": loop.unexplained.lead,
+        },
+        "data_quality": list(data_quality),
+        "advice": list(loop.advice),
+        "calibration": calibration,
+    }
+
+
+def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str, Any]:
+    """The `triaxcal.calibration/1` in a calibration, loop or certificate document. Raises InputError."""
+    inner: Any = document
+    for key in ("result", "calibration"):
+        if isinstance(inner, Mapping) and isinstance(inner.get(key), Mapping):
+            inner = inner[key]
+    if not isinstance(inner, Mapping) or inner.get("format") != "triaxcal.calibration/1":
+        raise InputError(f"{where}: format: expected a triaxcal.calibration/1, .loop/1 or .certificate/1 document")
+    return inner
+
+
+def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[str, float], float]:
+    """Sensor, channel references and reference magnitude of a calibration document. Raises InputError."""
+    part = calibration_part(document, where=where)
+    try:
+        k, m, b = (np.array(part[name], dtype=float) for name in ("scale_factor", "misalignment", "bias"))
+        effects = []
+        for name, held in part.get("effects", {}).items():
+            effect = effect_named(name)
+            effects.append((effect, np.array([held[c.name]["value"] for c in effect.coefficients], dtype=float)))
+        reference = {str(n): float(v) for n, v in part.get("channel_reference", {}).items()}
+        magnitude = float(part.get("reference", 1.0))
+    except KeyError as e:
+        raise InputError(f"{where}: {e.args[0]}: missing, or no effect of that name is known") from e
+    except (TypeError, ValueError, AttributeError) as e:
+        raise InputError(f"{where}: not numbers where numbers belong ({e})") from e
+    if any(v.shape != (3,) or not np.isfinite(v).all() for v in (k, m, b)) or not np.all(k):
+        raise InputError(
+            f"{where}: scale_factor, misalignment, bias: expected three numbers each, none zero in the first"
+        )
+    return Sensor(k, m, b, tuple(effects)), reference, magnitude

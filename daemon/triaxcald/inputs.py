@@ -1,0 +1,97 @@
+"""Recordings, ours or as text, as still poses: what every measuring command begins with."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from triaxcal.errors import InvalidData
+from triaxcal.poses import Pose, poses_of
+from triaxcal.stillness import StillnessDetector, Windows
+from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
+from triaxcald.errors import InputError, RecordingError
+from triaxcald.pipeline import Pipeline
+from triaxcald.recording.csv_text import read_csv
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.schema import Phase
+
+PROFILE = "profile.toml"
+"""Name under which a recording carries the profile; the files it names stand beside it under ``profile/``."""
+CALIBRATION: Phase = "calibration"
+VERIFICATION: Phase = "verification"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The still poses of a recording. ``windows`` are for pictures; ``profile`` where the recording carries one."""
+
+    name: str
+    poses: list[Pose]
+    windows: Windows | None
+    data_quality: list[str]
+    profile: Profile | None = None
+
+    @property
+    def signs(self) -> tuple[int, int, int] | None:
+        """Of the scale factors, where the profile declares them."""
+        nominal = self.profile.output.nominal_scale_factor if self.profile else None
+        return tuple(1 if k > 0 else -1 for k in nominal) if nominal else None  # type: ignore[return-value]
+
+
+def measure(name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS) -> Measured:
+    """``name`` is a path to an `.mcap`, `.csv` or `.csv.gz`, or `-`. Raises InputError, RecordingError."""
+    if name.endswith(".mcap"):
+        recording = Recording.open(Path(name))
+        bundle = bundle_of(recording)
+        pipeline = Pipeline(bundle, stream).feed_all(recording.raw(phase))
+        poses = pipeline.finish()
+        quality = pipeline.data_quality() + _creeping(poses)
+        return Measured(name, poses, pipeline.windows, quality, bundle.profile)
+    samples = read_csv(name)
+    detector = StillnessDetector()
+    try:
+        detector.feed(samples.time_ns, samples.readings, samples.channels)
+        detector.finish()
+        windows = detector.windows()
+    except InvalidData as e:
+        raise InputError(f"{name}: {e}") from e
+    poses = poses_of(windows, detector.spans())
+    quality = [f"duplicate_samples: {samples.duplicates}"] if samples.duplicates else []
+    return Measured(name, poses, windows, quality + _creeping(poses))
+
+
+def _creeping(poses: list[Pose]) -> list[str]:
+    creeping = [p for p in poses if p.creep.any()]
+    if not creeping:
+        return []
+    return [f"creeping_pose: {len(creeping)} of {len(poses)}, the first at {creeping[0].start_s:.1f} s"]
+
+
+def bundle_of(recording: Recording) -> Bundle:
+    """The profile that a recording carries. Raises RecordingError."""
+    try:
+        text = recording.attachments[PROFILE]
+    except KeyError:
+        raise RecordingError(f"{recording.name}: attachment {PROFILE}: missing; not a recording of a station") from None
+    files = {n.removeprefix("profile/"): d for n, d in recording.attachments.items() if n.startswith("profile/")}
+    return parse_bundle(text, files, where=f"{recording.name}: {PROFILE}")
+
+
+def read_document(path: str) -> Mapping[str, Any]:
+    """A JSON document. Raises InputError with the line at fault."""
+    try:
+        text = Path(path).read_text("utf-8")
+    except OSError as e:
+        raise InputError(f"{path}: {e.strerror}") from e
+    except UnicodeDecodeError as e:
+        raise InputError(f"{path}: not UTF-8 text (byte {e.start})") from e
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as e:
+        raise InputError(f"{path}, line {e.lineno}: not JSON: {e.msg}") from e
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: expected a JSON object")
+    return document

@@ -1,0 +1,89 @@
+"""From raw records to still poses: the one way that a live bus and a recording share."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from triaxcal.errors import InvalidData
+from triaxcal.poses import Pose, poses_of
+from triaxcal.stillness import StillnessDetector, Windows
+from triaxcal_drivers.catalogue import driver_named
+from triaxcal_drivers.interface import RawBatch, SampleBlock
+from triaxcal_drivers.profile import Bundle
+
+COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order")
+
+
+@dataclass
+class Pipeline:
+    """Decoder and stillness detector of one stream of one unit; counts whatever does not come through."""
+
+    bundle: Bundle
+    stream: str
+    counts: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(COUNTS, 0)))
+
+    def __post_init__(self) -> None:
+        self._decoder = driver_named(self.bundle.profile.driver).decoder(self.bundle, self.stream)
+        self._detector = StillnessDetector()
+        self._last_ns: int | None = None
+        self._first_host_ns: int | None = None
+
+    @property
+    def first_host_ns(self) -> int | None:
+        """Host time of the first raw record."""
+        return self._first_host_ns
+
+    def feed(self, batch: RawBatch) -> SampleBlock:
+        """Takes raw records; gives the samples that they complete."""
+        if self._first_host_ns is None and len(batch):
+            self._first_host_ns = int(batch.time_ns[0])
+        block = self._decoder.feed(batch)
+        for name in ("missing", "duplicates", "incomplete", "errors"):
+            self.counts[name] += getattr(block, name)
+        if len(block):
+            latest = np.maximum.accumulate(np.r_[self._last_ns or -(2**62), block.time_ns[:-1]])
+            fresh = block.time_ns > latest
+            self.counts["out_of_order"] += int((~fresh).sum())
+            self.counts["samples"] += int(fresh.sum())
+            self._last_ns = max(int(block.time_ns.max()), self._last_ns or -(2**62))
+            self._detector.feed(
+                block.time_ns[fresh], block.readings[fresh], {n: v[fresh] for n, v in block.channels.items()}
+            )
+        return block
+
+    def feed_all(self, batches: Iterable[RawBatch]) -> Pipeline:
+        for batch in batches:
+            self.feed(batch)
+        return self
+
+    @property
+    def windows(self) -> Windows | None:
+        """Summaries of the stream so far; None while there are none."""
+        try:
+            return self._detector.windows()
+        except InvalidData:
+            return None
+
+    def poses(self) -> list[Pose]:
+        """The still poses so far."""
+        windows = self.windows
+        return [] if windows is None else poses_of(windows, self._detector.spans())
+
+    def finish(self) -> list[Pose]:
+        """The still poses of the whole stream."""
+        self._detector.finish()
+        return self.poses()
+
+    def data_quality(self) -> list[str]:
+        """What the raw stream is to be blamed for, one line each."""
+        found = []
+        if self.counts["missing"] or self.counts["incomplete"]:
+            lost = self.counts["missing"] + self.counts["incomplete"]
+            found.append(f"missing_samples: {lost} of {self.counts['samples'] + lost}")
+        if self.counts["duplicates"]:
+            found.append(f"duplicate_samples: {self.counts['duplicates']}")
+        return found

@@ -1,0 +1,64 @@
+"""Is this the unit that is meant?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from triaxcal_drivers.interface import Device
+from triaxcal_drivers.profile import Bundle, Register
+from triaxcald.errors import ProvisionError
+
+
+class WrongUnit(ProvisionError):
+    """Another product or another serial number answers than was expected."""
+
+
+@dataclass(frozen=True)
+class IdentityRead:
+    """``serial``: the serial register as text of at least four digits, None where the profile has none.
+
+    ``values``: the raw numbers of the registers that the profile's identity expects, by name.
+    """
+
+    serial: str | None
+    values: Mapping[str, int]
+
+
+async def check_identity(
+    device: Device, bundle: Bundle, expected_serial: str | None, *, where: str | None = None
+) -> IdentityRead:
+    """Read who answers and compare. ``where`` names the place in messages; by default the profile.
+
+    Raises WrongUnit; RegisterRefused, DeviceSilent of the driver.
+    """
+    profile, where = bundle.profile, where or bundle.profile.name
+    values = {}
+    for name, expected in profile.identity.expect.items():
+        values[name] = await _read_raw_number(device, bundle, name)
+        if values[name] != expected:
+            raise WrongUnit(
+                f"the unit on {where} is no {profile.identity.product}: "
+                f"register {name} holds {values[name]:#x}, expected {expected:#x}"
+            )
+    serial = await read_serial(device, bundle)
+    if expected_serial is not None and not _same_serial(serial, expected_serial):
+        raise WrongUnit(f"the unit on {where} is serial {serial or 'unknown'}, expected {expected_serial}")
+    return IdentityRead(serial, values)
+
+
+async def read_serial(device: Device, bundle: Bundle) -> str | None:
+    """The serial number as `IdentityRead` has it. Raises RegisterRefused, DeviceSilent."""
+    name = bundle.profile.identity.serial_register
+    return f"{await _read_raw_number(device, bundle, name):04d}" if name else None
+
+
+async def _read_raw_number(device: Device, bundle: Bundle, name: str) -> int:
+    register: Register = bundle.profile.registers[name]
+    value = bundle.profile.decode(name, await device.read(name))
+    return round((value - register.offset) / register.scale)
+
+
+def _same_serial(serial: str | None, expected: str) -> bool:
+    """Leading zeros do not count: the device holds a number."""
+    return serial is not None and expected.strip().lstrip("0") == serial.lstrip("0")

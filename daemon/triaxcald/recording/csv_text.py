@@ -1,0 +1,228 @@
+"""Reads samples from CSV text: fast where all is well, and exact about the first fault where it is not."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import re
+import sys
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triaxcald.errors import InputError
+
+REQUIRED = ("t_s", "ux", "uy", "uz")
+_BLOCK = 2**22
+_LINE_LIMIT = 2**20  # bytes; no line of numbers is that long
+_TIME_LIMIT_S = 9.2e9  # beyond, nanoseconds do not fit 64 bits
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_COMMENT = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class CsvSamples:
+    """``time_ns`` (n,) strictly increasing, on the file's own zero; ``readings`` (n,3); ``channels`` (n,) each.
+
+    ``duplicates`` rows that repeated the row before them exactly; they are left out.
+    """
+
+    time_ns: NDArray[np.int64]
+    readings: NDArray[np.float64]
+    channels: Mapping[str, NDArray[np.float64]]
+    duplicates: int = 0
+
+
+def read_csv(source: Path | str | BinaryIO, name: str | None = None) -> CsvSamples:
+    """From a ``.csv`` or ``.csv.gz`` file, from standard input (``-``) or from a stream of bytes.
+
+    ``name`` stands for the input in messages. Raises InputError: file, line, field, what was expected.
+    """
+    if not isinstance(source, Path | str):
+        return _Parse(name or "CSV").run(source)
+    if str(source) == "-":
+        return _Parse(name or "standard input").run(sys.stdin.buffer)
+    label = name or str(source)
+    try:
+        with open(source, "rb") as file:
+            if str(source).endswith(".gz"):
+                with gzip.GzipFile(fileobj=file) as unzipped:
+                    return _Parse(label).run(unzipped)
+            return _Parse(label).run(file)
+    except OSError as e:
+        raise InputError(f"{label}: cannot be read: {e.strerror or e}") from e
+
+
+class _Parse:
+    """One reading of one file: where it is, and what it has found."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._line = 0  # lines done with
+        self._fields: list[str] = []
+        self._before: NDArray[np.float64] | None = None  # the last row
+        self._tables: list[NDArray[np.float64]] = []
+        self._times: list[NDArray[np.int64]] = []
+        self._duplicates = 0
+
+    def run(self, stream: BinaryIO | gzip.GzipFile) -> CsvSamples:
+        empty = True
+        for text in self._texts(stream):
+            empty = False
+            self._take(text)
+        if empty:
+            raise InputError(f"{self._name}: empty file, expected the header {','.join(REQUIRED)}")
+        if not self._fields:
+            raise InputError(f"{self._name}: only comments, expected the header {','.join(REQUIRED)}")
+        if not self._tables:
+            raise InputError(f"{self._name}: line {self._line}: no samples after the header, expected some")
+        table = np.concatenate(self._tables)
+        channels = {name: table[:, i].copy() for i, name in enumerate(self._fields) if i >= len(REQUIRED)}
+        return CsvSamples(np.concatenate(self._times), table[:, 1:4].copy(), channels, self._duplicates)
+
+    def _fail(self, line: int, what: str) -> NoReturn:
+        raise InputError(f"{self._name}: line {line}: {what}")
+
+    def _texts(self, stream: BinaryIO | gzip.GzipFile) -> Iterator[str]:
+        """Whole lines, a few MiB at a time."""
+        rest = b""
+        first = True
+        while block := self._read(stream):
+            if first:
+                block = block.removeprefix(b"\xef\xbb\xbf")
+                first = False
+            block = rest + block
+            end = block.rfind(b"\n") + 1
+            rest = block[end:]
+            if len(rest) > _LINE_LIMIT:
+                self._fail(self._line + block.count(b"\n") + 1, "no end of line, expected CSV text")
+            if end:
+                yield self._decode(block[:end])
+        if rest:
+            yield self._decode(rest)
+
+    def _read(self, stream: BinaryIO | gzip.GzipFile) -> bytes:
+        try:
+            return stream.read(_BLOCK)
+        except EOFError:
+            raise InputError(f"{self._name}: the gzip data end too early, expected a whole file") from None
+        except (gzip.BadGzipFile, zlib.error) as e:
+            raise InputError(f"{self._name}: not readable as gzip: {e}") from e
+
+    def _decode(self, data: bytes) -> str:
+        nul = data.find(b"\0")
+        if nul >= 0 or data.startswith((b"\x1f\x8b", b"\x89MCAP")):
+            self._fail(self._line + data.count(b"\n", 0, max(nul, 0)) + 1, "binary data, expected CSV text")
+        try:
+            return data.decode()
+        except UnicodeDecodeError as e:
+            line = self._line + data.count(b"\n", 0, e.start) + 1
+            self._fail(line, f"byte 0x{data[e.start]:02x}, expected UTF-8 text")
+
+    def _take(self, text: str) -> None:
+        if not self._fields:
+            text = self._header(text)
+            if not self._fields:
+                return
+        rows = self._fast(text)
+        lines = None
+        if rows is None:
+            rows, lines = self._slow(text)
+        if len(rows):
+            self._keep(rows, text, lines)
+        self._line += text.count("\n") + (not text.endswith("\n") and bool(text))
+
+    def _header(self, text: str) -> str:
+        """Takes the header off; what follows it."""
+        at = 0
+        while at < len(text):
+            end = text.find("\n", at) + 1 or len(text)
+            line = text[at:end].strip()
+            at = end
+            self._line += 1
+            if line and not line.startswith("#"):
+                self._fields = self._check_header([field.strip() for field in line.split(",")])
+                break
+        return text[at:]
+
+    def _check_header(self, fields: list[str]) -> list[str]:
+        expected = f"expected the header {','.join(REQUIRED)} and any further names"
+        if _NUMBER.fullmatch(fields[0]):
+            self._fail(self._line, f"no header, {expected}")
+        for i, name in enumerate(REQUIRED):
+            if i >= len(fields) or fields[i] != name:
+                found = f"'{fields[i][:40]}'" if i < len(fields) else "nothing"
+                self._fail(self._line, f"field {i + 1} of the header is {found} instead of '{name}', {expected}")
+        for i, field in enumerate(fields):
+            if not field:
+                self._fail(self._line, f"field {i + 1} of the header has no name, {expected}")
+            if field in fields[:i]:
+                self._fail(self._line, f"'{field}' is in the header twice, expected each name once")
+        return fields
+
+    def _fast(self, text: str) -> NDArray[np.float64] | None:
+        """The rows, or None where anything at all is out of the ordinary."""
+        if "#" in text:
+            text = _COMMENT.sub("", text)
+        if not text or text.isspace():
+            return np.empty((0, len(self._fields)))
+        try:
+            rows = np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2, comments=None)
+        except ValueError:
+            return None
+        usual = rows.shape[1] == len(self._fields) and np.isfinite(rows).all()
+        return rows if usual and (np.abs(rows[:, 0]) < _TIME_LIMIT_S).all() else None
+
+    def _slow(self, text: str) -> tuple[NDArray[np.float64], list[int]]:
+        """The rows and their line numbers, or the first fault."""
+        rows: list[list[float]] = []
+        numbers: list[int] = []
+        for number, line in enumerate(text.split("\n"), start=self._line + 1):
+            stripped = line.strip()
+            if stripped and not stripped.startswith("#"):
+                rows.append(self._row(number, stripped))
+                numbers.append(number)
+        return np.array(rows).reshape(-1, len(self._fields)), numbers
+
+    def _row(self, number: int, line: str) -> list[float]:
+        texts = line.split(",")
+        if len(texts) != len(self._fields):
+            self._fail(number, f"{len(texts)} fields, expected {len(self._fields)} ({','.join(self._fields)})")
+        row = []
+        for field, text in zip(self._fields, map(str.strip, texts), strict=True):
+            if not text:
+                self._fail(number, f"field {field}: empty, expected a number")
+            value = float(text) if _NUMBER.fullmatch(text) else float("nan")
+            if not np.isfinite(value):
+                self._fail(number, f"field {field}: '{text[:40]}', expected a finite number")
+            row.append(value)
+        if abs(row[0]) >= _TIME_LIMIT_S:
+            self._fail(number, f"field t_s: {texts[0].strip()}, expected seconds below {_TIME_LIMIT_S:g}")
+        return row
+
+    def _keep(self, rows: NDArray[np.float64], text: str, lines: list[int] | None) -> None:
+        """Adds the rows but for exact repetitions; times must rise."""
+        chain = rows if self._before is None else np.vstack((self._before, rows))
+        time_ns = np.rint(chain[:, 0] * 1e9).astype(np.int64)
+        step = np.diff(time_ns)
+        repeated = (chain[1:] == chain[:-1]).all(axis=1)
+        wrong = np.flatnonzero((step <= 0) & ~repeated)
+        if len(wrong):
+            i = int(wrong[0]) + 1 - (len(chain) - len(rows))  # of the rows
+            number = (lines if lines is not None else self._slow(text)[1])[i]
+            before, after = chain[int(wrong[0]) : int(wrong[0]) + 2, 0].tolist()
+            what = "comes twice with different values" if before == after else f"follows {before!r}"
+            self._fail(number, f"field t_s: {after!r} {what}, expected times that rise")
+        if self._before is None:
+            keep = np.concatenate(([True], ~repeated))
+        else:
+            keep, time_ns = ~repeated, time_ns[1:]
+        self._duplicates += int(len(keep) - keep.sum())
+        self._before = rows[-1]
+        self._tables.append(rows[keep])
+        self._times.append(time_ns[keep])

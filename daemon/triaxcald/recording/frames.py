@@ -1,0 +1,211 @@
+"""The MCAP file as a row of records, each with its offset, checked so strictly that damage cannot pass.
+
+The library's own readers give no offsets, do not check attachments, and trust the lengths they read.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, Message, Metadata, Schema
+
+from triaxcald.errors import RecordingError
+
+MAGIC = b"\x89MCAP0\r\n"
+HEAD = struct.Struct("<BQ")  # opcode, length
+CHUNK_LIMIT = 256 * 2**20  # bytes, before and after compression; ours are about 1 MiB
+_CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
+_KNOWN = frozenset(int(code) for code in Opcode)
+
+
+class Damage(RecordingError):
+    """The bytes at ``offset`` are not what an MCAP file has there."""
+
+    def __init__(self, name: str, offset: int, what: str) -> None:
+        super().__init__(f"{name}: {what} at byte {offset}; mend it with `triaxcal log recover`")
+        self.offset = offset
+        self.what = what
+
+
+class CutShort(Damage):
+    """The file ends before the record that begins at ``offset``, or in its middle."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One record of the file: ``body`` is what follows its opcode and length."""
+
+    offset: int
+    opcode: int
+    body: bytes
+
+    @property
+    def head(self) -> bytes:
+        return HEAD.pack(self.opcode, len(self.body))
+
+    @property
+    def end(self) -> int:
+        return self.offset + HEAD.size + len(self.body)
+
+
+def check_magic(stream: BinaryIO, name: str) -> None:
+    """Raises CutShort where the file ends inside the magic, RecordingError where it is something else."""
+    stream.seek(0)
+    magic = stream.read(len(MAGIC))
+    if magic == MAGIC:
+        return
+    if MAGIC.startswith(magic):
+        raise CutShort(name, 0, "the file ends")
+    raise RecordingError(f"{name}: not an MCAP file: it begins with {magic!r}, expected {MAGIC!r}")
+
+
+def size_of(stream: BinaryIO) -> int:
+    return stream.seek(0, os.SEEK_END)
+
+
+def frame_at(stream: BinaryIO, name: str, offset: int, size: int) -> Frame:
+    """The record at ``offset`` of a file of ``size`` bytes. Raises CutShort, Damage."""
+    stream.seek(offset)
+    head = stream.read(HEAD.size)
+    if len(head) < HEAD.size:
+        raise CutShort(name, offset, "the file ends, not finished,")
+    opcode, length = HEAD.unpack(head)
+    if opcode not in _KNOWN:
+        raise Damage(name, offset, f"unknown record type 0x{opcode:02x}")
+    if length > size - offset - HEAD.size:
+        raise CutShort(name, offset, "the file ends, not finished, in the record")
+    if opcode == Opcode.CHUNK and length > CHUNK_LIMIT:
+        raise Damage(name, offset, f"chunk of {length} bytes, expected at most {CHUNK_LIMIT},")
+    return Frame(offset, opcode, stream.read(length))
+
+
+def walk(stream: BinaryIO, name: str, size: int) -> Iterator[Frame]:
+    """All records in order, from the header to the footer. Raises CutShort, Damage."""
+    offset = len(MAGIC)
+    while True:
+        frame = frame_at(stream, name, offset, size)
+        yield frame
+        offset = frame.end
+        if frame.opcode == Opcode.FOOTER:
+            return
+
+
+Record = Attachment | Channel | DataEnd | Footer | Header | Metadata | Schema
+_READERS: Mapping[int, type[Record]] = {
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.CHANNEL: Channel,
+    Opcode.DATA_END: DataEnd,
+    Opcode.FOOTER: Footer,
+    Opcode.HEADER: Header,
+    Opcode.METADATA: Metadata,
+    Opcode.SCHEMA: Schema,
+}
+
+
+def parse(frame: Frame, name: str) -> Record | None:
+    """The record in ``frame``; None for indexes, statistics and chunks. Raises Damage."""
+    kind = _READERS.get(frame.opcode)
+    if kind is None:
+        return None
+    stream = ReadDataStream(io.BytesIO(frame.body))
+    try:
+        record: Record = kind.read(stream)
+    except (McapError, struct.error, UnicodeDecodeError) as e:
+        raise Damage(name, frame.offset, f"unreadable {kind.__name__} record") from e
+    if stream.count != len(frame.body):
+        raise Damage(name, frame.offset, f"{kind.__name__} record of the wrong length")
+    if isinstance(record, Attachment):
+        (crc,) = struct.unpack("<I", frame.body[-4:])
+        if crc not in (0, zlib.crc32(frame.body[:-4])):
+            raise Damage(name, frame.offset, f"attachment '{record.name}' fails its CRC")
+    return record
+
+
+def chunk_head(body: bytes) -> tuple[Chunk, int] | None:
+    """A chunk with what there is of its data, and the length these should have; None where it cannot be."""
+    try:
+        start, end, uncompressed_size, crc = _CHUNK_HEAD.unpack_from(body)
+        (name_length,) = struct.unpack_from("<I", body, _CHUNK_HEAD.size)
+        at = _CHUNK_HEAD.size + 4 + name_length
+        compression = body[at - name_length : at].decode()
+        (length,) = struct.unpack_from("<Q", body, at)
+    except (struct.error, UnicodeDecodeError):
+        return None
+    if uncompressed_size > CHUNK_LIMIT or compression not in ("", "zstd"):
+        return None
+    data = body[at + 8 : at + 8 + length]
+    return Chunk(compression, data, end, start, crc, uncompressed_size), length
+
+
+def whole_chunk_head(frame: Frame, name: str) -> Chunk:
+    """The chunk in ``frame``, still compressed. Raises Damage where its lengths do not agree."""
+    found = chunk_head(frame.body)
+    if found is None:
+        raise Damage(name, frame.offset, "unreadable chunk (expected zstd or no compression)")
+    chunk, length = found
+    size = _CHUNK_HEAD.size + 4 + len(chunk.compression) + 8 + length
+    if size != len(frame.body):
+        raise Damage(name, frame.offset, "chunk of the wrong length")
+    return chunk
+
+
+def chunk_data(frame: Frame, name: str) -> bytes:
+    """The records inside the chunk, decompressed, their CRC checked. Raises Damage."""
+    data = unpack(whole_chunk_head(frame, name))
+    if data is None:
+        raise Damage(name, frame.offset, "a chunk fails its CRC")
+    return data
+
+
+def unpack(chunk: Chunk) -> bytes | None:
+    """A whole chunk's records; None where they fail their CRC."""
+    data = chunk.data
+    if chunk.compression == "zstd":
+        try:
+            # The frame's own size decides how much memory is taken: check it first.
+            if zstandard.frame_content_size(data) != chunk.uncompressed_size:
+                return None
+            data = zstandard.decompress(data)
+        except zstandard.ZstdError:
+            return None
+    if len(data) != chunk.uncompressed_size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        return None
+    return data
+
+
+def unpack_part(chunk: Chunk) -> bytes:
+    """The records of a chunk that was cut off, as far as its bytes go; no CRC can vouch for them."""
+    if chunk.compression != "zstd":
+        return chunk.data
+    source = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(chunk.data))
+    try:
+        return source.read(chunk.uncompressed_size)
+    except zstandard.ZstdError:
+        return b""
+
+
+def chunk_records(data: bytes) -> Iterator[Schema | Channel | Message]:
+    """The whole records in ``data``; a last one that is cut off is left out."""
+    at = 0
+    while at + HEAD.size <= len(data):
+        opcode, length = HEAD.unpack_from(data, at)
+        body = data[at + HEAD.size : at + HEAD.size + length]
+        if len(body) < length:
+            return
+        if opcode == Opcode.MESSAGE and length >= 22:
+            yield Message.read(ReadDataStream(io.BytesIO(body)), length)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            record = parse(Frame(at, opcode, body), "chunk")
+            assert isinstance(record, Schema | Channel)
+            yield record
+        at += HEAD.size + length

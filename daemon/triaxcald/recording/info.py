@@ -1,0 +1,68 @@
+"""Says what is in a recording, for `triaxcal log info`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from triaxcald.recording import schema
+from triaxcald.recording.reader import Recording
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """The recording's contents as a JSON document; also of one not finished, up to its last whole record.
+
+    Raises RecordingError.
+    """
+    with Recording.open(path, unfinished=True) as recording:
+        topics = _topics(recording)
+        starts = [topic["start_ns"] for topic in topics.values()]
+        ends = [topic["end_ns"] for topic in topics.values()]
+        return {
+            "format": schema.FORMAT,
+            "file": str(path),
+            "bytes": recording.size,
+            "finished": recording.finished,
+            "recovered": schema.RECOVERY_RECORD in recording.metadata,
+            "chunks": recording.chunks,
+            "duration_s": (max(ends) - min(starts)) / 1e9 if starts else 0.0,
+            "topics": topics,
+            "raw": _phases(recording),
+            "metadata": recording.metadata,
+            "attachments": {
+                name: {
+                    "media_type": recording.attachments.media_types[name],
+                    "bytes": recording.attachments.sizes[name],
+                }
+                for name in recording.attachments
+            },
+            "losses": [asdict(loss) for loss in recording.losses()],
+        }
+
+
+def _topics(recording: Recording) -> dict[str, dict[str, int]]:
+    topics: dict[str, dict[str, int]] = {}
+    for topic, message in recording.messages():
+        time_ns = message.log_time
+        entry = topics.setdefault(topic, {"messages": 0, "start_ns": time_ns, "end_ns": time_ns})
+        entry["messages"] += 1
+        entry["start_ns"] = min(entry["start_ns"], time_ns)
+        entry["end_ns"] = max(entry["end_ns"], time_ns)
+    return topics
+
+
+def _phases(recording: Recording) -> dict[str, dict[str, Any]]:
+    """Of each phase: records, their bytes, and the time from the first to the last."""
+    phases: dict[str, dict[str, Any]] = {}
+    for phase, batch in recording.raw_batches():
+        if not len(batch):
+            continue
+        first_ns, last_ns = int(batch.time_ns.min()), int(batch.time_ns.max())
+        entry = phases.setdefault(phase, {"records": 0, "bytes": 0, "start_ns": first_ns, "end_ns": last_ns})
+        entry["records"] += len(batch)
+        entry["bytes"] += len(batch.payload)
+        entry["start_ns"] = min(entry["start_ns"], first_ns)
+        entry["end_ns"] = max(entry["end_ns"], last_ns)
+        entry["duration_s"] = (entry["end_ns"] - entry["start_ns"]) / 1e9
+    return phases

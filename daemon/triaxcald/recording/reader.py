@@ -1,0 +1,226 @@
+"""Reads a recording in bounded memory, one chunk at a time, and believes nothing that fails its CRC."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, NamedTuple, Self, TypeVar
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, DataEnd, Footer, Header, Message, Metadata
+
+from triaxcal_drivers.interface import RawBatch
+from triaxcald.errors import RecordingError
+from triaxcald.recording import schema
+from triaxcald.recording.frames import (
+    MAGIC,
+    CutShort,
+    Damage,
+    Frame,
+    check_magic,
+    chunk_data,
+    chunk_records,
+    frame_at,
+    parse,
+    size_of,
+    walk,
+)
+
+T = TypeVar("T")
+
+
+class TopicMessage(NamedTuple):
+    topic: str
+    message: Message
+
+
+class Attachments(Mapping[str, bytes]):
+    """Attachments by name; each is read from the file when it is asked for."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._offsets: dict[str, int] = {}
+        self.media_types: dict[str, str] = {}
+        self.sizes: dict[str, int] = {}
+
+    def add(self, offset: int, attachment: Attachment) -> None:
+        self._offsets[attachment.name] = offset
+        self.media_types[attachment.name] = attachment.media_type
+        self.sizes[attachment.name] = len(attachment.data)
+
+    def __getitem__(self, name: str) -> bytes:
+        record = parse(self._recording.frame(self._offsets[name]), self._recording.name)
+        assert isinstance(record, Attachment)
+        return record.data
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._offsets)
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+
+class Recording:
+    """One unit's recording, opened; a context manager.
+
+    Opening reads the whole file once and checks it: every byte of a finished recording is under a CRC.
+    ``unfinished`` also takes one that is still being written or was cut short, up to its last whole record.
+    Raises RecordingError, from opening and from every iterator.
+    """
+
+    def __init__(self, stream: BinaryIO, name: str, *, unfinished: bool = False) -> None:
+        self.name = name
+        self.finished = True
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments = Attachments(self)
+        self._stream = stream
+        self._chunks: list[int] = []
+        self._topics: dict[int, str] = {}
+        self.size = size_of(stream)
+        check_magic(stream, name)
+        try:
+            self._survey()
+        except CutShort:
+            if not unfinished:
+                raise
+            self.finished = False
+        found = self.metadata.get(schema.FORMAT_RECORD, {}).get("format")
+        if found != schema.FORMAT:
+            raise RecordingError(f"{name}: recording format {found!r}, expected '{schema.FORMAT}'")
+
+    @classmethod
+    def open(cls, path: Path, *, unfinished: bool = False) -> Recording:
+        try:
+            stream = open(path, "rb")  # noqa: SIM115 -- the recording closes it
+        except OSError as e:
+            raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
+        try:
+            return cls(stream, str(path), unfinished=unfinished)
+        except BaseException:
+            stream.close()
+            raise
+
+    def close(self) -> None:
+        self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def chunks(self) -> int:
+        return len(self._chunks)
+
+    def phases(self) -> list[str]:
+        """In the order in which they began."""
+        return list(dict.fromkeys(phase for phase, _ in self.raw_batches()))
+
+    def raw(self, phase: schema.Phase) -> Iterator[RawBatch]:
+        """The phase's raw records in the order in which they came."""
+        return (batch for found, batch in self.raw_batches() if found == phase)
+
+    def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
+        """All raw records with their phase."""
+        return ((phase, batch) for _, phase, batch in self._decoded(schema.RAW, schema.decode_raw))
+
+    def raw_digest(self) -> schema.RawDigest:
+        """Of all raw records; the metadata record ``raw`` says what it was when they were written."""
+        digest = schema.RawDigest()
+        for phase, batch in self.raw_batches():
+            digest.update(phase, batch)
+        return digest
+
+    def register_accesses(self) -> Iterator[schema.RegisterAccess]:
+        return self._decoded(schema.REGISTERS, schema.decode_register_access)
+
+    def events(self) -> Iterator[schema.Event]:
+        return self._decoded(schema.EVENTS, schema.decode_event)
+
+    def losses(self) -> Iterator[schema.Loss]:
+        return self._decoded(schema.LOSS, schema.decode_loss)
+
+    def messages(self) -> Iterator[TopicMessage]:
+        """Every message with its topic, undecoded, in the order of the file."""
+        topics = dict(self._topics)
+        for offset in self._chunks:
+            for record in chunk_records(chunk_data(self.frame(offset), self.name)):
+                if isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                elif isinstance(record, Message):
+                    if record.channel_id not in topics:
+                        raise Damage(self.name, offset, f"message on unknown channel {record.channel_id}")
+                    yield TopicMessage(topics[record.channel_id], record)
+
+    def frame(self, offset: int) -> Frame:
+        try:
+            return frame_at(self._stream, self.name, offset, self.size)
+        except OSError as e:
+            raise RecordingError(f"{self.name}: reading failed at byte {offset}: {e.strerror}") from e
+
+    def _decoded(self, topic: str, decode: Callable[[bytes], T]) -> Iterator[T]:
+        for found, message in self.messages():
+            if found == topic:
+                try:
+                    yield decode(message.data)
+                except ValueError as e:
+                    raise RecordingError(f"{self.name}: {topic} at {message.log_time} ns: {e}") from e
+
+    def _survey(self) -> None:
+        """Notes where everything is and checks the two CRCs that together cover every byte."""
+        crc = zlib.crc32(MAGIC)
+        for frame in walk(self._stream, self.name, self.size):
+            self._note(frame)
+            if frame.opcode == Opcode.DATA_END:
+                self._check_data(frame, crc)
+                crc = 0
+            elif frame.opcode == Opcode.FOOTER:
+                self._check_end(frame, crc)
+            else:
+                crc = zlib.crc32(frame.body, zlib.crc32(frame.head, crc))
+
+    def _note(self, frame: Frame) -> None:
+        if frame.opcode == Opcode.CHUNK:
+            self._chunks.append(frame.offset)
+            return
+        record = parse(frame, self.name)
+        if isinstance(record, Header) and record.profile != schema.PROFILE:
+            raise RecordingError(
+                f"{self.name}: an MCAP file, but not a recording of triaxcal: its header says profile"
+                f" '{record.profile}', expected '{schema.PROFILE}'"
+            )
+        if isinstance(record, Metadata):
+            self.metadata.setdefault(record.name, {}).update(record.metadata)
+        elif isinstance(record, Attachment):
+            self.attachments.add(frame.offset, record)
+        elif isinstance(record, Channel):
+            self._topics[record.id] = record.topic
+
+    def _check_data(self, frame: Frame, crc: int) -> None:
+        record = parse(frame, self.name)
+        assert isinstance(record, DataEnd)
+        if record.data_section_crc in (0, crc):
+            return
+        for number, offset in enumerate(self._chunks, start=1):
+            try:
+                chunk_data(self.frame(offset), self.name)
+            except Damage as e:
+                raise Damage(self.name, offset, f"chunk {number} of {self.chunks}: {e.what}") from e
+        raise Damage(self.name, frame.offset, "header, metadata or index records fail the CRC checked")
+
+    def _check_end(self, frame: Frame, crc: int) -> None:
+        record = parse(frame, self.name)
+        assert isinstance(record, Footer)
+        crc = zlib.crc32(frame.body[:-4], zlib.crc32(frame.head, crc))
+        if record.summary_crc not in (0, crc):
+            raise Damage(self.name, frame.offset, "the summary fails its CRC checked")
+        self._stream.seek(frame.end)
+        tail = self._stream.read(len(MAGIC) + 1)
+        if tail != MAGIC:
+            kind = CutShort if MAGIC.startswith(tail) else Damage
+            raise kind(self.name, frame.end, "the file does not end as it should")

@@ -1,0 +1,247 @@
+"""Mends a recording that was cut short or damaged: keeps every whole record and counts what is lost."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, DataEnd, Message, Metadata, Schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import Writer as McapWriter
+
+from triaxcald.errors import RecordingError
+from triaxcald.recording import schema
+from triaxcald.recording.damaged import DamagedFile, Stretch
+from triaxcald.recording.frames import (
+    CHUNK_LIMIT,
+    HEAD,
+    MAGIC,
+    Damage,
+    Frame,
+    chunk_data,
+    chunk_head,
+    chunk_records,
+    parse,
+    unpack,
+    unpack_part,
+)
+
+
+@dataclass
+class Recovery:
+    """What was kept and what was lost.
+
+    ``raw_records`` kept; ``raw_missing`` lost from the file by their running index (what was to come after
+    the last one is unknown where ``cut_short``); ``raw_dropped`` never reached it, by its own loss records.
+    ``chunks_failed`` and ``attachments_failed`` fail their CRC and are given up. ``unverified_messages`` kept
+    from a chunk that was cut off, where no CRC can vouch for them. ``undeclared_messages`` given up because
+    the chunk that declares their type is lost. ``bytes_dropped`` of the file in no whole record kept.
+    ``unlocated_damage``: the CRC of the whole is wrong though no chunk's or attachment's is, so that header
+    or metadata may hold a wrong byte.
+    """
+
+    raw_records: int = 0
+    raw_missing: int = 0
+    raw_dropped: int = 0
+    messages: int = 0
+    attachments: int = 0
+    chunks_failed: int = 0
+    attachments_failed: int = 0
+    unverified_messages: int = 0
+    undeclared_messages: int = 0
+    bytes_dropped: int = 0
+    cut_short: bool = False
+    unlocated_damage: bool = False
+
+    @property
+    def lossless(self) -> bool:
+        """Whether all was there but for the end of the file and its indexes."""
+        return not (self.raw_missing or self.bytes_dropped or self.undeclared_messages or self.unlocated_damage)
+
+
+def recover(path: Path, out: Path) -> Recovery:
+    """Writes what can be had of ``path`` to ``out``, a finished recording; ``path`` is only read.
+
+    Raises RecordingError: ``path`` is no recording of ours or cannot be read, ``out`` exists or cannot be
+    written (nothing of it is left behind).
+    """
+    try:
+        with open(path, "rb") as source:
+            damaged = DamagedFile(source, str(path))
+            return _write(damaged, path.name, out)
+    except FileExistsError:
+        raise RecordingError(f"{out}: exists already; a recording is never overwritten") from None
+    except OSError as e:
+        raise RecordingError(f"{e.filename or out}: {e.strerror}") from e
+
+
+def _write(damaged: DamagedFile, name: str, out: Path) -> Recovery:
+    sink = open(out, "xb")  # noqa: SIM115 -- closed below, before it is deleted where that must be
+    try:
+        with sink:
+            return _Mending(damaged, McapWriter(sink, enable_data_crcs=True)).run(name)
+    except BaseException:
+        out.unlink()
+        raise
+
+
+class _Mending:
+    """Carries record after record from the damaged file to the new one, counting."""
+
+    def __init__(self, damaged: DamagedFile, mcap: McapWriter) -> None:
+        self._damaged = damaged
+        self._mcap = mcap
+        self._recovery = Recovery(cut_short=True)
+        self._channel_ids: dict[int, int] = {}  # of the damaged file -> of the new one
+        self._digest = schema.RawDigest()
+        self._raw_end = 0  # running index after the last record known of
+        self._written: dict[str, str] = {}  # the metadata record `raw`, where the writer came to its end
+        self._has_format = False
+        self._located = False  # damage has been met
+
+    def run(self, name: str) -> Recovery:
+        self._mcap.start(profile=schema.PROFILE)
+        crc = zlib.crc32(MAGIC)
+        for piece in self._damaged.pieces():
+            if isinstance(piece, Stretch):
+                self._stretch(piece)
+            elif piece.opcode == Opcode.DATA_END:
+                self._data_end(piece, crc)
+            else:
+                crc = zlib.crc32(piece.body, zlib.crc32(piece.head, crc))
+                self._frame(piece)
+        self._count_missing()
+        self._write_end(name)
+        return self._recovery
+
+    def _frame(self, frame: Frame) -> None:
+        try:
+            if frame.opcode == Opcode.CHUNK:
+                self._records(chunk_data(frame, self._damaged.name))
+                return
+            record = parse(frame, self._damaged.name)
+        except Damage:
+            self._located = True
+            self._recovery.bytes_dropped += frame.end - frame.offset
+            if frame.opcode == Opcode.CHUNK:
+                self._recovery.chunks_failed += 1
+            else:
+                self._recovery.attachments_failed += 1
+            return
+        if isinstance(record, Attachment):
+            self._recovery.attachments += 1
+            self._mcap.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+        elif isinstance(record, Metadata):
+            self._metadata(record)
+
+    def _metadata(self, record: Metadata) -> None:
+        if record.name == schema.RAW_RECORD:
+            self._written = record.metadata
+            return
+        self._has_format = self._has_format or record.name == schema.FORMAT_RECORD
+        self._mcap.add_metadata(record.name, record.metadata)
+
+    def _stretch(self, stretch: Stretch) -> None:
+        """Keeps what a chunk of the wrong length or one that was cut off still holds."""
+        self._located = True
+        body = self._damaged.read(stretch.offset, min(stretch.length, CHUNK_LIMIT))
+        found = chunk_head(body[HEAD.size :]) if body[:1] == bytes([Opcode.CHUNK]) else None
+        if found is None:
+            self._recovery.bytes_dropped += stretch.length
+            return
+        chunk, length = found
+        if len(chunk.data) == length and (data := unpack(chunk)) is not None:
+            self._records(data)
+            return
+        self._recovery.bytes_dropped += stretch.length
+        if len(chunk.data) == length:
+            self._recovery.chunks_failed += 1
+        elif stretch.at_end:
+            self._recovery.unverified_messages += self._records(unpack_part(chunk))
+
+    def _records(self, data: bytes) -> int:
+        """Carries over a chunk's records; the number of messages among them that were kept."""
+        kept = 0
+        for record in chunk_records(data):
+            if isinstance(record, Message):
+                kept += self._message(record)
+            else:
+                self._damaged.declare(record)
+        self._recovery.messages += kept
+        return kept
+
+    def _message(self, message: Message) -> bool:
+        channel, kind = self._declaration(message.channel_id)
+        if channel is None or kind is None:
+            self._recovery.undeclared_messages += 1
+            return False
+        try:
+            self._count(channel.topic, message.data)
+        except ValueError:
+            return False  # in a chunk that no CRC vouches for
+        if message.channel_id not in self._channel_ids:
+            schema_id = self._mcap.register_schema(kind.name, kind.encoding, kind.data)
+            self._channel_ids[message.channel_id] = self._mcap.register_channel(
+                channel.topic, channel.message_encoding, schema_id, channel.metadata
+            )
+        self._mcap.add_message(
+            self._channel_ids[message.channel_id],
+            message.log_time,
+            message.data,
+            message.publish_time,
+            message.sequence,
+        )
+        return True
+
+    def _declaration(self, channel_id: int) -> tuple[Channel | None, Schema | None]:
+        """What the file says of the channel, else what the format fixes."""
+        channel = self._damaged.channels.get(channel_id)
+        if channel is not None:
+            return channel, self._damaged.schemas.get(channel.schema_id)
+        if not 1 <= channel_id <= len(schema.CHANNELS):
+            return None, None
+        topic, name = schema.CHANNELS[channel_id - 1]
+        kind = schema.SCHEMAS[name]
+        return (
+            Channel(channel_id, topic, MessageEncoding.Protobuf, {}, channel_id),
+            Schema(channel_id, kind.data, SchemaEncoding.Protobuf, kind.name),
+        )
+
+    def _count(self, topic: str, data: bytes) -> None:
+        """Raises ValueError where ``data`` is not what the topic holds."""
+        if topic == schema.RAW:
+            first, phase, batch = schema.decode_raw(data)
+            self._digest.update(phase, batch)
+            self._raw_end = max(self._raw_end, first + len(batch))
+        elif topic == schema.LOSS:
+            loss = schema.decode_loss(data)
+            if loss.where == schema.RAW:
+                self._recovery.raw_dropped += loss.records
+                self._raw_end = max(self._raw_end, loss.first + loss.records)
+
+    def _data_end(self, frame: Frame, crc: int) -> None:
+        self._recovery.cut_short = False
+        record = parse(frame, self._damaged.name)
+        assert isinstance(record, DataEnd)
+        wrong = record.data_section_crc not in (0, crc)
+        self._recovery.unlocated_damage = wrong and not self._located
+
+    def _count_missing(self) -> None:
+        recovery = self._recovery
+        recovery.raw_records = self._digest.records
+        by_index = self._raw_end - recovery.raw_records - recovery.raw_dropped
+        written = int(self._written.get("records", "0"))
+        recovery.raw_missing = max(by_index, written - recovery.raw_records, 0)
+
+    def _write_end(self, name: str) -> None:
+        if not self._has_format:
+            self._mcap.add_metadata(schema.FORMAT_RECORD, {"format": schema.FORMAT})
+        raw = {"records": str(self._digest.records), "sha256": self._digest.hexdigest()}
+        self._mcap.add_metadata(schema.RAW_RECORD, raw)
+        story = {"of": name, **{key: str(value).lower() for key, value in asdict(self._recovery).items()}}
+        if "sha256" in self._written:
+            story["sha256_when_written"] = self._written["sha256"]
+        self._mcap.add_metadata(schema.RECOVERY_RECORD, story)
+        self._mcap.finish()  # type: ignore[no-untyped-call]

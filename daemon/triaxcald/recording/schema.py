@@ -1,0 +1,285 @@
+"""What a recording holds: topics, protobuf messages built at run time, and the digest of the raw records.
+
+Reader and writer meet only here. Ids of schemas and channels are fixed, so that a recording whose first chunk
+(the one that declares them) is lost can still be read by `recover`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import DecodeError
+from google.protobuf.message_factory import GetMessageClass
+
+from triaxcal_drivers.interface import RawBatch, SampleBlock
+
+FORMAT = "triaxcal.recording/1"
+FORMAT_RECORD = "recording"  # the metadata record that holds FORMAT
+RAW_RECORD = "raw"  # the metadata record with count and digest, written at the end
+RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
+PROFILE = "triaxcal"  # in the header of the MCAP file
+
+Phase = Literal["calibration", "verification"]
+PreviewTopic = Literal["/preview/readings", "/preview/corrected"]
+Operation = Literal["read", "write"]
+
+RAW, REGISTERS, EVENTS, LOSS = "/raw", "/registers", "/events", "/loss"
+PREVIEWS: tuple[PreviewTopic, PreviewTopic] = ("/preview/readings", "/preview/corrected")
+MAX_RECORDS = 8192  # raw records in one message; a longer batch is cut, so that reading needs little memory
+
+_PACKAGE = "triaxcal.recording.v1"
+_F = FieldDescriptorProto
+_Field = tuple[str, "FieldDescriptorProto.Type.ValueType", bool]  # name, type, repeated
+
+_MESSAGES: Mapping[str, Sequence[_Field]] = {
+    "RawBatch": (
+        ("first", _F.TYPE_FIXED64, False),
+        ("phase", _F.TYPE_STRING, False),
+        ("time_ns", _F.TYPE_FIXED64, True),
+        ("source", _F.TYPE_FIXED32, True),
+        ("flags", _F.TYPE_BYTES, False),
+        ("length", _F.TYPE_FIXED32, True),
+        ("payload", _F.TYPE_BYTES, False),
+    ),
+    "RegisterAccess": (
+        ("time_ns", _F.TYPE_FIXED64, False),
+        ("register", _F.TYPE_STRING, False),
+        ("operation", _F.TYPE_STRING, False),
+        ("raw", _F.TYPE_BYTES, False),
+        ("error", _F.TYPE_STRING, False),
+    ),
+    "Event": (
+        ("time_ns", _F.TYPE_FIXED64, False),
+        ("kind", _F.TYPE_STRING, False),
+        ("text", _F.TYPE_STRING, False),
+    ),
+    "Loss": (
+        ("time_ns", _F.TYPE_FIXED64, False),
+        ("where", _F.TYPE_STRING, False),
+        ("first", _F.TYPE_FIXED64, False),
+        ("records", _F.TYPE_FIXED64, False),
+        ("reason", _F.TYPE_STRING, False),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class RegisterAccess:
+    """``raw`` is what went over the wire, most significant byte first; ``error`` is empty where it worked."""
+
+    time_ns: int
+    register: str
+    operation: Operation
+    raw: bytes
+    error: str = ""
+
+
+@dataclass(frozen=True)
+class Event:
+    """``text`` is a JSON object."""
+
+    time_ns: int
+    kind: str
+    text: str
+
+    @property
+    def detail(self) -> Any:
+        return json.loads(self.text)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """``records`` dropped before they reached the file; ``where`` is the topic they were meant for.
+
+    ``first`` is the running index of the first of them, for the raw topic alone.
+    """
+
+    time_ns: int
+    where: str
+    first: int
+    records: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Schema:
+    """One message type as MCAP wants it declared, and its class."""
+
+    name: str
+    data: bytes
+    message: Any
+
+
+def _schema(name: str, fields: Sequence[_Field]) -> Schema:
+    file = FileDescriptorProto(name=f"triaxcal/recording/v1/{name.lower()}.proto", package=_PACKAGE, syntax="proto3")
+    message = file.message_type.add(name=name)
+    for number, (field, kind, repeated) in enumerate(fields, start=1):
+        label = _F.LABEL_REPEATED if repeated else _F.LABEL_OPTIONAL
+        message.field.add(name=field, number=number, type=kind, label=label)
+    pool = DescriptorPool()
+    pool.Add(file)
+    full_name = f"{_PACKAGE}.{name}"
+    data = FileDescriptorSet(file=[file]).SerializeToString()
+    return Schema(full_name, data, GetMessageClass(pool.FindMessageTypeByName(full_name)))
+
+
+SCHEMAS: Mapping[str, Schema] = {name: _schema(name, fields) for name, fields in _MESSAGES.items()}
+
+# (topic, message) in the order of their ids, which start at 1; the preview's schema differs per recording.
+CHANNELS: Sequence[tuple[str, str]] = (
+    (RAW, "RawBatch"),
+    (REGISTERS, "RegisterAccess"),
+    (EVENTS, "Event"),
+    (LOSS, "Loss"),
+)
+
+
+def preview_schema(channels: Sequence[str]) -> Schema:
+    """The preview message with one plain double field for each auxiliary channel, for Foxglove to plot."""
+    vector = [("time_ns", _F.TYPE_FIXED64, False)] + [(axis, _F.TYPE_DOUBLE, False) for axis in "xyz"]
+    named = [(field, _F.TYPE_DOUBLE, False) for field in preview_fields(channels)]
+    return _schema("Preview", vector + named)
+
+
+def preview_fields(channels: Sequence[str]) -> list[str]:
+    """The channels' field names: letters, digits and underscores, none twice, none hiding time or an axis."""
+    taken = {"time_ns", "x", "y", "z"}
+    fields = []
+    for channel in channels:
+        field = re.sub(r"\W", "_", channel, flags=re.ASCII)
+        if not re.match(r"[A-Za-z_]", field):
+            field = f"_{field}"
+        while field in taken:
+            field += "_"
+        taken.add(field)
+        fields.append(field)
+    return fields
+
+
+def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
+    """``first`` is the running index of the batch's first record among all that were offered."""
+    message = SCHEMAS["RawBatch"].message(
+        first=first,
+        phase=phase,
+        time_ns=batch.time_ns.tolist(),
+        source=batch.source.tolist(),
+        flags=batch.flags.tobytes(),
+        length=batch.length.tolist(),
+        payload=batch.payload,
+    )
+    return bytes(message.SerializeToString())
+
+
+def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
+    """(running index of the first record, phase, batch). Raises ValueError where ``data`` is none."""
+    message = _parse("RawBatch", data)
+    batch = RawBatch(
+        np.array(message.time_ns, dtype=np.uint64).astype(np.int64),
+        np.array(message.source, dtype=np.uint32),
+        np.frombuffer(message.flags, dtype=np.uint8),
+        np.array(message.length, dtype=np.uint16),
+        message.payload,
+    )
+    return int(message.first), str(message.phase), batch
+
+
+def encode(value: RegisterAccess | Event | Loss) -> bytes:
+    message = SCHEMAS[type(value).__name__].message(**vars(value))
+    return bytes(message.SerializeToString())
+
+
+def decode_register_access(data: bytes) -> RegisterAccess:
+    m = _parse("RegisterAccess", data)
+    return RegisterAccess(m.time_ns, m.register, m.operation, m.raw, m.error)
+
+
+def decode_event(data: bytes) -> Event:
+    m = _parse("Event", data)
+    return Event(m.time_ns, m.kind, m.text)
+
+
+def decode_loss(data: bytes) -> Loss:
+    m = _parse("Loss", data)
+    return Loss(m.time_ns, m.where, m.first, m.records, m.reason)
+
+
+def _parse(name: str, data: bytes) -> Any:
+    """Raises ValueError where ``data`` is no message ``name``."""
+    try:
+        return SCHEMAS[name].message.FromString(data)
+    except DecodeError as e:
+        raise ValueError(f"not a message {name}") from e
+
+
+def cut(batch: RawBatch, records: int = MAX_RECORDS) -> Iterator[RawBatch]:
+    """The batch in pieces of at most ``records``."""
+    if len(batch) <= records:
+        yield batch
+        return
+    ends = np.concatenate(([0], np.cumsum(batch.length, dtype=np.int64)))
+    for start in range(0, len(batch), records):
+        stop = min(start + records, len(batch))
+        piece = slice(start, stop)
+        yield RawBatch(
+            batch.time_ns[piece],
+            batch.source[piece],
+            batch.flags[piece],
+            batch.length[piece],
+            batch.payload[int(ends[start]) : int(ends[stop])],
+        )
+
+
+class RawDigest:
+    """SHA-256 over raw records, the same however they are cut into batches and the phases interleaved.
+
+    Each phase has two running hashes, over the records' fixed-width columns and over their payloads.
+    """
+
+    _RECORD = np.dtype([("time_ns", "<i8"), ("source", "<u4"), ("flags", "u1"), ("length", "<u2")])
+
+    def __init__(self) -> None:
+        self.records = 0
+        self._phases: dict[str, tuple[hashlib._Hash, hashlib._Hash]] = {}
+
+    def update(self, phase: str, batch: RawBatch) -> None:
+        if not len(batch):
+            return
+        columns, payloads = self._phases.setdefault(phase, (hashlib.sha256(), hashlib.sha256()))
+        table = np.empty(len(batch), dtype=self._RECORD)
+        for name in ("time_ns", "source", "flags", "length"):
+            table[name] = getattr(batch, name)
+        columns.update(table.tobytes())
+        payloads.update(batch.payload)
+        self.records += len(batch)
+
+    def hexdigest(self) -> str:
+        whole = hashlib.sha256()
+        for phase in sorted(self._phases):
+            columns, payloads = self._phases[phase]
+            whole.update(hashlib.sha256(phase.encode()).digest() + columns.digest() + payloads.digest())
+        return whole.hexdigest()
+
+
+class Decimator:
+    """Picks at most one sample of each period of the samples' own time, however they are cut into blocks."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = max(1, round(1e9 / rate_hz))
+        self._last_slot = -1
+
+    def pick(self, block: SampleBlock) -> list[int]:
+        """Indices into ``block`` of the samples to keep."""
+        if not len(block):
+            return []
+        slot = block.time_ns // self._period_ns
+        before = np.concatenate(([self._last_slot], slot[:-1]))
+        self._last_slot = int(slot[-1])
+        return [int(i) for i in np.flatnonzero(slot != before)]

@@ -1,0 +1,97 @@
+"""How a number is written for a person: units, digits, uncertainty. What is missing is an em dash."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+MISSING = "—"
+_LARGEST = 1e30
+_SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+
+def number(value: object) -> float | None:
+    """`value` as a float when it is a finite number of a size that can be drawn, None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return None
+    return float(value) if -_LARGEST < value < _LARGEST else None
+
+
+def clean(value: object) -> str:
+    """Text from data without characters that print as nothing or reorder their neighbours."""
+    text = "".join(c if c.isprintable() else " " if c.isspace() else "\ufffd" for c in str(value))
+    return " ".join(text.split())
+
+
+def effect_title(effect: str) -> str:
+    """`channel_bias:supply_v` becomes `Channel bias: supply_v`."""
+    name, _, channel = effect.partition(":")
+    title = name.replace("_order_", "-order ").replace("_", " ").capitalize()
+    return f"{title}: {channel}" if channel else title
+
+
+def fixed(value: float | None, decimals: int) -> str:
+    if value is None:
+        return MISSING
+    text = f"{value:.{decimals}f}"
+    if float(text) == 0.0:
+        text = text.lstrip("-")
+    return text.replace("-", "−")
+
+
+def digits(value: float | None, significant: int = 3) -> str:
+    """`value` to so many significant digits, without an exponent where one can do without."""
+    if value is None:
+        return MISSING
+    if value == 0.0:
+        return "0"
+    mantissa, exponent = f"{value:.{significant - 1}e}".split("e")
+    if not -4 <= int(exponent) < 7:
+        return f"{mantissa} × {power(int(exponent))}".replace("-", "−")
+    return fixed(value, max(0, significant - 1 - int(exponent)))
+
+
+def micro(value_g: float | None) -> str:
+    """An error in g as a bare number of µg, three digits."""
+    if value_g is None:
+        return MISSING
+    value_ug = value_g * 1e6
+    return fixed(value_ug, 2) if abs(value_ug) < 0.1 else digits(value_ug)
+
+
+def micro_g(value_g: float | None) -> str:
+    return MISSING if value_g is None else f"{micro(value_g)} µg"
+
+
+def power(exponent: int) -> str:
+    return "10" + str(exponent).translate(_SUPERSCRIPT)
+
+
+def unit_text(unit: str) -> str:
+    for exponent in "234":
+        unit = unit.replace(f"^{exponent}", exponent.translate(_SUPERSCRIPT))
+    return unit
+
+
+def p_value(p: float | None) -> str:
+    if p is None:
+        return MISSING
+    return f"< {power(-6)}" if p < 1e-6 else digits(p, 2)
+
+
+def plus_minus(value: float | None, standard_error: float | None, unit: str) -> str:
+    """`(6.254 ± 0.016) × 10⁻³ rad`: the error to two digits, the value to the same place."""
+    if value is None:
+        return MISSING
+    unit = unit_text(unit)
+    scale = max(abs(value), standard_error or 0.0)
+    exponent = 0 if scale == 0.0 or 0.1 <= scale < 1e7 else 3 * math.floor((math.log10(scale) + 1) / 3)
+    tail = f" × {power(exponent)}" if exponent else ""
+    scaled = value / 10.0**exponent
+    if not standard_error or standard_error < 0.0:
+        return f"{digits(scaled, 6)}{tail} {unit} ± {MISSING}".replace("  ", " ")
+    scaled_error = standard_error / 10.0**exponent
+    decimals = min(12, max(0, 1 - math.floor(math.log10(scaled_error))))
+    body = f"{fixed(scaled, decimals)} ± {fixed(scaled_error, decimals)}"
+    return (f"({body}){tail} {unit}" if tail else f"{body} {unit}").strip()

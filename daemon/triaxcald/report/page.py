@@ -1,0 +1,90 @@
+"""The page itself: documents in, one self-contained HTML text out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from triaxcald.report import figures
+from triaxcald.report.charts import bars_picture, stream_picture, time_picture
+from triaxcald.report.document import mapping, read_document
+from triaxcald.report.sphere import sphere_picture
+from triaxcald.report.stream import StreamOverview
+from triaxcald.report.verdict import judge
+
+# Parts of a certificate that the page shows elsewhere, or that are too long to read.
+_SHOWN_ELSEWHERE = {
+    "format", "calibration", "loop", "before", "after", "held_out", "findings", "unexplained", "poses",
+    "limits", "data_quality", "advice", "residual",
+}  # fmt: skip
+_LONGEST_LIST = 16
+
+
+def render_report(
+    document: Mapping[str, object],
+    *,
+    title: str,
+    stream: StreamOverview | None = None,
+    certificate: Mapping[str, object] | None = None,
+) -> str:
+    """HTML of a `triaxcal.calibration/1` or `triaxcal.loop/1`: no script, no outside resource.
+
+    Limits (`limits`, named like the fields of a residual, in g) come from the document or the certificate; a
+    document with `refused` gives the reason in place of a result. The same input gives the same bytes.
+    """
+    outcome, papers = read_document(document), certificate or {}
+    limits = {name: figures.number(value) for name, value in mapping(papers.get("limits")).items()}
+    floor_g = outcome.final.noise_floor_g
+    return _ENVIRONMENT.get_template("report.html").render(
+        title=title,
+        outcome=outcome,
+        verdict=judge(outcome, limits),
+        bars=bars_picture(outcome.stages, outcome.held_out),
+        sphere=sphere_picture(outcome.poses, outcome.stages, floor_g),
+        over_time=time_picture(outcome.poses, outcome.stages, floor_g),
+        streams=stream_picture(stream) if stream is not None else None,
+        provenance=list(_entries(papers)),
+    )
+
+
+def _entries(papers: Mapping[str, object], above: str = "") -> Iterator[tuple[str, str]]:
+    """The certificate's own facts as (label, text), nested ones with their path."""
+    for key, value in papers.items():
+        if not above and key in _SHOWN_ELSEWHERE:
+            continue
+        label = f"{above}{str(key).replace('_', ' ')}"
+        if isinstance(value, Mapping):
+            yield from _entries(value, f"{label}: ")
+        elif not isinstance(value, (list, tuple)):
+            yield label, "" if value is None else str(value)
+        elif len(value) <= _LONGEST_LIST and not any(isinstance(v, (Mapping, list, tuple)) for v in value):
+            yield label, ", ".join(str(v) for v in value)
+
+
+def _printable(value: object) -> object:
+    if value is None or value == "":
+        return figures.MISSING
+    return value if isinstance(value, Markup) else figures.clean(value)
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).with_name("templates")),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_printable,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for function in (
+        figures.digits, figures.effect_title, figures.fixed, figures.micro, figures.micro_g, figures.p_value,
+        figures.plus_minus,
+    ):  # fmt: skip
+        environment.filters[function.__name__] = function
+    return environment
+
+
+_ENVIRONMENT = _environment()

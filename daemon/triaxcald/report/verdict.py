@@ -1,0 +1,123 @@
+"""The first line of the page: what came out, in one word and one sentence, and what speaks against it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from triaxcald.report.document import Outcome
+from triaxcald.report.figures import effect_title, micro_g
+
+_SIGNIFICANT_P = 0.01
+_WORDS = {"within": "Within limits", "outside": "Outside a limit", "unexplained": "Unexplained error left"}
+
+
+@dataclass(frozen=True)
+class LimitCheck:
+    """One declared limit in g against what was measured; `passed` is None where nothing was measured."""
+
+    name: str
+    measured_g: float | None
+    limit_g: float | None
+
+    @property
+    def passed(self) -> bool | None:
+        if self.measured_g is None or self.limit_g is None:
+            return None
+        return self.measured_g <= self.limit_g
+
+
+@dataclass(frozen=True)
+class Verdict:
+    kind: Literal["within", "outside", "unexplained", "refused"]
+    headline: str
+    sentence: str
+    reservations: tuple[str, ...]
+    checks: tuple[LimitCheck, ...]
+
+
+def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None]) -> Verdict:
+    """The verdict on an outcome.
+
+    Limits are named like the fields of a residual, or `held_out_rms_g`, and hold inclusively. A limit that
+    nothing was measured against is never taken as kept.
+    """
+    checks = tuple(_checks(outcome, {**outcome.limits, **certificate_limits}))
+    if outcome.refused is not None:
+        return Verdict("refused", "Refused", outcome.refused, (), checks)
+    reservations = tuple(_reservations(outcome, checks))
+    errors = _errors(outcome)
+    open_checks = [check for check in checks if check.passed is None]
+    exceeded = [check.name for check in checks if check.passed is False]
+    if exceeded:
+        return Verdict("outside", _WORDS["outside"], f"{', '.join(exceeded)}: over the limit. {errors}",
+                       reservations, checks)  # fmt: skip
+    if _unexplained(outcome):
+        kept = "Every declared limit is kept, but more" if checks and not open_checks else "More"
+        sentence = f"{kept} is left than the noise of the poses accounts for. {errors}"
+        return Verdict("unexplained", _WORDS["unexplained"], sentence, reservations, checks)
+    if open_checks or not (checks or _tested(outcome)):
+        return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
+                       reservations, checks)  # fmt: skip
+    headline = _WORDS["within"] if checks else "Nothing left unexplained"
+    return Verdict("within", headline, errors, reservations, checks)
+
+
+def _checks(outcome: Outcome, limits: Mapping[str, float | None]) -> list[LimitCheck]:
+    held_out_g = outcome.held_out.after_rms_g if outcome.held_out else None
+    measured = {
+        "rms_g": ("Residual, rms", outcome.final.rms_g),
+        "max_abs_g": ("Residual, largest", outcome.final.max_abs_g),
+        "cross_validated_rms_g": ("Cross-validated error, rms", outcome.final.cross_validated_rms_g),
+        "held_out_rms_g": ("Held-out error, rms", held_out_g),
+    }
+    return [LimitCheck(*measured.get(name, (name, None)), limit) for name, limit in limits.items()]
+
+
+def _tested(outcome: Outcome) -> bool:
+    return outcome.unexplained is not None or outcome.final.lack_of_fit_p is not None
+
+
+def _unexplained(outcome: Outcome) -> bool:
+    if outcome.unexplained is not None:
+        return outcome.unexplained.significant
+    p = outcome.final.lack_of_fit_p
+    return p is not None and p < _SIGNIFICANT_P
+
+
+def _errors(outcome: Outcome) -> str:
+    """The error before and after where both are known, the most honest one available, against the floor."""
+    name, pairs = "cross-validated", [s.residual.cross_validated_rms_g for s in outcome.stages]
+    if outcome.held_out is not None and outcome.held_out.after_rms_g is not None:
+        name, pairs = "held-out", [outcome.held_out.before_rms_g, outcome.held_out.after_rms_g]
+    if not pairs or pairs[-1] is None:
+        name, pairs = "residual", [s.residual.rms_g for s in outcome.stages]
+    floor_g = outcome.final.noise_floor_g
+    if name == "held-out" and outcome.held_out is not None:
+        floor_g = outcome.held_out.noise_floor_g
+    after = pairs[-1] if pairs else None
+    text = f"Error of the magnitude, {name}: {micro_g(after)} rms"
+    if len(pairs) > 1 and pairs[0] is not None:
+        text += f", {micro_g(pairs[0])} before"
+    return f"{text}; noise floor {micro_g(floor_g)}."
+
+
+def _reservations(outcome: Outcome, checks: tuple[LimitCheck, ...]) -> list[str]:
+    found = []
+    if not checks:
+        found.append("No limit was declared; the verdict compares with the noise floor alone.")
+    if not _tested(outcome):
+        found.append("Whether anything is left beyond noise was not tested.")
+    for finding in outcome.findings:
+        if finding.verdict == "confounded" or finding.alternatives:
+            others = ", ".join(effect_title(name).lower() for name in finding.alternatives)
+            found.append(f"These poses cannot tell {effect_title(finding.effect).lower()} from {others or 'others'}.")
+    rejected = len(outcome.poses) - outcome.poses_used
+    if rejected:
+        found.append(f"{rejected} of {len(outcome.poses)} poses not used.")
+    for count, what in ((len(outcome.warnings), "warning"), (len(outcome.data_quality), "remark")):
+        if count:
+            where = "on the fit" if what == "warning" else "on the quality of the data"
+            found.append(f"{count} {what}{'s' if count > 1 else ''} {where}, listed below.")
+    return found

@@ -1,0 +1,160 @@
+"""A simulated unit on a simulated tumble fixture: the file that describes it, its physics, its place on a bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from triaxcal.effects import effect_named
+from triaxcal.errors import InvalidData
+from triaxcal.plan import directions
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.catalogue import driver_named
+from triaxcal_drivers.modbus.model import ModbusBus
+from triaxcal_drivers.profile import Bundle, Strict, load_bundle, parse_toml, validate
+from triaxcald.errors import InputError
+from triaxcald.simulation.can_unit import CanUnit
+from triaxcald.simulation.modbus_unit import ModbusUnit
+from triaxcald.simulation.time_base import RealTimeBase, TimeBase
+from triaxcald.simulation.unit import ReferenceUnit
+
+Triple = tuple[float, float, float]
+
+
+class SensorTruth(Strict):
+    """The sensor's true coefficients; ``noise_g`` is white, of one sample."""
+
+    scale_factor: Triple = (-2.410618, -2.403823, -2.371761)
+    misalignment: Triple = (625.454406e-5, 404.734018e-5, -65.046441e-5)
+    bias: Triple = (564.518583e-5, -288.4559e-5, 463.952349e-5)
+    noise_g: Annotated[float, Field(ge=0)] = 2e-4
+    effects: Mapping[str, Mapping[str, float]] = Field(default_factory=dict)
+
+
+class Surroundings(Strict):
+    temperature_c: float = 25.0
+    ramp_c_per_s: float = 0.0
+    swing_c: float = 0.0
+    swing_period_s: Annotated[float, Field(gt=0)] = 600.0
+
+
+class Fixture(Strict):
+    """The tumble fixture: it goes through its poses again and again, in an order shuffled by the seed."""
+
+    poses: Annotated[int, Field(ge=9, le=1000)] = 26
+    hold_s: Annotated[float, Field(gt=0)] = 4.0
+    move_s: Annotated[float, Field(gt=0)] = 1.5
+    attitude_error_deg: Annotated[float, Field(ge=0, le=20)] = 2.0
+
+
+class DeviceFile(Strict):
+    """`triaxcal sim DEVICE.toml`."""
+
+    format: Literal["triaxcal.device/1"]
+    profile: Annotated[str, Field(description="name of a built-in reference profile")]
+    serial: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    speed: Annotated[float, Field(gt=0, le=1000, description="unit seconds per second of the wall clock")] = 1.0
+    seed: int = 0
+    eeprom: Annotated[str | None, Field(description="file that holds the EEPROM between runs")] = None
+    bus: dict[str, Any]
+    sensor: SensorTruth = SensorTruth()
+    surroundings: Surroundings = Surroundings()
+    fixture: Fixture = Fixture()
+
+
+@dataclass(frozen=True)
+class SyntheticPhysics:
+    """Binds the metrology's synthetic unit to the simulated electronics."""
+
+    unit: SyntheticUnit
+
+    def sample(self, unit_time_s: Any) -> tuple[Any, Any]:
+        return self.unit.sample(unit_time_s)
+
+
+def load_device(path: Path) -> DeviceFile:
+    """Raises InputError, ProfileError."""
+    try:
+        text = path.read_bytes()
+    except OSError as e:
+        raise InputError(f"{path}: {e.strerror}") from e
+    return validate(DeviceFile, parse_toml(text, where=str(path)), text, where=str(path))
+
+
+def physics_of(device: DeviceFile) -> SyntheticPhysics:
+    """Raises InputError where an effect is not in the catalogue."""
+    effects = []
+    for name, held in device.sensor.effects.items():
+        try:
+            effect = effect_named(name)
+        except KeyError:
+            raise InputError(f"sensor.effects.{name}: no effect of that name is known") from None
+        known = [c.name for c in effect.coefficients]
+        if unknown := set(held) - set(known):
+            raise InputError(f"sensor.effects.{name}.{unknown.pop()}: known coefficients: {', '.join(known)}")
+        effects.append((effect, np.array([held.get(c, 0.0) for c in known])))
+    truth = device.sensor
+    sensor = Sensor(np.array(truth.scale_factor), np.array(truth.misalignment), np.array(truth.bias), tuple(effects))
+    place = device.surroundings
+    environment = Environment(place.temperature_c, place.ramp_c_per_s, place.swing_c, place.swing_period_s)
+    return SyntheticPhysics(
+        SyntheticUnit(sensor, tumble_of(device), np.full(3, truth.noise_g), environment, seed=device.seed)
+    )
+
+
+def tumble_of(device: DeviceFile) -> Tumble:
+    """The plan's directions, shuffled, each off by the fixture's attitude error."""
+    fixture = device.fixture
+    try:
+        plan = np.array([v for _, v in directions(fixture.poses)])
+    except InvalidData as e:
+        raise InputError(f"fixture.poses: {e}") from e
+    rng = np.random.default_rng([device.seed, 1])
+    # Neighbours in time far apart in direction would be quickest to tell; a shuffle is enough.
+    order = rng.permutation(len(plan))
+    error = rng.standard_normal(plan.shape) * np.radians(fixture.attitude_error_deg)
+    off = plan[order] + error
+    return Tumble(off / np.linalg.norm(off, axis=1, keepdims=True), fixture.hold_s, fixture.move_s)
+
+
+@dataclass
+class SimulatedUnit:
+    """A described unit, ready to be served. ``unit`` is the electronics, for whoever wants to look inside."""
+
+    device: DeviceFile
+    bundle: Bundle
+    unit: ReferenceUnit
+    time_base: TimeBase
+    bus: Any
+
+    @property
+    def truth(self) -> Mapping[str, Mapping[str, float]]:
+        return self.device.sensor.effects
+
+    def serve(self) -> AbstractAsyncContextManager[Any]:
+        """On its bus, until the context ends. Raises BusError."""
+        if isinstance(self.bus, CanBus):
+            return CanUnit(self.unit, self.time_base, self.bus)
+        assert isinstance(self.bus, ModbusBus)
+        return ModbusUnit(self.unit, self.time_base, self.bus.where, unit_id=self.bus.unit_id)
+
+
+def simulate(device: DeviceFile, *, where: str, stored: bytes | None = None) -> SimulatedUnit:
+    """Build the unit. Raises InputError, ProfileError."""
+    bundle = load_bundle(Path(device.profile))
+    driver = driver_named(bundle.profile.driver, where=where)
+    if bundle.profile.name not in ("triax-ref-can", "triax-ref-modbus"):
+        raise InputError(f"{where}: profile: only triax-ref-can and triax-ref-modbus are simulated")
+    bus = validate(driver.bus_model, device.bus, b"", where=f"{where}: bus")
+    unit = ReferenceUnit(
+        physics_of(device), serial_number=device.serial, stored=stored, rate_hz=bundle.profile.sampling.rate_hz
+    )
+    return SimulatedUnit(device, bundle, unit, RealTimeBase(device.speed), bus)

@@ -1,0 +1,237 @@
+"""The reference unit on Modbus, over TCP or RTU on a serial line: register map and FIFO windows."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triaxcal_drivers.modbus.model import ModbusBus
+from triaxcal_drivers.modbus.protocol import (
+    DEVICE_FAILURE,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_VALUE,
+    READ_INPUT,
+    ModbusRefusal,
+    SerialLine,
+    TcpAddress,
+    Unanswered,
+)
+from triaxcal_drivers.modbus.stack import serve_serial, serve_tcp
+from triaxcald.simulation.memory import CALIBRATION, TABLE
+from triaxcald.simulation.serial_pair import pty_pair
+from triaxcald.simulation.time_base import TimeBase
+from triaxcald.simulation.unit import ReferenceUnit, RegisterFault, SampleRun, UnitSilent
+
+READINGS_WINDOW, CORRECTED_WINDOW = 0x0000, 0x0400
+HEADER_WORDS, RECORD_WORDS, WINDOW_RECORDS = 3, 10, 12
+WINDOW_WORDS = HEADER_WORDS + RECORD_WORDS * WINDOW_RECORDS
+FIFO_RECORDS = 4096
+PTY = "pty:"
+_FILL_PERIOD_S = 1.0
+_CODES = {
+    "unknown": ILLEGAL_ADDRESS,
+    "read_only": ILLEGAL_ADDRESS,
+    "write_only": ILLEGAL_ADDRESS,
+    "locked": DEVICE_FAILURE,
+    "bad_value": ILLEGAL_VALUE,
+}
+
+
+def _addresses() -> dict[int, str]:
+    """First word of every holding register."""
+    at = {
+        0x0000: "vendor_id",
+        0x0002: "product_code",
+        0x0004: "firmware_version",
+        0x0006: "serial_number",
+        0x0008: "status",
+        0x0009: "write_counter",
+        0x0010: "unlock_key",
+        0x0011: "store",
+        0x0013: "reset",
+    }
+    address = 0x0100
+    for name in CALIBRATION:
+        at[address], at[address + 0x0100] = name, "stored_" + name
+        address += TABLE[name].size // 2
+    return at
+
+
+HOLDING = _addresses()
+_WORDS = {address + word: (name, word) for address, name in HOLDING.items() for word in range(TABLE[name].size // 2)}
+
+
+class Fifo:
+    """Records of ten words; when it is full the oldest one goes, and is counted."""
+
+    def __init__(self) -> None:
+        self._records = bytearray()
+        self.lost = 0
+
+    def __len__(self) -> int:
+        return len(self._records) // (2 * RECORD_WORDS)
+
+    def push(self, records: bytes) -> None:
+        self._records += records
+        excess = max(0, len(self) - FIFO_RECORDS)
+        del self._records[: excess * 2 * RECORD_WORDS]
+        self.lost += excess
+
+    def window(self, words: int) -> bytes:
+        """The first ``words`` words of the window; takes out the records that lie in them whole."""
+        number = min(len(self), WINDOW_RECORDS, max(0, words - HEADER_WORDS) // RECORD_WORDS)
+        taken = bytes(self._records[: number * 2 * RECORD_WORDS])
+        del self._records[: len(taken)]
+        header = b"".join(v.to_bytes(2, "big") for v in (number, len(self), self.lost % 2**16))
+        return (header + taken).ljust(2 * WINDOW_WORDS, b"\0")[: 2 * words]
+
+    def clear(self) -> None:
+        self._records.clear()
+        self.lost = 0
+
+
+class ModbusMap:
+    """The unit's registers and FIFO windows as Modbus sees them; implements `protocol.Handler`."""
+
+    def __init__(self, unit: ReferenceUnit, time_base: TimeBase) -> None:
+        self._unit = unit
+        self._time_base = time_base
+        self._started_s = unit.started_s
+        self._windows = {READINGS_WINDOW: Fifo(), CORRECTED_WINDOW: Fifo()}
+
+    def fill(self) -> None:
+        """Moves the samples that have come due into the FIFOs; empties these where the unit has restarted."""
+        run = self._unit.advance(self._time_base.now_s())
+        if self._unit.started_s != self._started_s:
+            self._started_s = self._unit.started_s
+            for fifo in self._windows.values():
+                fifo.clear()
+        stamp_us = np.rint((run.unit_time_s - self._started_s) * 1e6).astype(np.int64) % 2**32
+        self._windows[READINGS_WINDOW].push(_records(run, stamp_us, run.counts))
+        self._windows[CORRECTED_WINDOW].push(_records(run, stamp_us, run.corrected))
+
+    def alive(self) -> bool:
+        return self._unit.alive(self._time_base.now_s())
+
+    def read(self, function: int, address: int, count: int) -> bytes:
+        self.fill()
+        if function == READ_INPUT:
+            if address not in self._windows or count > WINDOW_WORDS:
+                raise ModbusRefusal(ILLEGAL_ADDRESS)
+            return self._windows[address].window(count)
+        words = []
+        for at in range(address, address + count):
+            if at not in _WORDS:
+                raise ModbusRefusal(ILLEGAL_ADDRESS)
+            name, word = _WORDS[at]
+            words.append(self._read(name)[2 * word : 2 * word + 2])
+        return b"".join(words)
+
+    def write(self, address: int, data: bytes) -> None:
+        """Whole registers, in order of address; the first that is refused ends it."""
+        names, at, end = [], address, address + len(data) // 2
+        while at < end:
+            if at not in _WORDS:
+                raise ModbusRefusal(ILLEGAL_ADDRESS)
+            name, word = _WORDS[at]
+            size = TABLE[name].size // 2
+            if word or at + size > end:
+                raise ModbusRefusal(ILLEGAL_VALUE)  # a part of a register
+            names.append(name)
+            at += size
+        self.fill()  # the samples before the write were made with the old registers
+        for name in names:
+            self._write(name, data[: TABLE[name].size])
+            data = data[TABLE[name].size :]
+
+    def _read(self, name: str) -> bytes:
+        try:
+            return self._unit.read(name, self._time_base.now_s())
+        except RegisterFault as e:
+            raise ModbusRefusal(_CODES[e.kind]) from e
+        except UnitSilent as e:
+            raise Unanswered from e
+
+    def _write(self, name: str, raw: bytes) -> None:
+        try:
+            self._unit.write(name, raw, self._time_base.now_s())
+        except RegisterFault as e:
+            raise ModbusRefusal(_CODES[e.kind]) from e
+        except UnitSilent as e:
+            raise Unanswered from e
+
+
+def _records(run: SampleRun, stamp_us: NDArray[np.int64], xyz: NDArray[np.int32]) -> bytes:
+    records = np.empty(
+        len(run), dtype=[("counter", ">u2"), ("stamp_us", ">u4"), ("xyz", ">i4", 3), ("temperature", ">i2")]
+    )
+    records["counter"], records["stamp_us"] = run.counter, stamp_us
+    records["xyz"], records["temperature"] = xyz, run.temperature_raw
+    return records.tobytes()
+
+
+class ModbusUnit:
+    """Serves the unit while the context is open; ``bus`` then says how to reach it.
+
+    A serial port ``pty:/tmp/link`` is a pseudo-terminal made for the purpose, with a symbolic link to the end
+    that a driver opens. Raises BusError where the port or the address is not to be had.
+    """
+
+    def __init__(
+        self,
+        unit: ReferenceUnit,
+        time_base: TimeBase,
+        where: TcpAddress | SerialLine = TcpAddress("127.0.0.1", 0),  # noqa: B008 - frozen
+        *,
+        unit_id: int = 1,
+    ) -> None:
+        self._map = ModbusMap(unit, time_base)
+        self._time_base = time_base
+        self._where = where
+        self._unit_id = unit_id
+        self._stack = AsyncExitStack()
+        self.bus: ModbusBus
+
+    async def __aenter__(self) -> Self:
+        async with AsyncExitStack() as stack:
+            self.bus = await self._serve(stack)
+            filling = asyncio.create_task(self._fill())
+            stack.callback(filling.cancel)
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, e: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._stack.aclose()
+
+    async def _serve(self, stack: AsyncExitStack) -> ModbusBus:
+        if isinstance(self._where, TcpAddress):
+            port = await stack.enter_async_context(serve_tcp(self._map, self._where, unit_id=self._unit_id))
+            return ModbusBus(host=self._where.host, port=port, unit_id=self._unit_id)
+        line = self._where
+        outside = line.port
+        if line.port.startswith(PTY):
+            outside = line.port.removeprefix(PTY)
+            near, _ = await stack.enter_async_context(pty_pair(Path(outside)))
+            line = SerialLine(near, line.baudrate, parity="N")  # a pseudo-terminal takes no parity
+        await stack.enter_async_context(serve_serial(self._map, line, unit_id=self._unit_id))
+        return ModbusBus(
+            serial_port=outside,
+            baudrate=line.baudrate,
+            parity=line.parity,
+            stopbits=line.stopbits,
+            unit_id=self._unit_id,
+        )
+
+    async def _fill(self) -> None:
+        """So that a unit that nobody reads overflows as it goes, and not in one long run later."""
+        while True:
+            await self._time_base.wait_until(self._time_base.now_s() + _FILL_PERIOD_S)
+            self._map.fill()

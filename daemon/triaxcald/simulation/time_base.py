@@ -1,0 +1,73 @@
+"""The simulated unit's time: the wall clock times a speed, or a clock that a test moves by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+import time
+from typing import Protocol
+
+
+class TimeBase(Protocol):
+    def now_s(self) -> float:
+        """Unit time in seconds; never goes back."""
+
+    async def wait_until(self, unit_s: float) -> None:
+        """Returns once ``now_s()`` has reached ``unit_s``; at once where it has already."""
+
+
+class RealTimeBase:
+    """Starts at 0 when made and runs ``speed`` times as fast as the wall clock."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        if not speed > 0:
+            raise ValueError(f"speed must be above 0, not {speed}")
+        self.speed = speed
+        self._origin_s = time.monotonic()
+
+    def now_s(self) -> float:
+        return (time.monotonic() - self._origin_s) * self.speed
+
+    async def wait_until(self, unit_s: float) -> None:
+        while (left := unit_s - self.now_s()) > 0:
+            await asyncio.sleep(left / self.speed)
+
+
+class SteppedTimeBase:
+    """Stands still until a test moves it; whoever waits is woken in the order of the times waited for."""
+
+    def __init__(self, start_s: float = 0.0) -> None:
+        self._now_s = start_s
+        self._waiting: list[tuple[float, int, asyncio.Future[None]]] = []
+        self._order = itertools.count()
+
+    def now_s(self) -> float:
+        return self._now_s
+
+    async def wait_until(self, unit_s: float) -> None:
+        if unit_s <= self._now_s:
+            return
+        woken = asyncio.get_running_loop().create_future()
+        heapq.heappush(self._waiting, (unit_s, next(self._order), woken))
+        await woken
+
+    async def advance_to(self, unit_s: float) -> None:
+        """Move to ``unit_s``, stopping at every time somebody waits for, so that loops keep their period."""
+        await self._let_others_run()
+        while self._waiting and self._waiting[0][0] <= unit_s:
+            due_s, _, woken = heapq.heappop(self._waiting)
+            if not woken.done():  # a waiter that was cancelled is done
+                self._now_s = max(self._now_s, due_s)
+                woken.set_result(None)
+                await self._let_others_run()
+        self._now_s = max(self._now_s, unit_s)
+        await self._let_others_run()
+
+    async def advance(self, by_s: float) -> None:
+        await self.advance_to(self._now_s + by_s)
+
+    @staticmethod
+    async def _let_others_run() -> None:
+        for _ in range(5):  # the woken task, and those that it wakes in turn
+            await asyncio.sleep(0)

@@ -1,0 +1,133 @@
+"""The station file: which units are where, how they are to be measured, and what is good enough."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, Field, model_validator
+
+from triaxcal_drivers.catalogue import driver_named
+from triaxcal_drivers.profile import Bundle, Strict, load_bundle, parse_toml, validate
+from triaxcald.errors import InputError
+
+
+class Plan(Strict):
+    """Poses to record, seconds to hold each, poses to check the device by afterwards."""
+
+    poses: Annotated[int, Field(ge=9, le=1000)] = 26
+    hold_s: Annotated[float, Field(ge=0.6, le=3600)] = 3.0
+    check_poses: Annotated[int, Field(ge=1, le=100)] = 6
+    apart_deg: Annotated[float, Field(ge=1, le=60, description="poses nearer than this count once")] = 10.0
+    patience_s: Annotated[
+        float, Field(gt=0, description="give up when no new pose has come for so long, in seconds of the samples")
+    ] = 300.0
+
+
+class Limits(Strict):
+    """What is good enough; nothing is judged where nothing is given."""
+
+    residual_rms_g: Annotated[float | None, Field(gt=0)] = None
+    cross_validated_rms_g: Annotated[float | None, Field(gt=0)] = None
+    verification_rms_g: Annotated[float | None, Field(gt=0)] = None
+
+
+class Provisioning(Strict):
+    write: Annotated[bool, Field(description="write the result to the device")] = True
+
+
+class Unit(Strict):
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    profile: Annotated[str, Field(description="a file beside the station file, or the name of a built-in profile")]
+    serial: Annotated[str | None, Field(description="refuse any other unit")] = None
+    signs: Annotated[
+        tuple[Literal[-1, 1], Literal[-1, 1], Literal[-1, 1]] | None,
+        Field(description="of the scale factors; by default the profile's"),
+    ] = None
+    bus: dict[str, Any]
+
+
+class StationFile(Strict):
+    format: Literal["triaxcal.station/1"]
+    name: str
+    folder: Annotated[str, Field(description="where recordings and results go, beside the station file")] = "."
+    reference: Annotated[float, Field(gt=0, description="magnitude of the reference vector; 1 g")] = 1.0
+    plan: Plan = Plan()
+    limits: Limits = Limits()
+    provisioning: Provisioning = Provisioning()
+    units: Annotated[tuple[Unit, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Self:
+        names = [u.name for u in self.units]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"units: the name '{name}' is given twice")
+        return self
+
+
+@dataclass(frozen=True)
+class Place:
+    """A unit with everything it takes to talk to it."""
+
+    unit: Unit
+    bundle: Bundle
+    bus: BaseModel
+
+    @property
+    def where(self) -> str:
+        settings = ", ".join(f"{k}={v}" for k, v in self.unit.bus.items())
+        return f"unit {self.unit.name} ({settings})"
+
+    @property
+    def signs(self) -> tuple[int, int, int]:
+        nominal = self.bundle.profile.output.nominal_scale_factor
+        if self.unit.signs:
+            return self.unit.signs
+        return tuple(1 if k > 0 else -1 for k in nominal) if nominal else (1, 1, 1)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Station:
+    """A validated station file with its own text and the units' profiles."""
+
+    path: Path
+    text: bytes
+    file: StationFile
+    places: tuple[Place, ...]
+
+    @property
+    def folder(self) -> Path:
+        return self.path.parent / self.file.folder
+
+    def place(self, name: str | None) -> Place:
+        """The unit of that name, or the only one. Raises InputError."""
+        names = [p.unit.name for p in self.places]
+        if name is None and len(self.places) == 1:
+            return self.places[0]
+        if name not in names:
+            raise InputError(f"{self.path}: units: name one of {', '.join(names)} with --unit")
+        return self.places[names.index(name)]
+
+
+def parse_station(text: bytes, *, where: str) -> StationFile:
+    """Raises ProfileError with file, line and field."""
+    return validate(StationFile, parse_toml(text, where=where), text, where=where)
+
+
+def load_station(path: Path) -> Station:
+    """Raises InputError, ProfileError, DriverMissing: one line with file, line and field."""
+    try:
+        text = path.read_bytes()
+    except OSError as e:
+        raise InputError(f"{path}: {e.strerror}") from e
+    file = parse_station(text, where=str(path))
+    places = []
+    for i, unit in enumerate(file.units):
+        beside = path.parent / unit.profile
+        bundle = load_bundle(beside if beside.exists() else Path(unit.profile))
+        driver = driver_named(bundle.profile.driver, where=str(path))
+        bus = validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
+        places.append(Place(unit, bundle, bus))
+    return Station(path, text, file, tuple(places))

@@ -1,0 +1,326 @@
+"""One unit's way down the line: record, certify, provision, verify. Everything goes into its recording."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import aclosing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+from triaxcal.errors import Refused, TriaxcalError
+from triaxcal_drivers.catalogue import driver_named
+from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.interface import Device, RawBatch
+from triaxcal_drivers.profile import CORRECTED, READINGS
+from triaxcald.certificate import Certified, certify, software
+from triaxcald.documents import Document, to_text
+from triaxcald.errors import StationError
+from triaxcald.files import write_text
+from triaxcald.inputs import CALIBRATION, PROFILE, VERIFICATION
+from triaxcald.pipeline import Pipeline
+from triaxcald.provision.access import RecordedDevice, RegisterAccess
+from triaxcald.provision.identity import IdentityRead, check_identity
+from triaxcald.provision.procedure import ProvisionReport, provision
+from triaxcald.provision.restore import restore
+from triaxcald.provision.snapshot import Snapshot
+from triaxcald.recording.schema import Phase, RawDigest
+from triaxcald.recording.writer import RecordingWriter
+from triaxcald.report.page import render_report
+from triaxcald.report.stream import StreamOverview, thin
+from triaxcald.station.config import Place, Station
+from triaxcald.station.guidance import Guide, guide
+from triaxcald.verification import Verification, verification_document, verify
+
+JUDGE_EVERY_S = 0.5
+"""Seconds of samples between two looks at the poses so far."""
+CERTIFICATE, VERIFICATION_FILE, STATION_FILE = "certificate.json", "verification.json", "station.toml"
+REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
+
+
+class Progress(Protocol):
+    """Who shows the operator how it goes."""
+
+    def stage(self, unit: str, text: str) -> None: ...
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one unit's run ended. ``exit_code`` as the command line owes it; ``error`` one line where it failed."""
+
+    unit: str
+    exit_code: int
+    recording: Path | None = None
+    certificate: Path | None = None
+    report: Path | None = None
+    certified: Certified | None = None
+    verification: Document | None = None
+    provisioned: ProvisionReport | None = None
+    error: str | None = None
+    wanted: tuple[str, ...] = ()
+
+
+@dataclass
+class _Phase:
+    """The raw records of one phase, as they go to disk and down the pipelines."""
+
+    name: Phase
+    pipelines: dict[str, Pipeline]
+    digest: RawDigest
+
+
+class UnitRun:
+    """The whole line for one unit of a station."""
+
+    def __init__(
+        self, station: Station, place: Place, progress: Progress, *, clock_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        self.station, self.place, self.progress, self.clock_ns = station, place, progress, clock_ns
+        self.name = place.unit.name
+        self.profile = place.bundle.profile
+
+    async def run(self) -> Outcome:
+        """Never raises for what a unit, a bus or the data do; says it in the outcome."""
+        device = self.device()
+        path: Path | None = None
+        try:
+            await device.open()
+            try:
+                identity = await self.identify(device)
+                path = self.recording_path(identity)
+                with self.writer(path, identity) as writer:
+                    return await self._line(device, identity, writer, path)
+            finally:
+                with suppress(DriverError):
+                    await device.close()
+        except Refused as e:
+            return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}", wanted=e.wanted)
+        except TriaxcalError as e:
+            return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}")
+        except (DriverError, StationError) as e:
+            return Outcome(self.name, 4, path, error=f"{self.place.where}: {e}")
+
+    def device(self) -> Device:
+        return driver_named(self.profile.driver).device(self.place.bundle, self.place.bus)
+
+    async def identify(self, device: Device) -> IdentityRead:
+        self.progress.stage(self.name, "reading identity")
+        return await check_identity(device, self.place.bundle, self.place.unit.serial, where=self.place.where)
+
+    def recording_path(self, identity: IdentityRead) -> Path:
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
+        folder = self.station.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder / f"{self.name}-{identity.serial or 'unknown'}-{stamp}.mcap"
+
+    def writer(self, path: Path, identity: IdentityRead) -> RecordingWriter:
+        unit = {"name": self.name, "serial": identity.serial or "", "signs": ",".join(map(str, self.place.signs))}
+        writer = RecordingWriter(
+            path,
+            metadata={
+                "station": {"name": self.station.file.name},
+                "unit": unit,
+                "software": software(),
+            },
+            preview_channels=self._channels(),
+            preview_unit=self.profile.output.unit,
+            clock_ns=self.clock_ns,
+        )
+        writer.attach(STATION_FILE, "application/toml", self.station.text)
+        writer.attach(PROFILE, "application/toml", self.place.bundle.text)
+        for name, data in self.place.bundle.files.items():
+            writer.attach(f"profile/{name}", "application/octet-stream", data)
+        return writer
+
+    def _channels(self) -> list[str]:
+        names: dict[str, None] = {}
+        for stream in self.profile.streams.values():
+            names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
+        return list(names)
+
+    async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter, path: Path) -> Outcome:
+        plan = self.station.file.plan
+        tumble = self.phase(CALIBRATION)
+        await self._collect(device, writer, tumble, READINGS, plan.poses, use_plan=True)
+        self.progress.stage(self.name, "fitting")
+        poses = tumble.pipelines[READINGS].finish()
+        certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
+        writer.attach(CERTIFICATE, "application/json", to_text(certified.document).encode())
+        stem = path.with_suffix("")
+        outcome = Outcome(
+            self.name,
+            0 if certified.within_limits else 1,
+            path,
+            write_text(Path(f"{stem}.certificate.json"), to_text(certified.document)),
+            certified=certified,
+        )
+        provisioned, verification = None, None
+        if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
+            provisioned, verification = await self._write_back(device, writer, certified, tumble, identity)
+            if verification and verification["verdict"] == "outside limits":
+                outcome = Outcome(**{**vars(outcome), "exit_code": 1})
+        self.progress.stage(self.name, "writing the report")
+        page = await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS], verification)
+        writer.attach("report.html", "text/html", page.encode())
+        return Outcome(
+            **{
+                **vars(outcome),
+                "report": write_text(Path(f"{stem}.report.html"), page),
+                "provisioned": provisioned,
+                "verification": verification,
+            }
+        )
+
+    def phase(self, name: Phase) -> _Phase:
+        streams = [s for s in (READINGS, CORRECTED) if s in self.profile.streams]
+        return _Phase(name, {s: Pipeline(self.place.bundle, s) for s in streams}, RawDigest())
+
+    def _certify(self, tumble: _Phase, poses: list[Any], identity: IdentityRead) -> Certified:
+        return certify(
+            self.place.bundle,
+            self.station.file,
+            self.station.text,
+            tumble.pipelines[READINGS],
+            poses,
+            tumble.digest,
+            unit_name=self.name,
+            serial=identity.serial,
+            signs=self.place.signs,
+        )
+
+    async def _collect(
+        self, device: Device, writer: RecordingWriter, phase: _Phase, stream: str, wanted: int, *, use_plan: bool
+    ) -> None:
+        """Records until there are ``wanted`` distinct poses. Raises Refused when none has come for too long."""
+        plan = self.station.file.plan
+        judged_s, news_s, found = 0.0, 0.0, 0
+        async for _ in self.records(device, writer, phase):
+            windows = phase.pipelines[stream].windows
+            if windows is None:
+                continue
+            now_s = (int(windows.end_ns[-1]) - int(windows.start_ns[0])) * 1e-9
+            if now_s - judged_s < JUDGE_EVERY_S:
+                continue
+            judged_s = now_s
+            state = guide(
+                phase.pipelines[stream].poses(),
+                wanted=wanted,
+                hold_s=plan.hold_s,
+                apart_deg=plan.apart_deg,
+                now_s=now_s,
+                nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == READINGS else (1, 1, 1),
+                plan=use_plan,
+            )
+            self.progress.poses(self.name, phase.name, state)
+            if state.complete:
+                return
+            if state.found > found:
+                found, news_s = state.found, now_s
+            if now_s - news_s > plan.patience_s:
+                raise Refused(
+                    f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there", wanted=(state.hint,)
+                )
+
+    async def records(self, device: Device, writer: RecordingWriter, phase: _Phase) -> AsyncIterator[RawBatch]:
+        """Raw records on their way to disk and down the pipelines; what the disk has no room for goes to neither."""
+        async with aclosing(cast(Any, device.stream(list(phase.pipelines)))) as stream:
+            async for batch in stream:
+                if not writer.raw(phase.name, batch):
+                    continue
+                phase.digest.update(phase.name, batch)
+                for name, pipeline in phase.pipelines.items():
+                    block = pipeline.feed(batch)
+                    if len(block):
+                        writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
+                yield batch
+
+    async def _write_back(
+        self, device: Device, writer: RecordingWriter, certified: Certified, tumble: _Phase, identity: IdentityRead
+    ) -> tuple[ProvisionReport, Document | None]:
+        assert certified.image is not None
+        self.progress.stage(self.name, "writing the registers")
+        report = await provision(
+            device,
+            self.place.bundle,
+            certified.image,
+            expected_serial=identity.serial,
+            record=lambda access: _record(writer, access),
+            where=self.place.where,
+        )
+        writer.attach(REGISTERS_BEFORE, "application/json", _snapshot_text(report.before))
+        writer.attach(REGISTERS_AFTER, "application/json", _snapshot_text(report.after))
+        writer.event("provisioned", {"written": list(report.written)})
+        if CORRECTED not in self.profile.streams:
+            return report, None
+        try:
+            document = await self._verify(device, writer, tumble)
+        except (DriverError, StationError, TriaxcalError, asyncio.CancelledError) as e:
+            state = await self._undo(device, writer, report)
+            if isinstance(e, asyncio.CancelledError):
+                raise
+            raise StationError(f"verification failed: {e}; {state}") from e
+        if document["verdict"] == "outside limits":
+            writer.event("restored", {"state": await self._undo(device, writer, report)})
+        return report, document
+
+    async def _undo(self, device: Device, writer: RecordingWriter, report: ProvisionReport) -> str:
+        recorded = RecordedDevice(device, lambda access: _record(writer, access))
+        try:
+            await asyncio.shield(restore(recorded, self.place.bundle, report.before, stored=True))
+        except (DriverError, StationError) as e:
+            return f"NOT restored: {e}"
+        return "old calibration restored and verified"
+
+    async def _verify(self, device: Device, writer: RecordingWriter, tumble: _Phase) -> Document:
+        self.progress.stage(self.name, "verifying by physics")
+        file = self.station.file
+        check = self.phase(VERIFICATION)
+        await self._collect(device, writer, check, CORRECTED, file.plan.check_poses, use_plan=False)
+        document = verification_document(
+            self._corrected(tumble), self._corrected(check), limit_g=file.limits.verification_rms_g,
+            raw_sha256=check.digest.hexdigest(),
+        )  # fmt: skip
+        writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
+        return document
+
+    def _corrected(self, phase: _Phase) -> Verification:
+        return verify(phase.pipelines[CORRECTED].finish(), self.station.file.reference)
+
+    def _report(self, certified: Certified, pipeline: Pipeline, verification: Document | None) -> str:
+        papers = dict(certified.document)
+        if verification:
+            papers["verification"] = verification
+        return render_report(
+            certified.document["result"],
+            title=f"{papers['unit']['product']} {papers['unit']['serial']}",
+            stream=overview(pipeline, self.profile.output.unit),
+            certificate=papers,
+        )
+
+
+def overview(pipeline: Pipeline, unit: str) -> StreamOverview | None:
+    """The stream for a picture, from the windows' means."""
+    windows = pipeline.windows
+    if windows is None:
+        return None
+    start = int(windows.start_ns[0])
+    time_s, readings = thin((windows.start_ns - start) * 1e-9, windows.mean)
+    spans = tuple((p.start_s, p.end_s) for p in pipeline.poses())
+    return StreamOverview(time_s, readings, spans, unit)
+
+
+def _record(writer: RecordingWriter, access: RegisterAccess) -> None:
+    writer.register(access.register, access.kind, access.raw, access.error or "")
+
+
+def _snapshot_text(snapshot: Snapshot) -> bytes:
+    return (json.dumps({name: raw.hex() for name, raw in snapshot.raw.items()}, indent=2) + "\n").encode()
+
+
+async def run_station(station: Station, progress: Progress) -> Sequence[Outcome]:
+    """All units of a station at once; one that fails does not stop the others."""
+    return await asyncio.gather(*(UnitRun(station, place, progress).run() for place in station.places))

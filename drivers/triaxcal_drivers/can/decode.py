@@ -1,0 +1,207 @@
+"""Raw CAN records to samples: put together by counter, in order, the same however the records are cut."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triaxcal_drivers.can.layout import NODES, Layout
+from triaxcal_drivers.can.model import READING_CHANNELS
+from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
+
+Ints = NDArray[np.int64]
+
+_EXTENDED_KEY = 1 << 32
+LATEST = 8
+"""A message may come this many samples late; an unfinished sample is waited for so long."""
+RETURN = 32
+"""A counter that goes back further than this has started anew."""
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Records that belong to the stream: host time, message number, counter, and the values they hold."""
+
+    time_ns: Ints
+    message: Ints
+    counter: Ints
+    values: NDArray[np.float64]  # (n, channels), nan where the message does not hold the channel
+
+    def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _Parts:
+        return _Parts(self.time_ns[rows], self.message[rows], self.counter[rows], self.values[rows])
+
+    def __len__(self) -> int:
+        return len(self.counter)
+
+    def followed_by(self, other: _Parts) -> _Parts:
+        return _Parts(
+            np.concatenate([self.time_ns, other.time_ns]),
+            np.concatenate([self.message, other.message]),
+            np.concatenate([self.counter, other.counter]),
+            np.concatenate([self.values, other.values]),
+        )
+
+
+class CanDecoder:
+    """Decodes one stream of one unit.
+
+    **Node.** Where identifiers shift with the node, the unit is the one whose message comes first; those of
+    other nodes are passed over.
+
+    **Counter.** It is unwrapped against the record before, by the shorter way round. Two kinds of jump are
+    taken for a restart of the device: backwards by more than `RETURN`, and forwards by more than 1/64 of
+    the counter's range to a count in its first 1/256. The sample after a restart continues the
+    unwrapped counter by the host time since the record before, in whole periods and by one at least; so
+    time never goes backwards, and the pause counts as missing samples. (A restart within the last 1/64 of
+    the range, or one whose first messages are not seen, cannot be told from lost samples.)
+
+    **Time.** Host time of the first record, plus the periods counted since; host time where there is no
+    counter.
+
+    **Samples.** One is delivered when every message of it has come and the ones before it are settled. One
+    that lacks messages is given up, and counted ``incomplete``, once the counter is more than `LATEST` past
+    it; one of which nothing came counts as ``missing``. Each message that is repeated, or comes after its
+    sample was given up, counts as one duplicate.
+    """
+
+    def __init__(self, layout: Layout, *, rate_hz: float) -> None:
+        self._layout = layout
+        self._period_ns = 1e9 / rate_hz
+        self._names = tuple(layout.channels)
+        self._sizes = [
+            max(
+                s.size
+                for s in [*(s for m, s in layout.channels.values() if m == i), *layout.counters[i : i + 1]]
+            )
+            for i in range(len(layout.messages))
+        ]
+        self._range = 1 << layout.counter_bits
+        self._latest = min(LATEST, self._range // 8)
+        self._return = min(RETURN, self._range // 4)
+        self._node: int | None = None
+        self._started = False
+        self._origin_ns = self._origin = 0  # time and unwrapped counter of the first record
+        self._last_ns = self._last_raw = self._last = 0  # of the record before
+        self._top = 0  # highest unwrapped counter so far
+        self._settled = 0  # every sample below is delivered or given up
+        empty = np.zeros(0, dtype=np.int64)
+        self._held = _Parts(empty, empty, empty, np.zeros((0, len(self._names))))
+
+    def feed(self, batch: RawBatch) -> SampleBlock:
+        parts, errors = self._extract(batch)
+        if not len(parts):
+            return replace(self._block(parts.time_ns, parts.counter, parts.values), errors=errors)
+        if not self._started:
+            self._start(parts)
+        block = self._assemble(parts) if self._layout.counters else self._as_they_come(parts)
+        return replace(block, errors=errors)
+
+    def _start(self, parts: _Parts) -> None:
+        self._started = True
+        first, first_ns = int(parts.counter[0]), int(parts.time_ns[0])
+        self._origin_ns = self._last_ns = first_ns
+        self._origin = self._last_raw = self._last = self._top = self._settled = first
+
+    def _extract(self, batch: RawBatch) -> tuple[_Parts, int]:
+        bad = (batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) != 0
+        message = self._messages(batch, ~bad & ((batch.flags & RawFlag.REMOTE) == 0))
+        short = (message >= 0) & (batch.length < np.array(self._sizes)[message])
+        rows = np.flatnonzero((message >= 0) & ~short)
+        message = message[rows]
+        length = batch.length.astype(np.int64)
+        starts = (np.cumsum(length) - length)[rows]
+        octets = np.frombuffer(batch.payload, dtype=np.uint8)
+        counter = np.zeros(len(rows), dtype=np.int64)
+        values = np.full((len(rows), len(self._names)), np.nan)
+        for number, size in enumerate(self._sizes):
+            mine = np.flatnonzero(message == number)
+            data = octets[starts[mine, None] + np.arange(size)]
+            for column, (at, signal) in enumerate(self._layout.channels.values()):
+                if at == number:
+                    values[mine, column] = signal.values(data)
+            if self._layout.counters:
+                counter[mine] = self._layout.counters[number].raw(data).astype(np.int64) % self._range
+        return _Parts(batch.time_ns[rows], message, counter, values), int(bad.sum() + short.sum())
+
+    def _messages(self, batch: RawBatch, usable: NDArray[np.bool_]) -> Ints:
+        """Which message of the stream each record is; -1 for none."""
+        extended = (batch.flags & RawFlag.EXTENDED_ID) != 0
+        key = batch.source.astype(np.int64) + extended * _EXTENDED_KEY
+        found = np.full(len(batch), -1, dtype=np.int64)
+        node = np.zeros(len(batch), dtype=np.int64)
+        for number, message in enumerate(self._layout.messages):
+            above = key - message.identifier - message.extended * _EXTENDED_KEY
+            match = (above >= 1) & (above <= NODES) if message.per_node else above == 0
+            found[match & usable] = number
+            node[match] = above[match]
+        shifting = found >= 0
+        shifting &= np.array([m.per_node for m in self._layout.messages])[found]
+        if self._node is None and shifting.any():
+            self._node = int(node[np.argmax(shifting)])
+        found[shifting & (node != self._node)] = -1
+        return found
+
+    def _as_they_come(self, parts: _Parts) -> SampleBlock:
+        """Without a counter every message is a sample, at host time."""
+        time_ns = np.maximum.accumulate(np.maximum(parts.time_ns, self._last_ns))
+        counter = self._settled + np.arange(len(parts))
+        self._settled += len(parts)
+        self._last_ns = int(time_ns[-1])
+        return self._block(time_ns, counter, parts.values)
+
+    def _unwrap(self, parts: _Parts) -> Ints:
+        before = np.concatenate([[self._last_raw], parts.counter[:-1]])
+        half = self._range // 2
+        step = (parts.counter - before + half) % self._range - half
+        restarted = step < -self._return
+        restarted |= (step > self._range // 64) & (parts.counter < self._range // 256)
+        pause_ns = np.diff(parts.time_ns, prepend=self._last_ns)
+        step[restarted] = np.maximum(1, np.rint(pause_ns[restarted] / self._period_ns))
+        unwrapped = self._last + np.cumsum(step)
+        self._last_ns, self._last_raw = int(parts.time_ns[-1]), int(parts.counter[-1])
+        self._last = int(unwrapped[-1])
+        return unwrapped
+
+    def _assemble(self, raw: _Parts) -> SampleBlock:
+        parts = replace(raw, counter=self._unwrap(raw))
+        highest = np.maximum.accumulate(np.concatenate([[self._top], parts.counter]))
+        in_time = (parts.counter >= highest[:-1] - self._latest) & (parts.counter >= self._origin)
+        fresh = np.flatnonzero(in_time)
+        fresh = fresh[~np.isin(self._key(parts[fresh]), self._key(self._held))]
+        fresh = fresh[np.unique(self._key(parts[fresh]), return_index=True)[1]]
+        self._top = int(highest[-1])
+        return replace(self._settle(self._held.followed_by(parts[fresh])), duplicates=len(parts) - len(fresh))
+
+    def _key(self, parts: _Parts) -> Ints:
+        return parts.counter * len(self._layout.messages) + parts.message
+
+    def _settle(self, parts: _Parts) -> SampleBlock:
+        """Deliver and give up what can be, hold the rest."""
+        samples, row, came = np.unique(parts.counter, return_inverse=True, return_counts=True)
+        complete = came == len(self._layout.messages)
+        given_up = max(self._settled, self._top - self._latest)
+        ahead = np.searchsorted(samples, given_up)
+        whole = complete[ahead:] & (samples[ahead:] == given_up + np.arange(len(samples) - ahead))
+        settled = given_up + (len(whole) if whole.all() else int(np.argmin(whole)))
+        new = (samples >= self._settled) & (samples < settled)
+        values = np.full((len(samples), len(self._names)), np.nan)
+        for column, (number, _) in enumerate(self._layout.channels.values()):
+            mine = parts.message == number
+            values[row[mine], column] = parts.values[mine, column]
+        counter = samples[new & complete]
+        time_ns = self._origin_ns + np.rint((counter - self._origin) * self._period_ns).astype(np.int64)
+        block = replace(
+            self._block(time_ns, counter, values[new & complete]),
+            missing=settled - self._settled - int(new.sum()),
+            incomplete=int((new & ~complete).sum()),
+        )
+        self._settled = settled
+        self._held = parts[parts.counter >= self._top - self._latest]
+        return block
+
+    def _block(self, time_ns: Ints, counter: Ints, values: NDArray[np.float64]) -> SampleBlock:
+        columns = [self._names.index(name) for name in READING_CHANNELS]
+        auxiliary = {n: values[:, i] for i, n in enumerate(self._names) if n not in READING_CHANNELS}
+        return SampleBlock(time_ns, counter, values[:, columns], auxiliary)

@@ -1,0 +1,184 @@
+"""A unit on a CAN bus: its stream of frames, and its registers by CANopen SDO."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import threading
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from typing import TypeVar
+
+import can
+import canopen
+from canopen.sdo.client import SdoClient
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from triaxcal_drivers.can.bus import open_bus
+from triaxcal_drivers.can.layout import Layout, nearest
+from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
+from triaxcal_drivers.can.receive import FrameQueue, Identifier
+from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, ProfileError, RegisterRefused
+from triaxcal_drivers.interface import RawBatch, RawFlag
+
+T = TypeVar("T")
+
+_POLL_S = 0.1  # how long closing waits for python-can's receive thread to look up
+_NMT_START = 1
+
+
+class CanDevice:
+    """A device behind python-can; a CANopen node where the profile says so.
+
+    One receive thread serves both the open stream and the SDO client; blocking calls run in worker threads.
+    """
+
+    def __init__(self, profile: CanProfile, bus: CanBus, layouts: Mapping[str, Layout]) -> None:
+        self._profile = profile
+        self._settings = bus
+        self._layouts = layouts
+        self._bus: can.BusABC | None = None
+        self._notifier: can.Notifier | None = None
+        self._frames: FrameQueue | None = None
+        self._network = canopen.Network()
+        self._sdo_lock = threading.Lock()  # one transfer at a time, also after a caller was cancelled
+
+    @property
+    def dropped(self) -> int:
+        """Frames lost in this process since `open`, because the stream was not read fast enough."""
+        return self._frames.dropped if self._frames else 0
+
+    async def open(self) -> None:
+        """Raises BusError, DeviceAbsent."""
+        await self.close()
+        self._frames = FrameQueue(asyncio.get_running_loop())
+        self._bus = await asyncio.to_thread(open_bus, self._settings)
+        self._network = canopen.Network(self._bus)
+        self._sdo = self._sdo_client()
+        self._notifier = can.Notifier(self._bus, [self._frames, *self._network.listeners], _POLL_S)
+        opened = False
+        try:
+            if self._profile.canopen:
+                await self._start()
+            opened = True
+        finally:
+            if not opened:
+                await self.close()
+
+    async def close(self) -> None:
+        notifier, bus, self._notifier, self._bus = self._notifier, self._bus, None, None
+        if notifier is not None:
+            await asyncio.to_thread(notifier.stop)
+        if bus is not None:
+            await asyncio.to_thread(bus.shutdown)
+
+    def _sdo_client(self) -> SdoClient:
+        node = self._settings.node_id
+        nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
+        client = SdoClient(0x600 + node, 0x580 + node, nothing_known)  # type: ignore[no-untyped-call]
+        client.RESPONSE_TIMEOUT = self._profile.sampling.reply_timeout_s
+        client.network = self._network
+        self._network.subscribe(client.tx_cobid, client.on_response)
+        return client
+
+    async def _start(self) -> None:
+        """NMT start, and the check that the right device is there.
+
+        A node that was stopped answers no SDO, one that is still booting misses the command: it is sent
+        before and after the check.
+        """
+        await self._send(0, bytes([_NMT_START, self._settings.node_id]))
+        await self._identify()
+        await self._send(0, bytes([_NMT_START, self._settings.node_id]))
+
+    async def _identify(self) -> None:
+        identity = self._profile.identity
+        asked = [*identity.expect, *([identity.serial_register] if identity.serial_register else [])]
+        for name in asked or list(self._profile.registers)[:1]:
+            try:
+                raw = await self.read(name)
+            except DeviceSilent as e:
+                raise DeviceAbsent(f"nothing answers at {self._settings}") from e
+            except RegisterRefused as e:
+                raise DeviceAbsent(f"{self._settings} is not a {identity.product}: {e}") from e
+            expected = identity.expect.get(name)
+            if expected is not None and int.from_bytes(raw, "little") != expected:
+                raise DeviceAbsent(
+                    f"{self._settings} is not a {identity.product}: {name} is "
+                    f"0x{int.from_bytes(raw, 'little'):X}, expected 0x{expected:X}"
+                )
+
+    async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+        """Frames of the named streams and error frames, until the iterator is closed; one at a time.
+
+        Raises DeviceSilent when no frame of theirs has come for ``silence_timeout_s``, BusError.
+        """
+        frames = self._opened_frames()
+        frames.open(self._identifiers(names))
+        loop, timeout_s = asyncio.get_running_loop(), self._profile.sampling.silence_timeout_s
+        deadline = loop.time() + timeout_s
+        try:
+            while True:
+                batch = await frames.batch(deadline - loop.time())
+                if batch is not None and ((batch.flags & RawFlag.ERROR) == 0).any():
+                    deadline = loop.time() + timeout_s
+                if batch:
+                    yield batch
+                elif loop.time() >= deadline:
+                    raise DeviceSilent(
+                        f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s"
+                    )
+        finally:
+            frames.close()
+
+    def _identifiers(self, names: Sequence[str]) -> set[Identifier]:
+        for name in names:
+            if name not in self._layouts:
+                raise ProfileError(
+                    f"profile {self._profile.name}: no stream '{name}'{nearest(name, self._layouts)}"
+                )
+        node = self._settings.node_id
+        return {(m.identifier_of(node), m.extended) for name in names for m in self._layouts[name].messages}
+
+    def _opened_frames(self) -> FrameQueue:
+        if self._frames is None or self._notifier is None:
+            raise BusError(f"{self._settings} is not open")
+        return self._frames
+
+    async def read(self, register: str) -> bytes:
+        """Least significant byte first. Raises RegisterRefused, DeviceSilent, BusError."""
+        address = object_address(self._profile.registers[register].object)
+        return await self._transfer(register, lambda: bytes(self._sdo.upload(*address)))
+
+    async def write(self, register: str, raw: bytes) -> None:
+        """``raw`` least significant byte first. Raises RegisterRefused, DeviceSilent, BusError."""
+        address = object_address(self._profile.registers[register].object)
+        await self._transfer(register, lambda: self._sdo.download(*address, raw))
+
+    async def _transfer(self, register: str, transfer: Callable[[], T]) -> T:
+        frames = self._opened_frames()
+        place = f"register {register} ({self._profile.registers[register].object}) of {self._settings}"
+
+        def locked() -> T:
+            with self._sdo_lock:
+                return transfer()
+
+        try:
+            return await asyncio.to_thread(locked)
+        except SdoAbortedError as e:
+            reason = SdoAbortedError.CODES.get(e.code, "unknown reason")
+            raise RegisterRefused(
+                f"{place}: refused, 0x{e.code:08X} {reason}", register=register, code=e.code
+            ) from e
+        except (SdoCommunicationError, struct.error) as e:  # the latter: an answer cut short
+            frames.check()
+            raise DeviceSilent(
+                f"{place}: no valid answer within {self._profile.sampling.reply_timeout_s:g} s"
+            ) from e
+        except (can.CanError, OSError) as e:
+            raise BusError(f"{place}: {e}") from e
+
+    async def _send(self, identifier: int, data: bytes) -> None:
+        try:
+            await asyncio.to_thread(self._network.send_message, identifier, data)
+        except (can.CanError, OSError) as e:
+            raise BusError(f"cannot send to {self._settings}: {e}") from e

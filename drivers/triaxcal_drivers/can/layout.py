@@ -1,0 +1,192 @@
+"""Where a stream's channels lie in its CAN messages, and their extraction for many frames at once. No I/O."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triaxcal_drivers.can.model import CanStream, Scaling
+from triaxcal_drivers.errors import ProfileError
+
+NODES = 127
+SHORTEST_COUNTER = 4
+_FLOATS = {16: np.uint16, 32: np.uint32, 64: np.uint64}
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Up to 64 bits of a message, numbered as in a DBC file.
+
+    Bit k is bit k % 8 (0 the least significant) of byte k // 8. ``start`` is the signal's least significant
+    bit where it is little-endian, its most significant one where it is big-endian.
+    """
+
+    name: str
+    start: int
+    length: int
+    big_endian: bool = False
+    signed: bool = False
+    is_float: bool = False
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def _place(self) -> tuple[range, int]:
+        """The bytes it touches, least significant first, and how far it lies above their lowest bit."""
+        if not self.big_endian:
+            return range(self.start // 8, (self.start + self.length - 1) // 8 + 1), self.start % 8
+        last = (
+            8 * (self.start // 8) + 7 - self.start % 8 + self.length - 1
+        )  # counted from the first byte's top
+        return range(last // 8, self.start // 8 - 1, -1), 7 - last % 8
+
+    @property
+    def size(self) -> int:
+        """Bytes that a message must have to hold it."""
+        return max(self._place()[0]) + 1
+
+    def raw(self, data: NDArray[np.uint8]) -> NDArray[Any]:
+        """The unscaled numbers (n,) in messages ``data`` (n, bytes): uint64, int64 or a float type."""
+        places, shift = self._place()
+        bits = np.zeros(len(data), dtype=np.uint64)
+        for k, place in enumerate(places[:8]):
+            bits |= data[:, place].astype(np.uint64) << np.uint64(8 * k)
+        bits >>= np.uint64(shift)
+        if len(places) == 9:
+            bits |= data[:, places[8]].astype(np.uint64) << np.uint64(64 - shift)
+        spare = np.uint64(64 - self.length)
+        bits <<= spare
+        if self.signed and not self.is_float:
+            return bits.view(np.int64) >> np.int64(spare)
+        bits >>= spare
+        if self.is_float:
+            narrow = bits.astype(_FLOATS[self.length])
+            return narrow.view(f"f{self.length // 8}")
+        return bits
+
+    def values(self, data: NDArray[np.uint8]) -> NDArray[np.float64]:
+        scaled: NDArray[np.float64] = self.raw(data).astype(np.float64) * self.scale + self.offset
+        return scaled
+
+
+@dataclass(frozen=True)
+class Message:
+    """A CAN message. Where it is ``per_node``, a unit at node N sends it as ``identifier`` + N."""
+
+    name: str
+    identifier: int
+    signals: Mapping[str, Signal]
+    extended: bool = False
+    per_node: bool = False
+
+    def identifier_of(self, node_id: int) -> int:
+        return self.identifier + node_id if self.per_node else self.identifier
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A stream: its messages, the (message, signal) of each channel, and the counter in each message."""
+
+    messages: tuple[Message, ...]
+    channels: Mapping[str, tuple[int, Signal]]
+    counters: tuple[Signal, ...]
+
+    @property
+    def counter_bits(self) -> int:
+        return self.counters[0].length if self.counters else 0
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A hint for an error message."""
+    names = sorted(set(known))
+    if close := difflib.get_close_matches(name, names, n=1, cutoff=0.5):
+        return f"; did you mean '{close[0]}'?"
+    return f"; known: {', '.join(names[:12])}" if names else ""
+
+
+def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> Layout:
+    """The layout of ``stream`` in a file's messages.
+
+    A name that several messages hold is taken from one that another channel needs in any case.
+    Raises ProfileError (one line: ``where``, the name, the nearest right one).
+    """
+    wanted = stream.wanted()
+    holders = {name: _holders(messages, reference, where) for name, (reference, _) in wanted.items()}
+    needed = {h[0][0] for h in holders.values() if len(h) == 1}
+    chosen: dict[str, tuple[int, Signal]] = {}
+    for name, (reference, scaling) in wanted.items():
+        found = [h for h in holders[name] if len(holders[name]) == 1 or h[0] in needed]
+        if len(found) != 1:
+            names = ", ".join(messages[m].name for m, _ in holders[name])
+            raise ProfileError(f"{where}: '{reference}' is in several messages ({names}); name one of them")
+        chosen[name] = (found[0][0], _scaled(found[0][1], scaling))
+    order = sorted(needed)
+    used = tuple(messages[m] for m in order)
+    channels = {name: (order.index(m), signal) for name, (m, signal) in chosen.items()}
+    layout = Layout(used, channels, _counters(used, stream.counter, where))
+    _check_identifiers(used, where)
+    return layout
+
+
+def _holders(messages: Sequence[Message], reference: str, where: str) -> list[tuple[int, Signal]]:
+    """Which messages hold the signal: ``Signal``, or ``Message.Signal``."""
+    within, _, name = reference.rpartition(".")
+    if within and within not in [m.name for m in messages]:
+        raise ProfileError(f"{where}: no message '{within}'{nearest(within, [m.name for m in messages])}")
+    pool = [(i, m) for i, m in enumerate(messages) if within in ("", m.name)]
+    found = [(i, m.signals[name]) for i, m in pool if name in m.signals]
+    if not found:
+        at = f" in message '{within}'" if within else ""
+        known = [s for _, m in pool for s in m.signals]
+        raise ProfileError(f"{where}: no signal '{name}'{at}{nearest(name, known)}")
+    return found
+
+
+def _scaled(signal: Signal, scaling: Scaling) -> Signal:
+    return Signal(
+        signal.name,
+        signal.start,
+        signal.length,
+        signal.big_endian,
+        signal.signed,
+        signal.is_float,
+        signal.scale if scaling.scale is None else scaling.scale,
+        signal.offset if scaling.offset is None else scaling.offset,
+    )
+
+
+def _counters(used: Sequence[Message], counter: str | None, where: str) -> tuple[Signal, ...]:
+    if counter is None:
+        if len(used) > 1:
+            names = ", ".join(m.name for m in used)
+            raise ProfileError(f"{where}: a sample made of several messages ({names}) needs a counter")
+        return ()
+    for message in used:
+        if counter not in message.signals:
+            hint = nearest(counter, message.signals)
+            raise ProfileError(
+                f"{where}: no signal '{counter}' (the counter) in message '{message.name}'{hint}"
+            )
+    found = tuple(m.signals[counter] for m in used)
+    widths = sorted({s.length for s in found})
+    if len(widths) > 1 or widths[0] < SHORTEST_COUNTER or widths[0] > 32 or any(s.is_float for s in found):
+        raise ProfileError(
+            f"{where}: counter '{counter}' is {' and '.join(map(str, widths))} bits wide, "
+            f"expected an integer of the same {SHORTEST_COUNTER} to 32 bits in every message"
+        )
+    return found
+
+
+def _check_identifiers(used: Sequence[Message], where: str) -> None:
+    """Identifiers that shift with the node must tell messages apart whichever node sends them."""
+    for a, b in combinations([m for m in used if m.per_node], 2):
+        if a.extended == b.extended and abs(a.identifier - b.identifier) < NODES:
+            raise ProfileError(
+                f"{where}: messages '{a.name}' and '{b.name}' are less than {NODES} identifiers apart; "
+                "they cannot shift with the node"
+            )

@@ -1,0 +1,149 @@
+"""A CAN device's profile and the settings of its bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from triaxcal_drivers import registers as codec
+from triaxcal_drivers.profile import AXES, Profile, Register, Strict
+
+READING_CHANNELS = tuple("u" + axis for axis in AXES)
+
+ObjectName = Annotated[
+    str,
+    Field(pattern=r"^0x[0-9A-Fa-f]{4}:[0-9A-Fa-f]{2}$", description='index and sub-index: "0x2100:01"'),
+]
+
+
+def object_address(name: str) -> tuple[int, int]:
+    """``"0x2100:01"`` as (0x2100, 1)."""
+    index, subindex = name.split(":")
+    return int(index, 16), int(subindex, 16)
+
+
+class Scaling(Strict):
+    """Takes the place of the file's own scaling where given: value = raw * scale + offset."""
+
+    scale: float | None = None
+    offset: float | None = None
+
+    @model_validator(mode="after")
+    def _not_zero(self) -> Self:
+        if self.scale == 0:
+            raise ValueError("scale must not be zero")
+        return self
+
+
+class DbcChannel(Scaling):
+    signal: Annotated[str, Field(description="name of the signal, or Message.Signal")]
+
+
+class PdoChannel(Scaling):
+    object: ObjectName
+
+
+def _named(key: str) -> BeforeValidator:
+    """A channel may be given by its name in the file alone."""
+    return BeforeValidator(lambda given: {key: given} if isinstance(given, str) else given)
+
+
+def _has_readings(channels: Mapping[str, object]) -> None:
+    for name in READING_CHANNELS:
+        if name not in channels:
+            raise ValueError(f"channels.{name} is missing")
+
+
+class DbcStream(Strict):
+    """A stream whose messages a DBC file describes.
+
+    The sample is made of the messages that hold its channels; ``counter`` names a signal that each of them
+    holds. ``base_node_id`` is the node for which the DBC's identifiers are written: given it, a unit at
+    another node sends them shifted by the difference.
+    """
+
+    layout: Literal["dbc"]
+    file: str
+    base_node_id: Annotated[int | None, Field(ge=1, le=127)] = None
+    counter: str | None = None
+    channels: Mapping[str, Annotated[DbcChannel, _named("signal")]]
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        _has_readings(self.channels)
+        return self
+
+    def wanted(self) -> dict[str, tuple[str, Scaling]]:
+        """The name in the file, and the scaling, of each channel."""
+        return {name: (channel.signal, channel) for name, channel in self.channels.items()}
+
+
+class PdoStream(Strict):
+    """A stream whose messages are the TPDOs that an EDS file maps; channels are the mapped objects."""
+
+    layout: Literal["pdo"]
+    eds: str
+    counter: ObjectName | None = None
+    channels: Mapping[str, Annotated[PdoChannel, _named("object")]]
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        _has_readings(self.channels)
+        return self
+
+    @property
+    def file(self) -> str:
+        return self.eds
+
+    def wanted(self) -> dict[str, tuple[str, Scaling]]:
+        """The object's name, and the scaling, of each channel."""
+        return {name: (channel.object, channel) for name, channel in self.channels.items()}
+
+
+CanStream = Annotated[DbcStream | PdoStream, Field(discriminator="layout")]
+
+
+class CanRegister(Register):
+    """A register that is an object of the CANopen object dictionary, reached by SDO."""
+
+    object: ObjectName
+
+
+class CanProfile(Profile):
+    """A device on CAN. With registers, or streams laid out by an EDS, it is taken for a CANopen node."""
+
+    streams: Mapping[str, CanStream]
+    registers: Mapping[str, CanRegister] = {}
+
+    @property
+    def canopen(self) -> bool:
+        return bool(self.registers) or any(isinstance(s, PdoStream) for s in self.streams.values())
+
+    def files(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(stream.file for stream in self.streams.values()))
+
+    def encode(self, name: str, value: float) -> bytes:
+        """``value`` as register bytes on the wire, least significant first. Raises RegisterValueError."""
+        return codec.encode(self.registers[name], value, order="little", name=name)
+
+    def decode(self, name: str, raw: bytes) -> float:
+        """The inverse of `encode`. Raises RegisterValueError on a wrong length."""
+        return codec.decode(self.registers[name], raw, order="little", name=name)
+
+
+class CanBus(Strict):
+    """Where a unit is: a python-can interface and channel, and its node on that bus.
+
+    ``options`` are passed on to python-can as they are; its configuration files are not read.
+    """
+
+    interface: Annotated[str, Field(description='a python-can interface: "socketcan", "udp_multicast"…')]
+    channel: Annotated[str | int, Field(description='"can0", a multicast address…')]
+    node_id: Annotated[int, Field(ge=1, le=127)]
+    bitrate: Annotated[int | None, Field(gt=0, description="bit/s")] = None
+    options: Mapping[str, str | int | bool] = {}
+
+    def __str__(self) -> str:
+        return f"node {self.node_id} on {self.interface} {self.channel}"

@@ -1,0 +1,234 @@
+"""A Modbus unit: polls its streams, reads and writes its registers."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
+
+from triaxcal_drivers.errors import (
+    BusError,
+    DeviceAbsent,
+    DeviceSilent,
+    ProfileError,
+    RegisterRefused,
+    RegisterValueError,
+)
+from triaxcal_drivers.interface import RawBatch, RawFlag
+from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream
+from triaxcal_drivers.modbus.protocol import (
+    READ_HOLDING,
+    READ_INPUT,
+    MalformedReply,
+    ModbusRefusal,
+    SerialLine,
+)
+from triaxcal_drivers.modbus.stack import ModbusClient
+from triaxcal_drivers.registers import SIZES
+
+_BATCH_REPLIES = 32
+"""A stream hands out what it has after so many replies, though more may be waiting in the device."""
+
+Record = tuple[int, int, int, bytes]
+
+
+@dataclass
+class _Polled:
+    """A stream while it is polled."""
+
+    name: str
+    stream: PollStream | FifoStream
+    due_s: float
+    heard_s: float
+    trouble: str = "no reply"
+
+    @property
+    def source(self) -> int:
+        return self.stream.function << 16 | self.stream.address
+
+
+class ModbusDevice:
+    """One unit on one connection. Register access and polling share it, one request at a time.
+
+    Registers go most significant byte first, whatever the word order of the profile. ``now_ns`` is the host's
+    clock, for the receive times.
+    """
+
+    def __init__(self, profile: ModbusProfile, bus: ModbusBus, *, now_ns: Callable[[], int] = time.time_ns) -> None:
+        self._profile = profile
+        self._bus = bus
+        self._now_ns = now_ns
+        self._client: ModbusClient | None = None
+
+    async def open(self) -> None:
+        await self.close()
+        timeout_s = self._profile.sampling.reply_timeout_s
+        unit_id = self._bus.unit_id
+        where = self._bus.where
+        if isinstance(where, SerialLine):
+            self._client = await ModbusClient.over_serial(where, unit_id=unit_id, reply_timeout_s=timeout_s)
+        else:
+            self._client = await ModbusClient.over_tcp(where, unit_id=unit_id, reply_timeout_s=timeout_s)
+        try:
+            await self._probe(self._client)
+        except BaseException:
+            await self.close()
+            raise
+
+    async def close(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            await client.close()
+
+    async def _probe(self, client: ModbusClient) -> None:
+        """Any answer shows that the unit is there, an exception too. Takes no samples from it."""
+        function, address, count = self._probe_request()
+        for last in (False, True):
+            try:
+                await client.read(function, address, count)
+            except (ModbusRefusal, MalformedReply):
+                return
+            except DeviceSilent as e:
+                if last:
+                    raise DeviceAbsent(f"nothing answers at {client.where}: {_cause(e)}") from e
+            else:
+                return
+
+    def _probe_request(self) -> tuple[int, int, int]:
+        names = [self._profile.identity.serial_register, *self._profile.identity.expect]
+        for name in [n for n in names if n] + list(self._profile.registers):
+            register = self._profile.registers[name]
+            if register.access != "wo":
+                return _function(register), register.address, _words(register)
+        stream = self._profile.streams["readings"]
+        return stream.function, stream.address, stream.record_start if isinstance(stream, FifoStream) else 1
+
+    async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+        """Replies of the named streams, polled in turn. A failed request is a record too: an exception's code,
+        a malformed reply as it came, nothing for a missing reply.
+
+        Raises DeviceSilent, BusError; ProfileError where the profile has no such stream.
+        """
+        loop = asyncio.get_running_loop()
+        for name in names:
+            if name not in self._profile.streams:
+                raise ProfileError(f"profile {self._profile.name}: no stream named '{name}'")
+        now_s = loop.time()
+        polled = [_Polled(name, self._profile.streams[name], now_s, now_s) for name in names]
+        while polled:
+            await asyncio.sleep(min(p.due_s for p in polled) - loop.time())
+            for p in [p for p in polled if p.due_s <= loop.time()]:
+                p.due_s = max(p.due_s + p.stream.poll_period_s, loop.time())
+                records = await self._drain(p)
+                yield RawBatch.of(records)
+                silent_s = loop.time() - p.heard_s
+                if silent_s >= self._profile.sampling.silence_timeout_s:
+                    raise DeviceSilent(
+                        f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
+                    )
+
+    async def _drain(self, p: _Polled) -> list[Record]:
+        """One read of a stream, or reads until its FIFO is empty, but not for ever."""
+        records: list[Record] = []
+        for _ in range(_BATCH_REPLIES):
+            flags, data = await self._request(p)
+            records.append((self._now_ns(), p.source, flags, data))
+            taken, remaining = self._held(p.stream, data) if not flags else (0, 0)
+            if taken:
+                p.heard_s = asyncio.get_running_loop().time()
+            elif not flags:
+                p.trouble = "it answers, but its FIFO stays empty"
+            if not remaining:
+                return records
+        p.due_s = 0.0  # more is waiting: come back at once
+        return records
+
+    async def _request(self, p: _Polled) -> tuple[RawFlag, bytes]:
+        try:
+            data = await self._connected().read(p.stream.function, p.stream.address, p.stream.words)
+        except ModbusRefusal as e:
+            p.trouble = str(e)
+            return RawFlag.ERROR, bytes([e.code])
+        except MalformedReply as e:
+            p.trouble = "malformed replies"
+            return RawFlag.INVALID, e.pdu
+        except DeviceSilent:
+            p.trouble = "no reply"
+            return RawFlag.ERROR, b""
+        return RawFlag(0), data
+
+    def _held(self, stream: PollStream | FifoStream, data: bytes) -> tuple[int, int]:
+        """Records in a reply, and records left in the device."""
+        if not isinstance(stream, FifoStream):
+            return 1, 0
+
+        def number(word: int) -> int:
+            return int.from_bytes(data[2 * word : 2 * word + 2], self._profile.byte_order)
+
+        count = number(stream.header.count)
+        if stream.header.remaining is not None:
+            return count, number(stream.header.remaining)
+        return count, int(count >= stream.record_capacity)
+
+    async def read(self, register: str) -> bytes:
+        entry = self._register(register)
+        try:
+            raw = await self._connected().read(_function(entry), entry.address, _words(entry))
+        except ModbusRefusal as e:
+            raise self._refused(register, "read", e.code, str(e)) from e
+        except MalformedReply as e:
+            raise BusError(f"register {register}: {e}") from e
+        return self._ordered(entry, raw)
+
+    async def write(self, register: str, raw: bytes) -> None:
+        """Raises RegisterValueError where ``raw`` is not as long as the register; nothing is sent then."""
+        entry = self._register(register)
+        if len(raw) != SIZES[entry.type]:
+            raise RegisterValueError(
+                f"register {register}: {len(raw)} bytes, expected {SIZES[entry.type]} ({entry.type})"
+            )
+        if entry.table == "input":
+            raise RegisterValueError(f"register {register}: an input register cannot be written")
+        single = self._profile.single_write and _words(entry) == 1
+        try:
+            await self._connected().write(entry.address, self._ordered(entry, raw), single=single)
+        except ModbusRefusal as e:
+            raise self._refused(register, "written", e.code, str(e)) from e
+        except MalformedReply as e:
+            raise BusError(f"register {register}: {e}") from e
+
+    def _refused(self, register: str, done: str, code: int, reason: str) -> RegisterRefused:
+        where = f"{self._connected().where}: register {register} (0x{self._register(register).address:04X})"
+        return RegisterRefused(f"{where} cannot be {done}: {reason}", register=register, code=code)
+
+    def _register(self, name: str) -> ModbusRegister:
+        if name not in self._profile.registers:
+            raise ProfileError(f"profile {self._profile.name}: no register named '{name}'")
+        return self._profile.registers[name]
+
+    def _ordered(self, register: ModbusRegister, raw: bytes) -> bytes:
+        """From most significant first to the device's order, or back: the same exchange both ways."""
+        words = [raw[i : i + 2] for i in range(0, len(raw), 2)]
+        if (register.word_order or self._profile.word_order) == "little":
+            words.reverse()
+        if self._profile.byte_order == "little":
+            words = [w[::-1] for w in words]
+        return b"".join(words)
+
+    def _connected(self) -> ModbusClient:
+        if self._client is None:
+            raise BusError("the device is not open")
+        return self._client
+
+
+def _function(register: ModbusRegister) -> int:
+    return READ_INPUT if register.table == "input" else READ_HOLDING
+
+
+def _words(register: ModbusRegister) -> int:
+    return SIZES[register.type] // 2
+
+
+def _cause(e: DeviceSilent) -> str:
+    return str(e).partition(": ")[2]

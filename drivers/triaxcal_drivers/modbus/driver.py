@@ -1,0 +1,39 @@
+"""What the catalogue finds under the name ``modbus``."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.interface import Decoder, Device
+from triaxcal_drivers.modbus.decoder import ModbusDecoder
+from triaxcal_drivers.modbus.device import ModbusDevice
+from triaxcal_drivers.modbus.model import ModbusBus, ModbusProfile
+from triaxcal_drivers.profile import Bundle
+
+
+class ModbusDriver:
+    """Modbus TCP and RTU."""
+
+    profile_model = ModbusProfile
+    bus_model = ModbusBus
+
+    def device(self, bundle: Bundle, bus: Any) -> Device:
+        if not isinstance(bus, ModbusBus):
+            raise TypeError(f"expected a ModbusBus, not {type(bus).__name__}")
+        return ModbusDevice(_profile(bundle), bus)
+
+    def decoder(self, bundle: Bundle, stream: str) -> Decoder:
+        profile = _profile(bundle)
+        if stream not in profile.streams:
+            close = difflib.get_close_matches(stream, profile.streams, n=1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(profile.streams)}"
+            raise ProfileError(f"profile {profile.name}: no stream named '{stream}'; {hint}")
+        return ModbusDecoder(profile, stream)
+
+
+def _profile(bundle: Bundle) -> ModbusProfile:
+    if not isinstance(bundle.profile, ModbusProfile):
+        raise ProfileError(f"profile {bundle.profile.name} is for the driver '{bundle.profile.driver}', not 'modbus'")
+    return bundle.profile

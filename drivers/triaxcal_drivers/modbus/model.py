@@ -1,0 +1,219 @@
+"""What a profile says of a Modbus device, and where such a device is found."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from triaxcal_drivers.modbus.protocol import (
+    MAX_READ_WORDS,
+    MAX_WRITE_WORDS,
+    READ_HOLDING,
+    READ_INPUT,
+    SerialLine,
+    TcpAddress,
+)
+from triaxcal_drivers.profile import AXES, Profile, Register, Strict
+from triaxcal_drivers.registers import SIZES
+
+WordType = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
+Order = Literal["big", "little"]
+Table = Literal["input", "holding"]
+Address = Annotated[int, Field(ge=0, le=0xFFFF)]
+Word = Annotated[int, Field(ge=0, lt=MAX_READ_WORDS)]
+
+
+def words_of(type_: str) -> int:
+    """Registers of 16 bits that a value of that type takes."""
+    return SIZES[type_] // 2
+
+
+class Channel(Strict):
+    """A number in a reply or record; the value is ``raw * scale + offset``."""
+
+    word: Annotated[Word, Field(description="first word, counted from the start of the reply or record")]
+    type: WordType
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: str = ""
+    word_order: Annotated[Order | None, Field(description="where it differs from the profile's")] = None
+
+    @model_validator(mode="after")
+    def _sound(self) -> Self:
+        if self.scale == 0:
+            raise ValueError("scale must not be zero")
+        return self
+
+
+class Counter(Strict):
+    """A sample counter; it wraps at 2^bits."""
+
+    word: Word
+    type: Literal["uint16", "uint32"]
+    bits: Annotated[int | None, Field(ge=4, le=32, description="where fewer than the type has")] = None
+
+    @property
+    def modulus_bits(self) -> int:
+        return self.bits or 8 * SIZES[self.type]
+
+
+class TimeStamp(Strict):
+    """The device's time of a sample, in ticks of ``unit_s``; it wraps with its type."""
+
+    word: Word
+    type: Literal["uint16", "uint32", "uint64"]
+    unit_s: Annotated[float, Field(gt=0, description="seconds a tick: 1e-6, 0.001…")]
+
+
+class _Stream(Strict):
+    table: Table = "input"
+    address: Address
+    poll_period_s: Annotated[float, Field(ge=0, le=60)]
+    channels: Annotated[dict[str, Channel], Field(description="x, y and z; any further ones by their names")]
+    counter: Counter | None = None
+    time_stamp: TimeStamp | None = None
+
+    @model_validator(mode="after")
+    def _has_axes(self) -> Self:
+        for axis in AXES:
+            if axis not in self.channels:
+                raise ValueError(f"channels.{axis} is missing: channels must have x, y and z")
+        return self
+
+    @property
+    def function(self) -> int:
+        """The function code that reads it."""
+        return READ_INPUT if self.table == "input" else READ_HOLDING
+
+    def _fields(self) -> dict[str, Channel | Counter | TimeStamp]:
+        fields: dict[str, Channel | Counter | TimeStamp] = {
+            f"channels.{name}": channel for name, channel in self.channels.items()
+        }
+        if self.counter:
+            fields["counter"] = self.counter
+        if self.time_stamp:
+            fields["time_stamp"] = self.time_stamp
+        return fields
+
+    @property
+    def _span(self) -> int:
+        """Words from the start of a record to the end of its last field."""
+        return max(f.word + words_of(f.type) for f in self._fields().values())
+
+
+class PollStream(_Stream):
+    """A block of registers that holds the newest sample; read once a poll period."""
+
+    layout: Literal["poll"]
+
+    @property
+    def words(self) -> int:
+        return self._span
+
+
+class FifoHeader(Strict):
+    """Words at the start of a FIFO window."""
+
+    count: Annotated[Word, Field(description="word that holds the number of records in this window")]
+    remaining: Annotated[Word | None, Field(description="word: records left in the device after it")] = None
+    lost: Annotated[Word | None, Field(description="word: samples lost to overflow so far; wraps")] = None
+
+
+class FifoStream(_Stream):
+    """A window on the device's FIFO; reading it takes the records out."""
+
+    layout: Literal["fifo"]
+    header: FifoHeader
+    record_start: Annotated[Word, Field(description="word at which the first record begins")]
+    record_words: Annotated[int, Field(ge=3, le=MAX_READ_WORDS)]
+    record_capacity: Annotated[int, Field(ge=1, le=MAX_READ_WORDS, description="records in a window")]
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        for name, field in self._fields().items():
+            if field.word + words_of(field.type) > self.record_words:
+                raise ValueError(f"{name} reaches past the record's {self.record_words} words")
+        for name, word in self.header.model_dump().items():
+            if word is not None and word >= self.record_start:
+                raise ValueError(f"header.{name} = {word} lies in the records, which start at {self.record_start}")
+        return self
+
+    @property
+    def words(self) -> int:
+        return self.record_start + self.record_words * self.record_capacity
+
+
+Stream = Annotated[PollStream | FifoStream, Field(discriminator="layout")]
+
+
+class ModbusRegister(Register):
+    table: Table = "holding"
+    address: Address
+    word_order: Annotated[Order | None, Field(description="where it differs from the profile's")] = None
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.type not in ("int24", "uint24") and self.address + words_of(self.type) > 0x10000:
+            raise ValueError(f"address {self.address} leaves no room for {self.type}")
+        if self.type in ("int24", "uint24"):
+            raise ValueError(f"type {self.type} is none of Modbus: use {self.type.replace('24', '32')}")
+        if self.table == "input" and self.access != "ro":
+            raise ValueError('an input register is read-only: set access = "ro"')
+        return self
+
+
+class ModbusProfile(Profile):
+    """A Modbus device. Orders: "big" is most significant first, of words in a value, of bytes in a word."""
+
+    streams: dict[str, Stream]
+    registers: dict[str, ModbusRegister] = Field(default_factory=dict)
+    word_order: Order = "big"
+    byte_order: Order = "big"
+    max_read_words: Annotated[int, Field(ge=1, le=MAX_READ_WORDS)] = MAX_READ_WORDS
+    max_write_words: Annotated[int, Field(ge=1, le=MAX_WRITE_WORDS)] = MAX_WRITE_WORDS
+    single_write: Annotated[bool, Field(description="write registers of one word with function 6, not 16")] = False
+
+    @model_validator(mode="after")
+    def _blocks_fit(self) -> Self:
+        for name, stream in self.streams.items():
+            if stream.words > self.max_read_words:
+                raise ValueError(
+                    f"streams.{name} takes {stream.words} words, more than one read gives "
+                    f"(max_read_words {self.max_read_words})"
+                )
+            if stream.address + stream.words > 0x10000:
+                raise ValueError(f"streams.{name}: {stream.words} words from {stream.address} leave the table")
+        for name, register in self.registers.items():
+            if words_of(register.type) > min(self.max_read_words, self.max_write_words):
+                raise ValueError(f"registers.{name}: {register.type} is longer than one request may be")
+        sources = [(s.function, s.address) for s in self.streams.values()]
+        if len(set(sources)) < len(sources):
+            raise ValueError("streams: two of them start at the same address")
+        return self
+
+
+class ModbusBus(Strict):
+    """Where the unit is: over TCP at ``host``, or RTU on ``serial_port``."""
+
+    host: str | None = None
+    port: Annotated[int, Field(ge=1, le=65535)] = 502
+    serial_port: str | None = None
+    baudrate: Annotated[int, Field(ge=300, le=4_000_000)] = 19200
+    parity: Literal["N", "E", "O"] = "E"
+    stopbits: Literal[1, 2] = 1
+    unit_id: Annotated[int, Field(ge=0, le=255)] = 1
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.host is None) == (self.serial_port is None):
+            raise ValueError(
+                'give either host = "…" (Modbus TCP) or serial_port = "…" (RTU)' + (", not both" if self.host else "")
+            )
+        return self
+
+    @property
+    def where(self) -> TcpAddress | SerialLine:
+        if self.serial_port is not None:
+            return SerialLine(self.serial_port, self.baudrate, self.parity, self.stopbits)
+        return TcpAddress(self.host or "", self.port)

@@ -1,0 +1,110 @@
+"""The Modbus application protocol as far as it is used here: names, errors, and what a unit answers. No I/O."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from triaxcal_drivers.errors import DriverError
+
+READ_HOLDING, READ_INPUT, WRITE_SINGLE, WRITE_MULTIPLE = 3, 4, 6, 16
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
+MAX_READ_WORDS, MAX_WRITE_WORDS = 125, 123
+_REASONS = {
+    1: "illegal function",
+    2: "illegal data address",
+    3: "illegal data value",
+    4: "device failure",
+    5: "acknowledged, still busy",
+    6: "device busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target does not respond",
+}
+
+
+class ModbusRefusal(DriverError):
+    """The device answered with an exception; ``code`` is the protocol's."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception 0x{code:02X} ({_REASONS.get(code, 'unknown')})")
+        self.code = code
+
+
+class MalformedReply(DriverError):
+    """A reply of the wrong function, length or address; ``pdu`` is what came, function code first."""
+
+    def __init__(self, message: str, pdu: bytes) -> None:
+        super().__init__(message)
+        self.pdu = pdu
+
+
+@dataclass(frozen=True)
+class TcpAddress:
+    """``port`` 0, for a unit that is served: one that is free."""
+
+    host: str
+    port: int
+
+
+@dataclass(frozen=True)
+class SerialLine:
+    """A serial port and its settings; 8 data bits, as RTU demands."""
+
+    port: str
+    baudrate: int = 19200
+    parity: Literal["N", "E", "O"] = "E"
+    stopbits: Literal[1, 2] = 1
+
+    @property
+    def frame_gap_s(self) -> float:
+        """The silence that separates RTU frames: 3.5 characters, 1.75 ms above 19200 baud."""
+        if self.baudrate > 19200:
+            return 1.75e-3
+        return 3.5 * (9 + (self.parity != "N") + self.stopbits) / self.baudrate
+
+
+class Unanswered(Exception):
+    """Raised by a handler whose unit leaves this request without a reply."""
+
+
+class Handler(Protocol):
+    """What a served unit does. While ``alive`` is False it leaves every request without a reply."""
+
+    def alive(self) -> bool: ...
+
+    def read(self, function: int, address: int, count: int) -> bytes:
+        """2·count bytes. Raises ModbusRefusal, Unanswered."""
+
+    def write(self, address: int, data: bytes) -> None:
+        """Raises ModbusRefusal, Unanswered."""
+
+
+def answer(handler: Handler, pdu: bytes) -> bytes:
+    """The reply PDU to a request PDU, an exception where the request is wrong or refused."""
+    try:
+        return _carry_out(handler, pdu)
+    except ModbusRefusal as e:
+        return bytes([pdu[0] | 0x80, e.code])
+
+
+def _carry_out(handler: Handler, pdu: bytes) -> bytes:
+    function, body = pdu[0], pdu[1:]
+    if function not in (READ_HOLDING, READ_INPUT, WRITE_SINGLE, WRITE_MULTIPLE):
+        raise ModbusRefusal(ILLEGAL_FUNCTION)
+    if len(body) < 4:
+        raise ModbusRefusal(ILLEGAL_VALUE)
+    address, number = struct.unpack(">HH", body[:4])
+    if function in (READ_HOLDING, READ_INPUT):
+        if not 1 <= number <= MAX_READ_WORDS:
+            raise ModbusRefusal(ILLEGAL_VALUE)
+        return bytes([function, 2 * number]) + handler.read(function, address, number)
+    if function == WRITE_SINGLE:
+        handler.write(address, body[2:4])
+        return pdu
+    data = body[5:]
+    if not (1 <= number <= MAX_WRITE_WORDS and body[4:5] == bytes([2 * number]) and len(data) == 2 * number):
+        raise ModbusRefusal(ILLEGAL_VALUE)
+    handler.write(address, data)
+    return pdu[:5]

@@ -1,0 +1,282 @@
+"""Every failure at every step ends with the old calibration, and the message says so."""
+
+import asyncio
+
+import pytest
+
+from triaxcal_drivers.errors import DeviceSilent, RegisterRefused
+from triaxcald.errors import ProvisionError
+from triaxcald.simulation.memory import CALIBRATION, Stored
+from triaxcald.simulation.physics import ConstantPhysics
+from triaxcald.simulation.unit import Faults, ReferenceUnit
+
+UNTOUCHED = "old calibration untouched"
+RESTORED = "old calibration restored and verified"
+
+
+def refusing(*names: str) -> Faults:
+    return Faults(refuse_registers=frozenset(names))
+
+
+async def fail(bench) -> str:
+    with pytest.raises(ProvisionError) as caught:
+        await bench.provision()
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+async def test_a_refused_unlock_leaves_the_unit_untouched(make_bench) -> None:
+    bench = make_bench(faults=refusing("unlock_key"))
+    assert await fail(bench) == f"provisioning failed at unlock: register unlock_key: locked; {UNTOUCHED}"
+    bench.assert_holds(bench.old)
+    assert bench.device.written == []
+
+
+@pytest.mark.parametrize("name", CALIBRATION)
+async def test_a_refused_write_is_undone(make_bench, name: str) -> None:
+    bench = make_bench(faults=refusing(name))
+    assert await fail(bench) == f"provisioning failed at writing {name}: register {name}: locked; {RESTORED}"
+    bench.assert_holds(bench.old)
+    assert bench.stored.write_counter == 3
+
+
+@pytest.mark.parametrize("name", CALIBRATION)
+async def test_a_register_that_reads_back_differently_is_never_stored(make_bench, name: str) -> None:
+    bench = make_bench(faults=Faults(corrupt_write={name: 0x01}))
+    message = await fail(bench)
+    assert message.startswith(f"provisioning failed at reading back: register {name} holds ")
+    assert message.endswith(RESTORED)
+    bench.assert_holds(bench.old)
+    assert bench.stored.write_counter == 3
+
+
+async def test_a_refused_store_is_undone(make_bench) -> None:
+    bench = make_bench(faults=refusing("store"))
+    assert await fail(bench) == f"provisioning failed at store: register store: locked; {RESTORED}"
+    bench.assert_holds(bench.old)
+
+
+async def test_a_forgotten_store_is_noticed_after_the_reset(make_bench) -> None:
+    bench = make_bench(faults=Faults(forget_store=True))
+    message = await fail(bench)
+    assert message.startswith("provisioning failed at reading back after the reset: register scale_factor_x holds ")
+    assert message.endswith(RESTORED)
+    bench.assert_holds(bench.old)
+
+
+async def test_a_refused_reset_is_undone_by_writing_back(make_bench) -> None:
+    bench = make_bench(faults=refusing("reset"))
+    message = await fail(bench)
+    assert message.startswith("provisioning failed at reset: register reset: locked; NOT restored: register reset")
+    bench.assert_holds(bench.old)  # only that it cannot be shown after a restart
+
+
+@pytest.mark.parametrize("name", ["unlock_key", *CALIBRATION])
+async def test_a_unit_that_dies_before_the_store_keeps_its_old_calibration(make_bench, name: str) -> None:
+    bench = make_bench(faults=Faults(die_on_write=name))
+    message = await fail(bench)
+    if name == "unlock_key":
+        assert message.endswith(UNTOUCHED)
+    else:
+        assert f"failed at writing {name}" in message
+        assert "NOT restored: nothing answers; the stored calibration is the old one" in message
+    bench.assert_stored(bench.old)
+
+
+async def test_a_unit_that_dies_on_the_store_is_reported_as_open(make_bench) -> None:
+    bench = make_bench(faults=Faults(die_on_write="store"))
+    message = await fail(bench)
+    assert "failed at store" in message
+    assert "NOT restored: nothing answers; either calibration may be stored" in message
+    bench.assert_stored(bench.old)
+
+
+async def test_a_unit_that_dies_while_storing_keeps_its_old_calibration(make_bench) -> None:
+    clean = make_bench()
+    store_s = None
+
+    def watch(operation: int, done: bool) -> None:
+        nonlocal store_s
+        if clean.device.log[-1] == ("write", "store"):
+            store_s = clean.device.now_s
+
+    clean.device.trouble = watch
+    await clean.provision()
+    bench = make_bench(faults=Faults(die_at_s=store_s + 0.03))
+    message = await fail(bench)
+    assert "failed at store" in message
+    assert "NOT restored" in message
+    bench.assert_stored(bench.old)
+
+
+async def test_a_unit_that_dies_on_the_reset_holds_the_new_calibration_and_the_message_does_not_promise(
+    make_bench,
+) -> None:
+    bench = make_bench(faults=Faults(die_on_write="reset"))
+    message = await fail(bench)
+    assert "failed at reset" in message
+    assert "NOT restored: nothing answers; either calibration may be stored" in message
+    bench.assert_stored(bench.new)
+
+
+async def test_values_tried_but_never_stored_come_back_too(make_bench) -> None:
+    bench = make_bench(faults=refusing("calibration_date"))
+    bench.put_in_ram("bias_x", 0.125)
+    tried = {name: bench.unit.read(name, bench.device.now_s) for name in CALIBRATION}
+    assert (await fail(bench)).endswith(RESTORED)
+    assert {name: bench.unit.read(name, bench.device.now_s) for name in CALIBRATION} == tried
+    bench.assert_stored(bench.old)
+
+
+class Trouble:
+    """Strikes once, at operation number ``at``."""
+
+    def __init__(self, bench, kind: str, at: int) -> None:
+        self.bench, self.kind, self.at = bench, kind, at
+        self.task: asyncio.Task[object] | None = None
+        bench.device.trouble = self
+
+    def __call__(self, operation: int, done: bool) -> None:
+        device, at_s = self.bench.device, self.bench.device.now_s
+        if operation != self.at or done != (self.kind in ("the reply is lost", "power is cut after it")):
+            return
+        self.at = 0
+        match self.kind:
+            case "power is cut before it" | "power is cut after it":
+                device.unit.power_cycle(at_s)
+            case "the unit dies":
+                device.unit.power_cycle(at_s)
+                device.dead = True
+            case "the request is lost" | "the reply is lost":
+                raise DeviceSilent("no reply")
+            case "it is refused":
+                raise RegisterRefused("refused", register="?", code=1)
+            case "it is cancelled":
+                self.task.cancel()
+            case "it is interrupted":
+                raise KeyboardInterrupt
+            case "a bug shows":
+                raise ZeroDivisionError
+
+
+async def operations_of_a_clean_run(make_bench) -> int:
+    bench = make_bench()
+    await bench.provision()
+    assert bench.device.operations > 90
+    return bench.device.operations
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "power is cut before it",
+        "power is cut after it",
+        "the unit dies",
+        "the request is lost",
+        "the reply is lost",
+        "it is refused",
+    ],
+)
+async def test_whatever_operation_is_struck_the_outcome_is_as_told(make_bench, kind: str) -> None:
+    told = {}
+    for at in range(1, await operations_of_a_clean_run(make_bench) + 1):
+        bench = make_bench()
+        Trouble(bench, kind, at)
+        try:
+            await bench.provision()
+        except ProvisionError as e:
+            told[at] = str(e)
+        else:  # the trouble was borne: a busy device may be silent, a restarting one too
+            bench.assert_holds(bench.new)
+            continue
+        if told[at].endswith((UNTOUCHED, RESTORED)) and kind != "the unit dies":
+            bench.assert_holds(bench.old)
+        elif told[at].endswith((UNTOUCHED, "the stored calibration is the old one")):
+            bench.assert_stored(bench.old)
+        else:
+            assert kind == "the unit dies", (at, told[at])
+            assert told[at].endswith("either calibration may be stored")
+            bench.assert_stored(bench.old if bench.stored.write_counter == 3 else bench.new)
+    endings = {message.rpartition("; ")[2] for message in told.values()}
+    assert UNTOUCHED in endings
+    assert len(told) > 60
+    if kind == "the unit dies":
+        assert RESTORED not in endings
+    else:
+        assert endings == {UNTOUCHED, RESTORED}
+
+
+@pytest.mark.parametrize(
+    ("kind", "error"),
+    [
+        ("it is cancelled", asyncio.CancelledError),
+        ("it is interrupted", KeyboardInterrupt),
+        ("a bug shows", ZeroDivisionError),
+    ],
+)
+async def test_whenever_it_is_stopped_the_old_calibration_is_back_before_it_goes_on(make_bench, kind, error) -> None:
+    notes = set()
+    for at in range(1, await operations_of_a_clean_run(make_bench) + 1):
+        bench = make_bench()
+        trouble = Trouble(bench, kind, at)
+
+        async def run(bench=bench) -> tuple[str, ...]:
+            try:
+                await bench.provision()
+            except error as e:
+                return tuple(e.__notes__)
+            pytest.fail("was not stopped")
+
+        trouble.task = asyncio.create_task(run())
+        (note,) = await trouble.task
+        notes.add(note)
+        bench.assert_holds(bench.old)
+    assert notes == {UNTOUCHED, RESTORED}
+
+
+async def test_a_store_under_way_is_let_to_end_before_the_restart(make_bench) -> None:
+    clean = make_bench()
+    await clean.provision()
+    store = clean.device.log.index(("write", "store")) + 1
+    bench = make_bench()
+    trouble = Trouble(bench, "it is cancelled", store + 1)
+    trouble.task = asyncio.create_task(bench.provision())
+    with pytest.raises(asyncio.CancelledError):
+        await trouble.task
+    assert bench.stored.write_counter == 5  # the new one was stored whole, then the old one again
+    bench.assert_holds(bench.old)
+
+
+async def test_where_the_restart_is_refused_the_old_values_are_written_back(make_bench) -> None:
+    bench = make_bench(faults=refusing("reset", "calibration_date"))
+    assert (await fail(bench)).endswith(RESTORED)
+    bench.assert_holds(bench.old)
+    assert bench.device.written.count("bias_x") == 2
+
+
+async def test_a_second_cancellation_does_not_stop_the_restoring(make_bench) -> None:
+    bench = make_bench()
+    trouble = Trouble(bench, "it is cancelled", await operations_of_a_clean_run(make_bench))
+    trouble.task = task = asyncio.create_task(bench.provision())
+    strike = trouble.__call__
+
+    def twice(operation: int, done: bool) -> None:
+        strike(operation, done)
+        if trouble.at == 0:
+            task.cancel()
+
+    bench.device.trouble = twice
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    bench.assert_holds(bench.old)
+
+
+async def test_a_device_whose_old_calibration_was_damaged_can_be_provisioned(make_bench) -> None:
+    bench = make_bench()
+    image = bytearray(Stored(bench.old, write_counter=3).image())
+    image[-1] ^= 0xFF
+    bench.unit = ReferenceUnit(ConstantPhysics(), serial_number=7, stored=bytes(image))
+    bench.device.exchange(bench.unit)
+    await bench.provision()
+    bench.assert_holds(bench.new)

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from triaxcal_drivers.interface import RawBatch, SampleBlock
+from triaxcald.errors import RecordingError
+from triaxcald.recording.csv_text import read_csv
+from triaxcald.recording.export import write_csv
+from triaxcald.recording.info import describe
+from triaxcald.recording.recover import recover
+from triaxcald.recording.writer import RecordingWriter
+
+T0_NS = 1_700_000_000_000_000_000
+
+
+def test_a_recording_is_described(recording: Path, metadata: dict[str, dict[str, str]]) -> None:
+    found = json.loads(json.dumps(describe(recording)))
+    assert found["format"] == "triaxcal.recording/1"
+    assert (found["finished"], found["recovered"], found["chunks"]) == (True, False, 8)
+    assert found["bytes"] == recording.stat().st_size
+    assert found["duration_s"] == 6.0
+    assert {topic: entry["messages"] for topic, entry in found["topics"].items()} == {
+        "/events": 2,
+        "/registers": 2,
+        "/raw": 6,
+        "/preview/readings": 6,
+    }
+    assert found["raw"]["calibration"] == {
+        "records": 200,
+        "bytes": 1600,
+        "start_ns": T0_NS,
+        "end_ns": T0_NS + 199_000_000,
+        "duration_s": 0.199,
+    }
+    assert found["metadata"].items() >= metadata.items()
+    assert found["attachments"]["result.json"] == {"media_type": "application/json", "bytes": 2}
+    assert found["losses"] == []
+
+
+def test_a_recording_not_finished_is_described_up_to_where_it_is(
+    tmp_path: Path, new_writer: Callable[..., RecordingWriter], batch_of: Callable[..., RawBatch]
+) -> None:
+    writer = new_writer()
+    writer.raw("calibration", batch_of(0, 30))
+    writer.drain()
+    found = describe(tmp_path / "rec.mcap")
+    assert not found["finished"]
+    assert found["raw"]["calibration"]["records"] == 30
+
+
+def test_a_mended_recording_is_described_as_such(recording: Path, tmp_path: Path) -> None:
+    recover(recording, tmp_path / "mended.mcap")
+    assert describe(tmp_path / "mended.mcap")["recovered"]
+
+
+def test_samples_are_written_as_text() -> None:
+    block = SampleBlock(
+        np.array([T0_NS, T0_NS + 1_500_000_001]),
+        np.arange(2),
+        np.array([[0.1, -2.0, 3e-7], [1.0, 2.0, 3.0]]),
+        {"temp_c": np.array([21.5, 22.0])},
+    )
+    out = io.StringIO()
+    assert write_csv(out, [block]) == 2
+    expected = "t_s,ux,uy,uz,temp_c\n0.000000000,0.1,-2.0,3e-07,21.5\n1.500000001,1.0,2.0,3.0,22.0\n"
+    assert out.getvalue() == expected
+
+
+def test_no_samples_are_a_header_alone() -> None:
+    out = io.StringIO()
+    assert write_csv(out, []) == 0
+    assert out.getvalue() == "t_s,ux,uy,uz\n"
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(st.lists(st.tuples(st.integers(1, 10**10), finite, finite, finite, finite), min_size=1, max_size=20))
+def test_what_is_exported_reads_back_to_the_last_bit(rows: list[tuple[int, float, float, float, float]]) -> None:
+    table = np.array([row[1:] for row in rows])
+    time_ns = T0_NS + np.cumsum([row[0] for row in rows])
+    blocks = [
+        SampleBlock(time_ns[i : i + 7], time_ns[i : i + 7], table[i : i + 7, :3], {"a": table[i : i + 7, 3]})
+        for i in range(0, len(rows), 7)
+    ]
+    out = io.StringIO()
+    write_csv(out, blocks)
+    found = read_csv(io.BytesIO(out.getvalue().encode()))
+    np.testing.assert_array_equal(found.readings, table[:, :3])
+    np.testing.assert_array_equal(found.channels["a"], table[:, 3])
+    np.testing.assert_array_equal(found.time_ns, time_ns - time_ns[0])
+
+
+def test_blocks_of_different_channels_do_not_mix() -> None:
+    one = SampleBlock(np.array([1]), np.array([0]), np.zeros((1, 3)), {"a": np.zeros(1)})
+    other = SampleBlock(np.array([2]), np.array([1]), np.zeros((1, 3)), {})
+    with pytest.raises(RecordingError, match=r"channels \[\] after sample 1, expected \['a'\]"):
+        write_csv(io.StringIO(), [one, other])

@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer as McapWriter
+
+from triaxcal_drivers.interface import RawBatch
+from triaxcald.errors import RecordingError
+from triaxcald.recording import schema
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.writer import RecordingWriter
+
+
+def test_what_was_written_is_read(
+    recording: Path, batch_of: Callable[..., RawBatch], metadata: dict[str, dict[str, str]]
+) -> None:
+    with Recording.open(recording) as rec:
+        assert rec.finished
+        assert rec.phases() == ["calibration", "verification"]
+        for phase, first, n in (("calibration", 0, 200), ("verification", 200, 100)):
+            batches = list(rec.raw(phase))  # type: ignore[arg-type]
+            expected = batch_of(first, n)
+            assert b"".join(b.payload for b in batches) == expected.payload
+            for column in ("time_ns", "source", "flags", "length"):
+                got = np.concatenate([getattr(b, column) for b in batches])
+                np.testing.assert_array_equal(got, getattr(expected, column))
+        assert [r.register for r in rec.register_accesses()] == ["scale_factor_x", "store"]
+        assert next(rec.register_accesses()).raw == bytes.fromhex("c019999a")
+        assert [e.kind for e in rec.events()] == ["recording_started", "pose_done"]
+        assert list(rec.losses()) == []
+        assert rec.metadata.items() >= metadata.items()
+        assert dict(rec.attachments) == {"station.toml": b"name = 'bench'\n", "result.json": b"{}"}
+        assert rec.attachments.media_types["result.json"] == "application/json"
+
+
+def test_iterators_do_not_disturb_each_other(recording: Path) -> None:
+    with Recording.open(recording) as rec:
+        pairs = list(zip(rec.raw("calibration"), rec.raw("calibration"), strict=True))
+        assert len(pairs) == 4
+        for a, b in pairs:
+            np.testing.assert_array_equal(a.time_ns, b.time_ns)
+
+
+class Frugal(io.BytesIO):
+    """Refuses to hand out more than ``limit`` bytes at once."""
+
+    limit = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        assert size is not None
+        assert 0 <= size <= self.limit, f"{size} bytes at once"
+        return super().read(size)
+
+
+def test_reading_never_takes_more_than_a_chunk_at_once(
+    tmp_path: Path, new_writer: Callable[..., RecordingWriter], batch_of: Callable[..., RawBatch]
+) -> None:
+    big = batch_of(0, schema.MAX_RECORDS)
+    with new_writer() as writer:
+        for _ in range(40):
+            writer.raw("calibration", big)
+    stream = Frugal((tmp_path / "rec.mcap").read_bytes())
+    stream.limit = len(stream.getvalue()) // 5
+    rec = Recording(stream, "frugal")
+    assert sum(len(b) for b in rec.raw("calibration")) == 40 * schema.MAX_RECORDS
+
+
+def test_every_flipped_bit_is_reported(recording: Path) -> None:
+    whole = recording.read_bytes()
+    for at in range(len(whole)):
+        flipped = bytearray(whole)
+        flipped[at] ^= 1 << at % 8
+        with pytest.raises(RecordingError) as e:
+            Recording(io.BytesIO(flipped), "rec.mcap")
+        assert str(e.value).startswith("rec.mcap: ")
+        assert "\n" not in str(e.value)
+
+
+def test_a_damaged_chunk_is_named_with_its_offset_and_the_remedy(recording: Path) -> None:
+    whole = bytearray(recording.read_bytes())
+    chunks = list(_chunk_offsets(bytes(whole)))
+    whole[chunks[3] + 80] ^= 0x10
+    recording.write_bytes(whole)
+    expected = rf"chunk 4 of 8: a chunk fails its CRC at byte {chunks[3]}; mend it with `triaxcal log recover`$"
+    with pytest.raises(RecordingError, match=expected):
+        Recording.open(recording)
+
+
+def _chunk_offsets(data: bytes) -> list[int]:
+    """Found by the compression's name, which stands 37 bytes into a chunk record."""
+    offsets, at = [], data.find(b"\x04\0\0\0zstd")
+    while at >= 0:
+        if data[at - 37] == 6:
+            offsets.append(at - 37)
+        at = data.find(b"\x04\0\0\0zstd", at + 1)
+    return offsets
+
+
+def test_a_recording_cut_short_is_an_error_at_every_length(recording: Path) -> None:
+    whole = recording.read_bytes()
+    for length in range(len(whole)):
+        with pytest.raises(RecordingError, match=r"^rec: .* at byte \d+; mend it with `triaxcal log recover`$"):
+            Recording(io.BytesIO(whole[:length]), "rec")
+
+
+def test_an_unfinished_recording_can_be_read_up_to_where_it_is(
+    tmp_path: Path, new_writer: Callable[..., RecordingWriter], batch_of: Callable[..., RawBatch]
+) -> None:
+    writer = new_writer()
+    writer.raw("calibration", batch_of(0, 30))
+    writer.drain()
+    with Recording.open(tmp_path / "rec.mcap", unfinished=True) as rec:
+        assert not rec.finished
+        assert [len(b) for b in rec.raw("calibration")] == [30]
+    with pytest.raises(RecordingError, match="the file ends, not finished"):
+        Recording.open(tmp_path / "rec.mcap")
+
+
+def test_what_is_not_mcap_is_called_that(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(b"t_s,ux,uy,uz\n0,1,2,3\n")
+    with pytest.raises(RecordingError, match=r"x\.mcap: not an MCAP file: it begins with b't_s,ux,u'"):
+        Recording.open(path)
+
+
+def test_another_programs_mcap_is_called_that(tmp_path: Path) -> None:
+    path = tmp_path / "ros.mcap"
+    with open(path, "wb") as file:
+        mcap = McapWriter(file)
+        mcap.start(profile="ros2")
+        mcap.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(RecordingError, match="not a recording of triaxcal: its header says profile 'ros2'"):
+        Recording.open(path)
+
+
+def test_a_later_format_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "later.mcap"
+    with open(path, "wb") as file:
+        mcap = McapWriter(file)
+        mcap.start(profile="triaxcal")
+        mcap.add_metadata("recording", {"format": "triaxcal.recording/2"})
+        mcap.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(RecordingError, match="format 'triaxcal.recording/2', expected 'triaxcal.recording/1'"):
+        Recording.open(path)
+
+
+def test_a_file_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"none\.mcap: cannot be read: No such file or directory$"):
+        Recording.open(tmp_path / "none.mcap")

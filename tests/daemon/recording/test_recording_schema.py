@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import hashlib
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from triaxcal_drivers.interface import RawBatch, SampleBlock
+from triaxcald.recording import schema
+
+TWO = RawBatch.of([(256, 0x181, 0, b"\x01\x02"), (512, 0x281, 16, b"\xff")])
+
+
+def test_a_raw_batch_is_packed_fixed_width_columns_on_the_wire() -> None:
+    expected = (
+        "09 0700000000000000"  # 1: first = 7, fixed64
+        "12 0b 63616c6962726174696f6e"  # 2: phase = "calibration"
+        "1a 10 0001000000000000 0002000000000000"  # 3: time_ns, packed fixed64
+        "22 08 81010000 81020000"  # 4: source, packed fixed32
+        "2a 02 00 10"  # 5: flags
+        "32 08 02000000 01000000"  # 6: length, packed fixed32
+        "3a 03 01 02 ff"  # 7: payload
+    )
+    assert schema.encode_raw(7, "calibration", TWO) == bytes.fromhex(expected)
+
+
+def test_a_raw_batch_reads_back_as_it_was() -> None:
+    first, phase, batch = schema.decode_raw(schema.encode_raw(7, "verification", TWO))
+    assert (first, phase, batch.payload) == (7, "verification", TWO.payload)
+    for column in ("time_ns", "source", "flags", "length"):
+        got, put = getattr(batch, column), getattr(TWO, column)
+        assert got.dtype == put.dtype
+        np.testing.assert_array_equal(got, put)
+
+
+@pytest.mark.parametrize("data", [b"\x09\x01", b"\xff\xff\xff", bytes.fromhex("3a03ffffff")])
+def test_bytes_that_are_no_raw_batch_are_a_value_error(data: bytes) -> None:
+    with pytest.raises(ValueError):
+        schema.decode_raw(data)
+
+
+def test_the_raw_digest_is_sha256_of_columns_and_payloads_by_phase() -> None:
+    digest = schema.RawDigest()
+    digest.update("calibration", TWO)
+    columns = struct.pack("<qIBH", 256, 0x181, 0, 2) + struct.pack("<qIBH", 512, 0x281, 16, 1)
+    parts = [hashlib.sha256(part).digest() for part in (b"calibration", columns, b"\x01\x02\xff")]
+    assert digest.hexdigest() == hashlib.sha256(b"".join(parts)).hexdigest()
+    assert digest.records == 2
+
+
+records = st.lists(
+    st.tuples(st.integers(0, 2**62), st.integers(0, 2**32 - 1), st.integers(0, 255), st.binary(max_size=9)),
+    max_size=30,
+)
+
+
+@given(records, records, st.integers(1, 7))
+def test_the_raw_digest_does_not_see_how_records_are_cut_and_phases_interleaved(
+    calibration: list[tuple[int, int, int, bytes]], verification: list[tuple[int, int, int, bytes]], size: int
+) -> None:
+    whole, pieces = schema.RawDigest(), schema.RawDigest()
+    whole.update("calibration", RawBatch.of(calibration))
+    whole.update("verification", RawBatch.of(verification))
+    for phase, rows in (("verification", verification), ("calibration", calibration)):
+        for piece in schema.cut(RawBatch.of(rows), size):
+            assert len(piece) <= size
+            pieces.update(phase, piece)
+    assert pieces.hexdigest() == whole.hexdigest()
+
+
+def test_the_raw_digest_sees_a_byte_that_moves_from_one_record_to_the_next() -> None:
+    def hexdigest(*payloads: bytes) -> str:
+        digest = schema.RawDigest()
+        digest.update("calibration", RawBatch.of([(1, 2, 0, data) for data in payloads]))
+        return digest.hexdigest()
+
+    assert hexdigest(b"ab", b"c") != hexdigest(b"a", b"bc")
+
+
+def test_each_auxiliary_channel_is_a_plain_field_of_the_preview() -> None:
+    names = ["temp_c", "supply.v", "supply v", "x", "3rd", "größe"]
+    assert schema.preview_fields(names) == ["temp_c", "supply_v", "supply_v_", "x_", "_3rd", "gr__e"]
+    message = schema.preview_schema(["temp_c"]).message(time_ns=1, x=1.0, y=2.0, z=3.0, temp_c=21.5)
+    doubles = b"".join(
+        bytes([number << 3 | 1]) + struct.pack("<d", v) for number, v in ((2, 1), (3, 2), (4, 3), (5, 21.5))
+    )
+    assert message.SerializeToString() == b"\x09" + (1).to_bytes(8, "little") + doubles
+
+
+@given(st.lists(st.integers(0, 40), min_size=1, max_size=60), st.lists(st.integers(1, 9), min_size=1))
+def test_the_preview_is_the_same_however_samples_are_cut_into_blocks(steps: list[int], sizes: list[int]) -> None:
+    time_ns = 10**18 + np.cumsum(steps) * 1_000_000
+
+    def picked(bounds: list[int]) -> list[int]:
+        decimator = schema.Decimator(100.0)
+        found = []
+        for start, stop in zip([0, *bounds], [*bounds, len(time_ns)], strict=True):
+            piece = time_ns[start:stop]
+            block = SampleBlock(piece, piece, np.zeros((len(piece), 3)), {})
+            found += [start + i for i in decimator.pick(block)]
+        return found
+
+    bounds = [int(b) for b in np.cumsum(sizes) if b < len(time_ns)]
+    whole = picked([])
+    assert picked(bounds) == whole
+    slots = time_ns[whole] // 10_000_000
+    assert len(set(slots.tolist())) == len(whole)  # never two in one period

@@ -1,0 +1,325 @@
+"""The driver against bytes written by hand from the Modbus Application Protocol and its RTU and MBAP framings.
+
+The RTU frames for unit 0x11 are the worked examples that circulate with the protocol (function 3 at 0x6B,
+function 4 at 8, functions 6 and 16 at 1).
+"""
+
+import asyncio
+import os
+from contextlib import aclosing
+
+import numpy as np
+import pytest
+
+from triaxcal_drivers.errors import (
+    BusError,
+    DeviceAbsent,
+    DeviceSilent,
+    ProfileError,
+    RegisterRefused,
+    RegisterValueError,
+)
+from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.modbus.device import ModbusDevice
+from triaxcal_drivers.modbus.model import ModbusBus
+
+# The probe at opening: reads input register 8, which holds 10.
+PROBE = ("0001 0000 0006 11 04 0008 0001", "0001 0000 0005 11 04 02 000A")
+RTU_PROBE = ("11 04 00 08 00 01 B2 98", "11 04 02 00 0A F8 F4")
+
+
+async def opened(bundle, heard) -> ModbusDevice:
+    bus = (
+        ModbusBus(serial_port=heard.path, parity="N", unit_id=17)
+        if hasattr(heard, "path")
+        else ModbusBus(host="127.0.0.1", port=heard.port, unit_id=17)
+    )
+    device = ModbusDevice(bundle.profile, bus, now_ns=lambda: 1_000)
+    await device.open()
+    return device
+
+
+async def first_batches(device, stream, number):
+    batches = []
+    async with aclosing(device.stream([stream])) as records:
+        async for batch in records:
+            batches.append(batch)
+            if len(batches) == number:
+                break
+    return batches
+
+
+async def collect(device, stream, batches):
+    async for batch in device.stream([stream]):
+        batches.append(batch)
+
+
+async def test_registers_are_read_and_written_over_tcp(bundle, tcp_device):
+    exchanges = [
+        PROBE,
+        ("0002 0000 0006 11 03 0001 0002", "0002 0000 0007 11 03 04 000A 0102"),
+        ("0003 0000 000B 11 10 0001 0002 04 000A 0102", "0003 0000 0006 11 10 0001 0002"),
+        ("0004 0000 0009 11 10 0001 0001 02 0003", "0004 0000 0006 11 10 0001 0001"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        assert await device.read("pair") == bytes.fromhex("000A 0102")
+        await device.write("pair", bytes.fromhex("000A 0102"))
+        await device.write("setting", b"\x00\x03")
+        await device.close()
+    assert len(heard) == 4
+
+
+async def test_registers_are_read_and_written_over_a_serial_line(bundle, serial_device):
+    exchanges = [
+        RTU_PROBE,
+        ("11 10 00 01 00 02 04 00 0A 01 02 C6 F0", "11 10 00 01 00 02 12 98"),
+        ("11 06 00 01 00 03 9A 9B", "11 06 00 01 00 03 9A 9B"),
+    ]
+    async with serial_device(*exchanges) as heard:
+        device = await opened(bundle(('name = "by-hand"', 'name = "by-hand"\nsingle_write = true')), heard)
+        await device.write("pair", bytes.fromhex("000A 0102"))
+        await device.write("setting", b"\x00\x03")
+        await device.close()
+    assert len(heard) == 3
+
+
+async def test_a_stream_is_polled_over_a_serial_line(bundle, serial_device):
+    exchanges = [RTU_PROBE, ("11 03 00 6B 00 03 76 87", "11 03 06 AE 41 56 52 43 40 49 AD")]
+    async with serial_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        (batch,) = await first_batches(device, "readings", 1)
+        await device.close()
+    assert batch.payload == bytes.fromhex("AE41 5652 4340")
+    assert batch.source.tolist() == [0x0003_006B]
+    assert batch.time_ns.tolist() == [1_000]
+    assert not batch.flags.any()
+
+
+async def test_registers_go_most_significant_first_whatever_order_the_device_keeps(bundle, tcp_device):
+    exchanges = [
+        PROBE,
+        ("0002 0000 0006 11 03 0001 0002", "0002 0000 0007 11 03 04 0102 000A"),
+        ("0003 0000 000B 11 10 0001 0002 04 0102 000A", "0003 0000 0006 11 10 0001 0002"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        assert await device.read("twisted") == bytes.fromhex("000A 0102")
+        await device.write("twisted", bytes.fromhex("000A 0102"))
+        await device.close()
+    assert len(heard) == 3
+
+
+async def test_bytes_in_a_word_are_swapped_where_the_profile_says_so(bundle, tcp_device):
+    exchanges = [PROBE, ("0002 0000 0006 11 03 0001 0002", "0002 0000 0007 11 03 04 0A00 0201")]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(('name = "by-hand"', 'name = "by-hand"\nbyte_order = "little"')), heard)
+        assert await device.read("pair") == bytes.fromhex("000A 0102")
+        await device.close()
+
+
+async def test_a_refused_register_names_itself_and_the_code(bundle, tcp_device):
+    exchanges = [
+        PROBE,
+        ("0002 0000 0006 11 03 0001 0002", "0002 0000 0003 11 83 02"),
+        ("0003 0000 0009 11 10 0001 0001 02 0003", "0003 0000 0003 11 90 04"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        with pytest.raises(RegisterRefused) as refused:
+            await device.read("pair")
+        assert (refused.value.register, refused.value.code) == ("pair", 2)
+        assert "register pair (0x0001) cannot be read: exception 0x02 (illegal data address)" in str(refused.value)
+        with pytest.raises(RegisterRefused) as refused:
+            await device.write("setting", b"\x00\x03")
+        assert (refused.value.register, refused.value.code) == ("setting", 4)
+        await device.close()
+
+
+async def test_a_register_of_the_wrong_length_is_not_sent(bundle, tcp_device):
+    async with tcp_device(PROBE) as heard:
+        device = await opened(bundle(), heard)
+        with pytest.raises(RegisterValueError, match=r"register pair: 2 bytes, expected 4 \(uint32\)"):
+            await device.write("pair", b"\0\0")
+        with pytest.raises(RegisterValueError, match="an input register cannot be written"):
+            await device.write("level", b"\0\0")
+        with pytest.raises(ProfileError, match="no register named 'pear'"):
+            await device.read("pear")
+        await device.close()
+    assert len(heard) == 1
+
+
+async def test_a_late_reply_is_not_taken_for_the_next_one(bundle, tcp_device):
+    exchanges = [
+        PROBE,
+        ("0002 0000 0006 11 03 0001 0001", None),
+        ("0003 0000 0006 11 03 0001 0001", "0002 0000 0005 11 03 02 AAAA 0003 0000 0005 11 03 02 BBBB"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        with pytest.raises(DeviceSilent, match=r"unit 17: no reply in 0\.05 s"):
+            await device.read("setting")
+        assert await device.read("setting") == b"\xbb\xbb"
+        await device.close()
+
+
+async def test_a_reply_of_another_unit_is_no_answer(bundle, tcp_device):
+    other_then_own = "0002 0000 0005 12 03 02 AAAA 0002 0000 0005 11 03 02 BBBB"
+    async with tcp_device(PROBE, ("0002 0000 0006 11 03 0001 0001", other_then_own)) as heard:
+        device = await opened(bundle(), heard)
+        assert await device.read("setting") == b"\xbb\xbb"
+        await device.close()
+
+
+async def test_a_frame_with_a_wrong_crc_is_no_answer(bundle, serial_device):
+    async with serial_device(RTU_PROBE, ("11 03 00 01 00 01 D7 5A", "11 03 02 00 0A F9 81")) as heard:
+        device = await opened(bundle(), heard)
+        with pytest.raises(DeviceSilent):
+            await device.read("setting")
+        await device.close()
+    assert len(heard) == 2
+
+
+async def test_a_late_reply_on_a_serial_line_is_waited_out(bundle):
+    """RTU frames have no transaction number: the reply to the first request must not answer the second."""
+    master, slave = os.openpty()
+    loop = asyncio.get_running_loop()
+    # The driver waits 50 ms for a reply, and as long again for a late one before it asks anew.
+    replies = [
+        (0.0, "11 04 02 00 0A F8 F4"),
+        (0.07, "11 03 02 00 0A F9 80"),
+        (0.04, "11 03 02 00 0B 38 40"),
+    ]
+
+    def answer() -> None:
+        os.read(master, 64)
+        after_s, reply = replies.pop(0)
+        loop.call_later(after_s, os.write, master, bytes.fromhex(reply))
+
+    loop.add_reader(master, answer)
+    device = ModbusDevice(bundle().profile, ModbusBus(serial_port=os.ttyname(slave), parity="N", unit_id=17))
+    await device.open()
+    with pytest.raises(DeviceSilent):
+        await device.read("setting")
+    assert await device.read("setting") == b"\x00\x0b"
+    await device.close()
+    loop.remove_reader(master)
+    os.close(master)
+    os.close(slave)
+
+
+async def test_failed_requests_are_records_with_flags(bundle, tcp_device):
+    ask = "0000 0006 11 03 006B 0003"
+    exchanges = [
+        PROBE,
+        (f"0002 {ask}", "0002 0000 0003 11 83 06"),  # an exception
+        (f"0003 {ask}", "0003 0000 0007 11 03 04 0001 0002"),  # two words in place of three
+        (f"0004 {ask}", None),  # nothing
+        (f"0005 {ask}", "0005 0000 0009 11 04 06 0001 0002 0003"),  # another function
+        (f"0006 {ask}", "0006 0000 0009 11 03 06 0001 0002 0003"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        batches = await first_batches(device, "readings", 5)
+        await device.close()
+    assert [int(b.flags[0]) for b in batches] == [
+        RawFlag.ERROR,
+        RawFlag.INVALID,
+        RawFlag.ERROR,
+        RawFlag.INVALID,
+        0,
+    ]
+    assert [b.payload.hex() for b in batches] == [
+        "06",
+        "030400010002",
+        "",
+        "0406000100020003",
+        "000100020003",
+    ]
+    assert {int(b.source[0]) for b in batches} == {0x0003_006B}
+
+
+async def test_a_fifo_is_read_again_at_once_while_records_remain(bundle, tcp_device):
+    ask = "0000 0006 11 04 0020 000A"
+    full = "0000 0017 11 04 14 0002 {} 0001 0002 0003 0000 0001 0002 0003 0001"
+    exchanges = [
+        PROBE,
+        (f"0002 {ask}", "0002" + full.format("0002")),
+        (f"0003 {ask}", "0003" + full.format("0000")),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(("poll_period_s = 0.001", "poll_period_s = 60.0")), heard)
+        (batch,) = await first_batches(device, "queue", 1)
+        await device.close()
+    assert len(heard) == 3
+    np.testing.assert_array_equal(batch.length, [20, 20])
+
+
+async def test_a_stream_that_fails_for_long_is_silent_and_says_why(bundle, tcp_device):
+    refusals = [(f"{i:04X} 0000 0006 11 03 006B 0003", f"{i:04X} 0000 0003 11 83 04") for i in range(2, 2000)]
+    async with tcp_device(PROBE, *refusals) as heard:
+        device = await opened(bundle(), heard)
+        batches = []
+        with pytest.raises(DeviceSilent, match=r"stream readings has been silent .*exception 0x04") as silent:
+            await collect(device, "readings", batches)
+        assert sum(map(len, batches)) == len(heard) - 1
+        assert "0.2 s" in str(silent.value)
+        await device.close()
+
+
+async def test_a_fifo_that_stays_empty_is_silent(bundle, tcp_device):
+    empty = [
+        (f"{i:04X} 0000 0006 11 04 0020 000A", f"{i:04X} 0000 0017 11 04 14" + "0000" * 10) for i in range(2, 2000)
+    ]
+    async with tcp_device(PROBE, *empty) as heard:
+        device = await opened(bundle(), heard)
+        with pytest.raises(DeviceSilent, match="its FIFO stays empty"):
+            await collect(device, "queue", [])
+        await device.close()
+
+
+async def test_a_refused_connection_says_where(bundle, tcp_device):
+    async with tcp_device() as heard:
+        port = heard.port
+    device = ModbusDevice(bundle().profile, ModbusBus(host="127.0.0.1", port=port))
+    with pytest.raises(BusError, match=f"^cannot connect to 127.0.0.1:{port}: Connection refused$"):
+        await device.open()
+
+
+async def test_a_missing_serial_port_says_which(bundle):
+    device = ModbusDevice(bundle().profile, ModbusBus(serial_port="/dev/ttyNONE"))
+    with pytest.raises(BusError, match=r"^cannot open /dev/ttyNONE: No such file or directory$"):
+        await device.open()
+
+
+async def test_a_device_that_never_answers_is_absent(bundle, tcp_device):
+    async with tcp_device((PROBE[0], None), ("0002" + PROBE[0][4:], None)) as heard:
+        with pytest.raises(DeviceAbsent, match=r"^nothing answers at .* unit 17: no reply in 0\.05 s$"):
+            await opened(bundle(), heard)
+    assert len(heard) == 2
+
+
+async def test_an_exception_shows_that_the_device_is_there(bundle, tcp_device):
+    async with tcp_device((PROBE[0], "0001 0000 0003 11 84 02")) as heard:
+        device = await opened(bundle(), heard)
+        await device.close()
+
+
+async def test_a_connection_that_breaks_is_a_fault_of_the_bus(bundle):
+    async def hang_up(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readexactly(12)
+        writer.write(bytes.fromhex(PROBE[1]))
+        await reader.readexactly(12)
+        writer.close()
+
+    async with await asyncio.start_server(hang_up, "127.0.0.1", 0) as server:
+        port = server.sockets[0].getsockname()[1]
+        device = ModbusDevice(bundle().profile, ModbusBus(host="127.0.0.1", port=port, unit_id=17))
+        await device.open()
+        with pytest.raises(BusError, match="the connection was lost"):
+            await device.read("setting")
+        with pytest.raises(BusError, match="the connection is closed"):
+            await device.read("setting")
+        await device.close()
+        with pytest.raises(BusError, match="the device is not open"):
+            await device.read("setting")
