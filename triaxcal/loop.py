@@ -20,11 +20,11 @@ from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.fit import Problem, State, fit, linearise, problem_of, solve, start
 from triaxcal.poses import Pose
+from triaxcal.sensor import Sensor
+from triaxcal.visibility import is_visible, projected
 
 FAMILYWISE = 0.01
 """Probability of any false finding on data with nothing inside."""
-VISIBLE = 0.02
-"""An effect is visible when the part of it that the model cannot absorb is at least this share of it."""
 EFFECTS_MOST = 4
 P_LEAST = 1e-300
 
@@ -117,41 +117,6 @@ def diagnose(
     )
 
 
-def is_visible(problem: Problem, state: State, effect: Effect, given: Sequence[Effect] = ()) -> bool:
-    """Whether every coefficient of an effect shows beside the model and the effects given."""
-    return len(_projected(problem, state, effect, given)) == len(effect.coefficients)
-
-
-def _columns(problem: Problem, state: State, effects: Sequence[Effect]) -> tuple[Floats, Floats, Floats]:
-    """Weighted residuals, weighted linear columns, and those of the effects, all at ``state``."""
-    extended = State(np.concatenate([state.theta, np.zeros(_count(effects))]), (*state.effects, *effects))
-    r, J, s = linearise(problem, extended)
-    at = len(state.theta)
-    return r / s, J[:, :at] / s[:, None], J[:, at:] / s[:, None]
-
-
-def _count(effects: Sequence[Effect]) -> int:
-    return sum(len(e.coefficients) for e in effects)
-
-
-def _projected(problem: Problem, state: State, effect: Effect, given: Sequence[Effect] = ()) -> Floats:
-    """Orthonormal rows (q,n): the part of an effect that the model, with the effects given, cannot absorb."""
-    if any(n not in problem.channel_reference for n in effect.needs):
-        return np.empty((0, len(problem.u)))
-    _, J, Z = _columns(problem, state, (*given, effect))
-    own = len(effect.coefficients)
-    J, Z = np.concatenate([J, Z[:, :-own]], axis=1), Z[:, -own:]
-    size = np.linalg.norm(Z, axis=0)
-    if not np.all(size > 1e-9):
-        return np.empty((0, len(problem.u)))
-    norms = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    rest = Z / size - J / norms @ np.linalg.lstsq(J / norms, Z / size, rcond=1e-12)[0]
-    _, singular, rows = np.linalg.svd(rest.T @ rest)
-    kept = np.sqrt(singular) > VISIBLE
-    basis = rest @ rows[kept].T
-    return np.asarray((basis / np.sqrt(singular[kept])).T)
-
-
 class _Search:
     """Forward by information criterion, backward by significance; every step refits the whole model."""
 
@@ -204,7 +169,7 @@ class _Search:
     def _candidates(self, now: State, adopted: list[Effect]) -> list[_Candidate]:
         out = []
         for effect in self.seen:
-            rank = len(_projected(self.problem, self.linear, effect, adopted)) if effect not in adopted else 0
+            rank = len(projected(self.problem, self.linear, effect, adopted)) if effect not in adopted else 0
             if not rank or (rank < len(effect.coefficients) and not adopted):
                 continue
             if len(self.poses) - len(now.theta) - len(effect.coefficients) < 1:
@@ -242,7 +207,7 @@ class _Search:
 
     def given(self, effect: Effect, others: Sequence[Effect]) -> float:
         """p of an effect when the others are in the model already; 1 where it has nothing to add to them."""
-        rank = len(_projected(self.problem, self.linear, effect, others))
+        rank = len(projected(self.problem, self.linear, effect, others))
         if not rank:
             return 1.0
         try:
@@ -259,7 +224,7 @@ class _Search:
         for other in self.seen:
             if other in adopted:
                 continue
-            contains = not len(_projected(self.problem, self.linear, effect, [*rest, other]))
+            contains = not len(projected(self.problem, self.linear, effect, [*rest, other]))
             larger = len(other.coefficients) > len(effect.coefficients)
             if not (contains and larger) and self.given(effect, [*rest, other]) > FAMILYWISE:
                 out.append(other.name)
@@ -333,33 +298,29 @@ def _held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) ->
     """Raises InvalidData where the check poses lack a channel that the effects need."""
     if not check:
         raise InvalidData("the check recording has no still pose")
-    errors = []
-    for calibration in (before, after):
-        errors.append(magnitude_errors(calibration, check))
+    errors = [
+        magnitude_errors(c.sensor, check, channel_reference=c.channel_reference, reference=c.reference)
+        for c in (before, after)
+    ]
     return HeldOut(_rms(errors[0][0]), _rms(errors[1][0]), _rms(errors[1][1]), len(check))
 
 
-def magnitude_errors(calibration: Calibration, poses: Sequence[Pose]) -> tuple[Floats, Floats]:
-    """|a| − reference (n,) of poses under a calibration, and its standard error (n,) from their noise.
+def magnitude_errors(
+    sensor: Sensor, poses: Sequence[Pose], *, channel_reference: Mapping[str, float], reference: float
+) -> tuple[Floats, Floats]:
+    """|a| − reference (n,) of poses under a sensor's model, and its standard error (n,) from their noise.
 
     Raises InvalidData where a channel that the effects need is missing.
     """
     channels = channels_of(list(poses))
-    missing = [n for n in calibration.channel_reference if n not in channels]
+    missing = [n for n in channel_reference if n not in channels]
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(missing)}, which the calibration needs")
     u = np.array([p.mean for p in poses])
-    held = conditions(channels, calibration.channel_reference)
-    sensor = calibration.sensor
-    s = sensor.along_axes(u, held)
-    inverse = np.linalg.inv(sensor.axes)
-    a = s @ inverse.T
-    length = np.linalg.norm(a, axis=1)
-    slope = sensor.departure_slope(s, held) + np.eye(3)
-    by_u = np.linalg.solve(slope.transpose(0, 2, 1), ((a / length[:, None]) @ inverse)[..., None])[..., 0]
-    by_u = by_u / sensor.scale_factor
+    held = conditions(channels, channel_reference)
+    length, by_u = sensor.magnitude(u, held)
     covariance = np.array([p.covariance for p in poses])
-    return length - calibration.reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))
+    return length - reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))
 
 
 def _rms(values: Floats) -> float:

@@ -83,3 +83,14 @@ class Sensor:
     def specific_force(self, u: Floats, conditions: Mapping[str, Floats]) -> Floats:
         """a (n,3) in g, sensor frame."""
         return np.linalg.solve(self.axes, self.along_axes(u, conditions).T).T
+
+    def magnitude(self, u: Floats, conditions: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+        """|a| (n,) and its gradient by the outputs (n,3)."""
+        s = self.along_axes(u, conditions)
+        inverse = np.linalg.inv(self.axes)
+        a = s @ inverse.T
+        length = np.linalg.norm(a, axis=1)
+        by_s = (a / length[:, None]) @ inverse
+        slope = np.eye(3) + self.departure_slope(s, conditions)
+        by_v = np.linalg.solve(slope.transpose(0, 2, 1), by_s[..., None])[..., 0]
+        return length, by_v / self.scale_factor

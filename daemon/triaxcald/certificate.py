@@ -80,7 +80,7 @@ def certify(
         },
         "software": software(),
         "settings": {"signs": list(signs), "reference": number(station.reference)},
-        "limits": {k: number(v) for k, v in station.limits.model_dump().items() if v is not None},
+        "limits": {k: number(v) for k, v in station.limits.model_dump(exclude={"verification_rms_g"}).items() if v},
         "verdict": "outside limits" if outside else "within limits" if _judged(station.limits) else "not judged",
         "outside": outside,
         "result": loop_document(loop, data_quality=pipeline.data_quality(), output_unit=profile.output.unit),
@@ -192,14 +192,14 @@ def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) ->
 
 
 def _judged(limits: Limits) -> bool:
-    return limits.residual_rms_g is not None or limits.cross_validated_rms_g is not None
+    return limits.rms_g is not None or limits.cross_validated_rms_g is not None
 
 
 def _outside(loop: Loop, limits: Limits) -> list[str]:
     residual = loop.after.residual
     out = []
     for name, value, limit in (
-        ("residual rms_g", residual.rms_g, limits.residual_rms_g),
+        ("rms_g", residual.rms_g, limits.rms_g),
         ("cross_validated_rms_g", residual.cross_validated_rms_g, limits.cross_validated_rms_g),
     ):
         if limit is not None and (value is None or value > limit):

@@ -30,6 +30,7 @@ class Pipeline:
         self._decoder = driver_named(self.bundle.profile.driver).decoder(self.bundle, self.stream)
         self._detector = StillnessDetector()
         self._last_ns: int | None = None
+        self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
 
     @property
@@ -45,6 +46,8 @@ class Pipeline:
         for name in ("missing", "duplicates", "incomplete", "errors"):
             self.counts[name] += getattr(block, name)
         if len(block):
+            if self._begin_ns is None:
+                self._begin_ns = int(block.time_ns[0])
             latest = np.maximum.accumulate(np.r_[self._last_ns or -(2**62), block.time_ns[:-1]])
             fresh = block.time_ns > latest
             self.counts["out_of_order"] += int((~fresh).sum())
@@ -59,6 +62,11 @@ class Pipeline:
         for batch in batches:
             self.feed(batch)
         return self
+
+    @property
+    def seconds(self) -> float:
+        """From the first sample to the latest."""
+        return 0.0 if self._last_ns is None or self._begin_ns is None else (self._last_ns - self._begin_ns) * 1e-9
 
     @property
     def windows(self) -> Windows | None:

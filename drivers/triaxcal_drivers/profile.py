@@ -307,7 +307,7 @@ def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:
     at = data
     for p in loc:
         inside = (isinstance(at, Mapping) and p in at) or (
-            isinstance(at, (list, tuple)) and isinstance(p, int)
+            isinstance(at, (list, tuple)) and isinstance(p, int) and p < len(at)
         )
         if p is part and not inside:
             return p is not loc[-1]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import can
-import canopen
 import numpy as np
 from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
@@ -41,6 +41,8 @@ HEARTBEAT_S = 1.0
 _BOOT_UP, _STOPPED, _OPERATIONAL, _PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 _COMMANDS = {0x01: _OPERATIONAL, 0x02: _STOPPED, 0x80: _PRE_OPERATIONAL}
 _RESET_NODE, _RESET_COMMUNICATION = 0x81, 0x82
+_UPLOAD, _DOWNLOAD, _ABORT = 2, 1, 4  # client command specifiers: the top three bits
+_EXPEDITED, _SIZED = 2, 1
 _INT24 = 2**23
 
 
@@ -48,9 +50,7 @@ def tpdos(run: SampleRun) -> tuple[list[bytes], list[bytes], list[bytes], list[b
     """The eight bytes of TPDO1 to TPDO4 for every sample of ``run``."""
     counter, temperature = _bytes(run.counter, "<u2"), _bytes(run.temperature_raw, "<i2")
     status = _bytes(run.status, "<u2")[:, :1]
-    corrected = np.where(
-        run.corrected == INVALID_CORRECTED, -_INT24, np.clip(run.corrected, 1 - _INT24, _INT24 - 1)
-    )
+    corrected = np.where(run.corrected == INVALID_CORRECTED, -_INT24, np.clip(run.corrected, 1 - _INT24, _INT24 - 1))
     frames = []
     for triples in (run.counts, corrected):
         x, y, z = (_bytes(triples[:, axis], "<i4")[:, :3] for axis in range(3))
@@ -60,11 +60,7 @@ def tpdos(run: SampleRun) -> tuple[list[bytes], list[bytes], list[bytes], list[b
 
 
 def _bytes(numbers: NDArray[np.integer[Any]], kind: str) -> NDArray[np.uint8]:
-    return (
-        np.ascontiguousarray(numbers.astype(kind))
-        .view(np.uint8)
-        .reshape(len(numbers), np.dtype(kind).itemsize)
-    )
+    return np.ascontiguousarray(numbers.astype(kind)).view(np.uint8).reshape(len(numbers), np.dtype(kind).itemsize)
 
 
 _SAMPLE_OBJECTS = {
@@ -73,17 +69,6 @@ _SAMPLE_OBJECTS = {
     (0x2301, 1): (2, slice(0, 3)), (0x2301, 2): (2, slice(3, 6)), (0x2301, 3): (3, slice(0, 3)),
 }  # fmt: skip
 """The TPDO, and the bytes in it, that show each object of the latest sample."""
-
-
-class _Answers(canopen.Network):
-    """The network that canopen's SDO server answers on; nothing is received through it."""
-
-    def __init__(self, send: Callable[[int, bytes], None]) -> None:
-        super().__init__()
-        self._send = send
-
-    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        self._send(can_id, bytes(data))
 
 
 class _Requests(can.Listener):
@@ -105,8 +90,10 @@ class _Requests(can.Listener):
 class CanUnit:
     """Serves ``unit`` as node ``bus.node_id`` while the context is entered.
 
-    Everything runs in the event loop; python-can's thread only receives. SDO goes through canopen's server
-    on the unit's EDS; NMT, heartbeat and TPDOs are done here, since they run in the unit's time.
+    Everything runs in the event loop; python-can's thread only receives. SDO is served here and not by
+    canopen's LocalNode, which stumbles over malformed requests, invents members of arrays and cannot keep
+    silent; NMT, heartbeat and TPDOs run in the unit's time. Expedited SDO transfers only: no object is
+    longer than four bytes.
     Raises BusError on entering where the bus cannot be opened, on leaving where it has failed meanwhile.
     """
 
@@ -119,25 +106,17 @@ class CanUnit:
         self._started_s: float | None = None  # of the start that was announced by a boot-up message
         self._heartbeat_s = 0.0
         self._latest: tuple[bytes, ...] = ()
-        self._silent = False  # the unit gives no answer to the request in hand
         self._failure: Exception | None = None
         profile = load_bundle(Path("triax-ref-can")).profile
         assert isinstance(profile, CanProfile)
+        self._objects = _objects(self._node_id)
         self._registers = {object_address(r.object): name for name, r in profile.registers.items()}
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
         self._bus = await asyncio.to_thread(open_bus, self._settings)
         node = self._node_id
-        self._bus.set_filters(
-            [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x000, 0x600 + node)]
-        )
-        eds = BUILT_IN / "triax-ref-can.eds"
-        objects = object_dictionary(eds.read_bytes(), node_id=node, where=eds.name)
-        self._node = canopen.LocalNode(node, objects)
-        self._node.add_read_callback(self._read)  # type: ignore[no-untyped-call]
-        self._node.add_write_callback(self._write)  # type: ignore[no-untyped-call]
-        self._node.associate_network(_Answers(self._answer))
+        self._bus.set_filters([{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x000, 0x600 + node)])
         self._requests = _Requests(asyncio.get_running_loop(), self._received)
         self._notifier = can.Notifier(self._bus, [self._requests], timeout=0.1)
         self._task = asyncio.create_task(self._run())
@@ -170,9 +149,9 @@ class CanUnit:
         if self._started_s != self._unit.started_s:
             self._started_s = self._unit.started_s
             self._boot(now_s)
-        if now_s >= self._heartbeat_s:
+        if now_s >= self._heartbeat_s - 1e-9:
             self._send(0x700 + self._node_id, bytes([self._state]))
-            self._heartbeat_s = now_s + HEARTBEAT_S
+            self._heartbeat_s += HEARTBEAT_S
         for frames in zip(*tpdos(self._unit.advance(now_s)), strict=True):
             self._latest = frames
             if self._state == _OPERATIONAL:
@@ -190,10 +169,6 @@ class CanUnit:
         except (can.CanError, OSError) as e:
             self._failure = e
 
-    def _answer(self, identifier: int, data: bytes) -> None:
-        if not self._silent:
-            self._send(identifier, data)
-
     def _received(self, message: can.Message) -> None:
         now_s = self._time.now_s()
         self._work(now_s)  # the samples before the request are taken with the registers before it
@@ -203,9 +178,8 @@ class CanUnit:
         if message.arbitration_id == 0:
             if len(data) == 2 and data[1] in (0, self._node_id):
                 self._command(data[0], now_s)
-        elif len(data) == 8 and self._state != _STOPPED:
-            self._silent = False
-            self._node.sdo.on_request(0x600 + self._node_id, bytearray(data), 0.0)  # type: ignore[no-untyped-call]
+        elif len(data) == 8 and self._state != _STOPPED and (answer := self._answer(data)) is not None:
+            self._send(0x580 + self._node_id, answer)
 
     def _command(self, command: int, now_s: float) -> None:
         if command == _RESET_NODE:
@@ -215,28 +189,60 @@ class CanUnit:
         else:
             self._state = _COMMANDS.get(command, self._state)
 
-    def _read(self, *, index: int, subindex: int, od: ODVariable) -> bytes | None:
-        """For canopen's SDO server; None where the EDS has the value."""
-        if (index, subindex) in _SAMPLE_OBJECTS and self._latest:
-            number, part = _SAMPLE_OBJECTS[index, subindex]
-            return self._latest[number][part]
-        name = self._registers.get((index, subindex))
-        if name is None:
+    def _answer(self, request: bytes) -> bytes | None:
+        """The SDO server (CiA 301): one request, its answer or an abort; None for silence."""
+        command, index, subindex = struct.unpack_from("<BHB", request)
+        try:
+            if command >> 5 == _UPLOAD:
+                data = self._read(index, subindex)
+                return struct.pack("<BHB4s", 0x43 | (4 - len(data)) << 2, index, subindex, data)
+            if command >> 5 == _DOWNLOAD and command & _EXPEDITED:
+                size = 4 - (command >> 2 & 3) if command & _SIZED else 4
+                self._write(index, subindex, request[4 : 4 + size])
+                return struct.pack("<BHB4x", 0x60, index, subindex)
+            if command >> 5 == _ABORT:
+                return None
+            raise SdoAbortedError(0x05040001)
+        except RegisterFault as fault:
+            code = ABORT_CODES[fault.kind]
+        except SdoAbortedError as abort:
+            code = abort.code
+        except UnitSilent:
             return None
-        try:
+        return struct.pack("<BHBI", 0x80, index, subindex, code)
+
+    def _object(self, index: int, subindex: int) -> ODVariable:
+        if (index, subindex) not in self._objects:
+            raise SdoAbortedError(0x06090011 if any(i == index for i, _ in self._objects) else 0x06020000)
+        return self._objects[index, subindex]
+
+    def _read(self, index: int, subindex: int) -> bytes:
+        variable = self._object(index, subindex)
+        if not variable.readable:
+            raise SdoAbortedError(ABORT_CODES["write_only"])
+        if name := self._registers.get((index, subindex)):
             return self._unit.read(name, self._time.now_s())[::-1]
-        except (RegisterFault, UnitSilent) as fault:
-            raise self._abort(fault) from fault
+        if variable.default is not None:
+            return variable.encode_raw(variable.default)
+        if not self._latest:
+            raise SdoAbortedError(0x08000024)  # no data yet
+        number, part = _SAMPLE_OBJECTS[index, subindex]
+        return self._latest[number][part]
 
-    def _write(self, *, index: int, subindex: int, od: ODVariable, data: bytes) -> None:
-        name = self._registers.get((index, subindex))
-        if name is None:
-            return
-        try:
-            self._unit.write(name, bytes(data)[::-1], self._time.now_s())
-        except (RegisterFault, UnitSilent) as fault:
-            raise self._abort(fault) from fault
+    def _write(self, index: int, subindex: int, raw: bytes) -> None:
+        variable = self._object(index, subindex)
+        if not variable.writable:
+            raise SdoAbortedError(ABORT_CODES["read_only"])
+        if len(raw) * 8 != len(variable):
+            raise SdoAbortedError(0x06070010)
+        self._unit.write(self._registers[index, subindex], raw[::-1], self._time.now_s())
 
-    def _abort(self, fault: RegisterFault | UnitSilent) -> SdoAbortedError:
-        self._silent = isinstance(fault, UnitSilent)
-        return SdoAbortedError(ABORT_CODES[fault.kind] if isinstance(fault, RegisterFault) else 0x08000000)
+
+def _objects(node_id: int) -> dict[tuple[int, int], ODVariable]:
+    """Every object of the unit's EDS by index and sub-index."""
+    eds = BUILT_IN / "triax-ref-can.eds"
+    found = {}
+    for entry in object_dictionary(eds.read_bytes(), node_id=node_id, where=eds.name).values():
+        members = [entry] if isinstance(entry, ODVariable) else entry.subindices.values()
+        found.update({(v.index, v.subindex): v for v in members})
+    return found

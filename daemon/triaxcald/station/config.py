@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -9,6 +11,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, Field, model_validator
 
 from triaxcal_drivers.catalogue import driver_named
+from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Bundle, Strict, load_bundle, parse_toml, validate
 from triaxcald.errors import InputError
 
@@ -28,7 +32,7 @@ class Plan(Strict):
 class Limits(Strict):
     """What is good enough; nothing is judged where nothing is given."""
 
-    residual_rms_g: Annotated[float | None, Field(gt=0)] = None
+    rms_g: Annotated[float | None, Field(gt=0)] = None
     cross_validated_rms_g: Annotated[float | None, Field(gt=0)] = None
     verification_rms_g: Annotated[float | None, Field(gt=0)] = None
 
@@ -79,6 +83,20 @@ class Place:
     def where(self) -> str:
         settings = ", ".join(f"{k}={v}" for k, v in self.unit.bus.items())
         return f"unit {self.unit.name} ({settings})"
+
+    def device(self) -> Device:
+        return driver_named(self.bundle.profile.driver).device(self.bundle, self.bus)
+
+    @asynccontextmanager
+    async def opened(self) -> AsyncIterator[Device]:
+        """The device, open until the context ends. Raises BusError, DeviceAbsent."""
+        device = self.device()
+        try:
+            await device.open()
+            yield device
+        finally:
+            with suppress(DriverError):
+                await device.close()
 
     @property
     def signs(self) -> tuple[int, int, int]:

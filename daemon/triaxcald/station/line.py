@@ -5,14 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import aclosing, suppress
+from collections.abc import AsyncGenerator, Callable, Sequence
+from contextlib import aclosing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 from triaxcal.errors import Refused, TriaxcalError
-from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device, RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS
@@ -85,27 +84,19 @@ class UnitRun:
 
     async def run(self) -> Outcome:
         """Never raises for what a unit, a bus or the data do; says it in the outcome."""
-        device = self.device()
         path: Path | None = None
         try:
-            await device.open()
-            try:
+            async with self.place.opened() as device:
                 identity = await self.identify(device)
                 path = self.recording_path(identity)
                 with self.writer(path, identity) as writer:
                     return await self._line(device, identity, writer, path)
-            finally:
-                with suppress(DriverError):
-                    await device.close()
         except Refused as e:
             return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}", wanted=e.wanted)
         except TriaxcalError as e:
             return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}")
         except (DriverError, StationError) as e:
             return Outcome(self.name, 4, path, error=f"{self.place.where}: {e}")
-
-    def device(self) -> Device:
-        return driver_named(self.profile.driver).device(self.place.bundle, self.place.bus)
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")
@@ -193,7 +184,14 @@ class UnitRun:
         )
 
     async def _collect(
-        self, device: Device, writer: RecordingWriter, phase: _Phase, stream: str, wanted: int, *, use_plan: bool
+        self,
+        device: Device,
+        writer: RecordingWriter | None,
+        phase: _Phase,
+        stream: str,
+        wanted: int,
+        *,
+        use_plan: bool,
     ) -> None:
         """Records until there are ``wanted`` distinct poses. Raises Refused when none has come for too long."""
         plan = self.station.file.plan
@@ -225,18 +223,31 @@ class UnitRun:
                     f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there", wanted=(state.hint,)
                 )
 
-    async def records(self, device: Device, writer: RecordingWriter, phase: _Phase) -> AsyncIterator[RawBatch]:
-        """Raw records on their way to disk and down the pipelines; what the disk has no room for goes to neither."""
+    async def records(self, device: Device, writer: RecordingWriter | None, phase: _Phase) -> AsyncGenerator[RawBatch]:
+        """Raw records on their way to disk, if any, and down the pipelines.
+
+        What the disk has no room for goes to neither, so that an audit sees what the station saw.
+        """
         async with aclosing(cast(Any, device.stream(list(phase.pipelines)))) as stream:
             async for batch in stream:
-                if not writer.raw(phase.name, batch):
+                if writer is not None and not writer.raw(phase.name, batch):
                     continue
                 phase.digest.update(phase.name, batch)
                 for name, pipeline in phase.pipelines.items():
                     block = pipeline.feed(batch)
-                    if len(block):
+                    if writer is not None and len(block):
                         writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
                 yield batch
+
+    async def check(self) -> Verification:
+        """Records nothing and writes nothing: only asks the device, in check poses, for its own corrected output."""
+        async with self.place.opened() as device:
+            await self.identify(device)
+            self.progress.stage(self.name, "check poses")
+            check = self.phase(VERIFICATION)
+            wanted = self.station.file.plan.check_poses
+            await self._collect(device, None, check, CORRECTED, wanted, use_plan=False)
+            return self._corrected(check)
 
     async def _write_back(
         self, device: Device, writer: RecordingWriter, certified: Certified, tumble: _Phase, identity: IdentityRead

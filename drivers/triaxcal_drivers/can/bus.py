@@ -17,6 +17,6 @@ def open_bus(settings: CanBus) -> can.BusABC:
         options["bitrate"] = settings.bitrate
     try:
         return can.Bus(settings.channel, settings.interface, ignore_config=True, **options)
-    except (can.CanError, OSError, ValueError, TypeError, ImportError) as e:
+    except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as e:
         reason = " ".join(str(e).split()) or type(e).__name__
         raise BusError(f"cannot open {settings.interface} {settings.channel}: {reason}") from e

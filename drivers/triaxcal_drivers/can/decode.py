@@ -71,10 +71,7 @@ class CanDecoder:
         self._period_ns = 1e9 / rate_hz
         self._names = tuple(layout.channels)
         self._sizes = [
-            max(
-                s.size
-                for s in [*(s for m, s in layout.channels.values() if m == i), *layout.counters[i : i + 1]]
-            )
+            max(s.size for s in [*(s for m, s in layout.channels.values() if m == i), *layout.counters[i : i + 1]])
             for i in range(len(layout.messages))
         ]
         self._range = 1 << layout.counter_bits

@@ -63,9 +63,7 @@ def _check(signal: Signal, message: str, length: int, where: str) -> None:
     if signal.is_float and signal.length not in (16, 32, 64):
         raise ProfileError(f"{where}: signal '{signal.name}' is a float of {signal.length} bits")
     if not 1 <= signal.length <= 64 or signal.size > length:
-        raise ProfileError(
-            f"{where}: signal '{signal.name}' does not fit the {length} bytes of message '{message}'"
-        )
+        raise ProfileError(f"{where}: signal '{signal.name}' does not fit the {length} bytes of message '{message}'")
 
 
 def object_dictionary(data: bytes, *, node_id: int, where: str) -> ObjectDictionary:
@@ -117,9 +115,7 @@ def _mapped(objects: ObjectDictionary, number: int, where: str) -> dict[str, Sig
     return signals
 
 
-def _mapped_signal(
-    objects: ObjectDictionary, index: int, subindex: int, start: int, length: int, where: str
-) -> Signal:
+def _mapped_signal(objects: ObjectDictionary, index: int, subindex: int, start: int, length: int, where: str) -> Signal:
     name = f"0x{index:04X}:{subindex:02X}"
     variable = objects.get_variable(index, subindex)
     if variable is None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import struct
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 import can
@@ -26,6 +27,15 @@ _POLL_S = 0.1  # how long closing waits for python-can's receive thread to look 
 _NMT_START = 1
 
 
+@dataclass(frozen=True)
+class _Connection:
+    bus: can.BusABC
+    notifier: can.Notifier
+    frames: FrameQueue
+    network: canopen.Network
+    sdo: SdoClient
+
+
 class CanDevice:
     """A device behind python-can; a CANopen node where the profile says so.
 
@@ -36,48 +46,51 @@ class CanDevice:
         self._profile = profile
         self._settings = bus
         self._layouts = layouts
-        self._bus: can.BusABC | None = None
-        self._notifier: can.Notifier | None = None
-        self._frames: FrameQueue | None = None
-        self._network = canopen.Network()
+        self._connection: _Connection | None = None
+        self._dropped = 0
         self._sdo_lock = threading.Lock()  # one transfer at a time, also after a caller was cancelled
 
     @property
     def dropped(self) -> int:
-        """Frames lost in this process since `open`, because the stream was not read fast enough."""
-        return self._frames.dropped if self._frames else 0
+        """Frames lost in this process so far, because a stream was not read fast enough."""
+        return self._dropped + (self._connection.frames.dropped if self._connection else 0)
 
     async def open(self) -> None:
         """Raises BusError, DeviceAbsent."""
         await self.close()
-        self._frames = FrameQueue(asyncio.get_running_loop())
-        self._bus = await asyncio.to_thread(open_bus, self._settings)
-        self._network = canopen.Network(self._bus)
-        self._sdo = self._sdo_client()
-        self._notifier = can.Notifier(self._bus, [self._frames, *self._network.listeners], _POLL_S)
-        opened = False
+        bus = await asyncio.to_thread(open_bus, self._settings)
+        network = canopen.Network(bus)
+        frames = FrameQueue(asyncio.get_running_loop())
+        notifier = can.Notifier(bus, [frames, *network.listeners], _POLL_S)
+        self._connection = _Connection(bus, notifier, frames, network, self._sdo_client(network))
+        started = False
         try:
             if self._profile.canopen:
                 await self._start()
-            opened = True
+            started = True
         finally:
-            if not opened:
+            if not started:
                 await self.close()
 
     async def close(self) -> None:
-        notifier, bus, self._notifier, self._bus = self._notifier, self._bus, None, None
-        if notifier is not None:
-            await asyncio.to_thread(notifier.stop)
-        if bus is not None:
-            await asyncio.to_thread(bus.shutdown)
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            await asyncio.to_thread(connection.notifier.stop)
+            await asyncio.to_thread(connection.bus.shutdown)
+            self._dropped += connection.frames.dropped
 
-    def _sdo_client(self) -> SdoClient:
+    def _connected(self) -> _Connection:
+        if self._connection is None:
+            raise BusError(f"{self._settings} is not open")
+        return self._connection
+
+    def _sdo_client(self, network: canopen.Network) -> SdoClient:
         node = self._settings.node_id
         nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
         client = SdoClient(0x600 + node, 0x580 + node, nothing_known)  # type: ignore[no-untyped-call]
         client.RESPONSE_TIMEOUT = self._profile.sampling.reply_timeout_s
-        client.network = self._network
-        self._network.subscribe(client.tx_cobid, client.on_response)
+        client.network = network
+        network.subscribe(client.tx_cobid, client.on_response)
         return client
 
     async def _start(self) -> None:
@@ -107,13 +120,13 @@ class CanDevice:
                     f"0x{int.from_bytes(raw, 'little'):X}, expected 0x{expected:X}"
                 )
 
-    async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+    async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
         """Frames of the named streams and error frames, until the iterator is closed; one at a time.
 
         Raises DeviceSilent when no frame of theirs has come for ``silence_timeout_s``, BusError.
         """
-        frames = self._opened_frames()
-        frames.open(self._identifiers(names))
+        frames = self._connected().frames
+        opened = frames.open(self._identifiers(names))
         loop, timeout_s = asyncio.get_running_loop(), self._profile.sampling.silence_timeout_s
         deadline = loop.time() + timeout_s
         try:
@@ -124,61 +137,48 @@ class CanDevice:
                 if batch:
                     yield batch
                 elif loop.time() >= deadline:
-                    raise DeviceSilent(
-                        f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s"
-                    )
+                    raise DeviceSilent(f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s")
         finally:
-            frames.close()
+            frames.close(opened)
 
     def _identifiers(self, names: Sequence[str]) -> set[Identifier]:
         for name in names:
             if name not in self._layouts:
-                raise ProfileError(
-                    f"profile {self._profile.name}: no stream '{name}'{nearest(name, self._layouts)}"
-                )
+                raise ProfileError(f"profile {self._profile.name}: no stream '{name}'{nearest(name, self._layouts)}")
         node = self._settings.node_id
         return {(m.identifier_of(node), m.extended) for name in names for m in self._layouts[name].messages}
-
-    def _opened_frames(self) -> FrameQueue:
-        if self._frames is None or self._notifier is None:
-            raise BusError(f"{self._settings} is not open")
-        return self._frames
 
     async def read(self, register: str) -> bytes:
         """Least significant byte first. Raises RegisterRefused, DeviceSilent, BusError."""
         address = object_address(self._profile.registers[register].object)
-        return await self._transfer(register, lambda: bytes(self._sdo.upload(*address)))
+        return await self._transfer(register, lambda sdo: bytes(sdo.upload(*address)))
 
     async def write(self, register: str, raw: bytes) -> None:
         """``raw`` least significant byte first. Raises RegisterRefused, DeviceSilent, BusError."""
         address = object_address(self._profile.registers[register].object)
-        await self._transfer(register, lambda: self._sdo.download(*address, raw))
+        await self._transfer(register, lambda sdo: sdo.download(*address, raw))
 
-    async def _transfer(self, register: str, transfer: Callable[[], T]) -> T:
-        frames = self._opened_frames()
+    async def _transfer(self, register: str, transfer: Callable[[SdoClient], T]) -> T:
+        connection = self._connected()
         place = f"register {register} ({self._profile.registers[register].object}) of {self._settings}"
 
         def locked() -> T:
             with self._sdo_lock:
-                return transfer()
+                return transfer(connection.sdo)
 
         try:
             return await asyncio.to_thread(locked)
         except SdoAbortedError as e:
             reason = SdoAbortedError.CODES.get(e.code, "unknown reason")
-            raise RegisterRefused(
-                f"{place}: refused, 0x{e.code:08X} {reason}", register=register, code=e.code
-            ) from e
+            raise RegisterRefused(f"{place}: refused, 0x{e.code:08X} {reason}", register=register, code=e.code) from e
         except (SdoCommunicationError, struct.error) as e:  # the latter: an answer cut short
-            frames.check()
-            raise DeviceSilent(
-                f"{place}: no valid answer within {self._profile.sampling.reply_timeout_s:g} s"
-            ) from e
+            connection.frames.check()
+            raise DeviceSilent(f"{place}: no valid answer within {self._profile.sampling.reply_timeout_s:g} s") from e
         except (can.CanError, OSError) as e:
             raise BusError(f"{place}: {e}") from e
 
     async def _send(self, identifier: int, data: bytes) -> None:
         try:
-            await asyncio.to_thread(self._network.send_message, identifier, data)
+            await asyncio.to_thread(self._connected().network.send_message, identifier, data)
         except (can.CanError, OSError) as e:
             raise BusError(f"cannot send to {self._settings}: {e}") from e

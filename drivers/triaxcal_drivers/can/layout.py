@@ -40,9 +40,7 @@ class Signal:
         """The bytes it touches, least significant first, and how far it lies above their lowest bit."""
         if not self.big_endian:
             return range(self.start // 8, (self.start + self.length - 1) // 8 + 1), self.start % 8
-        last = (
-            8 * (self.start // 8) + 7 - self.start % 8 + self.length - 1
-        )  # counted from the first byte's top
+        last = 8 * (self.start // 8) + 7 - self.start % 8 + self.length - 1  # counted from the first byte's top
         return range(last // 8, self.start // 8 - 1, -1), 7 - last % 8
 
     @property
@@ -169,9 +167,7 @@ def _counters(used: Sequence[Message], counter: str | None, where: str) -> tuple
     for message in used:
         if counter not in message.signals:
             hint = nearest(counter, message.signals)
-            raise ProfileError(
-                f"{where}: no signal '{counter}' (the counter) in message '{message.name}'{hint}"
-            )
+            raise ProfileError(f"{where}: no signal '{counter}' (the counter) in message '{message.name}'{hint}")
     found = tuple(m.signals[counter] for m in used)
     widths = sorted({s.length for s in found})
     if len(widths) > 1 or widths[0] < SHORTEST_COUNTER or widths[0] > 32 or any(s.is_float for s in found):

@@ -45,9 +45,11 @@ class PdoChannel(Scaling):
     object: ObjectName
 
 
-def _named(key: str) -> BeforeValidator:
+def _named(key: str, channel: type[Scaling]) -> BeforeValidator:
     """A channel may be given by its name in the file alone."""
-    return BeforeValidator(lambda given: {key: given} if isinstance(given, str) else given)
+    return BeforeValidator(
+        lambda given: {key: given} if isinstance(given, str) else given, json_schema_input_type=str | channel
+    )
 
 
 def _has_readings(channels: Mapping[str, object]) -> None:
@@ -68,7 +70,7 @@ class DbcStream(Strict):
     file: str
     base_node_id: Annotated[int | None, Field(ge=1, le=127)] = None
     counter: str | None = None
-    channels: Mapping[str, Annotated[DbcChannel, _named("signal")]]
+    channels: Mapping[str, Annotated[DbcChannel, _named("signal", DbcChannel)]]
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -86,7 +88,7 @@ class PdoStream(Strict):
     layout: Literal["pdo"]
     eds: str
     counter: ObjectName | None = None
-    channels: Mapping[str, Annotated[PdoChannel, _named("object")]]
+    channels: Mapping[str, Annotated[PdoChannel, _named("object", PdoChannel)]]
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

@@ -30,6 +30,7 @@ class HostClock:
     sending, kvaser, vector and pcan an adapter's clock laid on the epoch; gs_usb, serial and some others an
     adapter's clock that starts at 0 and may wrap. A stamp more than 10 s off the host's clock is
     therefore read as the adapter's: from there on its differences count, starting from the host's time.
+    Where there is no stamp, the host's time is taken.
     """
 
     def __init__(self, now_ns: Callable[[], int] = time.time_ns) -> None:
@@ -38,6 +39,8 @@ class HostClock:
 
     def time_ns(self, timestamp_s: float) -> int:
         now_ns = self._now_ns()
+        if timestamp_s <= 0:
+            return now_ns
         stamp_ns = round(timestamp_s * 1e9)
         if abs(stamp_ns + self._offset_ns - now_ns) > _OFF_CLOCK_NS:
             self._offset_ns = now_ns - stamp_ns
@@ -63,17 +66,21 @@ class FrameQueue(can.Listener):
         self._failure: Exception | None = None
         self._some, self._enough = asyncio.Event(), asyncio.Event()
 
-    def open(self, identifiers: Collection[Identifier]) -> None:
+    def open(self, identifiers: Collection[Identifier]) -> object:
+        """Take these from now on; returns what `close` wants."""
         with self._lock:
             self._frames.clear()
             self._lossy = False
-            self._identifiers = frozenset(identifiers)
+            self._identifiers = opened = frozenset(identifiers)
         self._some.clear()
         self._enough.clear()
+        return opened
 
-    def close(self) -> None:
+    def close(self, opened: object) -> None:
+        """Nothing happens where another stream has been opened since."""
         with self._lock:
-            self._identifiers = None
+            if self._identifiers is opened:
+                self._identifiers = None
 
     def on_message_received(self, msg: can.Message) -> None:
         """Called in python-can's thread."""
@@ -130,7 +137,7 @@ class FrameQueue(can.Listener):
         with self._lock:
             taken = [self._frames.popleft() for _ in range(min(BATCH_FRAMES, len(self._frames)))]
             left = len(self._frames)
-        if left == 0:
+        if left == 0 and self._failure is None:
             self._some.clear()
         if left < BATCH_FRAMES:
             self._enough.clear()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.modbus.model import (
+    READING_CHANNELS,
     Channel,
     Counter,
     FifoStream,
@@ -19,7 +20,6 @@ from triaxcal_drivers.modbus.model import (
     words_of,
 )
 from triaxcal_drivers.modbus.timeline import Arrivals, Clockwork, Timeline
-from triaxcal_drivers.profile import AXES
 from triaxcal_drivers.registers import SIZES
 
 Bytes = NDArray[np.uint8]
@@ -131,7 +131,7 @@ class ModbusDecoder:
         return SampleBlock(
             placed.time_ns,
             placed.counter,
-            np.stack([values.pop(axis) for axis in AXES], axis=1),
+            np.stack([values.pop(name) for name in READING_CHANNELS], axis=1),
             values,
             missing=placed.missing,
             duplicates=len(records) - len(kept),

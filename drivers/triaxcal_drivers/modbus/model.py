@@ -17,6 +17,7 @@ from triaxcal_drivers.modbus.protocol import (
 from triaxcal_drivers.profile import AXES, Profile, Register, Strict
 from triaxcal_drivers.registers import SIZES
 
+READING_CHANNELS = tuple("u" + axis for axis in AXES)
 WordType = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 Order = Literal["big", "little"]
 Table = Literal["input", "holding"]
@@ -70,15 +71,15 @@ class _Stream(Strict):
     table: Table = "input"
     address: Address
     poll_period_s: Annotated[float, Field(ge=0, le=60)]
-    channels: Annotated[dict[str, Channel], Field(description="x, y and z; any further ones by their names")]
+    channels: Annotated[dict[str, Channel], Field(description="ux, uy and uz; any further ones by their names")]
     counter: Counter | None = None
     time_stamp: TimeStamp | None = None
 
     @model_validator(mode="after")
     def _has_axes(self) -> Self:
-        for axis in AXES:
-            if axis not in self.channels:
-                raise ValueError(f"channels.{axis} is missing: channels must have x, y and z")
+        for name in READING_CHANNELS:
+            if name not in self.channels:
+                raise ValueError(f"channels.{name} is missing: channels must have ux, uy and uz")
         return self
 
     @property
@@ -197,7 +198,7 @@ class ModbusBus(Strict):
     """Where the unit is: over TCP at ``host``, or RTU on ``serial_port``."""
 
     host: str | None = None
-    port: Annotated[int, Field(ge=1, le=65535)] = 502
+    port: Annotated[int, Field(ge=0, le=65535, description="0: a simulated unit takes any free one")] = 502
     serial_port: str | None = None
     baudrate: Annotated[int, Field(ge=300, le=4_000_000)] = 19200
     parity: Literal["N", "E", "O"] = "E"

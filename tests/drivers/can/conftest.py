@@ -1,4 +1,5 @@
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from triaxcal_drivers.can.decode import CanDecoder
 from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.model import DbcStream, PdoStream
 from triaxcal_drivers.interface import RawBatch, SampleBlock
-from triaxcal_drivers.profile import Bundle, load_bundle, parse_bundle
+from triaxcal_drivers.profile import BUILT_IN, Bundle, load_bundle, parse_bundle
 
 EDS = "triax-ref-can.eds"
 PDO_CHANNELS: dict[str, Any] = {
@@ -23,9 +24,7 @@ PDO_CHANNELS: dict[str, Any] = {
 
 @pytest.fixture(scope="session")
 def profiles() -> Path:
-    import triaxcal_drivers.profile
-
-    return triaxcal_drivers.profile.BUILT_IN
+    return BUILT_IN
 
 
 @pytest.fixture(scope="session")
@@ -45,9 +44,7 @@ def edited(bundle: Bundle) -> Callable[..., Bundle]:
         for old, new in dbc:
             assert old in held
             held = held.replace(old, new)
-        return parse_bundle(
-            text.encode(), {"triax-ref-can.dbc": held.encode()}, where="unit.toml"
-        )
+        return parse_bundle(text.encode(), {"triax-ref-can.dbc": held.encode()}, where="unit.toml")
 
     return edit
 
@@ -63,9 +60,7 @@ def decoder(bundle: Bundle) -> CanDecoder:
 @pytest.fixture
 def pdo_decoder(profiles: Path) -> CanDecoder:
     stream = PdoStream(layout="pdo", eds=EDS, counter="0x2300:04", channels=PDO_CHANNELS)
-    return CanDecoder(
-        stream_layout(stream, {EDS: (profiles / EDS).read_bytes()}, where="test"), rate_hz=100.0
-    )
+    return CanDecoder(stream_layout(stream, {EDS: (profiles / EDS).read_bytes()}, where="test"), rate_hz=100.0)
 
 
 def joined(blocks: Sequence[SampleBlock]) -> dict[str, Any]:
@@ -88,7 +83,7 @@ def decode_all() -> Callable[..., dict[str, Any]]:
         decoder: CanDecoder, records: Sequence[tuple[int, int, int, bytes]], cuts: Sequence[int] = ()
     ) -> dict[str, Any]:
         edges = [0, *sorted(cuts), len(records)]
-        batches = [RawBatch.of(records[a:b]) for a, b in zip(edges, edges[1:], strict=False)]
+        batches = [RawBatch.of(records[a:b]) for a, b in pairwise(edges)]
         return joined([decoder.feed(batch) for batch in batches])
 
     return decode

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,12 @@ def test_the_layout_out_of_the_eds_decodes_as_the_dbc_does(
 ) -> None:
     random = np.random.default_rng(1)
     records = [
-        (t, source, flags, random.bytes(6) + data[6:] if source == 0x185 else random.bytes(5) + data[5:7] + b"\x0d")
+        (
+            t,
+            source,
+            flags,
+            random.bytes(6) + data[6:] if source == 0x185 else random.bytes(5) + data[5:7] + b"\x0d",
+        )
         for t, source, flags, data in whole(range(65500, 65600))
     ]
     by_dbc, by_pdo = decode_all(decoder, records), decode_all(pdo_decoder, records)
@@ -82,9 +88,7 @@ def test_the_layout_out_of_the_eds_decodes_as_the_dbc_does(
     assert by_dbc == by_pdo
 
 
-def test_a_unit_at_another_node_is_found_by_its_shifted_identifiers(
-    bundle: Bundle, decode_all: DecodeAll
-) -> None:
+def test_a_unit_at_another_node_is_found_by_its_shifted_identifiers(bundle: Bundle, decode_all: DecodeAll) -> None:
     for node in (1, 42, 127):
         decoder = CanDriver().decoder(bundle, "readings")
         assert decode_all(decoder, whole(range(5), node=node))["counter"] == [0, 1, 2, 3, 4]
@@ -92,9 +96,7 @@ def test_a_unit_at_another_node_is_found_by_its_shifted_identifiers(
 
 def test_frames_of_a_second_node_are_passed_over(decoder: CanDecoder, decode_all: DecodeAll) -> None:
     mixed = [r for pair in zip(whole(range(20)), whole(range(50, 70), node=6), strict=True) for r in pair]
-    assert decode_all(decoder, mixed) == decode_all(
-        CanDecoder(decoder._layout, rate_hz=100.0), whole(range(20))
-    )
+    assert decode_all(decoder, mixed) == decode_all(CanDecoder(decoder._layout, rate_hz=100.0), whole(range(20)))
 
 
 def test_without_base_node_id_the_dbcs_identifiers_hold_as_they_are(
@@ -105,17 +107,13 @@ def test_without_base_node_id_the_dbcs_identifiers_hold_as_they_are(
     assert decode_all(decoder, whole(range(3)))["counter"] == [0, 1, 2]
 
 
-def test_the_profiles_scaling_goes_before_the_dbcs(
-    edited: Callable[..., Bundle], decode_all: DecodeAll
-) -> None:
+def test_the_profiles_scaling_goes_before_the_dbcs(edited: Callable[..., Bundle], decode_all: DecodeAll) -> None:
     changed = edited(('ux = "Ux"', 'ux = { signal = "Ux", scale = 2.0, offset = 1.0 }'))
     decoded = decode_all(CanDriver().decoder(changed, "readings"), whole([7]))
     assert decoded["readings"] == [[15.0, 0.0, 0.0]]
 
 
-def test_the_counter_wraps_without_a_gap_and_time_goes_by_periods(
-    decoder: CanDecoder, decode_all: DecodeAll
-) -> None:
+def test_the_counter_wraps_without_a_gap_and_time_goes_by_periods(decoder: CanDecoder, decode_all: DecodeAll) -> None:
     # host time is compressed, as with an accelerated unit
     records = [(T0 + (r[0] - T0) // 50, *r[1:]) for r in whole(range(65530, 65550))]
     decoded = decode_all(decoder, records)
@@ -139,18 +137,14 @@ def test_samples_that_never_came_are_counted_missing(decoder: CanDecoder, decode
     assert decoded["time_ns"][2] == T0 + 5 * PERIOD
 
 
-def test_a_sample_that_lacks_a_message_is_counted_and_not_delivered(
-    decoder: CanDecoder, decode_all: DecodeAll
-) -> None:
+def test_a_sample_that_lacks_a_message_is_counted_and_not_delivered(decoder: CanDecoder, decode_all: DecodeAll) -> None:
     records = [r for r in whole(range(20)) if r[3] != z(4)[3]]
     decoded = decode_all(decoder, records)
     assert decoded["counter"] == [0, 1, 2, 3, *range(5, 20)]
     assert (decoded["incomplete"], decoded["missing"]) == (1, 0)
 
 
-def test_a_message_is_waited_for_over_eight_samples_and_no_longer(
-    bundle: Bundle, decode_all: DecodeAll
-) -> None:
+def test_a_message_is_waited_for_over_eight_samples_and_no_longer(bundle: Bundle, decode_all: DecodeAll) -> None:
     for late, incomplete in ((LATEST, 0), (LATEST + 1, 1)):
         records = [xy(0), *whole(range(1, late + 1)), z(0), *whole(range(late + 1, 20))]
         decoded = decode_all(CanDriver().decoder(bundle, "readings"), records)
@@ -191,9 +185,7 @@ def test_after_a_restart_time_goes_on_by_the_hosts_clock(
     assert decoded["missing"] + more["missing"] == 37
 
 
-def test_time_never_goes_back_when_a_restart_takes_no_host_time(
-    decoder: CanDecoder, decode_all: DecodeAll
-) -> None:
+def test_time_never_goes_back_when_a_restart_takes_no_host_time(decoder: CanDecoder, decode_all: DecodeAll) -> None:
     records = [r for k in (40000, 40001, 0, 1, 2) for r in (xy(k), z(k))]  # all at the same host time
     decoded = decode_all(decoder, records)
     assert [(t - T0) // PERIOD for t in decoded["time_ns"]] == [0, 1, 2, 3, 4]
@@ -244,8 +236,8 @@ def test_samples_and_counts_are_the_same_however_the_records_are_cut(
     cuts = data.draw(st.lists(st.integers(0, len(records)), max_size=6))
     assert decode_all(fresh(), records, cuts) == whole_at_once
     assert decode_all(fresh(), records, range(len(records))) == whole_at_once
-    assert all(a < b for a, b in zip(whole_at_once["time_ns"], whole_at_once["time_ns"][1:], strict=False))
-    assert all(a < b for a, b in zip(whole_at_once["counter"], whole_at_once["counter"][1:], strict=False))
+    assert all(a < b for a, b in pairwise(whole_at_once["time_ns"]))
+    assert all(a < b for a, b in pairwise(whole_at_once["counter"]))
 
 
 @shared

@@ -33,8 +33,7 @@ def opened(bundle: Bundle) -> Callable[[], object]:
 def test_a_missing_signal_is_named_with_the_nearest_one(edited: Edited) -> None:
     message = refusal(opened(edited(('"Ux"', '"Uxx"'))))
     assert message == (
-        "triax-ref-can.dbc (profile triax-ref-can, streams.readings): "
-        "no signal 'Uxx'; did you mean 'Ux'?"
+        "triax-ref-can.dbc (profile triax-ref-can, streams.readings): no signal 'Uxx'; did you mean 'Ux'?"
     )
 
 
@@ -163,7 +162,11 @@ PDO: dict[str, Any] = {
     [
         ("[1A00sub3]", "[1A00subx]", "object 0x1A00:03 has no default value"),
         ("DefaultValue=0x23000118", "DefaultValue=0x23000110", "TPDO1 maps 16 bits of 0x2300:01"),
-        ("DefaultValue=0x23000118", "DefaultValue=0x24000118", "TPDO1 maps 0x2400:01, which is not an object"),
+        (
+            "DefaultValue=0x23000118",
+            "DefaultValue=0x24000118",
+            "TPDO1 maps 0x2400:01, which is not an object",
+        ),
         ("DefaultValue=0x23000318", "DefaultValue=0x23000218", "no signal '0x2300:03'; did you mean"),
         ("[DeviceInfo]", "DeviceInfo", "not an EDS file"),
         ("DefaultValue=$NODEID+0x40000180", "DefaultValue=", "object 0x1800:01 has no default value"),

@@ -46,13 +46,25 @@ async def test_only_the_streams_identifiers_and_error_frames_are_taken() -> None
 async def test_nothing_is_taken_while_no_stream_is_open() -> None:
     frames = FrameQueue(asyncio.get_running_loop())
     frames.on_message_received(frame())
-    frames.open(WANTED)
+    opened = frames.open(WANTED)
     frames.on_message_received(frame(1))
-    frames.close()
+    frames.close(opened)
     frames.on_message_received(frame(2))
     batch = await frames.batch(1.0)
     assert batch is not None
     assert batch.payload == bytes.fromhex("0100")
+
+
+async def test_closing_a_stream_does_not_touch_the_one_opened_after_it() -> None:
+    frames = FrameQueue(asyncio.get_running_loop())
+    earlier = frames.open(WANTED)
+    frames.on_message_received(frame(1))
+    frames.open(WANTED)
+    frames.close(earlier)
+    frames.on_message_received(frame(2))
+    batch = await frames.batch(1.0)
+    assert batch is not None
+    assert batch.payload == bytes.fromhex("0200")
 
 
 async def test_batches_hold_no_more_than_256_frames() -> None:
@@ -83,9 +95,7 @@ async def test_an_overflow_is_counted_and_flagged_on_the_next_frame_kept() -> No
 
 async def test_frames_from_another_thread_all_arrive_in_order() -> None:
     frames = await opened(capacity=100_000)
-    sender = threading.Thread(
-        target=lambda: [frames.on_message_received(frame(n)) for n in range(20_000)], daemon=True
-    )
+    sender = threading.Thread(target=lambda: [frames.on_message_received(frame(n)) for n in range(20_000)], daemon=True)
     sender.start()
     payload = b""
     while len(payload) < 40_000:
@@ -129,3 +139,11 @@ def test_an_adapters_clock_that_wraps_is_laid_on_the_hosts_anew() -> None:
     clock.time_ns(4294.9)
     now_ns[0] += 100_000_000
     assert clock.time_ns(0.03) == now_ns[0]
+
+
+def test_without_a_stamp_the_hosts_time_is_taken() -> None:
+    now_ns = [1_700_000_000_000_000_000]
+    clock = HostClock(lambda: now_ns[0])
+    assert clock.time_ns(0.0) == now_ns[0]
+    now_ns[0] += 5_000_000
+    assert clock.time_ns(0.0) == now_ns[0]

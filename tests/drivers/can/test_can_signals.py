@@ -30,9 +30,7 @@ def signals(draw: st.DrawFn) -> tuple[cantools_can.Signal, int]:
 
 
 @given(signals(), st.data())
-def test_every_signal_reads_as_cantools_reads_it(
-    drawn: tuple[cantools_can.Signal, int], data: st.DataObject
-) -> None:
+def test_every_signal_reads_as_cantools_reads_it(drawn: tuple[cantools_can.Signal, int], data: st.DataObject) -> None:
     theirs, length = drawn
     frames = data.draw(st.lists(st.binary(min_size=length, max_size=length), min_size=1, max_size=5))
     ours = Signal(

@@ -22,7 +22,7 @@ layout = "poll"
 table = "holding"
 address = 0x6B
 poll_period_s = 0.001
-channels = { x = { word = 0, type = "int16" }, y = { word = 1, type = "int16" }, z = { word = 2, type = "int16" } }
+channels = { ux = { word = 0, type = "int16" }, uy = { word = 1, type = "int16" }, uz = { word = 2, type = "int16" } }
 
 [streams.queue]
 layout = "fifo"
@@ -33,7 +33,7 @@ record_start = 2
 record_words = 4
 record_capacity = 2
 counter = { word = 3, type = "uint16" }
-channels = { x = { word = 0, type = "int16" }, y = { word = 1, type = "int16" }, z = { word = 2, type = "int16" } }
+channels = { ux = { word = 0, type = "int16" }, uy = { word = 1, type = "int16" }, uz = { word = 2, type = "int16" } }
 
 [registers]
 level = { table = "input", access = "ro", address = 8, type = "uint16" }

@@ -26,9 +26,9 @@ counter = { word = 0, type = "uint16" }
 time_stamp = { word = 1, type = "uint32", unit_s = 1e-6 }
 
 [streams.full.channels]
-x = { word = 3, type = "int32", scale = 0.5 }
-y = { word = 5, type = "int32", scale = 0.5 }
-z = { word = 7, type = "int32", scale = 0.5, offset = 1.0 }
+ux = { word = 3, type = "int32", scale = 0.5 }
+uy = { word = 5, type = "int32", scale = 0.5 }
+uz = { word = 7, type = "int32", scale = 0.5, offset = 1.0 }
 temp_c = { word = 9, type = "int16", scale = 0.01 }
 
 [registers]
@@ -159,10 +159,10 @@ def test_every_type_is_decoded_in_every_order(bundle, type_, word_order, byte_or
     if byte_order == "little":
         words = [w[::-1] for w in words]
     at = [i * len(words) for i in range(3)]
-    channels = ", ".join(f'{a} = {{ word = {w}, type = "{type_}" }}' for a, w in zip("xyz", at, strict=True))
+    channels = ", ".join(f'u{a} = {{ word = {w}, type = "{type_}" }}' for a, w in zip("xyz", at, strict=True))
     text = (
-        'channels = { x = { word = 0, type = "int16" }, y = { word = 1, type = "int16" }, '
-        'z = { word = 2, type = "int16" } }\n\n[streams.queue]'
+        'channels = { ux = { word = 0, type = "int16" }, uy = { word = 1, type = "int16" }, '
+        'uz = { word = 2, type = "int16" } }\n\n[streams.queue]'
     )
     decode = decoder(
         bundle,

@@ -1,0 +1,58 @@
+"""All commands, and the one place where errors become exit codes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from triaxcal.errors import InvalidData, Refused
+from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
+from triaxcald.cli import devices, line, measuring, recordings
+from triaxcald.cli.arguments import OneLineParser
+from triaxcald.cli.console import say
+from triaxcald.errors import DaemonError
+
+DONE, OUTSIDE, BAD_INPUT, REFUSED, DEVICE, INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+
+def parser() -> OneLineParser:
+    top = OneLineParser(prog="triaxcal", description="Calibrates three-axis accelerometers.")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for room in (line, measuring, devices, recordings):
+        room.register(commands)
+    return top
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs one command; gives its exit code. Errors are one line on standard error."""
+    try:
+        chosen = parser().parse_args(arguments)
+    except SystemExit as e:
+        return int(e.code or 0)
+    try:
+        code: int = chosen.run(chosen)
+        sys.stdout.flush()
+        return code
+    except Refused as e:
+        say(f"triaxcal: refused: {e}" + (f"; add the poses {', '.join(e.wanted)}" if e.wanted else ""))
+        return REFUSED
+    except RegisterValueError as e:
+        say(f"triaxcal: refused: {e}; nothing was written")
+        return REFUSED
+    except (InvalidData, ProfileError, DriverMissing) as e:
+        say(f"triaxcal: {e}")
+        return BAD_INPUT
+    except DriverError as e:
+        say(f"triaxcal: {e}")
+        return DEVICE
+    except DaemonError as e:
+        say(f"triaxcal: {e}")
+        return e.exit_code
+    except KeyboardInterrupt:
+        say("triaxcal: interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output has gone; nothing more can be said there.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE

@@ -1,0 +1,87 @@
+"""What a person sees: results on standard output, progress and warnings on standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from triaxcald.recording.schema import Phase
+from triaxcald.station.guidance import Guide
+
+
+def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
+    """One JSON document on standard output, nothing else."""
+    sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def say(text: str) -> None:
+    """A line to standard error."""
+    sys.stderr.write(text + "\n")
+
+
+def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """To standard output; columns of numbers are the caller's text."""
+    shown = Table(title=title, title_justify="left", header_style="bold")
+    for i, name in enumerate(columns):
+        shown.add_column(name, justify="left" if i == 0 else "right", overflow="fold")
+    for row in rows:
+        shown.add_row(*("—" if v is None else str(v) for v in row))
+    width = None if sys.stdout.isatty() else 160
+    Console(file=sys.stdout, width=width, markup=False, highlight=False).print(shown)
+
+
+def micro(value: float | None) -> str:
+    """A number of g in µg."""
+    return "—" if value is None else f"{value * 1e6:.1f}"
+
+
+class Bars:
+    """Progress bars, one a unit; plain lines where standard error is no terminal."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.fields[unit]:<8}", markup=False),
+            BarColumn(bar_width=26),
+            TextColumn("{task.completed:.0f}/{task.total:.0f} poses"),
+            TimeElapsedColumn(),
+            TextColumn("{task.description}", markup=False),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._tasks: dict[str, TaskID] = {}
+        self._said: dict[str, str] = {}
+
+    def __enter__(self) -> Bars:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def _task(self, unit: str) -> TaskID:
+        if unit not in self._tasks:
+            self._tasks[unit] = self._progress.add_task("", total=1, unit=unit)
+        return self._tasks[unit]
+
+    def stage(self, unit: str, text: str) -> None:
+        self._progress.update(self._task(unit), description=text)
+        self._plain(unit, text)
+
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
+        what = "check poses" if phase == "verification" else "poses"
+        self._progress.update(
+            self._task(unit), completed=guide.found, total=guide.wanted, description=f"{what}: {guide.hint}"
+        )
+        self._plain(unit, f"{what}: {guide.found} of {guide.wanted}")
+
+    def _plain(self, unit: str, text: str) -> None:
+        if not self._console.is_terminal and self._said.get(unit) != text:
+            self._said[unit] = text
+            say(f"{unit}: {text}")

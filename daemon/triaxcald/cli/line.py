@@ -1,0 +1,205 @@
+"""demo, run, sim, record."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import signal
+from collections.abc import Sequence
+from contextlib import aclosing
+from pathlib import Path
+from typing import Any
+
+from triaxcal_drivers.profile import READINGS
+from triaxcald.cli.arguments import add_json, positive, writable
+from triaxcald.cli.console import Bars, emit, micro, say, table
+from triaxcald.demo import DemoUnit, run_demo
+from triaxcald.documents import number
+from triaxcald.inputs import CALIBRATION
+from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
+from triaxcald.simulation.eeprom import keep_eeprom, read_eeprom
+from triaxcald.station.config import load_station
+from triaxcald.station.line import Outcome, UnitRun, run_station
+
+SEVEREST = (4, 3, 2, 1, 0)
+
+
+def register(commands: Any) -> None:
+    p = commands.add_parser("demo", help="the whole line on two simulated units, in under a minute")
+    p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
+    p.add_argument("--seed", type=int, default=1, help="of the units' hidden effects, noise and poses")
+    add_json(p)
+    p.set_defaults(run=demo_command)
+    p = commands.add_parser("run", help="the whole line on the devices of a station file")
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    add_json(p)
+    p.set_defaults(run=run_command)
+    p = commands.add_parser("sim", help="serve a simulated unit on a bus until stopped")
+    p.add_argument("device", metavar="DEVICE.toml", type=Path)
+    p.set_defaults(run=sim_command)
+    p = commands.add_parser("record", help="record only")
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="REC.mcap")
+    p.add_argument("--seconds", type=positive, metavar="S", help="of the samples' time; default: until interrupted")
+    p.add_argument("--unit", help="where the station has more than one")
+    p.set_defaults(run=record_command)
+
+
+def run_command(a: argparse.Namespace) -> int:
+    station = load_station(a.station)
+    with Bars() as bars:
+        outcomes = asyncio.run(run_station(station, bars))
+    if a.json:
+        emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
+    else:
+        show_outcomes(outcomes)
+    return worst(outcomes)
+
+
+def worst(outcomes: Sequence[Outcome]) -> int:
+    codes = {o.exit_code for o in outcomes}
+    return next(code for code in SEVEREST if code in codes)
+
+
+def _document(o: Outcome) -> dict[str, Any]:
+    result = o.certified.document["result"] if o.certified else None
+    return {
+        "unit": o.unit,
+        "exit_code": o.exit_code,
+        "error": o.error,
+        "wanted_poses": list(o.wanted),
+        "serial": o.certified.document["unit"]["serial"] if o.certified else None,
+        "recording": str(o.recording) if o.recording else None,
+        "certificate": str(o.certificate) if o.certificate else None,
+        "report": str(o.report) if o.report else None,
+        "before": result["before"] if result else None,
+        "after": result["after"] if result else None,
+        "findings": result["findings"] if result else [],
+        "registers_written": list(o.provisioned.written) if o.provisioned else [],
+        "verification": o.verification,
+    }
+
+
+def show_outcomes(outcomes: Sequence[Outcome]) -> None:
+    for o in outcomes:
+        if o.certified:
+            show_outcome(o)
+        if o.error:
+            say(f"triaxcal: {o.error}" + (f"; add the poses {', '.join(o.wanted)}" if o.wanted else ""))
+
+
+def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
+    """The before / after table of one unit, and where its papers are."""
+    assert o.certified is not None
+    loop, v = o.certified.loop, o.verification
+    b, f = loop.before.residual, loop.after.residual
+    rows: list[Sequence[Any]] = [
+        ["fit: residual rms", micro(b.rms_g), micro(f.rms_g), micro(f.noise_floor_g)],
+        ["fit: cross-validated rms", micro(b.cross_validated_rms_g), micro(f.cross_validated_rms_g), ""],
+    ]
+    if v:
+        rows.append(
+            ["device's own output", micro(v["before_rms_g"]), micro(v["after_rms_g"]), micro(v["noise_floor_g"])]
+        )
+    table(
+        f"unit {o.unit}, serial {o.certified.document['unit']['serial']}: error of the magnitude, µg rms",
+        ["", "before", "after", "noise floor"],
+        [*rows, *extra],
+    )
+    for finding in loop.findings:
+        print(f"  {finding.verdict}: {finding.effect}")
+        for name, (value, error, unit) in finding.coefficients.items():
+            print(f"    {name} {value:+.4g} ± {error:.1g} {unit}")
+    if not loop.findings:
+        print("  no effect of the catalogue shows")
+    if loop.unexplained.significant:
+        print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms; {loop.unexplained.lead}")
+    if o.provisioned:
+        print(f"  {len(o.provisioned.written)} registers written, stored, read back after a restart")
+    if v:
+        print(f"  verified by physics: {v['verdict']}")
+    for line in o.certified.document["outside"]:
+        print(f"  outside limits: {line}")
+    for what, path in (("recording", o.recording), ("certificate", o.certificate), ("report", o.report)):
+        print(f"  {what:<12}{path}")
+
+
+def demo_command(a: argparse.Namespace) -> int:
+    with Bars() as bars:
+        units = asyncio.run(run_demo(a.out, a.seed, bars))
+    if a.json:
+        emit({"format": "triaxcal.demo/1", "units": [_demo_document(u) for u in units]})
+    else:
+        for u in units:
+            _show_demo(u)
+    return max(worst([u.outcome for u in units]), 0 if all(u.found for u in units) else 1)
+
+
+def _demo_document(u: DemoUnit) -> dict[str, Any]:
+    cycled = u.after_power_cycle
+    return {
+        **_document(u.outcome),
+        "hidden": {name: dict(values) for name, values in u.hidden.items()},
+        "found": u.found,
+        "after_power_cycle_rms_g": number(cycled.rms_g) if cycled else None,
+    }
+
+
+def _show_demo(u: DemoUnit) -> None:
+    if u.outcome.certified is None:
+        say(f"triaxcal: {u.outcome.error}")
+        return
+    extra = []
+    if u.after_power_cycle:
+        after = u.after_power_cycle
+        extra.append(["the same after a power cycle", "", micro(after.rms_g), micro(after.noise_floor_g)])
+    show_outcome(u.outcome, extra)
+    for name, values in u.hidden.items():
+        truth = ", ".join(f"{axis} {value:+.4g}" for axis, value in values.items())
+        print(f"  hidden in it: {name} ({truth}): {'found' if u.found else 'NOT found'}\n")
+
+
+def sim_command(a: argparse.Namespace) -> int:
+    device = load_device(a.device)
+    eeprom = a.device.parent / device.eeprom if device.eeprom else None
+    simulated = simulate(device, where=str(a.device), stored=read_eeprom(eeprom) if eeprom else None)
+    asyncio.run(_serve(simulated, eeprom))
+    return 0
+
+
+async def _serve(simulated: SimulatedUnit, eeprom: Path | None) -> None:
+    stop = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    async with simulated.serve():
+        settings = ", ".join(f"{k}={v}" for k, v in simulated.device.bus.items())
+        say(
+            f"serving {simulated.bundle.profile.name}, serial {simulated.device.serial}, on {settings}; Ctrl-C stops it"
+        )
+        async with keep_eeprom(simulated.unit, eeprom):
+            await stop.wait()
+
+
+def record_command(a: argparse.Namespace) -> int:
+    writable(a.output)
+    station = load_station(a.station)
+    place = station.place(a.unit)
+    with Bars() as bars:
+        line = asyncio.run(_record(UnitRun(station, place, bars), a.output, a.seconds))
+    say(line)
+    return 0
+
+
+async def _record(run: UnitRun, path: Path, seconds: float | None) -> str:
+    async with run.place.opened() as device:
+        identity = await run.identify(device)
+        with run.writer(path, identity) as writer:
+            phase = run.phase(CALIBRATION)
+            pipeline = phase.pipelines[READINGS]
+            run.progress.stage(run.name, "recording")
+            async with aclosing(run.records(device, writer, phase)) as records:
+                async for _ in records:
+                    if seconds is not None and pipeline.seconds >= seconds:
+                        break
+            return f"{path}: {pipeline.counts['samples']} samples in {pipeline.seconds:.1f} s" + "".join(
+                f", {n} {kind}" for kind, n in pipeline.counts.items() if n and kind != "samples"
+            )

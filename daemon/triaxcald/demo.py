@@ -1,0 +1,140 @@
+"""The whole line on two simulated units, one on CAN and one on Modbus, each with an effect hidden in it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from triaxcald.errors import InputError
+from triaxcald.simulation.bench import DeviceFile, SimulatedUnit, simulate
+from triaxcald.station.config import load_station
+from triaxcald.station.line import Outcome, Progress, UnitRun, run_station
+from triaxcald.verification import Verification
+
+SPEED = 20.0
+HIDDEN = ("second_order_nonlinearity", "temperature_bias", "temperature_scale_factor")
+"""Effects that the reference unit has registers for."""
+SIZES = {"second_order_nonlinearity": 4e-4, "temperature_bias": 4e-5, "temperature_scale_factor": 4e-5}
+STATION = """\
+format = "triaxcal.station/1"
+name = "demo"
+
+[plan]
+poses = 26
+hold_s = 3.0
+check_poses = 8
+
+[limits]
+rms_g = 5e-5
+verification_rms_g = 5e-5
+
+[[units]]
+name = "can"
+profile = "triax-ref-can"
+serial = "{can_serial}"
+bus = {{ interface = "virtual", channel = "{channel}", node_id = 5 }}
+
+[[units]]
+name = "modbus"
+profile = "triax-ref-modbus"
+serial = "{modbus_serial}"
+bus = {{ host = "127.0.0.1", port = {port}, unit_id = 1 }}
+"""
+
+
+@dataclass(frozen=True)
+class DemoUnit:
+    """One unit's outcome beside its truth; ``found`` says that the loop named what was hidden, and nothing else."""
+
+    hidden: Mapping[str, Mapping[str, float]]
+    outcome: Outcome
+    after_power_cycle: Verification | None
+    found: bool
+
+
+async def run_demo(folder: Path, seed: int, progress: Progress) -> list[DemoUnit]:
+    """Recordings, certificates and reports go to ``folder``. Raises InputError where it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise InputError(f"{folder}: {e.strerror}") from e
+    channel = f"triaxcal-demo-{id(progress)}"
+    devices = _devices(seed, channel)
+    async with AsyncExitStack() as first:
+        units = [simulate(d, where="demo") for d in devices]
+        servers = [await first.enter_async_context(unit.serve()) for unit in units]
+        path = folder / "station.toml"
+        path.write_text(_station(devices, channel, servers[1].bus.port))
+        outcomes = await run_station(load_station(path), progress)
+    # The plug is pulled on both: what follows knows nothing but their EEPROMs.
+    checks = await _after_power_cycle(devices, units, channel, path, progress, outcomes)
+    return [
+        DemoUnit(unit.truth, outcome, check, _found(unit, outcome))
+        for unit, outcome, check in zip(units, outcomes, checks, strict=True)
+    ]
+
+
+def _devices(seed: int, channel: str) -> list[DeviceFile]:
+    rng = np.random.default_rng(seed)
+    effects = rng.choice(HIDDEN, 2, replace=False)
+    places: list[dict[str, Any]] = [
+        {"profile": "triax-ref-can", "bus": {"interface": "virtual", "channel": channel, "node_id": 5}},
+        {"profile": "triax-ref-modbus", "bus": {"host": "127.0.0.1", "port": 0, "unit_id": 1}},
+    ]
+    return [
+        DeviceFile.model_validate(
+            {
+                "format": "triaxcal.device/1",
+                "serial": int(rng.integers(1000, 9999)),
+                "speed": SPEED,
+                "seed": int(rng.integers(2**31)),
+                "sensor": {"effects": {str(effect): _draw(str(effect), rng)}},
+                "surroundings": {"swing_c": 6.0, "swing_period_s": 47.0},
+                **place,
+            },
+            strict=False,
+        )
+        for effect, place in zip(effects, places, strict=True)
+    ]
+
+
+def _draw(effect: str, rng: np.random.Generator) -> dict[str, float]:
+    sizes = SIZES[effect] * rng.uniform(0.6, 1.4, 3) * rng.choice([-1, 1], 3)
+    return dict(zip("xyz", (float(v) for v in sizes), strict=True))
+
+
+def _station(devices: list[DeviceFile], channel: str, port: int) -> str:
+    return STATION.format(
+        can_serial=f"{devices[0].serial:04d}", modbus_serial=f"{devices[1].serial:04d}", channel=channel, port=port
+    )
+
+
+async def _after_power_cycle(
+    devices: list[DeviceFile],
+    units: list[SimulatedUnit],
+    channel: str,
+    path: Path,
+    progress: Progress,
+    outcomes: Any,
+) -> list[Verification | None]:
+    async with AsyncExitStack() as second:
+        again = [simulate(d, where="demo", stored=u.unit.eeprom) for d, u in zip(devices, units, strict=True)]
+        servers = [await second.enter_async_context(unit.serve()) for unit in again]
+        path.write_text(_station(devices, channel, servers[1].bus.port))
+        station = load_station(path)
+        runs = [UnitRun(station, place, progress) for place in station.places]
+        todo = [run.check() for run, outcome in zip(runs, outcomes, strict=True) if outcome.provisioned]
+        done = iter(await asyncio.gather(*todo))
+        return [next(done) if outcome.provisioned else None for outcome in outcomes]
+
+
+def _found(unit: SimulatedUnit, outcome: Outcome) -> bool:
+    if outcome.certified is None:
+        return False
+    return [f.effect for f in outcome.certified.loop.findings] == list(unit.truth)

@@ -1,0 +1,41 @@
+"""The JSON Schemas in the documentation are those of the code, and fit the built-in profiles."""
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from triaxcal_drivers.profile import BUILT_IN
+
+REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
+
+
+@pytest.mark.parametrize("driver", ["can", "modbus"])
+def test_the_committed_schema_is_what_the_command_prints(driver):
+    """To renew it: python -m triaxcal_drivers.schema DRIVER > docs/reference/profile-DRIVER.schema.json"""
+    printed = subprocess.run(
+        [sys.executable, "-m", "triaxcal_drivers.schema", driver], capture_output=True, check=True, timeout=30
+    ).stdout
+    assert json.loads(printed) == json.loads((REFERENCE / f"profile-{driver}.schema.json").read_bytes())
+
+
+@pytest.mark.parametrize("path", sorted(BUILT_IN.glob("*.toml")), ids=lambda p: p.stem)
+def test_built_in_profiles_fit_the_schema_of_their_driver(path):
+    profile = tomllib.loads(path.read_text("utf-8"))
+    schema = json.loads((REFERENCE / f"profile-{profile['driver']}.schema.json").read_bytes())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(profile, schema)
+    with pytest.raises(jsonschema.ValidationError, match="colour"):
+        jsonschema.validate(profile | {"colour": 1}, schema)
+
+
+def test_an_unknown_driver_is_named_and_nothing_printed():
+    done = subprocess.run(
+        [sys.executable, "-m", "triaxcal_drivers.schema", "modbuss"], capture_output=True, text=True, timeout=30
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "no driver named 'modbuss'; did you mean 'modbus'?\n"
