@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 import time
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing
@@ -12,12 +13,12 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 from triaxcal.errors import Refused, TriaxcalError
-from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.errors import DriverError, RegisterValueError
 from triaxcal_drivers.interface import Device, RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.certificate import Certified, certify, software
 from triaxcald.documents import Document, to_text
-from triaxcald.errors import StationError
+from triaxcald.errors import DaemonError, StationError
 from triaxcald.files import write_text
 from triaxcald.inputs import CALIBRATION, PROFILE, VERIFICATION
 from triaxcald.pipeline import Pipeline
@@ -38,6 +39,9 @@ JUDGE_EVERY_S = 0.5
 """Seconds of samples between two looks at the poses so far."""
 CERTIFICATE, VERIFICATION_FILE, STATION_FILE = "certificate.json", "verification.json", "station.toml"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
+
+_DRAWING = threading.Lock()
+"""The pictures' style is the process's own: one report is drawn at a time."""
 
 
 class Progress(Protocol):
@@ -90,13 +94,21 @@ class UnitRun:
                 identity = await self.identify(device)
                 path = self.recording_path(identity)
                 with self.writer(path, identity) as writer:
-                    return await self._line(device, identity, writer, path)
+                    try:
+                        return await self._line(device, identity, writer, path)
+                    except (TriaxcalError, DriverError, DaemonError) as e:
+                        writer.event("failed", {"error": str(e)})
+                        raise
         except Refused as e:
             return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}", wanted=e.wanted)
         except TriaxcalError as e:
             return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}")
-        except (DriverError, StationError) as e:
+        except RegisterValueError as e:
+            return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}; nothing was written")
+        except DriverError as e:
             return Outcome(self.name, 4, path, error=f"{self.place.where}: {e}")
+        except DaemonError as e:
+            return Outcome(self.name, e.exit_code, path, error=f"{self.place.where}: {e}")
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")
@@ -305,12 +317,13 @@ class UnitRun:
         papers = dict(certified.document)
         if verification:
             papers["verification"] = verification
-        return render_report(
-            certified.document["result"],
-            title=f"{papers['unit']['product']} {papers['unit']['serial']}",
-            stream=overview(pipeline, self.profile.output.unit),
-            certificate=papers,
-        )
+        with _DRAWING:
+            return render_report(
+                certified.document["result"],
+                title=f"{papers['unit']['product']} {papers['unit']['serial']}",
+                stream=overview(pipeline, self.profile.output.unit),
+                certificate=papers,
+            )
 
 
 def overview(pipeline: Pipeline, unit: str) -> StreamOverview | None:

@@ -178,6 +178,31 @@ async def test_the_fifo_window_pops_what_it_returns(unit, time_base):
         )
 
 
+async def test_a_write_acts_on_the_samples_after_it_alone(unit, time_base):
+    async with ModbusUnit(unit, time_base) as served, socket_to(served) as ask:
+        await ask(UNLOCK)
+        await time_base.advance(0.005)
+        await ask("0002 0000 000B 01 10 0110 0002 04 3E80 0000")  # bias_z to 0.25 g
+        await time_base.advance(0.01)
+        reply = bytes.fromhex(await ask("0003 0000 0006 01 04 0400 0017"))[9:]
+    before, after = reply[6:26], reply[26:46]
+    assert (before[14:18], after[14:18]) == (bytes.fromhex("000F4240"), bytes.fromhex("000B71B0"))  # 1 g, 0.75 g
+
+
+async def test_a_unit_that_nobody_reads_does_its_work_as_it_goes(time_base):
+    runs = []
+
+    class Counted(Ramp):
+        def sample(self, unit_time_s):
+            runs.append(len(unit_time_s))
+            return super().sample(unit_time_s)
+
+    async with ModbusUnit(ReferenceUnit(Counted(), serial_number=1), time_base):
+        await time_base.advance(60.0)
+    assert sum(runs) >= 5900
+    assert max(runs) <= 101
+
+
 async def test_samples_that_nobody_fetches_are_counted_as_lost(unit, time_base):
     async with ModbusUnit(unit, time_base) as served, socket_to(served) as ask:
         await time_base.advance(41.0)  # 4101 samples, of which the FIFO holds 4096
@@ -291,6 +316,19 @@ async def test_the_driver_gets_every_sample_of_both_streams(unit, time_base, whe
         time_ns = np.concatenate([b.time_ns for b in blocks[name]])
         assert (np.diff(time_ns) == 10_000_000).all()
         assert sum(b.missing + b.duplicates + b.errors for b in blocks[name]) == 0
+
+
+async def test_a_backlog_is_fetched_without_waiting_for_the_next_poll(unit, time_base):
+    text = TEXT.replace("poll_period_s = 0.05", "poll_period_s = 60.0")
+    profile = parse_bundle(text.encode(), {}, where="test")
+    async with ModbusUnit(unit, time_base) as served, asyncio.timeout(PATIENCE_S):
+        device = ModbusDriver().device(profile, served.bus)
+        await device.open()
+        await time_base.advance(20.0)
+        blocks = (await gathered(device, profile, 2001))["readings"]
+        await device.close()
+    assert sum(map(len, blocks)) == 2001
+    assert len(blocks) > 1
 
 
 async def test_an_accelerated_unit_loses_nothing_while_registers_are_read(unit):

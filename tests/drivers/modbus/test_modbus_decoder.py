@@ -135,6 +135,26 @@ def test_without_a_counter_overflow_is_missing_by_the_devices_own_count(bundle):
     assert np.concatenate([before.counter, after.counter]).tolist() == [0, 1, 10, 11]
 
 
+def test_the_devices_count_of_lost_samples_starts_afresh_with_it(bundle):
+    no_clock = [
+        ('counter = { word = 0, type = "uint16" }\ntime_stamp = { word = 1, type = "uint32", unit_s = 1e-6 }', "")
+    ]
+    decode = decoder(bundle, "full", *no_clock)
+    blocks = [decode.feed(full((0, window(0, lost=lost)))) for lost in (10, 15, 15, 0, 0, 2)]
+    assert [b.missing for b in blocks] == [0, 5, 0, 0, 0, 2]
+
+
+def test_a_failed_request_counts_for_the_sample_after_it_and_no_later_one(bundle):
+    """Without a time stamp a counter near zero is a restart after a failed request, and else a gap."""
+    no_stamp = ('time_stamp = { word = 1, type = "uint32", unit_s = 1e-6 }', "")
+    decode = decoder(bundle, "full", no_stamp)
+    decode.feed(full((RawFlag.ERROR, b""), (0, window(40_000))))
+    assert decode.feed(full((0, window(3)))).missing == 65_536 + 3 - 40_000 - 1
+    decode.feed(full((0, window(40_000))))
+    decode.feed(full((RawFlag.ERROR, b"")))
+    assert decode.feed(full((0, window(3)))).missing == 0
+
+
 def test_a_restart_seen_only_in_the_time_stamp_is_bridged_by_the_host_time(bundle):
     block = decoder(bundle, "full").feed(full((0, window(7000, 7001)), (0, window(0, 1)), step_ns=250_000_000))
     assert np.diff(block.time_ns).tolist() == [10_000_000, 240_000_000, 10_000_000]

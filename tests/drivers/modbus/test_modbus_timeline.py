@@ -125,6 +125,20 @@ def test_a_restart_soon_after_a_start_is_not_taken_for_a_repeat():
     assert np.diff(placed.time_ns).tolist() == [PERIOD_NS, 10**9, PERIOD_NS]
 
 
+@pytest.mark.parametrize("clockwork", [COUNTED, STAMPED, STAMP_ALONE])
+def test_a_window_sent_again_after_a_failed_request_is_a_repeat(clockwork):
+    counter = np.array([5000, 5001, 5000, 5001, 5002])
+    placed = Timeline(clockwork).place(
+        arrivals(
+            None if clockwork is STAMP_ALONE else counter,
+            None if clockwork is COUNTED else counter * 10_000,
+            broken=[2],
+        )
+    )
+    assert placed.new.tolist() == [True, True, False, False, True]
+    assert np.diff(placed.time_ns).tolist() == [PERIOD_NS, PERIOD_NS]
+
+
 def test_time_never_goes_back_though_the_host_clock_does():
     placed = Timeline(STAMPED).place(
         arrivals(counter=[900, 0], stamp_us=[9_000_000, 0], arrival_ns=[10**9, 0], broken=[1])

@@ -216,16 +216,18 @@ async def test_failed_requests_are_records_with_flags(bundle, tcp_device):
         (f"0003 {ask}", "0003 0000 0007 11 03 04 0001 0002"),  # two words in place of three
         (f"0004 {ask}", None),  # nothing
         (f"0005 {ask}", "0005 0000 0009 11 04 06 0001 0002 0003"),  # another function
-        (f"0006 {ask}", "0006 0000 0009 11 03 06 0001 0002 0003"),
+        (f"0006 {ask}", "0006 0000 0007 11 03 06 0001 0002"),  # fewer words than it says
+        (f"0007 {ask}", "0007 0000 0009 11 03 06 0001 0002 0003"),
     ]
     async with tcp_device(*exchanges) as heard:
         device = await opened(bundle(), heard)
-        batches = await first_batches(device, "readings", 5)
+        batches = await first_batches(device, "readings", 6)
         await device.close()
     assert [int(b.flags[0]) for b in batches] == [
         RawFlag.ERROR,
         RawFlag.INVALID,
         RawFlag.ERROR,
+        RawFlag.INVALID,
         RawFlag.INVALID,
         0,
     ]
@@ -234,6 +236,7 @@ async def test_failed_requests_are_records_with_flags(bundle, tcp_device):
         "030400010002",
         "",
         "0406000100020003",
+        "030600010002",
         "000100020003",
     ]
     assert {int(b.source[0]) for b in batches} == {0x0003_006B}
