@@ -62,16 +62,17 @@ class RecordingWriter:
         self._order = threading.Lock()
         self._room = threading.Semaphore(queue_batches)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        head = {name: dict(record) for name, record in metadata.items()}
         try:
             self._file = _create(path)
+            self._mcap = McapWriter(self._file, enable_data_crcs=True)
+            self._write_head(head, preview_unit)
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; a recording is never overwritten") from None
         except OSError as e:
             raise RecordingError(f"{path}: cannot be created: {e.strerror}") from e
-        self._mcap = McapWriter(self._file, enable_data_crcs=True)
-        head = {name: dict(record) for name, record in metadata.items()}
-        self._jobs.put(partial(self._write_head, clock_ns(), head, preview_unit))
-        self._thread = threading.Thread(target=self._run, name=f"recording {path.name}")
+        # A caller that dies without closing must not be kept alive by it; `log recover` finishes the file.
+        self._thread = threading.Thread(target=self._run, name=f"recording {path.name}", daemon=True)
         self._thread.start()
 
     def raw(self, phase: schema.Phase, batch: RawBatch) -> bool:
@@ -158,7 +159,7 @@ class RecordingWriter:
         self._unreported.append((topic, first, records))
         return False
 
-    # What follows runs on the writer's thread.
+    # What follows runs on the writer's thread, but for the head.
 
     def _run(self) -> None:
         ended = False
@@ -207,12 +208,12 @@ class RecordingWriter:
         self._mcap.flush()  # type: ignore[no-untyped-call]
         self._flushed_ns = None
 
-    def _write_head(self, time_ns: int, metadata: Mapping[str, dict[str, str]], unit: str) -> None:
+    def _write_head(self, metadata: Mapping[str, dict[str, str]], unit: str) -> None:
         self._mcap.start(profile=schema.PROFILE)
         for name, record in {schema.FORMAT_RECORD: {"format": schema.FORMAT}, **metadata}.items():
             self._mcap.add_metadata(name, record)
         self._channel_ids = _declare(self._mcap, self._preview, unit)
-        self._write(schema.EVENTS, schema.Event(time_ns, "recording_started", "{}"))
+        self._write(schema.EVENTS, schema.Event(self._clock_ns(), "recording_started", "{}"))
         self._flush()  # schemas and channels are in the first chunk: have it on disk at once
 
     def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:

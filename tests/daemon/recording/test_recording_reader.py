@@ -144,7 +144,7 @@ def test_a_later_format_is_refused(tmp_path: Path) -> None:
         mcap.start(profile="triaxcal")
         mcap.add_metadata("recording", {"format": "triaxcal.recording/2"})
         mcap.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(RecordingError, match="format 'triaxcal.recording/2', expected 'triaxcal.recording/1'"):
+    with pytest.raises(RecordingError, match=r"format 'triaxcal.recording/2', expected 'triaxcal.recording/1'"):
         Recording.open(path)
 
 

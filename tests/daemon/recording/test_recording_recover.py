@@ -259,12 +259,12 @@ def give_a_batch():
 
 for _ in range(300):
     give_a_batch()
-safe, now_ns = offered, now_ns + 1_000_000_000
-writer.event("one second later")
-while True:
+safe, held = offered, 0
+while held < safe:
+    now_ns += 1_000_000_000
+    writer.event("another second")
     with Recording.open(path, unfinished=True) as recording:
-        if sum(len(batch) for batch in recording.raw("calibration")) >= safe:
-            break
+        held = sum(len(batch) for batch in recording.raw("calibration"))
 print(safe, flush=True)
 while True:
     give_a_batch()

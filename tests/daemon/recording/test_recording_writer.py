@@ -235,5 +235,5 @@ def test_a_closed_recording_takes_no_more(new_writer: NewWriter) -> None:
 def test_an_attachment_cannot_come_twice(new_writer: NewWriter) -> None:
     with new_writer() as writer:
         writer.attach("station.toml", "text/plain", b"a")
-        with pytest.raises(RecordingError, match="'station.toml' already"):
+        with pytest.raises(RecordingError, match=r"'station\.toml' already"):
             writer.attach("station.toml", "text/plain", b"b")
