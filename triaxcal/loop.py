@@ -240,7 +240,7 @@ class _Search:
         reason = (
             f"with it the cross-validated error falls from {_micro(without.cross_validated_rms_g)} to "
             f"{_micro(self.best.residual.cross_validated_rms_g)} (noise floor "
-            f"{_micro(self.best.residual.noise_floor_g)}); familywise p {p:.1e}"
+            f"{_micro(self.best.residual.noise_floor_g)}); familywise p {_probability(p)}"
         )
         if alternatives:
             reason += f"; {', '.join(alternatives)} would do as well on these poses"
@@ -264,7 +264,11 @@ def _improves(trial: Calibration, best: Calibration) -> bool:
 
 
 def _micro(value: float | None) -> str:
-    return "unknown" if value is None else f"{value * 1e6:.3g}e-6"
+    return "unknown" if value is None else f"{value * 1e6:.3g} µg"
+
+
+def _probability(p: float) -> str:
+    return "below 1e-12" if p < 1e-12 else f"{p:.1e}"
 
 
 def _unexplained(after: Calibration, search: _Search) -> Unexplained:
@@ -281,7 +285,7 @@ def _lead(after: Calibration, search: _Search) -> str:
     parts = []
     if worst.studentized**2 > 0.5 * squares.sum():
         parts.append(
-            f"most of it is one pose, at {worst.pose.start_s:.1f} s ({worst.residual_g * 1e6:+.3g}e-6): was it still?"
+            f"most of it is one pose, at {worst.pose.start_s:.1f} s ({worst.residual_g * 1e6:+.3g} µg): was it still?"
         )
     for name, why in search.passed_over.items():
         parts.append(f"the nearest effect is {name}, not adopted: {why}")

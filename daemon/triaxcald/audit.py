@@ -11,7 +11,7 @@ from typing import Any
 from triaxcal.errors import TriaxcalError
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.profile import CORRECTED, READINGS
-from triaxcald.certificate import certify
+from triaxcald.certificate import certify, software
 from triaxcald.documents import to_text
 from triaxcald.errors import RecordingError
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of
@@ -28,11 +28,15 @@ MOST = 8
 
 @dataclass(frozen=True)
 class Audit:
-    """``differences`` one line each; none means that everything comes out the same, byte for byte."""
+    """``differences`` one line each; none means that everything comes out the same, byte for byte.
+
+    ``notes`` are what an auditor should know and what is no difference: other versions of the software, losses.
+    """
 
     recording: str
     checked: tuple[str, ...]
     differences: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def audit(path: Path) -> Audit:
@@ -74,6 +78,7 @@ def _audit(name: str, recording: Recording) -> Audit:
             unit_name=unit.get("name", ""),
             serial=unit.get("serial") or None,
             signs=(signs[0], signs[1], signs[2]),
+            computed_with=recording.metadata.get("software", {}),
         )
     except (TriaxcalError, DriverError, ValueError, IndexError) as e:
         return Audit(name, tuple(checked), (f"{CERTIFICATE}: cannot be computed again: {e}",))
@@ -92,7 +97,18 @@ def _audit(name: str, recording: Recording) -> Audit:
         checked.append(REGISTERS_AFTER)
         wanted = {w.register: w.raw.hex() for w in again.image.words}
         differences += _compare_registers(recording.attachments[REGISTERS_AFTER], wanted)
-    return Audit(name, tuple(checked), tuple(differences))
+    return Audit(name, tuple(checked), tuple(differences), tuple(_notes(recording)))
+
+
+def _notes(recording: Recording) -> list[str]:
+    then, now = recording.metadata.get("software", {}), software()
+    notes = [f"{n}: {then[n]} then, {now[n]} now" for n in now if n in then and then[n] != now[n]]
+    lost = sum(loss.records for loss in recording.losses())
+    if lost:
+        notes.append(f"{lost} records were lost between bus and disk; the result stands on the others")
+    if "recovery" in recording.metadata:
+        notes.append("the recording was cut short and mended")
+    return notes
 
 
 def _compare(name: str, stored: bytes, again: str) -> list[str]:

@@ -55,8 +55,11 @@ def certify(
     unit_name: str,
     serial: str | None,
     signs: tuple[int, int, int],
+    computed_with: Mapping[str, str],
 ) -> Certified:
-    """Raises Refused where the poses cannot carry the answer, RegisterValueError where the registers cannot."""
+    """``computed_with``: `software` of the station, so that an audit years later can get the same bytes.
+
+    Raises Refused where the poses cannot carry the answer, RegisterValueError where the registers cannot."""
     loop = diagnose(poses, signs=signs, reference=station.reference)
     profile = bundle.profile
     measured_ns = pipeline.first_host_ns or 0
@@ -78,7 +81,7 @@ def certify(
             "started": datetime.fromtimestamp(measured_ns // 1_000_000_000, UTC).isoformat(),
             **pipeline.counts,
         },
-        "software": software(),
+        "software": dict(computed_with),
         "settings": {"signs": list(signs), "reference": number(station.reference)},
         "limits": {k: number(v) for k, v in station.limits.model_dump(exclude={"verification_rms_g"}).items() if v},
         "verdict": "outside limits" if outside else "within limits" if _judged(station.limits) else "not judged",

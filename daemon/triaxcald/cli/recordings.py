@@ -56,6 +56,8 @@ def audit_command(a: argparse.Namespace) -> int:
             )
             for line in x.differences:
                 print(f"  {line}")
+            for line in x.notes:
+                print(f"  note: {line}")
     return 1 if any(x.differences for x in audits) else 0
 
 

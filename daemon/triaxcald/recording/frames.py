@@ -120,7 +120,7 @@ def parse(frame: Frame, name: str) -> Record | None:
     stream = ReadDataStream(io.BytesIO(frame.body))
     try:
         record: Record = kind.read(stream)
-    except (McapError, struct.error, UnicodeDecodeError) as e:
+    except (McapError, struct.error, UnicodeDecodeError, OverflowError) as e:
         raise Damage(name, frame.offset, f"unreadable {kind.__name__} record") from e
     if stream.count != len(frame.body):
         raise Damage(name, frame.offset, f"{kind.__name__} record of the wrong length")
@@ -129,6 +129,12 @@ def parse(frame: Frame, name: str) -> Record | None:
         if crc not in (0, zlib.crc32(frame.body[:-4])):
             raise Damage(name, frame.offset, f"attachment '{record.name}' fails its CRC")
     return record
+
+
+def footer_fits(frame: Frame, crc: int) -> bool:
+    """Whether the footer's CRC is that of the summary before it, whose running CRC is ``crc``."""
+    (expected,) = struct.unpack("<I", frame.body[-4:])
+    return expected in (0, zlib.crc32(frame.body[:-4], zlib.crc32(frame.head, crc)))
 
 
 def chunk_head(body: bytes) -> tuple[Chunk, int] | None:

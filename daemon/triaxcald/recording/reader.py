@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import BinaryIO, NamedTuple, Self, TypeVar
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, DataEnd, Footer, Header, Message, Metadata
+from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata
 
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
@@ -22,6 +22,7 @@ from triaxcald.recording.frames import (
     check_magic,
     chunk_data,
     chunk_records,
+    footer_fits,
     frame_at,
     parse,
     size_of,
@@ -214,10 +215,7 @@ class Recording:
         raise Damage(self.name, frame.offset, "header, metadata or index records fail the CRC checked")
 
     def _check_end(self, frame: Frame, crc: int) -> None:
-        record = parse(frame, self.name)
-        assert isinstance(record, Footer)
-        crc = zlib.crc32(frame.body[:-4], zlib.crc32(frame.head, crc))
-        if record.summary_crc not in (0, crc):
+        if not footer_fits(frame, crc):
             raise Damage(self.name, frame.offset, "the summary fails its CRC checked")
         self._stream.seek(frame.end)
         tail = self._stream.read(len(MAGIC) + 1)

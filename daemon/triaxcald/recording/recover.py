@@ -232,8 +232,10 @@ class _Mending:
         recovery = self._recovery
         recovery.raw_records = self._digest.records
         by_index = self._raw_end - recovery.raw_records - recovery.raw_dropped
-        written = int(self._written.get("records", "0"))
-        recovery.raw_missing = max(by_index, written - recovery.raw_records, 0)
+        written = self._written.get("records", "")
+        # No CRC but the whole's vouches for metadata.
+        believed = int(written) if written.isdecimal() and not recovery.unlocated_damage else 0
+        recovery.raw_missing = max(by_index, believed - recovery.raw_records, 0)
 
     def _write_end(self, name: str) -> None:
         if not self._has_format:

@@ -193,6 +193,7 @@ class UnitRun:
             unit_name=self.name,
             serial=identity.serial,
             signs=self.place.signs,
+            computed_with=software(),
         )
 
     async def _collect(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.recording.writer import RecordingWriter
@@ -37,13 +38,14 @@ def _batch_of(first: int, n: int, payload_bytes: int = 8) -> RawBatch:
     )
 
 
-def _block_of(n: int, period_ns: int = 10_000_000) -> SampleBlock:
+def _block_of(n: int, start_ns: int = T0_NS, period_ns: int = 10_000_000) -> SampleBlock:
     index = np.arange(n)
+    temp_c: NDArray[np.float64] = index / 10.0
     return SampleBlock(
-        T0_NS + index * period_ns,
+        start_ns + index * period_ns,
         index,
         np.column_stack([index * 1.0, index * 2.0, index * 3.0]),
-        {"temp_c": index / 10.0, "supply.v": index * 0.5},
+        {"temp_c": temp_c, "supply.v": index * 0.5},
     )
 
 
@@ -106,7 +108,7 @@ def write_recording(tmp_path: Path, new_writer: Callable[..., RecordingWriter], 
             writer.register("scale_factor_x", "read", bytes.fromhex("c019999a"))
             for i in range(6):
                 writer.raw("calibration" if i < 4 else "verification", _batch_of(50 * i, 50))
-                writer.preview("/preview/readings", _block_of(5))
+                writer.preview("/preview/readings", _block_of(5, clock.now_ns))
                 writer.drain()
                 clock.now_ns += 1_000_000_000
             writer.event("pose_done", {"pose": 3})

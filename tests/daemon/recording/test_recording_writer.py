@@ -83,7 +83,7 @@ def test_the_stock_reader_reads_everything(recording: Path, metadata: dict[str, 
 def test_the_crc_of_the_whole_holds_for_a_reader_that_streams(recording: Path) -> None:
     with open(recording, "rb") as file:
         messages = list(NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False))
-    assert len(messages) == 11
+    assert len(messages) == 16
 
 
 def test_the_preview_is_thinned_and_bears_the_samples_time(

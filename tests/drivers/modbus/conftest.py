@@ -15,7 +15,7 @@ name = "by-hand"
 driver = "modbus"
 identity = { vendor = "v", product = "p", expect = { level = 10 } }
 output = { unit = "counts" }
-sampling = { rate_hz = 100.0, reply_timeout_s = 0.05, silence_timeout_s = 0.2 }
+sampling = { rate_hz = 100.0, reply_timeout_s = 5.0, silence_timeout_s = 10.0 }
 
 [streams.readings]
 layout = "poll"
@@ -54,11 +54,12 @@ class Heard(list[str]):
 
 @pytest.fixture
 def bundle() -> Callable[..., Bundle]:
-    """The profile above, with text replaced in it."""
+    """The profile above, with text replaced in it; ``hasty`` for tests that sit out a silence."""
 
-    def make(*replaced: tuple[str, str]) -> Bundle:
+    def make(*replaced: tuple[str, str], hasty: bool = False) -> Bundle:
         text = PROFILE
-        for old, new in replaced:
+        patience = ("reply_timeout_s = 5.0, silence_timeout_s = 10.0", "reply_timeout_s = 0.2, silence_timeout_s = 0.4")
+        for old, new in (*replaced, *([patience] if hasty else [])):
             assert old in text
             text = text.replace(old, new)
         return parse_bundle(text.encode(), {}, where="by-hand.toml")

@@ -57,6 +57,7 @@ def bus(**settings) -> ModbusBus:
 
 def test_a_bus_is_a_tcp_address_or_a_serial_line():
     assert bus(host="10.0.0.7").where == TcpAddress("10.0.0.7", 502)
+    assert bus(host="127.0.0.1", port=0).where == TcpAddress("127.0.0.1", 0)  # any free one, for a unit served
     assert bus(serial_port="/dev/ttyUSB0", baudrate=115200, parity="N", stopbits=2).where == SerialLine(
         "/dev/ttyUSB0", 115200, "N", 2
     )
@@ -68,7 +69,7 @@ def test_a_bus_is_a_tcp_address_or_a_serial_line():
         ({}, 'give either host = "…" (Modbus TCP) or serial_port = "…" (RTU)'),
         ({"host": "a", "serial_port": "b"}, "not both"),
         ({"hots": "a"}, "hots: unknown key; did you mean 'host'?"),
-        ({"host": "a", "port": 0}, "port: input should be greater than or equal to 1, not 0"),
+        ({"host": "a", "port": 65536}, "port: input should be less than or equal to 65535, not 65536"),
         ({"serial_port": "a", "parity": "even"}, "parity: input should be 'N', 'E' or 'O', not 'even'"),
         ({"host": "a", "unit_id": 256}, "unit_id: input should be less than or equal to 255, not 256"),
     ],
