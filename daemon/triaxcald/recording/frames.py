@@ -9,7 +9,7 @@ import io
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -17,7 +17,24 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, Message, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
 
 from triaxcald.errors import RecordingError
 
@@ -100,30 +117,36 @@ def walk(stream: BinaryIO, name: str, size: int) -> Iterator[Frame]:
             return
 
 
-Record = Attachment | Channel | DataEnd | Footer | Header | Metadata | Schema
-_READERS: Mapping[int, type[Record]] = {
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.CHANNEL: Channel,
-    Opcode.DATA_END: DataEnd,
-    Opcode.FOOTER: Footer,
-    Opcode.HEADER: Header,
-    Opcode.METADATA: Metadata,
-    Opcode.SCHEMA: Schema,
+_READERS: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.DATA_END: DataEnd.read,
+    Opcode.FOOTER: Footer.read,
+    Opcode.HEADER: Header.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
+    Opcode.CHUNK_INDEX: ChunkIndex.read,
+    Opcode.MESSAGE_INDEX: MessageIndex.read,
+    Opcode.METADATA_INDEX: MetadataIndex.read,
+    Opcode.STATISTICS: Statistics.read,
+    Opcode.SUMMARY_OFFSET: SummaryOffset.read,
 }
 
 
-def parse(frame: Frame, name: str) -> Record | None:
-    """The record in ``frame``; None for indexes, statistics and chunks. Raises Damage."""
-    kind = _READERS.get(frame.opcode)
-    if kind is None:
-        return None
+def parse(frame: Frame, name: str) -> McapRecord:
+    """The record in ``frame``, which must be as long as it says; chunks are for `chunk_data`. Raises Damage."""
+    kind = Opcode(frame.opcode).name.lower().replace("_", " ")
+    read = _READERS.get(frame.opcode)
+    if read is None:
+        raise Damage(name, frame.offset, f"a {kind} record out of place")
     stream = ReadDataStream(io.BytesIO(frame.body))
     try:
-        record: Record = kind.read(stream)
+        record = read(stream)
     except (McapError, struct.error, UnicodeDecodeError, OverflowError) as e:
-        raise Damage(name, frame.offset, f"unreadable {kind.__name__} record") from e
+        raise Damage(name, frame.offset, f"unreadable {kind} record") from e
     if stream.count != len(frame.body):
-        raise Damage(name, frame.offset, f"{kind.__name__} record of the wrong length")
+        raise Damage(name, frame.offset, f"{kind} record of the wrong length")
     if isinstance(record, Attachment):
         (crc,) = struct.unpack("<I", frame.body[-4:])
         if crc not in (0, zlib.crc32(frame.body[:-4])):

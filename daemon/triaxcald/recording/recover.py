@@ -33,8 +33,9 @@ from triaxcald.recording.frames import (
 class Recovery:
     """What was kept and what was lost.
 
-    ``raw_records`` kept; ``raw_missing`` lost from the file by their running index (what was to come after
-    the last one is unknown where ``cut_short``); ``raw_dropped`` never reached it, by its own loss records.
+    ``raw_records`` kept; ``raw_missing`` lost from the file by their running index (at least: what was to
+    come after the last one is unknown where ``cut_short``); ``raw_dropped`` never reached it, by its own
+    loss records.
     ``chunks_failed`` and ``attachments_failed`` fail their CRC and are given up. ``unverified_messages`` kept
     from a chunk that was cut off, where no CRC can vouch for them. ``undeclared_messages`` given up because
     the chunk that declares their type is lost. ``bytes_dropped`` of the file in no whole record kept.
@@ -98,7 +99,6 @@ class _Mending:
         self._digest = schema.RawDigest()
         self._raw_end = 0  # running index after the last record known of
         self._written: dict[str, str] = {}  # the metadata record `raw`, where the writer came to its end
-        self._has_format = False
         self._located = False  # damage has been met
 
     def run(self, name: str) -> Recovery:
@@ -140,8 +140,8 @@ class _Mending:
         if record.name == schema.RAW_RECORD:
             self._written = record.metadata
             return
-        self._has_format = self._has_format or record.name == schema.FORMAT_RECORD
-        self._mcap.add_metadata(record.name, record.metadata)
+        if record.name != schema.FORMAT_RECORD:  # a wrong byte in it would make the new file unreadable
+            self._mcap.add_metadata(record.name, record.metadata)
 
     def _stretch(self, stretch: Stretch) -> None:
         """Keeps what a chunk of the wrong length or one that was cut off still holds."""
@@ -238,8 +238,7 @@ class _Mending:
         recovery.raw_missing = max(by_index, believed - recovery.raw_records, 0)
 
     def _write_end(self, name: str) -> None:
-        if not self._has_format:
-            self._mcap.add_metadata(schema.FORMAT_RECORD, {"format": schema.FORMAT})
+        self._mcap.add_metadata(schema.FORMAT_RECORD, {"format": schema.FORMAT})
         raw = {"records": str(self._digest.records), "sha256": self._digest.hexdigest()}
         self._mcap.add_metadata(schema.RAW_RECORD, raw)
         story = {"of": name, **{key: str(value).lower() for key, value in asdict(self._recovery).items()}}

@@ -40,7 +40,7 @@ def _batch_of(first: int, n: int, payload_bytes: int = 8) -> RawBatch:
 
 def _block_of(n: int, start_ns: int = T0_NS, period_ns: int = 10_000_000) -> SampleBlock:
     index = np.arange(n)
-    temp_c: NDArray[np.float64] = index / 10.0
+    temp_c: NDArray[np.float64] = np.asarray(index / 10.0, dtype=np.float64)
     return SampleBlock(
         start_ns + index * period_ns,
         index,

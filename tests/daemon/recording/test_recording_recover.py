@@ -125,6 +125,21 @@ def test_records_behind_a_wrong_length_are_found_again(recording: Path, tmp_path
     assert recovery.raw_missing == 50
 
 
+def test_a_record_of_the_wrong_type_or_length_swallows_no_other(recording: Path, tmp_path: Path) -> None:
+    whole = recording.read_bytes()
+    rows = raw_rows(recording)
+    spans = chunk_spans(whole)
+    start, index = spans[3]  # a chunk, and the index of its messages
+    for opcode in set(range(16)) - {6}:
+        wrong = whole[:start] + bytes([opcode]) + whole[start + 1 :]
+        recovery, out = mend(wrong, tmp_path)
+        assert raw_rows(out) == rows[:100] + rows[150:]
+        assert recovery.raw_missing == 50
+    swallowing = (spans[5][0] - index - 9).to_bytes(8, "little")
+    recovery, out = mend(whole[: index + 1] + swallowing + whole[index + 9 :], tmp_path)
+    assert raw_rows(out) == rows
+
+
 def test_without_its_first_chunk_raw_records_registers_and_events_are_still_known(
     recording: Path, tmp_path: Path
 ) -> None:
