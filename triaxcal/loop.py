@@ -314,12 +314,14 @@ def magnitude_errors(
 ) -> tuple[Floats, Floats]:
     """|a| − reference (n,) of poses under a sensor's model, and its standard error (n,) from their noise.
 
-    Raises InvalidData where a channel that the effects need is missing.
+    The poses are of another recording than the model's, whose clock is its own: effects of time count as at their
+    reference. Raises InvalidData where a channel that the effects need is missing.
     """
     channels = channels_of(list(poses))
     missing = [n for n in channel_reference if n not in channels]
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(missing)}, which the calibration needs")
+    channels[TIME] = np.full(len(poses), channel_reference.get(TIME, 0.0))
     u = np.array([p.mean for p in poses])
     held = conditions(channels, channel_reference)
     length, by_u = sensor.magnitude(u, held)

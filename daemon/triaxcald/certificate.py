@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from triaxcal.calibration import Calibration, channels_of
-from triaxcal.effects import Effect
+from triaxcal.effects import TIME, Effect
 from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
 from triaxcal.poses import Pose
@@ -79,6 +79,8 @@ def certify(
         "recording": {
             "raw_sha256": digest.hexdigest(),
             "started": datetime.fromtimestamp(measured_ns // 1_000_000_000, UTC).isoformat(),
+            "seconds": number(pipeline.seconds),
+            "poses": len(poses),
             **pipeline.counts,
         },
         "software": dict(computed_with),
@@ -120,19 +122,25 @@ def roles(sensor: Sensor, channel_reference: Mapping[str, float]) -> dict[str, f
     return out
 
 
+def is_passing(effect: Effect) -> bool:
+    """Whether an effect is the recording's rather than the unit's, so that no register could hold it."""
+    return TIME in effect.needs
+
+
 def _held_by_device(
     profile: Profile, full: Calibration, poses: list[Pose], signs: tuple[int, int, int], reference: float
 ) -> Calibration | None:
     """The calibration with those effects alone that the device has registers for.
 
-    Refitted, not cut: without an effect the other coefficients have other best values.
+    Refitted, not cut: without an effect the other coefficients have other best values. Effects of time stay in the
+    fit, since they belong to this recording and not to the unit; the registers then hold the values at its middle.
     """
     if any(profile.by_role(f"scale_factor.{axis}") is None for axis in "xyz"):
         return None
     kept = [
         effect
         for effect, _ in full.sensor.effects
-        if all(profile.by_role(f"{effect.name}.{c.name}") for c in effect.coefficients)
+        if is_passing(effect) or all(profile.by_role(f"{effect.name}.{c.name}") for c in effect.coefficients)
     ]
     if len(kept) == len(full.sensor.effects):
         return full
@@ -145,9 +153,10 @@ def _image(profile: Profile, held: Calibration, date_days: int) -> RegisterImage
 
 
 def _registers_document(image: RegisterImage, held: Calibration, loop: Loop, poses: list[Pose]) -> Document:
-    host = [name for name in loop.after.terms if name not in held.terms]
+    in_registers = ["linear", *(e.name for e, _ in held.sensor.effects if not is_passing(e))]
+    host = [name for name in loop.after.terms if name not in in_registers]
     return {
-        "terms": list(held.terms),
+        "terms": in_registers,
         "left_to_host": host,
         "rms_g": number(held.residual.rms_g),
         "rounding_rms_g": number(rounding_cost(image, held, poses)),

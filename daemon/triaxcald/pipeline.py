@@ -12,10 +12,10 @@ from triaxcal.errors import InvalidData
 from triaxcal.poses import Pose, poses_of
 from triaxcal.stillness import StillnessDetector, Windows
 from triaxcal_drivers.catalogue import driver_named
-from triaxcal_drivers.interface import RawBatch, SampleBlock
+from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import Bundle
 
-COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order")
+COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order", "receiver_overflows")
 
 
 @dataclass
@@ -42,6 +42,7 @@ class Pipeline:
         """Takes raw records; gives the samples that they complete."""
         if self._first_host_ns is None and len(batch):
             self._first_host_ns = int(batch.time_ns[0])
+        self.counts["receiver_overflows"] += int(np.count_nonzero(batch.flags & RawFlag.LOST_BEFORE))
         block = self._decoder.feed(batch)
         for name in ("missing", "duplicates", "incomplete", "errors"):
             self.counts[name] += getattr(block, name)
@@ -92,6 +93,8 @@ class Pipeline:
         if self.counts["missing"] or self.counts["incomplete"]:
             lost = self.counts["missing"] + self.counts["incomplete"]
             found.append(f"missing_samples: {lost} of {self.counts['samples'] + lost}")
+        elif self.counts["receiver_overflows"]:
+            found.append(f"missing_samples: the receiver overflowed {self.counts['receiver_overflows']} times")
         if self.counts["duplicates"]:
             found.append(f"duplicate_samples: {self.counts['duplicates']}")
         return found

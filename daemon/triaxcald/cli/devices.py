@@ -12,7 +12,7 @@ from triaxcal.errors import Refused
 from triaxcal_drivers.catalogue import listed
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
 from triaxcal_drivers.profile import BUILT_IN, load_bundle
-from triaxcald.certificate import roles
+from triaxcald.certificate import is_passing, roles
 from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.documents import number, sensor_of
@@ -92,7 +92,7 @@ def image_from(path: str, place: Place) -> RegisterImage:
         f"{effect.name}.{c.name}"
         for effect, _ in sensor.effects
         for c in effect.coefficients
-        if profile.by_role(f"{effect.name}.{c.name}") is None
+        if not is_passing(effect) and profile.by_role(f"{effect.name}.{c.name}") is None
     ]
     if homeless:
         raise Refused(
