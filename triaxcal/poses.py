@@ -15,7 +15,7 @@ from scipy import special
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import InvalidData
-from triaxcal.stillness import Span, Windows
+from triaxcal.stillness import Span, Windows, resolution
 
 CREEP_SIGMA = 5.0
 
@@ -64,7 +64,7 @@ def poses_of(w: Windows, spans: Sequence[Span]) -> list[Pose]:
     error = np.sqrt(variance / count[:, None] * _Inflation(deviations).of(count))
     covariance = np.array([_correlation(w, s) * np.outer(e, e) for s, e in zip(spans, error, strict=True)])
     mean = np.array([w.mean[s.used].mean(axis=0) for s in spans])
-    covariance = _mend_along_the_radius(w, spans, mean, deviations, covariance)
+    covariance = _mend_along_the_radius(w, spans, mean, deviations, covariance) + np.diag(_rounding(w, spans))
     begin = int(w.start_ns[0])
     return [
         Pose(
@@ -123,6 +123,17 @@ def _mend_along_the_radius(
     across = np.einsum("kij,kj->ki", covariance, out) / now[:, None]
     mended: Floats = covariance + (along - now)[:, None, None] * across[:, :, None] * across[:, None, :]
     return mended
+
+
+def _rounding(w: Windows, spans: Sequence[Span]) -> Floats:
+    """(3,) variance of what rounding of the outputs leaves in a mean, however long: noise averages it out, if there is
+    enough of it (Widrow and Kollár 2008, Quantization Noise: the harmonics of the rounding error under Gaussian noise).
+    """
+    step = resolution(w)
+    scatter = np.mean([w.variance[s.used].mean(axis=0) for s in spans], axis=0)
+    noise = np.maximum(scatter / step**2 - 1 / 12, 0.0)
+    k = np.arange(1, 50)[:, None]
+    return np.asarray(step**2 * (np.exp(-4 * np.pi**2 * k**2 * noise) / (2 * np.pi**2 * k**2)).sum(axis=0))
 
 
 def _creep(s: Span, deviation: Floats, scatter: Floats) -> Floats:

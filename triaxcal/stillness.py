@@ -12,7 +12,7 @@ that no window shows alone is found afterwards, on the windows' means, at every 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
@@ -28,9 +28,13 @@ SPAN_LEAST_S = 0.6
 SPAN_LEAST_WINDOWS = 3
 REJOIN_S = 1.5
 """A disturbance shorter than this, with the same mean before and after, is a bump inside one pose."""
+REJOIN_SIGMA = 5.0
 FALSE_ALARM = 1e-6
 STEP_SIGMA = 7.0
 """Steps of window means are tested many times a pose, on noise that need not be white; hence not 3."""
+MOTION = 6.0
+"""Steadily moving outputs step 12 times as far from window to window, squared, as they scatter inside one; a random
+walk, the strongest colour that noise has, 4 times."""
 RATE_SAMPLES = 64
 
 
@@ -162,7 +166,11 @@ class StillnessDetector:
 
 def find_spans(w: Windows) -> list[Span]:
     """The still spans of a stream of windows, at least 0.6 s long."""
+    # Rounding of a digital output leaves windows without any scatter; a step of it is noise all the same.
+    w = replace(w, variance=np.maximum(w.variance, resolution(w) ** 2 / 4))
     still = _still(w)
+    if _only_moves(w, still):
+        return []
     runs = _runs(still, w.joined)
     noise = _step_scale(w, still)
     pieces = [p for run in runs for p in _cut_at_steps(w, _trim(w, run, noise), noise) if len(p)]
@@ -171,22 +179,34 @@ def find_spans(w: Windows) -> list[Span]:
 
 def _still(w: Windows) -> Bools:
     """Which windows scatter, and step from their neighbours, as the quietest ones do."""
-    # Rounding of a digital output leaves windows without any scatter; a step of it is noise all the same.
-    floor = _resolution(w.mean * w.size) ** 2 / 12.0
-    variance = np.maximum(w.variance, floor)
-    limit = np.array([_quiet_limit(variance[:, axis], w.size - 1) for axis in range(3)])
-    still: Bools = (variance <= limit).all(axis=1)
-    both = still & np.roll(still, 1) & w.joined
-    both[0] = False
+    limit = np.array([_quiet_limit(w.variance[:, axis], w.size - 1) for axis in range(3)])
+    still: Bools = (w.variance <= limit).all(axis=1)
+    both = _neighbours(w, still)
     if both.sum() < SPAN_LEAST_WINDOWS:
         return still
     step = np.diff(w.mean, axis=0, prepend=w.mean[:1]) ** 2
-    step[~w.joined] = 0.0
-    scale = np.maximum(np.median(step[both], axis=0) / stats.chi2.median(1), floor / w.size)
-    jump = (step > scale * STEP_SIGMA**2).any(axis=1)
+    least = np.median(w.variance[still], axis=0) / w.size
+    scale = np.maximum(np.median(step[both], axis=0) / stats.chi2.median(1), least)
+    jump = both & (step > scale * STEP_SIGMA**2).any(axis=1)
     # A jump lies between two windows: neither can be trusted to its edge.
     still &= ~jump & ~np.append(jump[1:], False)
     return still
+
+
+def _neighbours(w: Windows, still: Bools) -> Bools:
+    """Which windows follow without a gap on a still one, and are still too."""
+    both: Bools = still & np.roll(still, 1) & w.joined
+    both[0] = False
+    return both
+
+
+def _only_moves(w: Windows, still: Bools) -> bool:
+    """Whether the quietest windows are those of a motion, and nothing in the stream stands still."""
+    both = _neighbours(w, still)
+    if not both.any():
+        return False
+    step = np.median(np.diff(w.mean, axis=0, prepend=w.mean[:1])[both] ** 2, axis=0) / stats.chi2.median(1)
+    return bool((step > MOTION * np.median(w.variance[both], axis=0)).any())
 
 
 def _quiet_limit(variance: Floats, dof: int) -> float:
@@ -216,13 +236,15 @@ def _half_sample_mode(ordered: Floats) -> float:
     return float(np.mean(ordered))
 
 
-def _resolution(sums: Floats) -> Floats:
-    """(3,) the smallest difference that any two readings show, judged by the sums of windows."""
-    out = np.zeros(3)
+def resolution(w: Windows) -> Floats:
+    """(3,) the smallest difference that any two readings show, judged by the sums of windows; never quite zero."""
+    sums = w.mean * w.size
+    least = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
+    out = least.copy()
     for i in range(3):
         gaps = np.diff(np.unique(sums[:, i]))
-        gaps = gaps[gaps > 1e-9 * np.max(np.abs(sums[:, i]), initial=1e-300)]
-        out[i] = gaps.min() if len(gaps) else 0.0
+        gaps = gaps[gaps > least[i]]
+        out[i] = gaps.min() if len(gaps) else least[i]
     return out
 
 
@@ -237,9 +259,7 @@ def _runs(still: Bools, joined: Bools) -> list[Ints]:
 
 def _step_scale(w: Windows, still: Bools) -> Floats:
     """(3,) standard deviation of a still window's mean about its neighbours'."""
-    pairs: Bools = still & np.roll(still, 1) & w.joined
-    pairs[0] = False
-    steps = np.diff(w.mean, axis=0, prepend=w.mean[:1])[pairs]
+    steps = np.diff(w.mean, axis=0, prepend=w.mean[:1])[_neighbours(w, still)]
     if not len(steps):
         return np.asarray(np.sqrt(np.median(w.variance, axis=0) / w.size))
     floor = np.sqrt(np.median(w.variance[still], axis=0) / w.size)
@@ -289,7 +309,7 @@ def _rejoin(w: Windows, pieces: list[Ints]) -> list[Span]:
             before = spans[-1].used
             gap_s = (w.start_ns[piece[0]] - w.end_ns[before[-1]]) * 1e-9
             apart = np.abs(w.mean[before[-20:]].mean(axis=0) - w.mean[piece[:20]].mean(axis=0))
-            if gap_s < REJOIN_S and (apart <= 3 * scatter).all():
+            if gap_s < REJOIN_S and (apart <= REJOIN_SIGMA * scatter).all():
                 spans[-1] = Span(np.concatenate([before, piece]))
                 continue
         spans.append(Span(piece))

@@ -24,6 +24,7 @@ from triaxcald.verification import verification_document, verify
 
 MOST = 8
 """So many differences are listed, the others counted."""
+_NOTHING = object()
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,9 @@ def _audit(name: str, recording: Recording) -> Audit:
     differences += _compare(CERTIFICATE, recording.attachments[CERTIFICATE], to_text(again.document))
     if VERIFICATION_FILE in recording.attachments:
         checked.append(VERIFICATION_FILE)
+        if CORRECTED not in tumble:
+            missing = f"{VERIFICATION_FILE}: cannot be computed again: the profile has no stream '{CORRECTED}'"
+            return Audit(name, tuple(checked), (*differences, missing))
         check, check_digest = replay(VERIFICATION, (CORRECTED,))
         document = verification_document(
             verify(tumble[CORRECTED].finish(), station.reference),
@@ -128,8 +132,8 @@ def _compare(name: str, stored: bytes, again: str) -> list[str]:
 def differing(stored: Any, again: Any, at: str = "") -> list[str]:
     """Where two JSON values differ, one line each."""
     if isinstance(stored, Mapping) and isinstance(again, Mapping):
-        keys = dict.fromkeys([*stored, *again])
-        return [d for k in keys for d in differing(stored.get(k), again.get(k), f"{at}.{k}" if at else str(k))]
+        pairs = {k: (stored.get(k, _NOTHING), again.get(k, _NOTHING)) for k in [*stored, *again]}
+        return [d for k, (s, t) in pairs.items() for d in differing(s, t, f"{at}.{k}" if at else str(k))]
     if isinstance(stored, list) and isinstance(again, list) and len(stored) == len(again):
         return [d for i, (s, t) in enumerate(zip(stored, again, strict=True)) for d in differing(s, t, f"{at}[{i}]")]
     if type(stored) is type(again) and stored == again:
@@ -138,15 +142,19 @@ def differing(stored: Any, again: Any, at: str = "") -> list[str]:
 
 
 def _short(value: Any) -> str:
+    if value is _NOTHING:
+        return "nothing"
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 60 else text[:57] + "…"
 
 
 def _compare_registers(stored: bytes, wanted: Mapping[str, str]) -> list[str]:
     try:
-        held = dict(json.loads(stored))
+        held = json.loads(stored)
     except ValueError:
-        return [f"{REGISTERS_AFTER}: no JSON document"]
+        held = None
+    if not isinstance(held, dict):
+        return [f"{REGISTERS_AFTER}: no JSON document of registers"]
     return [
         f"{REGISTERS_AFTER}: {name}: the device holds {held.get(name)}, the certificate asks for {raw}"
         for name, raw in wanted.items()

@@ -13,8 +13,9 @@ import numpy as np
 
 from triaxcald.errors import InputError
 from triaxcald.simulation.bench import DeviceFile, SimulatedUnit, simulate
+from triaxcald.station.collection import Progress
 from triaxcald.station.config import load_station
-from triaxcald.station.line import Outcome, Progress, UnitRun, run_station
+from triaxcald.station.line import Outcome, UnitRun, run_station
 from triaxcald.verification import Verification
 
 SPEED = 20.0

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Residual
-from triaxcal.effects import effect_named
+from triaxcal.effects import Effect, effect_named
 from triaxcal.loop import Loop
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
@@ -212,4 +213,19 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
         raise InputError(
             f"{where}: scale_factor, misalignment, bias: expected three numbers each, none zero in the first"
         )
+    _require_finite(effects, reference, magnitude, where)
     return Sensor(k, m, b, tuple(effects)), reference, magnitude
+
+
+def _require_finite(
+    effects: Sequence[tuple[Effect, Floats]], reference: Mapping[str, float], magnitude: float, where: str
+) -> None:
+    """JSON as Python reads it has NaN."""
+    for effect, values in effects:
+        if not np.isfinite(values).all():
+            raise InputError(f"{where}: effects.{effect.name}: expected finite numbers")
+    for name, value in reference.items():
+        if not math.isfinite(value):
+            raise InputError(f"{where}: channel_reference.{name}: expected a finite number")
+    if not 0 < magnitude < math.inf:
+        raise InputError(f"{where}: reference: expected a positive number")

@@ -44,9 +44,9 @@ class Measured:
 def measure(name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS) -> Measured:
     """``name`` is a path to an `.mcap`, `.csv` or `.csv.gz`, or `-`. Raises InputError, RecordingError."""
     if name.endswith(".mcap"):
-        recording = Recording.open(Path(name))
-        bundle = bundle_of(recording)
-        pipeline = Pipeline(bundle, stream).feed_all(recording.raw(phase))
+        with Recording.open(Path(name)) as recording:
+            bundle = bundle_of(recording)
+            pipeline = Pipeline(bundle, stream).feed_all(recording.raw(phase))
         poses = pipeline.finish()
         quality = pipeline.data_quality() + _creeping(poses)
         return Measured(name, poses, pipeline.windows, quality, bundle.profile)
@@ -92,6 +92,8 @@ def read_document(path: str) -> Mapping[str, Any]:
         document = json.loads(text)
     except json.JSONDecodeError as e:
         raise InputError(f"{path}, line {e.lineno}: not JSON: {e.msg}") from e
+    except RecursionError as e:
+        raise InputError(f"{path}: not JSON: nested too deeply") from e
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a JSON object")
     return document

@@ -18,6 +18,7 @@ from triaxcald.documents import number
 from triaxcald.inputs import CALIBRATION
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.eeprom import keep_eeprom, read_eeprom
+from triaxcald.station.collection import Collection
 from triaxcald.station.config import load_station
 from triaxcald.station.line import Outcome, UnitRun, run_station
 
@@ -193,10 +194,10 @@ async def _record(run: UnitRun, path: Path, seconds: float | None) -> str:
     async with run.place.opened() as device:
         identity = await run.identify(device)
         with run.writer(path, identity) as writer:
-            phase = run.phase(CALIBRATION)
-            pipeline = phase.pipelines[READINGS]
+            collection = Collection(CALIBRATION, run.place.bundle)
+            pipeline = collection.pipelines[READINGS]
             run.progress.stage(run.name, "recording")
-            async with aclosing(run.records(device, writer, phase)) as records:
+            async with aclosing(collection.records(device, writer)) as records:
                 async for _ in records:
                     if seconds is not None and pipeline.seconds >= seconds:
                         break

@@ -16,12 +16,16 @@ COVERED_DEG = 25.0
 
 @dataclass(frozen=True)
 class Guide:
-    """``found`` of ``wanted`` distinct poses; ``held_s`` how long the unit has been still now (0 when it moves)."""
+    """``found`` of ``wanted`` distinct poses; ``held_s`` how long the unit has been still now (0 when it moves).
+
+    ``missing`` are the labels of the plan's poses that none has come near to.
+    """
 
     found: int
     wanted: int
     held_s: float
     hint: str
+    missing: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -52,16 +56,18 @@ def guide(
     found = min(len(distinct), wanted)
     if found >= wanted:
         return Guide(found, wanted, still_s, "done")
-    if 0 < still_s < hold_s:
-        return Guide(found, wanted, still_s, f"hold still, {still_s:.1f} of {hold_s:.1f} s")
-    if not plan:
-        return Guide(found, wanted, still_s, "turn the unit to another pose")
-    missing = [
+    missing = tuple(
         label
-        for label, v in directions(wanted)
+        for label, v in (directions(wanted) if plan else ())
         if all(float(v @ d) < np.cos(np.radians(COVERED_DEG)) for d in distinct)
-    ]
-    return Guide(found, wanted, still_s, f"next: {missing[0]} up" if missing else "any pose not taken yet")
+    )
+    if 0 < still_s < hold_s:
+        hint = f"hold still, {still_s:.1f} of {hold_s:.1f} s"
+    elif missing:
+        hint = f"next: {missing[0]} up"
+    else:
+        hint = "turn the unit to a pose not taken yet"
+    return Guide(found, wanted, still_s, hint, missing)
 
 
 def _directions(poses: Sequence[Pose], nominal: Sequence[float] | None) -> Floats:

@@ -6,15 +6,14 @@ import asyncio
 import json
 import threading
 import time
-from collections.abc import AsyncGenerator, Callable, Sequence
-from contextlib import aclosing
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any
 
 from triaxcal.errors import Refused, TriaxcalError
 from triaxcal_drivers.errors import DriverError, RegisterValueError
-from triaxcal_drivers.interface import Device, RawBatch
+from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.certificate import Certified, certify, software
 from triaxcald.documents import Document, to_text
@@ -27,28 +26,18 @@ from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.provision.procedure import ProvisionReport, provision
 from triaxcald.provision.restore import restore
 from triaxcald.provision.snapshot import Snapshot
-from triaxcald.recording.schema import Phase, RawDigest
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import render_report
 from triaxcald.report.stream import StreamOverview, thin
+from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, Station
-from triaxcald.station.guidance import Guide, guide
 from triaxcald.verification import Verification, verification_document, verify
 
-JUDGE_EVERY_S = 0.5
-"""Seconds of samples between two looks at the poses so far."""
 CERTIFICATE, VERIFICATION_FILE, STATION_FILE = "certificate.json", "verification.json", "station.toml"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
 
 _DRAWING = threading.Lock()
 """The pictures' style is the process's own: one report is drawn at a time."""
-
-
-class Progress(Protocol):
-    """Who shows the operator how it goes."""
-
-    def stage(self, unit: str, text: str) -> None: ...
-    def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -65,15 +54,6 @@ class Outcome:
     provisioned: ProvisionReport | None = None
     error: str | None = None
     wanted: tuple[str, ...] = ()
-
-
-@dataclass
-class _Phase:
-    """The raw records of one phase, as they go to disk and down the pipelines."""
-
-    name: Phase
-    pipelines: dict[str, Pipeline]
-    digest: RawDigest
 
 
 class UnitRun:
@@ -147,8 +127,8 @@ class UnitRun:
 
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter, path: Path) -> Outcome:
         plan = self.station.file.plan
-        tumble = self.phase(CALIBRATION)
-        await self._collect(device, writer, tumble, READINGS, plan.poses, use_plan=True)
+        tumble = Collection(CALIBRATION, self.place.bundle)
+        await self._collect(device, writer, tumble, READINGS, plan.poses)
         self.progress.stage(self.name, "fitting")
         poses = tumble.pipelines[READINGS].finish()
         certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
@@ -178,11 +158,7 @@ class UnitRun:
             }
         )
 
-    def phase(self, name: Phase) -> _Phase:
-        streams = [s for s in (READINGS, CORRECTED) if s in self.profile.streams]
-        return _Phase(name, {s: Pipeline(self.place.bundle, s) for s in streams}, RawDigest())
-
-    def _certify(self, tumble: _Phase, poses: list[Any], identity: IdentityRead) -> Certified:
+    def _certify(self, tumble: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
         return certify(
             self.place.bundle,
             self.station.file,
@@ -197,73 +173,30 @@ class UnitRun:
         )
 
     async def _collect(
-        self,
-        device: Device,
-        writer: RecordingWriter | None,
-        phase: _Phase,
-        stream: str,
-        wanted: int,
-        *,
-        use_plan: bool,
+        self, device: Device, writer: RecordingWriter | None, collection: Collection, stream: str, wanted: int
     ) -> None:
-        """Records until there are ``wanted`` distinct poses. Raises Refused when none has come for too long."""
-        plan = self.station.file.plan
-        judged_s, news_s, found = 0.0, 0.0, 0
-        async for _ in self.records(device, writer, phase):
-            windows = phase.pipelines[stream].windows
-            if windows is None:
-                continue
-            now_s = (int(windows.end_ns[-1]) - int(windows.start_ns[0])) * 1e-9
-            if now_s - judged_s < JUDGE_EVERY_S:
-                continue
-            judged_s = now_s
-            state = guide(
-                phase.pipelines[stream].poses(),
-                wanted=wanted,
-                hold_s=plan.hold_s,
-                apart_deg=plan.apart_deg,
-                now_s=now_s,
-                nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == READINGS else (1, 1, 1),
-                plan=use_plan,
-            )
-            self.progress.poses(self.name, phase.name, state)
-            if state.complete:
-                return
-            if state.found > found:
-                found, news_s = state.found, now_s
-            if now_s - news_s > plan.patience_s:
-                raise Refused(
-                    f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there", wanted=(state.hint,)
-                )
-
-    async def records(self, device: Device, writer: RecordingWriter | None, phase: _Phase) -> AsyncGenerator[RawBatch]:
-        """Raw records on their way to disk, if any, and down the pipelines.
-
-        What the disk has no room for goes to neither, so that an audit sees what the station saw.
-        """
-        async with aclosing(cast(Any, device.stream(list(phase.pipelines)))) as stream:
-            async for batch in stream:
-                if writer is not None and not writer.raw(phase.name, batch):
-                    continue
-                phase.digest.update(phase.name, batch)
-                for name, pipeline in phase.pipelines.items():
-                    block = pipeline.feed(batch)
-                    if writer is not None and len(block):
-                        writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
-                yield batch
+        await collection.until_posed(
+            device,
+            writer,
+            self.station.file.plan,
+            stream=stream,
+            wanted=wanted,
+            nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == READINGS else (1, 1, 1),
+            tell=lambda state: self.progress.poses(self.name, collection.phase, state),
+        )
 
     async def check(self) -> Verification:
         """Records nothing and writes nothing: only asks the device, in check poses, for its own corrected output."""
         async with self.place.opened() as device:
             await self.identify(device)
             self.progress.stage(self.name, "check poses")
-            check = self.phase(VERIFICATION)
+            check = Collection(VERIFICATION, self.place.bundle)
             wanted = self.station.file.plan.check_poses
-            await self._collect(device, None, check, CORRECTED, wanted, use_plan=False)
+            await self._collect(device, None, check, CORRECTED, wanted)
             return self._corrected(check)
 
     async def _write_back(
-        self, device: Device, writer: RecordingWriter, certified: Certified, tumble: _Phase, identity: IdentityRead
+        self, device: Device, writer: RecordingWriter, certified: Certified, tumble: Collection, identity: IdentityRead
     ) -> tuple[ProvisionReport, Document | None]:
         assert certified.image is not None
         self.progress.stage(self.name, "writing the registers")
@@ -299,11 +232,11 @@ class UnitRun:
             return f"NOT restored: {e}"
         return "old calibration restored and verified"
 
-    async def _verify(self, device: Device, writer: RecordingWriter, tumble: _Phase) -> Document:
+    async def _verify(self, device: Device, writer: RecordingWriter, tumble: Collection) -> Document:
         self.progress.stage(self.name, "verifying by physics")
         file = self.station.file
-        check = self.phase(VERIFICATION)
-        await self._collect(device, writer, check, CORRECTED, file.plan.check_poses, use_plan=False)
+        check = Collection(VERIFICATION, self.place.bundle)
+        await self._collect(device, writer, check, CORRECTED, file.plan.check_poses)
         document = verification_document(
             self._corrected(tumble), self._corrected(check), limit_g=file.limits.verification_rms_g,
             raw_sha256=check.digest.hexdigest(),
@@ -311,7 +244,7 @@ class UnitRun:
         writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
         return document
 
-    def _corrected(self, phase: _Phase) -> Verification:
+    def _corrected(self, phase: Collection) -> Verification:
         return verify(phase.pipelines[CORRECTED].finish(), self.station.file.reference)
 
     def _report(self, certified: Certified, pipeline: Pipeline, verification: Document | None) -> str:

@@ -40,12 +40,12 @@ def _batch_of(first: int, n: int, payload_bytes: int = 8) -> RawBatch:
 
 def _block_of(n: int, start_ns: int = T0_NS, period_ns: int = 10_000_000) -> SampleBlock:
     index = np.arange(n)
-    temp_c: NDArray[np.float64] = np.asarray(index / 10.0, dtype=np.float64)
+    n_float: NDArray[np.float64] = index.astype(np.float64)
     return SampleBlock(
         start_ns + index * period_ns,
         index,
         np.column_stack([index * 1.0, index * 2.0, index * 3.0]),
-        {"temp_c": temp_c, "supply.v": index * 0.5},
+        {"temp_c": n_float / 10, "supply.v": n_float / 2},
     )
 
 

@@ -1,0 +1,101 @@
+"""The raw records of one phase, on their way to disk and down the pipelines, until there are poses enough."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import AsyncGenerator, Callable, Sequence
+from contextlib import aclosing
+from dataclasses import dataclass, field
+from typing import Any, Protocol, cast
+
+from triaxcal.errors import Refused
+from triaxcal_drivers.interface import Device, RawBatch
+from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcald.pipeline import Pipeline
+from triaxcald.recording.schema import Phase, RawDigest
+from triaxcald.recording.writer import RecordingWriter
+from triaxcald.station.config import Plan
+from triaxcald.station.guidance import Guide, guide
+
+LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
+"""The poses so far are looked at so often, by the samples' time and by the host's, whichever is longer."""
+
+
+class Progress(Protocol):
+    """Who shows the operator how it goes."""
+
+    def stage(self, unit: str, text: str) -> None: ...
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
+
+
+@dataclass
+class Collection:
+    """``pipelines`` by stream: the readings, and the corrected output where the device has one."""
+
+    phase: Phase
+    bundle: Bundle
+    digest: RawDigest = field(default_factory=RawDigest)
+
+    def __post_init__(self) -> None:
+        streams = [s for s in (READINGS, CORRECTED) if s in self.bundle.profile.streams]
+        self.pipelines = {s: Pipeline(self.bundle, s) for s in streams}
+
+    async def records(self, device: Device, writer: RecordingWriter | None) -> AsyncGenerator[RawBatch]:
+        """What comes off the bus, once it is on its way to disk and through the pipelines.
+
+        What the disk has no room for goes to neither, so that an audit sees what the station saw.
+        """
+        async with aclosing(cast(Any, device.stream(list(self.pipelines)))) as stream:
+            async for batch in stream:
+                if writer is not None and not writer.raw(self.phase, batch):
+                    continue
+                self.digest.update(self.phase, batch)
+                for name, pipeline in self.pipelines.items():
+                    block = pipeline.feed(batch)
+                    if writer is not None and len(block):
+                        writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
+                yield batch
+
+    async def until_posed(
+        self,
+        device: Device,
+        writer: RecordingWriter | None,
+        plan: Plan,
+        *,
+        stream: str,
+        wanted: int,
+        nominal_scale_factor: Sequence[float] | None,
+        tell: Callable[[Guide], None],
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Records until ``stream`` shows ``wanted`` distinct poses; ``tell`` is told how it goes.
+
+        Raises Refused when no new pose has come for the plan's patience, and what the device's stream raises.
+        """
+        pipeline = self.pipelines[stream]
+        looked_s, looked_host_s, news_s, found = 0.0, -LOOK_HOST_S, 0.0, 0
+        async with aclosing(self.records(device, writer)) as records:
+            async for _ in records:
+                now_s, host_s = pipeline.seconds, clock_s()
+                if now_s - looked_s < LOOK_SAMPLES_S or host_s - looked_host_s < LOOK_HOST_S:
+                    continue
+                looked_s, looked_host_s = now_s, host_s
+                state = guide(
+                    pipeline.poses(),
+                    wanted=wanted,
+                    hold_s=plan.hold_s,
+                    apart_deg=plan.apart_deg,
+                    now_s=now_s,
+                    nominal_scale_factor=nominal_scale_factor,
+                    plan=stream == READINGS,
+                )
+                tell(state)
+                if state.complete:
+                    return
+                if state.found > found:
+                    found, news_s = state.found, now_s
+                if now_s - news_s > plan.patience_s:
+                    raise Refused(
+                        f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there",
+                        wanted=state.missing,
+                    )

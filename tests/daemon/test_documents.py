@@ -1,0 +1,171 @@
+"""The documents hold what the contract lists, and a sensor comes back out of them as it went in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from triaxcal.effects import effect_named
+from triaxcal.fit import fit
+from triaxcal.loop import diagnose
+from triaxcal.plan import directions
+from triaxcal.poses import Pose
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import noisy_poses
+from triaxcald.documents import (
+    calibration_document,
+    calibration_part,
+    loop_document,
+    number,
+    numbers,
+    poses_document,
+    sensor_of,
+    to_text,
+)
+from triaxcald.errors import InputError
+
+SECOND = effect_named("second_order_nonlinearity")
+TRUTH = Sensor(
+    np.array([-2.41, 2.40, -2.37]),
+    np.array([6e-3, 4e-3, -1e-3]),
+    np.array([5e-3, -3e-3, 4e-3]),
+    ((SECOND, np.array([4e-4, -3e-4, 5e-4])),),
+)
+SIGNS = (-1, 1, -1)
+
+
+@pytest.fixture(scope="module")
+def poses() -> list[Pose]:
+    ups = np.array([v for _, v in directions(26)])
+    temperatures = 25 + np.linspace(-5, 5, 26)[np.random.default_rng(2).permutation(26)]
+    return noisy_poses(TRUTH, ups, 1e-5, np.random.default_rng(1), channels={"temp_c": temperatures})
+
+
+def test_a_number_has_twelve_digits_and_what_is_none_is_null() -> None:
+    assert number(1 / 3) == 0.333333333333
+    assert number(-1.23456789012345e-300) == -1.23456789012e-300
+    assert [number(v) for v in (None, float("nan"), float("inf"))] == [None, None, None]
+    assert numbers(np.array([[1, 2], [3, np.nan]])) == [[1.0, 2.0], [3.0, None]]
+
+
+def test_a_document_reads_back_and_ends_with_a_line() -> None:
+    text = to_text({"unit": "µg", "a": [1.5]})
+    assert text == '{\n  "unit": "µg",\n  "a": [\n    1.5\n  ]\n}\n'
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        to_text({"a": float("nan")})
+
+
+def test_poses_have_the_keys_of_the_contract(poses: list[Pose]) -> None:
+    document = poses_document(poses)
+    assert document["format"] == "triaxcal.poses/1"
+    assert len(document["poses"]) == 26
+    first = document["poses"][0]
+    assert set(first) == {"start_s", "end_s", "samples", "mean", "standard_error", "channels"}
+    assert len(first["mean"]) == len(first["standard_error"]) == 3
+    assert first["channels"] == {"temp_c": pytest.approx(poses[0].channels["temp_c"], rel=1e-11)}
+    assert poses_document([]) == {"format": "triaxcal.poses/1", "poses": []}
+
+
+def test_a_calibration_comes_back_as_a_sensor(poses: list[Pose]) -> None:
+    calibration = fit(poses, signs=SIGNS, effects=[SECOND, effect_named("temperature_bias")], reference=1.5)
+    document = json.loads(to_text(calibration_document(calibration, output_unit="V")))
+    sensor, reference, magnitude = sensor_of(document, where="cal.json")
+    assert magnitude == 1.5
+    assert reference == {"temp_c": pytest.approx(calibration.channel_reference["temp_c"], rel=1e-11)}
+    np.testing.assert_allclose(sensor.scale_factor, calibration.sensor.scale_factor, rtol=1e-11)
+    np.testing.assert_allclose(sensor.misalignment, calibration.sensor.misalignment, rtol=1e-11)
+    np.testing.assert_allclose(sensor.bias, calibration.sensor.bias, rtol=1e-11)
+    assert [e.name for e, _ in sensor.effects] == ["second_order_nonlinearity", "temperature_bias"]
+    for (_, held), (_, meant) in zip(sensor.effects, calibration.sensor.effects, strict=True):
+        np.testing.assert_allclose(held, meant, rtol=1e-11)
+
+
+def test_matrix_and_centre_are_those_of_the_coefficients(poses: list[Pose]) -> None:
+    """a = A (u − c): the measured mean of a pose goes to its direction, but for noise and the missing effect."""
+    document = calibration_document(fit(poses, signs=SIGNS))
+    A, c = np.array(document["matrix"]), np.array(document["centre"])
+    assert A.shape == (3, 3)
+    for pose in document["poses"]:
+        up = A @ (np.array(pose["mean"]) - c)
+        assert np.linalg.norm(up) == pytest.approx(1.0, abs=2e-3)
+        np.testing.assert_allclose(up, pose["direction"], atol=2e-3)
+
+
+def test_units_name_the_reference_of_another_sensor(poses: list[Pose]) -> None:
+    calibration = fit(poses, signs=SIGNS, effects=[SECOND])
+    document = calibration_document(calibration, output_unit="counts", reference_unit="µT")
+    assert document["units"]["scale_factor"] == "counts/µT"
+    assert document["units"]["bias"] == "µT"
+    assert document["effects"]["second_order_nonlinearity"]["x"]["unit"] == "µT/µT²"
+
+
+def test_a_loop_says_what_each_pose_was_before(poses: list[Pose]) -> None:
+    document = loop_document(diagnose(poses, signs=SIGNS), data_quality=["missing_samples: 1 of 2"])
+    assert document["data_quality"] == ["missing_samples: 1 of 2"]
+    assert "held_out" not in document
+    before = np.array([p["before_residual_g"] for p in document["calibration"]["poses"]])
+    after = np.array([p["residual_g"] for p in document["calibration"]["poses"]])
+    assert np.sqrt(np.mean(before**2)) == pytest.approx(document["before"]["rms_g"], rel=1e-9)
+    assert np.sqrt(np.mean(after**2)) == pytest.approx(document["after"]["rms_g"], rel=1e-9)
+
+
+def test_the_calibration_is_found_in_a_loop_and_in_a_certificate(poses: list[Pose]) -> None:
+    loop = loop_document(diagnose(poses, signs=SIGNS))
+    inner = loop["calibration"]
+    for document in (inner, loop, {"format": "triaxcal.certificate/1", "result": loop}):
+        assert calibration_part(document, where="x") == inner
+
+
+def _without(*keys: str) -> Callable[[dict[str, Any]], None]:
+    def change(document: dict[str, Any]) -> None:
+        for key in keys:
+            del document[key]
+
+    return change
+
+
+def _with(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda document: document.__setitem__(key, value)
+
+
+def _effect(value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda d: d["effects"]["second_order_nonlinearity"]["x"].__setitem__("value", value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (_with("format", "triaxcal.poses/1"), "format: expected a triaxcal.calibration/1"),
+        (_without("format"), "format: expected a triaxcal.calibration/1"),
+        (_without("scale_factor"), "scale_factor: missing"),
+        (_with("bias", [1, 2]), "expected three numbers each"),
+        (_with("bias", [1, 2, None]), "numbers"),
+        (_with("bias", [1, 2, float("nan")]), "expected three numbers each"),
+        (_with("bias", "a few"), "numbers"),
+        (_with("scale_factor", [1, 0, 1]), "none zero in the first"),
+        (_with("misalignment", {"x": 1}), "numbers"),
+        (_with("effects", {"flat_earth": {}}), "flat_earth"),
+        (_with("effects", {"second_order_nonlinearity": {"x": {"value": 1}}}), "y: missing"),
+        (_with("effects", [1]), "numbers"),
+        (_effect("much"), "numbers"),
+        (_effect(float("nan")), "effects.second_order_nonlinearity: expected finite numbers"),
+        (_with("channel_reference", {"temp_c": "warm"}), "numbers"),
+        (_with("channel_reference", {"temp_c": float("inf")}), "channel_reference.temp_c: expected a finite number"),
+        (_with("reference", 0), "reference: expected a positive number"),
+        (_with("reference", float("nan")), "reference: expected a positive number"),
+    ],
+)
+def test_a_malformed_calibration_is_an_error_that_names_file_and_field(
+    poses: list[Pose], change: Callable[[dict[str, Any]], None], words: str
+) -> None:
+    document = calibration_document(fit(poses, signs=SIGNS, effects=[SECOND]))
+    change(document)
+    with pytest.raises(InputError) as caught:
+        sensor_of(document, where="cal.json")
+    assert str(caught.value).startswith("cal.json: ")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)

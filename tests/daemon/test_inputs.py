@@ -1,0 +1,108 @@
+"""What every measuring command begins with: a recording, ours or as text, as poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from triaxcald.errors import InputError, RecordingError
+from triaxcald.inputs import VERIFICATION, bundle_of, measure, read_document
+from triaxcald.recording.reader import Recording
+
+
+def test_a_recording_brings_its_profile_with_it(finished_run: Any) -> None:
+    measured = measure(str(finished_run.can))
+    assert len(measured.poses) >= 26
+    assert measured.profile is not None
+    assert measured.profile.output.unit == "V"
+    assert measured.signs == (-1, -1, -1)
+    assert measured.windows is not None
+    assert set(measured.poses[0].channels) == {"temp_c", "status"}
+
+
+def test_the_corrected_stream_and_the_verification_can_be_asked_for(finished_run: Any) -> None:
+    measured = measure(str(finished_run.can), phase=VERIFICATION, stream="corrected")
+    assert len(measured.poses) >= 3
+    lengths = [np.linalg.norm(p.mean) for p in measured.poses]
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-4)
+
+
+def _csv(n: int = 1200) -> str:
+    rng = np.random.default_rng(5)
+    rows = ["t_s,ux,uy,uz,temp_c"]
+    for i in range(n):
+        axis = i // 200 % 3
+        u = [(1.0 if k == axis else 0.0) + 1e-4 * rng.standard_normal() for k in range(3)]
+        rows.append(f"{i * 0.01:.2f},{u[0]:.6f},{u[1]:.6f},{u[2]:.6f},{20 + axis}")
+    return "\n".join(rows) + "\n"
+
+
+def test_text_has_no_signs_and_says_what_came_twice(tmp_path: Path) -> None:
+    lines = _csv().splitlines(keepends=True)
+    path = tmp_path / "a.csv"
+    path.write_text("".join(lines[:300] + [lines[299]] + lines[300:]))
+    measured = measure(str(path))
+    assert measured.signs is None
+    assert measured.profile is None
+    assert len(measured.poses) == 6
+    assert measured.data_quality == ["duplicate_samples: 1"]
+    assert [round(p.channels["temp_c"]) for p in measured.poses] == [20, 21, 22, 20, 21, 22]
+
+
+def test_a_pose_that_creeps_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    lines = _csv().splitlines()
+    for i in range(1, 201):
+        t, x, *rest = lines[i].split(",")
+        lines[i] = ",".join([t, f"{float(x) + 3e-6 * i:.7f}", *rest])
+    path.write_text("\n".join(lines) + "\n")
+    assert [q.split(":")[0] for q in measure(str(path)).data_quality] == ["creeping_pose"]
+
+
+def test_too_little_for_one_window_is_an_error_of_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t_s,ux,uy,uz\n0,1,2,3\n")
+    with pytest.raises(InputError, match=r"a\.csv: "):
+        measure(str(path))
+
+
+def test_a_recording_without_its_profile_is_named(finished_run: Any, rewrite: Callable[..., Path]) -> None:
+    path = rewrite(finished_run.can, attachment=lambda name, data: None if name == "profile.toml" else data)
+    with Recording.open(path) as recording, pytest.raises(RecordingError, match=r"attachment profile\.toml: missing"):
+        bundle_of(recording)
+
+
+def test_the_profile_in_a_recording_has_its_files_with_it(finished_run: Any) -> None:
+    with Recording.open(finished_run.can) as recording:
+        assert set(bundle_of(recording).files) == {"triax-ref-can.dbc"}
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"{", "line 1: not JSON: "),
+        (b'{\n"a": 1,\n"b" 2}', "line 3: not JSON: "),
+        (b"[1, 2]", "expected a JSON object"),
+        (b"\xff\xfe", "not UTF-8 text (byte 0)"),
+        (b"", "line 1: not JSON: "),
+        (b"[" * 100_000, "not JSON: nested too deeply"),
+    ],
+)
+def test_what_is_no_document_is_named_with_the_line(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "cal.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_document(str(path))
+    assert str(caught.value).startswith(str(path))
+    assert words in str(caught.value)
+
+
+def test_a_document_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cal\.json: No such file or directory"):
+        read_document(str(tmp_path / "cal.json"))
+    with pytest.raises(InputError, match="Is a directory"):
+        read_document(str(tmp_path))

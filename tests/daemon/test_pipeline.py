@@ -1,0 +1,115 @@
+"""The way from raw records to poses: the same however the records are cut, and nothing lost in silence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from triaxcal.poses import Pose
+from triaxcal_drivers.interface import RawBatch
+from triaxcal_drivers.profile import CORRECTED, READINGS, load_bundle
+from triaxcald.pipeline import Pipeline
+from triaxcald.recording.schema import cut
+from triaxcald.simulation.bench import DeviceFile, physics_of
+from triaxcald.simulation.can_unit import tpdos
+from triaxcald.simulation.unit import ReferenceUnit
+
+T0_NS = 1_700_000_000_000_000_000
+BUNDLE = load_bundle(Path("triax-ref-can"))
+
+
+@pytest.fixture(scope="module")
+def records() -> list[tuple[int, int, int, bytes]]:
+    """Twenty seconds of a unit that goes from pose to pose, as CAN frames."""
+    device = DeviceFile.model_validate(
+        {
+            "format": "triaxcal.device/1",
+            "profile": "triax-ref-can",
+            "bus": {},
+            "fixture": {"poses": 26, "hold_s": 2.0, "move_s": 0.8},
+        }
+    )
+    run = ReferenceUnit(physics_of(device), serial_number=1).advance(20.0)
+    frames = zip(*tpdos(run), strict=True)
+    return [
+        (T0_NS + round(t * 1e9) + 1000 * i, 0x185 + 0x100 * i, 0, data)
+        for t, parts in zip(run.unit_time_s, frames, strict=True)
+        for i, data in enumerate(parts)
+    ]
+
+
+def _poses_equal(one: list[Pose], other: list[Pose]) -> None:
+    assert [(p.start_s, p.end_s, p.samples) for p in one] == [(p.start_s, p.end_s, p.samples) for p in other]
+    for p, q in zip(one, other, strict=True):
+        np.testing.assert_array_equal(p.mean, q.mean)
+        np.testing.assert_array_equal(p.covariance, q.covariance)
+
+
+@pytest.mark.parametrize("stream", [READINGS, CORRECTED])
+@pytest.mark.parametrize("size", [1, 7, 1024])
+def test_poses_are_the_same_however_the_records_are_cut(
+    records: list[tuple[int, int, int, bytes]], stream: str, size: int
+) -> None:
+    whole = Pipeline(BUNDLE, stream).feed_all([RawBatch.of(records)])
+    pieces = Pipeline(BUNDLE, stream)
+    for batch in cut(RawBatch.of(records), size):
+        pieces.feed(batch)
+    expected = whole.finish()
+    assert len(expected) == 7
+    _poses_equal(pieces.finish(), expected)
+    assert pieces.counts == whole.counts
+    assert pieces.seconds == whole.seconds
+    assert pieces.first_host_ns == whole.first_host_ns == T0_NS
+
+
+def test_clean_records_are_counted_and_blamed_for_nothing(records: list[tuple[int, int, int, bytes]]) -> None:
+    pipeline = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(records)])
+    assert pipeline.counts == {
+        "samples": 2001, "missing": 0, "duplicates": 0, "incomplete": 0, "errors": 0, "out_of_order": 0
+    }  # fmt: skip
+    assert pipeline.data_quality() == []
+    assert pipeline.seconds == pytest.approx(20.0, abs=0.01)
+
+
+def test_lost_samples_are_counted_and_said(records: list[tuple[int, int, int, bytes]]) -> None:
+    kept = [r for i, r in enumerate(records) if not 400 <= i < 440]  # ten samples, all their frames
+    pipeline = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(kept)])
+    assert pipeline.counts["missing"] == 10
+    assert pipeline.counts["samples"] == 1991
+    assert pipeline.data_quality() == ["missing_samples: 10 of 2001"]
+
+
+def test_half_a_sample_is_counted_and_not_used(records: list[tuple[int, int, int, bytes]]) -> None:
+    kept = [r for i, r in enumerate(records) if i != 401]  # the second frame of sample 100
+    pipeline = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(kept)])
+    assert pipeline.counts["samples"] == 2000
+    assert pipeline.counts["incomplete"] + pipeline.counts["missing"] == 1
+    assert pipeline.data_quality() == ["missing_samples: 1 of 2001"]
+
+
+def test_a_sample_that_comes_twice_is_used_once_and_said(records: list[tuple[int, int, int, bytes]]) -> None:
+    twice = records[:404] + records[400:404] + records[404:]
+    pipeline = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(twice)])
+    assert pipeline.counts["samples"] == 2001
+    assert pipeline.counts["duplicates"] == 1
+    assert pipeline.data_quality() == ["duplicate_samples: 1"]
+
+
+def test_nothing_fed_is_no_pose_and_no_window() -> None:
+    pipeline = Pipeline(BUNDLE, READINGS)
+    assert pipeline.windows is None
+    assert pipeline.poses() == pipeline.finish() == []
+    assert pipeline.seconds == 0.0
+    assert pipeline.first_host_ns is None
+
+
+def test_poses_so_far_can_be_asked_for_at_any_time(records: list[tuple[int, int, int, bytes]]) -> None:
+    pipeline = Pipeline(BUNDLE, READINGS)
+    seen = []
+    for batch in cut(RawBatch.of(records), 800):
+        pipeline.feed(batch)
+        seen.append(len(pipeline.poses()))
+    assert seen == sorted(seen)
+    assert seen[-1] == 7
