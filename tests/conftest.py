@@ -25,8 +25,8 @@ from triaxcald.cli.commands import main
 from triaxcald.simulation.bench import load_device, physics_of, simulate
 from triaxcald.simulation.unit import Faults, ReferenceUnit
 
-FIXTURE = {"poses": 26, "hold_s": 2.0, "move_s": 0.8}
-PLAN = {"poses": 26, "hold_s": 1.0, "check_poses": 3}
+FIXTURE = {"poses": 14, "hold_s": 2.0, "move_s": 0.8}
+PLAN = {"poses": 14, "hold_s": 1.0, "check_poses": 3}
 SERIAL = 4711
 
 
@@ -115,6 +115,7 @@ class Workshop:
         lines = [line for line in text.splitlines() if not line.startswith(("silence_timeout_s", "reply_timeout_s"))]
         at = lines.index("[sampling]") + 1
         lines[at:at] = ["silence_timeout_s = 0.5", "reply_timeout_s = 0.3"]
+        lines = [line.replace("{ reconnect = true }", "{ reconnect = true, timeout_s = 1.0 }") for line in lines]
         for beside in BUILT_IN.glob(f"{name}.*"):
             shutil.copy(beside, self.folder)
         return self.write(f"{name}-impatient.toml", "\n".join(lines) + "\n").name
@@ -146,7 +147,7 @@ class Workshop:
         def run() -> None:
             try:
                 asyncio.run(work())
-            except BaseException as e:
+            except BaseException as e:  # noqa: BLE001 - it goes on in the test's own thread
                 box["failure"] = e
                 ready.set()
 
@@ -211,12 +212,14 @@ def _run_station(folder: Path) -> None:
     workshop = Workshop(folder)
     can_bus = {"interface": "virtual", "channel": f"finished-run-{os.getpid()}", "node_id": 5}
     sensor = {"effects": HIDDEN}
-    can = workshop.device("can.toml", profile="triax-ref-can", bus=can_bus, sensor=sensor)
-    modbus = workshop.device("modbus.toml", serial=4712, seed=4)
+    fixture = {**FIXTURE, "poses": 26}
+    can = workshop.device("can.toml", profile="triax-ref-can", bus=can_bus, sensor=sensor, fixture=fixture)
+    modbus = workshop.device("modbus.toml", serial=4712, seed=4, fixture=fixture)
     with workshop.serve(can) as first, workshop.serve(modbus) as second:
         station = workshop.station(
             {"name": "can", "profile": "triax-ref-can", "serial": "4711", "bus": first.bus},
             {"name": "modbus", "serial": "4712", "bus": second.bus},
+            plan={**PLAN, "poses": 26},
             limits={"rms_g": 1e-4, "verification_rms_g": 1e-4},
         )
         out, err = io.StringIO(), io.StringIO()

@@ -28,7 +28,10 @@ from triaxcal.sensor import Sensor
 DILUTION_LIMIT = 100.0
 """Above this a set of poses is refused: some combination of parameters is a hundred times worse than one pose."""
 DILUTION_WARNING = 10.0
+NOISE_LIMIT = 0.1
+"""Poses are refused where noise alone, times the dilution, is this share of the reference."""
 POSES_LEAST = 9
+NOT_STILL = "the poses do not look like those of one still triad"
 STEPS_MOST = 60
 CONVERGED = 1e-12
 """Relative step at which the search ends; the noise of any real pose is a million times larger."""
@@ -146,18 +149,26 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
         spread = dilution(a, linear_design(a / np.linalg.norm(a, axis=1, keepdims=True), x))
     except Refused as e:
         raise Refused(f"{e}; {_count(rough)}", wanted=_wanted_for(poses, signs)) from None
-    if not spread < DILUTION_LIMIT:
-        raise Refused(
-            f"the poses cannot carry nine parameters: some combination of them would be {spread:.3g} times as "
-            f"uncertain as one pose (limit {DILUTION_LIMIT:g}); {_count(a)}",
-            wanted=_wanted_for(poses, signs),
-        )
     k, angles, b = coefficients(A / problem.reference, c)
     ax, ay, az = angles
     sx, sy, sz = problem.signs
     D = problem.signs * problem.half / k
     w = problem.signs * b - problem.middle * D / problem.half
-    return State(np.concatenate([D, w, [ax * sy * sz, ay * sx * sz, az * sx * sy]]), ())
+    state = State(np.concatenate([D, w, [ax * sy * sz, ay * sx * sz, az * sx * sy]]), ())
+    noise = float(np.sqrt(np.mean(linearise(problem, state)[2] ** 2))) / problem.reference
+    known = spread * noise < NOISE_LIMIT
+    if not spread < DILUTION_LIMIT:
+        raise Refused(
+            f"the poses cannot carry nine parameters: some combination of them would be {spread:.3g} times as "
+            f"uncertain as one pose (limit {DILUTION_LIMIT:g}); {_count(a)}",
+            wanted=_labels(a * problem.signs) if known else _wanted_for(poses, signs),
+        )
+    if not known:
+        raise Refused(
+            f"the poses cannot carry nine parameters: they differ by little more than their noise; {_count(a)}",
+            wanted=_wanted_for(poses, signs),
+        )
+    return state
 
 
 def _count(a: Floats) -> str:
@@ -167,13 +178,19 @@ def _count(a: Floats) -> str:
 def _wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]:
     """The poses that would mend a set, as far as its directions can be told without a fit."""
     if not poses:
-        return tuple(label for label, _ in most_wanted(np.zeros((0, 3))))
+        return _labels(np.zeros((0, 3)))
     u = np.array([p.mean for p in poses])
     middle = (u.max(axis=0) + u.min(axis=0)) / 2
     # Without a scale an axis that hardly moved would look like one that swung from end to end.
-    half = np.max((u.max(axis=0) - u.min(axis=0)) / 2)
-    a = (u - middle) / max(float(half), 1e-300) * np.asarray(signs)
-    return tuple(label for label, _ in most_wanted(a + 1e-12))
+    half = float(np.max((u.max(axis=0) - u.min(axis=0)) / 2))
+    error = float(np.sqrt(np.mean([np.trace(p.covariance) for p in poses])))
+    if half <= error / NOISE_LIMIT:
+        return _labels(np.zeros((0, 3)))
+    return _labels((u - middle) / half * np.asarray(signs) + 1e-12)
+
+
+def _labels(a: Floats) -> tuple[str, ...]:
+    return tuple(label for label, _ in most_wanted(a))
 
 
 def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: int = STEPS_MOST) -> State:
@@ -186,7 +203,7 @@ def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: in
     for _ in range(steps):
         r, J, s = linearise(problem, State(theta, effects))
         if not (np.isfinite(J).all() and np.isfinite(r).all()):
-            raise Refused("the fit ran away; the poses do not look like those of one still triad")
+            raise Refused(f"the fit ran away; {NOT_STILL}")
         norm = np.linalg.norm(J / s[:, None], axis=0)
         norm[norm == 0] = 1.0
         step = -np.linalg.lstsq(J / s[:, None] / norm, r / s, rcond=1e-14)[0] / norm
@@ -202,7 +219,7 @@ def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: in
         if size < CONVERGED:
             return State(theta, effects)
     if steps == STEPS_MOST and size > 1e-9:
-        raise Refused(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e})")
+        raise Refused(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e}); {NOT_STILL}")
     return State(theta, effects)
 
 
@@ -240,12 +257,16 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State) -> Calibrat
     chi2 = float(np.sum((r / s) ** 2))
     left = n - p
     lack_of_fit_p = pure_error_p(chi2, left, poses) if left > 0 else None
-    inflation = max(1.0, float(np.sqrt(chi2 / left))) if left > 0 and (lack_of_fit_p or 1.0) < 0.05 else 1.0
+    inflation = max(1.0, float(np.sqrt(chi2 / left))) if lack_of_fit_p is not None and lack_of_fit_p < 0.05 else 1.0
     crossed = cross_validated(problem, state, leverage)
     sensor = state.sensor(problem)
     direction = sensor.specific_force(problem.u, problem.conditions)
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     design = linear_design(direction, (problem.u - problem.middle) / problem.half)
+    spread = dilution(direction, design)
+    if not spread < DILUTION_LIMIT:
+        # No scale factor and a bias of one reference fit anything: |a| is right everywhere and means nothing.
+        raise Refused(f"the fit ran away, to a dilution of {spread:.3g}; {NOT_STILL}")
     norms = np.linalg.norm(J / s[:, None], axis=0)
     residual = Residual(
         rms_g=float(np.sqrt(np.mean(r**2))),
@@ -265,7 +286,7 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State) -> Calibrat
             for i, pose in enumerate(poses)
         ),
         condition=float(np.linalg.cond(J / s[:, None] / np.maximum(norms, 1e-300))),
-        dilution=dilution(direction, design),
+        dilution=spread,
         inflation=inflation,
     )
     return Calibration(**{**vars(calibration), "warnings": tuple(_warnings(calibration))})

@@ -111,9 +111,9 @@ def _mend_along_the_radius(
         return covariance
     out = (mean - (mean.max(axis=0) + mean.min(axis=0)) / 2) / half**2
     out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
-    inside = np.array([_correlation(w, s) for s in spans]) * [
-        np.outer(e, e) for e in np.array([np.sqrt(w.variance[s.used].mean(axis=0) / w.size) for s in spans])
-    ]
+    # A scale for each pose, never zero, not even where a coarse output never changed in it.
+    scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans]) + resolution(w) ** 2 / 12
+    inside = np.array([_correlation(w, s) for s in spans]) * [np.outer(e, e) for e in np.sqrt(scatter / w.size)]
     predicted = np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", out, inside, out), 1e-300))
     series = [(d @ g / p)[:, None] for d, g, p in zip(deviations, out, predicted, strict=True)]
     count = np.array([len(s.used) for s in spans])

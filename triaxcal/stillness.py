@@ -86,9 +86,15 @@ class StillnessDetector:
     _broken: bool = False
 
     def feed(self, time_ns: Ints, readings: Floats, channels: Mapping[str, Floats] | None = None) -> None:
-        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3), ``channels`` each (n,)."""
+        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3), ``channels`` each (n,).
+
+        Raises InvalidData for a reading that is not a finite number: it would hide every pose.
+        """
         if not len(time_ns):
             return
+        if not np.isfinite(readings).all():
+            at = int(np.flatnonzero(~np.isfinite(readings).all(axis=1))[0])
+            raise InvalidData(f"the reading at {int(time_ns[at])} ns is not a finite number")
         held = {name: np.asarray(v, dtype=float) for name, v in (channels or {}).items()}
         self._pending.append((np.asarray(time_ns, dtype=np.int64), np.asarray(readings, dtype=float), held))
         if not self._size and sum(len(p[0]) for p in self._pending) >= RATE_SAMPLES:
@@ -180,14 +186,14 @@ def find_spans(w: Windows) -> list[Span]:
 def _still(w: Windows) -> Bools:
     """Which windows scatter, and step from their neighbours, as the quietest ones do."""
     limit = np.array([_quiet_limit(w.variance[:, axis], w.size - 1) for axis in range(3)])
-    still: Bools = (w.variance <= limit).all(axis=1)
+    still = np.asarray((w.variance <= limit).all(axis=1))
     both = _neighbours(w, still)
     if both.sum() < SPAN_LEAST_WINDOWS:
         return still
     step = np.diff(w.mean, axis=0, prepend=w.mean[:1]) ** 2
     least = np.median(w.variance[still], axis=0) / w.size
     scale = np.maximum(np.median(step[both], axis=0) / stats.chi2.median(1), least)
-    jump = both & (step > scale * STEP_SIGMA**2).any(axis=1)
+    jump: Bools = both & (step > scale * STEP_SIGMA**2).any(axis=1)
     # A jump lies between two windows: neither can be trusted to its edge.
     still &= ~jump & ~np.append(jump[1:], False)
     return still
@@ -239,7 +245,7 @@ def _half_sample_mode(ordered: Floats) -> float:
 def resolution(w: Windows) -> Floats:
     """(3,) the smallest difference that any two readings show, judged by the sums of windows; never quite zero."""
     sums = w.mean * w.size
-    least = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
+    least: Floats = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
     out = least.copy()
     for i in range(3):
         gaps = np.diff(np.unique(sums[:, i]))

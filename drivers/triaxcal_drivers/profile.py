@@ -297,9 +297,8 @@ def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str
             if isinstance(given, (str, int, float, bool)):
                 message += f", not {given!r}"
         at = f", line {line}" if line else ""
-        raise ProfileError(
-            f"{where}{at}: {'.'.join(path) or 'profile'}: {message[0].lower()}{message[1:]}"
-        ) from e
+        field = f"{'.'.join(path)}: " if path else ""
+        raise ProfileError(f"{where}{at}: {field}{message[0].lower()}{message[1:]}") from e
 
 
 def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:

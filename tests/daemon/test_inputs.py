@@ -31,11 +31,11 @@ def test_the_corrected_stream_and_the_verification_can_be_asked_for(finished_run
     np.testing.assert_allclose(lengths, 1.0, atol=1e-4)
 
 
-def _csv(n: int = 1200) -> str:
+def _csv(n: int = 1200, hold: int = 200) -> str:
     rng = np.random.default_rng(5)
     rows = ["t_s,ux,uy,uz,temp_c"]
     for i in range(n):
-        axis = i // 200 % 3
+        axis = i // hold % 3
         u = [(1.0 if k == axis else 0.0) + 1e-4 * rng.standard_normal() for k in range(3)]
         rows.append(f"{i * 0.01:.2f},{u[0]:.6f},{u[1]:.6f},{u[2]:.6f},{20 + axis}")
     return "\n".join(rows) + "\n"
@@ -44,7 +44,7 @@ def _csv(n: int = 1200) -> str:
 def test_text_has_no_signs_and_says_what_came_twice(tmp_path: Path) -> None:
     lines = _csv().splitlines(keepends=True)
     path = tmp_path / "a.csv"
-    path.write_text("".join(lines[:300] + [lines[299]] + lines[300:]))
+    path.write_text("".join([*lines[:300], lines[299], *lines[300:]]))
     measured = measure(str(path))
     assert measured.signs is None
     assert measured.profile is None
@@ -55,10 +55,10 @@ def test_text_has_no_signs_and_says_what_came_twice(tmp_path: Path) -> None:
 
 def test_a_pose_that_creeps_is_said(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    lines = _csv().splitlines()
-    for i in range(1, 201):
+    lines = _csv(6000, hold=1000).splitlines()
+    for i in range(1, 1001):
         t, x, *rest = lines[i].split(",")
-        lines[i] = ",".join([t, f"{float(x) + 3e-6 * i:.7f}", *rest])
+        lines[i] = ",".join([t, f"{float(x) + 2e-7 * i:.7f}", *rest])
     path.write_text("\n".join(lines) + "\n")
     assert [q.split(":")[0] for q in measure(str(path)).data_quality] == ["creeping_pose"]
 

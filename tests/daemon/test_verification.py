@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from triaxcal.poses import Pose
-from triaxcald.verification import verify, verification_document
+from triaxcald.verification import verification_document, verify
 
 
 def _pose(mean: list[float], error: float = 1e-5, at_s: float = 0.0) -> Pose:

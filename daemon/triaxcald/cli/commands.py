@@ -54,5 +54,14 @@ def main(arguments: Sequence[str]) -> int:
         return INTERRUPTED
     except BrokenPipeError:
         # Whoever read our output has gone; nothing more can be said there.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return DONE
+    except OSError as e:
+        _drop_output()
+        say(f"triaxcal: {e.filename or 'standard output'}: {e.strerror}")
+        return BAD_INPUT
+
+
+def _drop_output() -> None:
+    """What is still in the buffer, so that the interpreter does not stumble over it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -33,7 +33,13 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> 
     for row in rows:
         shown.add_row(*("—" if v is None else str(v) for v in row))
     width = None if sys.stdout.isatty() else 160
-    Console(file=sys.stdout, width=width, markup=False, highlight=False).print(shown)
+    _Output(file=sys.stdout, width=width, markup=False, highlight=False).print(shown)
+
+
+class _Output(Console):
+    def on_broken_pipe(self) -> None:
+        """rich would end the program, with a code that means something else here."""
+        raise BrokenPipeError
 
 
 def micro(value: float | None) -> str:

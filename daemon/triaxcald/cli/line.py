@@ -53,7 +53,10 @@ def run_command(a: argparse.Namespace) -> int:
     if a.json:
         emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
     else:
-        show_outcomes(outcomes)
+        for o in outcomes:
+            if o.certified:
+                show_outcome(o)
+    say_errors(outcomes)
     return worst(outcomes)
 
 
@@ -81,10 +84,8 @@ def _document(o: Outcome) -> dict[str, Any]:
     }
 
 
-def show_outcomes(outcomes: Sequence[Outcome]) -> None:
+def say_errors(outcomes: Sequence[Outcome]) -> None:
     for o in outcomes:
-        if o.certified:
-            show_outcome(o)
         if o.error:
             say(f"triaxcal: {o.error}" + (f"; add the poses {', '.join(o.wanted)}" if o.wanted else ""))
 
@@ -132,7 +133,9 @@ def demo_command(a: argparse.Namespace) -> int:
         emit({"format": "triaxcal.demo/1", "units": [_demo_document(u) for u in units]})
     else:
         for u in units:
-            _show_demo(u)
+            if u.outcome.certified:
+                _show_demo(u)
+    say_errors([u.outcome for u in units])
     return max(worst([u.outcome for u in units]), 0 if all(u.found for u in units) else 1)
 
 
@@ -147,9 +150,6 @@ def _demo_document(u: DemoUnit) -> dict[str, Any]:
 
 
 def _show_demo(u: DemoUnit) -> None:
-    if u.outcome.certified is None:
-        say(f"triaxcal: {u.outcome.error}")
-        return
     extra = []
     if u.after_power_cycle:
         after = u.after_power_cycle

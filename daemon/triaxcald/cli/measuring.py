@@ -17,7 +17,7 @@ from triaxcal.loop import Loop, diagnose, magnitude_errors
 from triaxcal.plan import FULL, PAPER, dilution, directions, most_wanted
 from triaxcal.visibility import unseen_effects
 from triaxcald import documents
-from triaxcald.cli.arguments import add_json, add_recording, count, positive, writable
+from triaxcald.cli.arguments import add_json, add_recording, count, positive, signs, writable
 from triaxcald.cli.console import emit, micro, say, table
 from triaxcald.documents import number
 from triaxcald.errors import InputError
@@ -50,6 +50,7 @@ def register(commands: Any) -> None:
     p.add_argument("recording", metavar="REC", nargs="?", help="name the poses that are still worth adding to it")
     p.add_argument("--poses", type=count, metavar="14|26|N", help=f"default {FULL}")
     p.add_argument("--for", dest="effects", nargs="+", metavar="EFFECT", default=[], help="effects it has to show")
+    p.add_argument("--sign", type=signs, metavar="S,S,S", help="of the scale factors of REC; write --sign=-,-,-")
     add_json(p)
     p.set_defaults(run=plan_command)
 
@@ -200,7 +201,7 @@ def _ups(n: int) -> Floats:
 def _plan_for_recording(a: argparse.Namespace) -> int:
     measured = measure(a.recording)
     try:
-        have = np.array([p.direction for p in fit(measured.poses).poses])
+        have = np.array([p.direction for p in fit(measured.poses, signs=_signs(a, measured)).poses])
         dilution_now: float | None = dilution(have)
         wanted = most_wanted(have, enough=1.0)
     except Refused as e:

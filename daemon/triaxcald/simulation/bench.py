@@ -89,17 +89,17 @@ def load_device(path: Path) -> DeviceFile:
     return validate(DeviceFile, parse_toml(text, where=str(path)), text, where=str(path))
 
 
-def physics_of(device: DeviceFile) -> SyntheticPhysics:
-    """Raises InputError where an effect is not in the catalogue."""
+def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics:
+    """Raises InputError where an effect is not in the catalogue; ``where`` names the file in it."""
     effects = []
     for name, held in device.sensor.effects.items():
         try:
             effect = effect_named(name)
         except KeyError:
-            raise InputError(f"sensor.effects.{name}: no effect of that name is known") from None
+            raise InputError(f"{where}: sensor.effects.{name}: no effect of that name is known") from None
         known = [c.name for c in effect.coefficients]
         if unknown := set(held) - set(known):
-            raise InputError(f"sensor.effects.{name}.{unknown.pop()}: known coefficients: {', '.join(known)}")
+            raise InputError(f"{where}: sensor.effects.{name}.{min(unknown)}: known coefficients: {', '.join(known)}")
         effects.append((effect, np.array([held.get(c, 0.0) for c in known])))
     truth = device.sensor
     sensor = Sensor(np.array(truth.scale_factor), np.array(truth.misalignment), np.array(truth.bias), tuple(effects))
@@ -155,6 +155,9 @@ def simulate(device: DeviceFile, *, where: str, stored: bytes | None = None) -> 
         raise InputError(f"{where}: profile: only triax-ref-can and triax-ref-modbus are simulated")
     bus = validate(driver.bus_model, device.bus, b"", where=f"{where}: bus")
     unit = ReferenceUnit(
-        physics_of(device), serial_number=device.serial, stored=stored, rate_hz=bundle.profile.sampling.rate_hz
+        physics_of(device, where=where),
+        serial_number=device.serial,
+        stored=stored,
+        rate_hz=bundle.profile.sampling.rate_hz,
     )
     return SimulatedUnit(device, bundle, unit, RealTimeBase(device.speed), bus)

@@ -135,7 +135,7 @@ def parse_station(text: bytes, *, where: str) -> StationFile:
 
 
 def load_station(path: Path) -> Station:
-    """Raises InputError, ProfileError, DriverMissing: one line with file, line and field."""
+    """Opens no bus. Raises InputError, ProfileError, DriverMissing: one line with file, line and field."""
     try:
         text = path.read_bytes()
     except OSError as e:
@@ -148,4 +148,5 @@ def load_station(path: Path) -> Station:
         driver = driver_named(bundle.profile.driver, where=str(path))
         bus = validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
         places.append(Place(unit, bundle, bus))
+        places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
     return Station(path, text, file, tuple(places))

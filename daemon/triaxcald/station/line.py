@@ -17,7 +17,7 @@ from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.certificate import Certified, certify, software
 from triaxcald.documents import Document, to_text
-from triaxcald.errors import DaemonError, StationError
+from triaxcald.errors import DaemonError, InputError, RecordingError, StationError
 from triaxcald.files import write_text
 from triaxcald.inputs import CALIBRATION, PROFILE, VERIFICATION
 from triaxcald.pipeline import Pipeline
@@ -34,6 +34,7 @@ from triaxcald.station.config import Place, Station
 from triaxcald.verification import Verification, verification_document, verify
 
 CERTIFICATE, VERIFICATION_FILE, STATION_FILE = "certificate.json", "verification.json", "station.toml"
+RESTORED = "old calibration restored and verified"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
 
 _DRAWING = threading.Lock()
@@ -97,7 +98,10 @@ class UnitRun:
     def recording_path(self, identity: IdentityRead) -> Path:
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
         folder = self.station.folder
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as e:
+            raise InputError(f"{folder}: no folder for recordings: {e.strerror}") from e
         return folder / f"{self.name}-{identity.serial or 'unknown'}-{stamp}.mcap"
 
     def writer(self, path: Path, identity: IdentityRead) -> RecordingWriter:
@@ -200,14 +204,17 @@ class UnitRun:
     ) -> tuple[ProvisionReport, Document | None]:
         assert certified.image is not None
         self.progress.stage(self.name, "writing the registers")
-        report = await provision(
-            device,
-            self.place.bundle,
-            certified.image,
-            expected_serial=identity.serial,
-            record=lambda access: _record(writer, access),
-            where=self.place.where,
-        )
+        try:
+            report = await provision(
+                device,
+                self.place.bundle,
+                certified.image,
+                expected_serial=identity.serial,
+                record=_Recorder(writer),
+                where=self.place.where,
+            )
+        except RecordingError as e:  # the disk, while the device was at work; the notes say in what state it is
+            raise StationError("; ".join([str(e), *getattr(e, "__notes__", [])])) from e
         writer.attach(REGISTERS_BEFORE, "application/json", _snapshot_text(report.before))
         writer.attach(REGISTERS_AFTER, "application/json", _snapshot_text(report.after))
         writer.event("provisioned", {"written": list(report.written)})
@@ -215,22 +222,25 @@ class UnitRun:
             return report, None
         try:
             document = await self._verify(device, writer, tumble)
-        except (DriverError, StationError, TriaxcalError, asyncio.CancelledError) as e:
+        except (DriverError, DaemonError, TriaxcalError, asyncio.CancelledError) as e:
             state = await self._undo(device, writer, report)
             if isinstance(e, asyncio.CancelledError):
                 raise
             raise StationError(f"verification failed: {e}; {state}") from e
         if document["verdict"] == "outside limits":
-            writer.event("restored", {"state": await self._undo(device, writer, report)})
+            state = await self._undo(device, writer, report)
+            writer.event("restored", {"state": state})
+            if state != RESTORED:
+                raise StationError(f"verification outside limits; {state}")
         return report, document
 
     async def _undo(self, device: Device, writer: RecordingWriter, report: ProvisionReport) -> str:
-        recorded = RecordedDevice(device, lambda access: _record(writer, access))
+        recorded = RecordedDevice(device, _Recorder(writer, lenient=True))
         try:
             await asyncio.shield(restore(recorded, self.place.bundle, report.before, stored=True))
         except (DriverError, StationError) as e:
             return f"NOT restored: {e}"
-        return "old calibration restored and verified"
+        return RESTORED
 
     async def _verify(self, device: Device, writer: RecordingWriter, tumble: Collection) -> Document:
         self.progress.stage(self.name, "verifying by physics")
@@ -271,8 +281,19 @@ def overview(pipeline: Pipeline, unit: str) -> StreamOverview | None:
     return StreamOverview(time_s, readings, spans, unit)
 
 
-def _record(writer: RecordingWriter, access: RegisterAccess) -> None:
-    writer.register(access.register, access.kind, access.raw, access.error or "")
+class _Recorder:
+    """Records register accesses; once the disk has failed, silently none, so that the device can be put back."""
+
+    def __init__(self, writer: RecordingWriter, *, lenient: bool = False) -> None:
+        self._writer, self._lenient = writer, lenient
+
+    def __call__(self, access: RegisterAccess) -> None:
+        try:
+            self._writer.register(access.register, access.kind, access.raw, access.error or "")
+        except RecordingError:
+            if not self._lenient:
+                self._lenient = True
+                raise
 
 
 def _snapshot_text(snapshot: Snapshot) -> bytes:

@@ -1,0 +1,259 @@
+"""poses, fit, diagnose, verify, plan: one JSON document with every key of the contract, and the exit codes."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+Run = Callable[..., Any]
+
+RESIDUAL = {"rms_g", "max_abs_g", "cross_validated_rms_g", "noise_floor_g", "lack_of_fit_p"}
+CALIBRATION = {
+    "format", "terms", "units", "scale_factor", "misalignment", "bias", "matrix", "centre", "effects",
+    "standard_error", "residual", "poses", "condition", "blind_to", "warnings",
+}  # fmt: skip
+LOOP = {"format", "before", "after", "findings", "unexplained", "data_quality", "advice", "calibration"}
+FINDING = {"effect", "verdict", "p_value", "coefficients", "alternatives", "reason", "remedy"}
+SIGNS = "--sign=-,-,-"
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        for inner in value:
+            yield from _numbers(inner)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield value
+
+
+def _all_finite(document: Any) -> None:
+    found = list(_numbers(document))
+    assert found
+    assert all(math.isfinite(v) for v in found)
+
+
+def _is_calibration(document: Any, effects: set[str]) -> None:
+    assert document["format"] == "triaxcal.calibration/1"
+    assert set(document) >= CALIBRATION
+    assert document["terms"] == ["linear", *document["effects"]]
+    assert set(document["effects"]) == effects
+    for name in ("scale_factor", "misalignment", "bias", "centre"):
+        assert np.shape(document[name]) == (3,)
+    assert np.shape(document["matrix"]) == (3, 3)
+    assert {k: np.shape(v) for k, v in document["standard_error"].items()} == {
+        "scale_factor": (3,), "misalignment": (3,), "bias": (3,)
+    }  # fmt: skip
+    for coefficients in document["effects"].values():
+        for held in coefficients.values():
+            assert set(held) == {"value", "standard_error", "unit"}
+            assert held["standard_error"] > 0
+    assert set(document["residual"]) == RESIDUAL
+    for pose in document["poses"]:
+        assert set(pose) >= {"start_s", "end_s", "mean", "residual_g", "studentized", "leverage", "used"}
+        assert pose["end_s"] > pose["start_s"]
+        assert np.shape(pose["mean"]) == (3,)
+        assert 0 < pose["leverage"] <= 1
+        assert pose["used"] is True
+    for name in ("blind_to", "warnings"):
+        assert all(isinstance(text, str) for text in document[name])
+    _all_finite(document)
+
+
+def test_poses_of_a_recording(finished_run: Any, triaxcal: Run) -> None:
+    done = triaxcal("poses", finished_run.can, "--json")
+    assert (done.code, done.err) == (0, "")
+    assert done.json["format"] == "triaxcal.poses/1"
+    assert len(done.json["poses"]) >= 26
+    for pose in done.json["poses"]:
+        assert set(pose) == {"start_s", "end_s", "samples", "mean", "standard_error", "channels"}
+        assert np.shape(pose["mean"]) == np.shape(pose["standard_error"]) == (3,)
+        assert pose["samples"] > 0
+        assert "temp_c" in pose["channels"]
+    _all_finite(done.json)
+
+
+def test_fit_of_a_recording_takes_signs_and_unit_from_its_profile(finished_run: Any, triaxcal: Run) -> None:
+    done = triaxcal("fit", finished_run.can, "--json")
+    assert (done.code, done.err) == (0, "")
+    _is_calibration(done.json, effects=set())
+    assert all(k < 0 for k in done.json["scale_factor"])
+    assert done.json["units"] == {
+        "output": "V", "reference": "g", "scale_factor": "V/g", "misalignment": "rad", "bias": "g"
+    }  # fmt: skip
+
+
+def test_fit_of_the_exported_text_is_fit_of_the_recording(finished_run: Any, exported: Path, triaxcal: Run) -> None:
+    of_recording = triaxcal("fit", finished_run.can, "--json").json
+    of_text = triaxcal("fit", exported, "--json", SIGNS, "--output-unit", "V").json
+    of_text.pop("data_quality")
+    of_recording.pop("data_quality")
+    assert of_text == of_recording
+
+
+def test_text_may_be_compressed_or_come_through_standard_input(
+    exported: Path, tmp_path: Path, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = triaxcal("fit", exported, "--json", SIGNS)
+    packed = tmp_path / "a.csv.gz"
+    packed.write_bytes(gzip.compress(exported.read_bytes(), 1))
+    assert triaxcal("fit", packed, "--json", SIGNS).json == plain.json
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(exported.read_bytes())))
+    assert triaxcal("fit", "-", "--json", SIGNS).json == plain.json
+
+
+def test_signs_turn_the_calibration_round(exported: Path, triaxcal: Run) -> None:
+    plus = triaxcal("fit", exported, "--json").json
+    minus = triaxcal("fit", exported, "--json", SIGNS).json
+    np.testing.assert_allclose(plus["scale_factor"], -np.array(minus["scale_factor"]), rtol=1e-9)
+    np.testing.assert_allclose(plus["bias"], -np.array(minus["bias"]), rtol=1e-9)
+    np.testing.assert_allclose(plus["centre"], minus["centre"], rtol=1e-9)
+
+
+def test_another_reference_scales_the_answer(exported: Path, triaxcal: Run) -> None:
+    one = triaxcal("fit", exported, "--json").json
+    fifty = triaxcal("fit", exported, "--json", "--reference", "50").json
+    np.testing.assert_allclose(fifty["scale_factor"], np.array(one["scale_factor"]) / 50, rtol=1e-9)
+    np.testing.assert_allclose(fifty["misalignment"], one["misalignment"], rtol=1e-6)
+    assert fifty["residual"]["rms_g"] == pytest.approx(50 * one["residual"]["rms_g"], rel=1e-9)
+
+
+def test_results_go_to_files_and_are_the_printed_document(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
+    cal, report = tmp_path / "cal.json", tmp_path / "r.html"
+    done = triaxcal("fit", finished_run.can, "--json", "-o", cal, "--report", report)
+    assert done.code == 0
+    assert cal.read_text() == done.out
+    page = report.read_text()
+    assert page.startswith("<!DOCTYPE html>")
+    assert str(finished_run.can) in page
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cal.json", "r.html"]
+
+
+def test_diagnose_finds_what_is_hidden_and_judges_it_on_another_recording(
+    finished_run: Any, tmp_path: Path, triaxcal: Run
+) -> None:
+    done = triaxcal("diagnose", finished_run.can, "--json", "--check", finished_run.can, "-o", tmp_path / "cal.json")
+    document = done.json
+    assert (done.code, done.err) == (0, "")
+    assert document["format"] == "triaxcal.loop/1"
+    assert set(document) == LOOP | {"held_out"}
+    assert set(document["before"]) == set(document["after"]) == RESIDUAL
+    assert set(document["held_out"]) == {"before_rms_g", "after_rms_g", "noise_floor_g", "poses"}
+    assert document["held_out"]["poses"] >= 26
+    assert document["held_out"]["after_rms_g"] < 0.5 * document["held_out"]["before_rms_g"]
+    assert [f["effect"] for f in document["findings"]] == ["second_order_nonlinearity"]
+    for finding in document["findings"]:
+        assert set(finding) == FINDING
+        assert finding["verdict"] == "adopted"
+        assert 0 <= finding["p_value"] < 0.01
+        values = {axis: held["value"] for axis, held in finding["coefficients"].items()}
+        errors = {axis: held["standard_error"] for axis, held in finding["coefficients"].items()}
+        for axis, truth in {"x": 5e-4, "y": -4e-4, "z": 3e-4}.items():
+            assert abs(values[axis] - truth) < 5 * errors[axis]
+    assert set(document["unexplained"]) == {"significant", "p_value", "rms_g", "lead"}
+    assert document["unexplained"]["significant"] is False
+    assert document["after"]["rms_g"] < 0.5 * document["before"]["rms_g"]
+    _is_calibration(document["calibration"], effects={"second_order_nonlinearity"})
+    assert json.loads((tmp_path / "cal.json").read_text()) == document
+
+
+def test_without_a_check_there_is_no_held_out_error(exported: Path, triaxcal: Run) -> None:
+    document = triaxcal("diagnose", exported, "--json", SIGNS).json
+    assert set(document) == LOOP
+
+
+def test_verify_judges_a_recording_by_a_calibration(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
+    linear, closed = tmp_path / "linear.json", tmp_path / "closed.json"
+    fitted = triaxcal("fit", finished_run.can, "-o", linear, "--json").json
+    triaxcal("diagnose", finished_run.can, "-o", closed)
+    done = triaxcal("verify", linear, finished_run.can, "--json")
+    assert (done.code, done.err) == (0, "")
+    assert set(done.json) == {"format", "rms_g", "max_abs_g", "noise_floor_g", "poses"}
+    _all_finite(done.json)
+    assert done.json["rms_g"] == pytest.approx(fitted["residual"]["rms_g"], rel=0.05)
+    assert len(done.json["poses"]) == len(fitted["poses"])
+    certificate = finished_run.unit("can")["certificate"]
+    by_closed = triaxcal("verify", closed, finished_run.can, "--json").json
+    assert by_closed["rms_g"] < 0.5 * done.json["rms_g"]
+    assert triaxcal("verify", certificate, finished_run.can, "--json").json == by_closed
+
+
+@pytest.mark.parametrize("command", [["fit"], ["diagnose"], ["verify", "cal"]])
+def test_a_limit_decides_between_0_and_1(finished_run: Any, tmp_path: Path, triaxcal: Run, command: list[str]) -> None:
+    cal = tmp_path / "cal.json"
+    triaxcal("fit", finished_run.can, "-o", cal)
+    words = [str(cal) if w == "cal" else w for w in command]
+    assert triaxcal(*words, finished_run.can, "--limit", "0.01", "--json").code == 0
+    outside = triaxcal(*words, finished_run.can, "--limit", "1e-9", "--json")
+    assert outside.code == 1
+    assert outside.err.startswith("outside the limit: rms ")
+    assert outside.json["format"].startswith("triaxcal.")
+
+
+def test_the_same_for_people_is_a_table_and_no_json(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
+    cal = tmp_path / "cal.json"
+    assert "bias.x" in triaxcal("fit", finished_run.can, "-o", cal).out
+    assert "still poses in " in triaxcal("poses", finished_run.can).out
+    assert (
+        "adopted: second_order_nonlinearity" in triaxcal("diagnose", finished_run.can, "--check", finished_run.can).out
+    )
+    assert "noise floor" in triaxcal("verify", cal, finished_run.can).out
+    assert "cannot show: " in triaxcal("plan").out
+    assert "poses worth adding" in triaxcal("plan", finished_run.can).out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "poses"),
+    [([], 26), (["--poses", "14"], 14), (["--poses", "26"], 26), (["--poses", "9"], 9), (["--poses", "40"], 40),
+     (["--for", "second_order_nonlinearity"], 14), (["--for", "third_order_nonlinearity"], 26)],
+)  # fmt: skip
+def test_plan_in_its_forms(triaxcal: Run, arguments: list[str], poses: int) -> None:
+    done = triaxcal("plan", *arguments, "--json")
+    assert (done.code, done.err) == (0, "")
+    assert done.json["format"] == "triaxcal.plan/1"
+    assert len(done.json["poses"]) == poses
+    assert len({p["label"] for p in done.json["poses"]}) == poses
+    np.testing.assert_allclose([np.linalg.norm(p["up"]) for p in done.json["poses"]], 1.0, rtol=1e-9)
+    assert done.json["dilution"] > 0
+    assert not set(arguments[1:]) & set(done.json["blind_to"])
+
+
+def test_a_plan_that_cannot_show_what_it_is_for_is_refused(triaxcal: Run) -> None:
+    done = triaxcal("plan", "--poses", "9", "--for", "third_order_nonlinearity", "--json")
+    assert done.code == 3
+    assert "cannot show third_order_nonlinearity" in done.err
+
+
+def test_plan_names_no_pose_where_none_is_missing(finished_run: Any, triaxcal: Run) -> None:
+    document = triaxcal("plan", finished_run.can, "--json").json
+    assert document["have"] >= 26
+    assert document["poses"] == []
+
+
+def test_plan_names_the_poses_that_a_recording_still_lacks(exported: Path, tmp_path: Path, triaxcal: Run) -> None:
+    """Without the poses near ±X up: with scale factors below zero an output below zero means up."""
+    poses = triaxcal("poses", exported, "--json").json["poses"]
+    up = [(-np.array(p["mean"])) / np.linalg.norm(p["mean"]) for p in poses]
+    cut = [p for p, v in zip(poses, up, strict=True) if v[0] > 0.4]
+    lines = exported.read_text().splitlines()
+    kept = [
+        line
+        for line in lines[1:]
+        if not any(p["start_s"] - 0.7 <= float(line.split(",")[0]) <= p["end_s"] + 0.7 for p in cut)
+    ]
+    path = tmp_path / "half.csv"
+    path.write_text("\n".join([lines[0], *kept]) + "\n")
+    document = triaxcal("plan", path, SIGNS, "--json").json
+    assert document["have"] == len(poses) - len(cut)
+    wanted = {p["label"]: p["up"] for p in document["poses"]}
+    assert wanted
+    assert all(v[0] > 0 for v in wanted.values()), wanted

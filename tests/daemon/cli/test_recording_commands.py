@@ -1,0 +1,124 @@
+"""audit, log: what they say of a recording."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+Run = Callable[..., Any]
+
+
+def test_audit_says_that_all_is_the_same(finished_run: Any, triaxcal: Run) -> None:
+    done = triaxcal("audit", finished_run.can, finished_run.modbus, "--json")
+    assert (done.code, done.err) == (0, "")
+    assert done.json["format"] == "triaxcal.audit/1"
+    assert [a["recording"] for a in done.json["audits"]] == [str(finished_run.can), str(finished_run.modbus)]
+    for audit in done.json["audits"]:
+        assert audit["checked"] == ["certificate.json", "verification.json", "registers-after.json"]
+        assert audit["differences"] == []
+    shown = triaxcal("audit", finished_run.can)
+    assert shown.out.startswith(f"{finished_run.can}: the same, byte for byte (certificate.json, ")
+
+
+def test_audit_ends_with_1_and_names_the_difference(
+    finished_run: Any, rewrite: Callable[..., Path], triaxcal: Run
+) -> None:
+    path = rewrite(
+        finished_run.can,
+        attachment=lambda name, data: data.replace(b'"bench"', b'"Bench"') if name == "station.toml" else data,
+    )
+    done = triaxcal("audit", finished_run.can, path)
+    assert done.code == 1
+    assert f"{path}: differs" in done.out
+    assert '  certificate.json: station.name: stored "bench", computed again "Bench"' in done.out
+    assert triaxcal("audit", path, "--json").code == 1
+
+
+def test_info_tells_what_is_in_a_recording(finished_run: Any, triaxcal: Run) -> None:
+    done = triaxcal("log", "info", finished_run.can, "--json")
+    assert (done.code, done.err) == (0, "")
+    info = done.json
+    assert (info["format"], info["finished"], info["recovered"]) == ("triaxcal.recording/1", True, False)
+    assert info["bytes"] == finished_run.can.stat().st_size
+    assert set(info["raw"]) == {"calibration", "verification"}
+    total = sum(p["records"] for p in info["raw"].values())
+    assert int(info["metadata"]["raw"]["records"]) == total
+    assert info["metadata"]["unit"] == {"name": "can", "serial": "4711", "signs": "-1,-1,-1"}
+    assert set(info["attachments"]) == {
+        "station.toml", "profile.toml", "profile/triax-ref-can.dbc", "certificate.json", "registers-before.json",
+        "registers-after.json", "verification.json", "report.html",
+    }  # fmt: skip
+    assert "finished: True" in triaxcal("log", "info", finished_run.can).out
+
+
+def test_export_is_csv_that_reads_back_as_the_same_numbers(finished_run: Any, triaxcal: Run) -> None:
+    done = triaxcal("log", "export", finished_run.modbus)
+    assert done.code == 0
+    rows = list(csv.reader(io.StringIO(done.out)))
+    assert rows[0] == ["t_s", "ux", "uy", "uz", "temp_c"]
+    values = np.array(rows[1:], dtype=float)
+    assert done.err == f"{len(values)} samples; none lost\n"
+    assert values[0, 0] == 0.0
+    np.testing.assert_allclose(np.diff(values[:, 0]), 0.01, atol=2e-6)
+    counts = values[:, 1:4] * 2**23 / 10
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
+
+
+def test_export_of_the_corrected_output_in_the_verification(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
+    out = tmp_path / "a.csv"
+    done = triaxcal("log", "export", finished_run.can, "-o", out, "--stream", "corrected", "--phase", "verification")
+    assert (done.code, done.out) == (0, "")
+    values = np.loadtxt(out, delimiter=",", skiprows=1)
+    length = np.linalg.norm(values[:, 1:4], axis=1)
+    assert abs(np.median(length) - 1) < 1e-4
+    before = out.read_bytes()
+    triaxcal("log", "export", finished_run.can, "-o", out).failed(2, f"{out}: cannot be written: File exists")
+    assert out.read_bytes() == before
+
+
+def test_export_knows_its_streams(finished_run: Any, triaxcal: Run) -> None:
+    triaxcal("log", "export", finished_run.can, "--stream", "reading").failed(
+        2, "--stream reading: the recording has readings, corrected"
+    )
+
+
+def test_a_recording_cut_short_is_mended_and_the_loss_is_counted(
+    finished_run: Any, tmp_path: Path, triaxcal: Run
+) -> None:
+    whole = finished_run.can.read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole[: len(whole) // 2])
+    assert triaxcal("log", "info", path, "--json").json["finished"] is False
+    done = triaxcal("log", "recover", path, "--json")
+    assert (done.code, done.err) == (0, "")
+    assert done.json["format"] == "triaxcal.recovery/1"
+    assert done.json["output"] == str(tmp_path / "cut.recovered.mcap")
+    assert done.json["cut_short"] is True
+    info = triaxcal("log", "info", done.json["output"], "--json").json
+    assert (info["finished"], info["recovered"]) == (True, True)
+    assert done.json["raw_records"] == info["raw"]["calibration"]["records"] > 0
+    assert triaxcal("poses", done.json["output"], "--json").json["poses"]
+    triaxcal("log", "recover", path).failed(2, f"{tmp_path / 'cut.recovered.mcap'}: exists already")
+    assert triaxcal("log", "recover", path, "-o", tmp_path / "b.mcap").code == 0
+    triaxcal("audit", tmp_path / "b.mcap").failed(2, "certificate.json: missing")
+
+
+@pytest.mark.parametrize("out", ["missing/b.mcap", "file/b.mcap"])
+def test_a_place_where_nothing_can_be_mended_to(finished_run: Any, tmp_path: Path, triaxcal: Run, out: str) -> None:
+    (tmp_path / "file").touch()
+    triaxcal("log", "recover", finished_run.can, "-o", tmp_path / out).failed(2, f"{tmp_path / out}: ")
+
+
+def test_a_whole_recording_recovers_without_a_loss(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
+    out = tmp_path / "again.mcap"
+    recovery = triaxcal("log", "recover", finished_run.can, "-o", out, "--json").json
+    assert not any(recovery[k] for k in ("cut_short", "raw_missing", "raw_dropped", "bytes_dropped", "chunks_failed"))
+    done = triaxcal("audit", out, "--json")
+    assert done.code == 0
+    assert done.json["audits"][0]["notes"] == ["the recording was cut short and mended"]

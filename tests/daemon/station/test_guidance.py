@@ -1,0 +1,91 @@
+"""What the operator is told follows from the poses so far and from nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from triaxcal.plan import directions
+from triaxcal.poses import Pose
+from triaxcald.station.guidance import Guide, guide
+
+PLAN = directions(14)
+UP = [v for _, v in PLAN]
+LABELS = [label for label, _ in PLAN]
+
+
+def _pose(up: Any, start_s: float = 0.0, seconds: float = 4.0, scale: Any = (1.0, 1.0, 1.0)) -> Pose:
+    mean = np.asarray(up) * np.asarray(scale)
+    return Pose(start_s, start_s + seconds, 400, mean, np.eye(3) * 1e-10, 30.0)
+
+
+def _guide(poses: Sequence[Pose], now_s: float = 1000.0, **more: Any) -> Guide:
+    settings = {"wanted": 14, "hold_s": 3.0, "apart_deg": 10.0, "nominal_scale_factor": (1, 1, 1), **more}
+    return guide(poses, now_s=now_s, **settings)
+
+
+def test_at_first_the_first_pose_of_the_plan_is_next() -> None:
+    state = _guide([], now_s=0.0)
+    assert (state.found, state.wanted, state.held_s, state.complete) == (0, 14, 0.0, False)
+    assert state.hint == "next: +X up"
+    assert list(state.missing) == LABELS
+
+
+def test_a_pose_that_is_there_is_not_asked_for_again() -> None:
+    state = _guide([_pose(UP[0])])
+    assert state.found == 1
+    assert state.hint == f"next: {LABELS[1]} up"
+    assert list(state.missing) == LABELS[1:]
+
+
+def test_a_pose_is_told_to_be_held_until_it_is_long_enough() -> None:
+    state = _guide([_pose(UP[0], seconds=1.25)], now_s=1.4)
+    assert state.found == 0
+    assert state.held_s == 1.25
+    assert state.hint.startswith("hold still, 1.2 of 3.0 s")
+
+
+def test_a_short_pose_that_is_over_does_not_count() -> None:
+    state = _guide([_pose(UP[0], seconds=1.25)], now_s=5.0)
+    assert (state.found, state.held_s) == (0, 0.0)
+    assert state.hint == f"next: {LABELS[0]} up"
+
+
+def test_poses_near_to_each_other_count_once() -> None:
+    near = UP[0] + np.array([0, np.sin(np.radians(6)), 0])
+    apart = UP[0] + np.array([0, np.tan(np.radians(14)), 0])
+    assert _guide([_pose(UP[0]), _pose(near, 5)]).found == 1
+    assert _guide([_pose(UP[0]), _pose(apart, 5)]).found == 2
+    assert _guide([_pose(UP[0]), _pose(apart, 5)], apart_deg=20.0).found == 1
+
+
+def test_the_signs_of_the_scale_factor_turn_the_unit_round() -> None:
+    """With negative scale factors a negative output means up."""
+    state = _guide([_pose(UP[0], scale=(-2.4, -2.4, -2.4))], nominal_scale_factor=(-2.4, -2.4, -2.4))
+    assert LABELS[0] not in state.missing
+    assert "-X" in state.missing
+    mixed = _guide([_pose(UP[0], scale=(-2.4, 2.4, 2.4))], nominal_scale_factor=(-2.4, 2.4, 2.4))
+    assert mixed.missing == state.missing
+
+
+def test_enough_distinct_poses_are_done_and_more_do_not_count() -> None:
+    state = _guide([_pose(u, 5.0 * i) for i, u in enumerate(UP)])
+    assert (state.found, state.hint, state.complete) == (14, "done", True)
+    more = _guide([_pose(u, 5.0 * i) for i, (_, u) in enumerate(directions(26))])
+    assert (more.found, more.complete) == (14, True)
+
+
+def test_without_a_plan_any_pose_will_do() -> None:
+    state = _guide([_pose(UP[0])], plan=False, wanted=3)
+    assert state.missing == ()
+    assert state.hint == "turn the unit to a pose not taken yet"
+
+
+def test_without_a_nominal_scale_factor_the_range_of_the_outputs_serves() -> None:
+    """Poses by an offset of half the range and an unknown scale are still told apart."""
+    offset = np.array([300.0, -200.0, 100.0])
+    poses = [_pose(u * 700.0 + offset, 5.0 * i) for i, u in enumerate(UP)]
+    assert _guide(poses, nominal_scale_factor=None).complete
+    assert _guide(poses[:8], nominal_scale_factor=None).found == 8

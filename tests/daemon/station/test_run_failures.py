@@ -1,0 +1,248 @@
+"""Whatever fails in a run: the right exit code, the other unit finishes, the device holds the old calibration."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from triaxcald.audit import audit
+from triaxcald.errors import RecordingError
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.writer import RecordingWriter
+from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
+from triaxcald.simulation.unit import Faults
+
+OLD = Stored(factory_calibration())
+
+
+@pytest.fixture(autouse=True)
+def _short_wait_for_a_dead_unit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("triaxcald.provision.restore.RECONNECT_S", 0.5)
+
+
+def _holds_old(served: Any) -> None:
+    """In use and stored; writing it back may have counted."""
+    held = Stored.from_image(served.unit.eeprom)
+    assert held.valid
+    assert held.calibration == OLD.calibration
+    assert {name: served.unit._ram[name] for name in CALIBRATION} == OLD.calibration
+
+
+def _only(folder: Path, pattern: str) -> Path:
+    found = list(folder.glob(pattern))
+    assert len(found) == 1, found
+    return found[0]
+
+
+def _run(workshop: Any, triaxcal: Callable[..., Any], faults: Faults | None = None, **settings: Any) -> Any:
+    """One Modbus unit; the command's outcome, the unit, and its recording (finished and readable)."""
+    with workshop.serve(workshop.device(), faults) as served:
+        unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
+        done = triaxcal("run", workshop.station(unit, **settings))
+        path = _only(workshop.folder, "*.mcap")
+        return done, served, path
+
+
+def _events(path: Path) -> list[tuple[str, Any]]:
+    with Recording.open(path) as recording:
+        return [(e.kind, e.detail) for e in recording.events()]
+
+
+def test_verification_outside_the_limit_brings_the_old_calibration_back(
+    workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    done, served, path = _run(workshop, triaxcal, limits={"verification_rms_g": 1e-9})
+    assert done.code == 1
+    assert "verified by physics: outside limits" in done.out
+    _holds_old(served)
+    assert ("restored", {"state": "old calibration restored and verified"}) in _events(path)
+    assert audit(path).differences == ()
+
+
+def test_a_fit_outside_its_limit_writes_nothing(workshop: Any, triaxcal: Callable[..., Any]) -> None:
+    done, served, path = _run(workshop, triaxcal, limits={"rms_g": 1e-9})
+    assert done.code == 1
+    assert "outside limits: rms_g " in done.out
+    assert served.unit.eeprom == OLD.image()
+    assert "provisioned" not in [kind for kind, _ in _events(path)]
+    assert audit(path).checked == ("certificate.json",)
+
+
+def test_a_station_that_is_told_not_to_write_does_not(workshop: Any, triaxcal: Callable[..., Any]) -> None:
+    done, served, path = _run(workshop, triaxcal, provisioning={"write": False})
+    assert done.code == 0
+    assert served.unit.eeprom == OLD.image()
+    with Recording.open(path) as recording:
+        assert all(a.operation == "read" for a in recording.register_accesses())
+
+
+def test_a_register_that_is_refused_leaves_the_old_calibration(workshop: Any, triaxcal: Callable[..., Any]) -> None:
+    done, served, path = _run(workshop, triaxcal, Faults(refuse_registers=frozenset({"misalignment_y"})))
+    done.failed(4, "unit unit0 (host=127.0.0.1, ", "provisioning failed at writing misalignment_y: ", "old calibration")
+    _holds_old(served)
+    assert _events(path)[-1][0] == "failed"
+    with Recording.open(path) as recording:
+        assert [a.register for a in recording.register_accesses() if a.error] == ["misalignment_y"]
+
+
+def test_a_store_that_the_unit_forgets_is_found_after_the_restart(workshop: Any, triaxcal: Callable[..., Any]) -> None:
+    done, served, _ = _run(workshop, triaxcal, Faults(forget_store=True))
+    done.failed(4, "provisioning failed at reading back after the reset: register scale_factor_x holds ")
+    assert "old calibration restored and verified" in done.err
+    assert served.unit.eeprom == OLD.image()
+    _holds_old(served)
+
+
+def test_a_unit_that_dies_while_it_is_written_is_not_said_to_be_restored(
+    workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    done, served, _ = _run(workshop, triaxcal, Faults(die_on_write="bias_y"))
+    done.failed(4, "provisioning failed at writing bias_y: ", "NOT restored: ", "the stored calibration is the old one")
+    assert served.unit.eeprom == OLD.image()
+
+
+def test_a_unit_that_falls_silent_leaves_a_readable_recording_and_no_result(
+    workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    done, served, path = _run(workshop, triaxcal, Faults(die_at_s=20.0))
+    done.failed(4, "unit unit0 (host=127.0.0.1, ")
+    assert served.unit.eeprom == OLD.image()
+    with Recording.open(path) as recording:
+        assert recording.finished
+        assert int(recording.metadata["raw"]["records"]) > 50
+    assert list(workshop.folder.glob("*.certificate.json")) == []
+    assert triaxcal("poses", path, "--json").json["poses"]
+    triaxcal("fit", path).failed(3, "refused: ")
+    triaxcal("audit", path).failed(2, str(path), "certificate.json: missing; the recording holds no result")
+
+
+def test_a_unit_that_falls_silent_in_the_verification_is_an_error(
+    workshop: Any, triaxcal: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its calibration was written by then; nobody can say that it was put back."""
+    event = RecordingWriter.event
+
+    with workshop.serve(workshop.device(), Faults()) as served:
+
+        def then_die(self: RecordingWriter, kind: str, detail: Any = None) -> None:
+            event(self, kind, detail)
+            if kind == "provisioned":
+                served.unit._died_s = 0.0
+
+        monkeypatch.setattr(RecordingWriter, "event", then_die)
+        unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
+        done = triaxcal("run", workshop.station(unit))
+    done.failed(4, "verification failed: ", "NOT restored: ")
+    assert _events(_only(workshop.folder, "*.mcap"))[-1][0] == "failed"
+
+
+@pytest.mark.parametrize("at", ["scale_factor_y", "reset"])
+def test_a_disk_that_fails_while_registers_are_written_does_not_keep_the_old_ones_away(
+    workshop: Any, triaxcal: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    register = RecordingWriter.register
+    failed = []
+
+    def full(self: RecordingWriter, name: str, operation: Any, raw: bytes, error: str = "") -> None:
+        if failed or (name, operation) == (at, "write"):
+            failed.append(name)
+            raise RecordingError("rec.mcap: writing failed: No space left on device")
+        register(self, name, operation, raw, error)
+
+    monkeypatch.setattr(RecordingWriter, "register", full)
+    done, served, _ = _run(workshop, triaxcal)
+    done.failed(4, "No space left on device", "old calibration restored and verified")
+    assert failed[0] == at
+    _holds_old(served)
+
+
+def test_a_disk_that_fails_in_the_verification_brings_the_old_calibration_back(
+    workshop: Any, triaxcal: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = RecordingWriter.raw
+
+    def full(self: RecordingWriter, phase: Any, batch: Any) -> bool:
+        if phase == "verification":
+            raise RecordingError("rec.mcap: writing failed: No space left on device")
+        return raw(self, phase, batch)
+
+    monkeypatch.setattr(RecordingWriter, "raw", full)
+    done, served, _ = _run(workshop, triaxcal)
+    done.failed(4, "verification failed: ", "No space left on device", "old calibration restored and verified")
+    _holds_old(served)
+
+
+def test_old_registers_that_will_not_come_back_are_an_error(
+    workshop: Any, triaxcal: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    event = RecordingWriter.event
+
+    with workshop.serve(workshop.device(), Faults()) as served:
+
+        def then_refuse(self: RecordingWriter, kind: str, detail: Any = None) -> None:
+            event(self, kind, detail)
+            if kind == "provisioned":
+                served.unit.faults = Faults(refuse_registers=frozenset({"bias_x"}))
+
+        monkeypatch.setattr(RecordingWriter, "event", then_refuse)
+        unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
+        done = triaxcal("run", workshop.station(unit, limits={"verification_rms_g": 1e-9}))
+    done.failed(4, "verification outside limits; NOT restored: ")
+
+
+def test_no_new_pose_for_too_long_is_refused_with_the_poses_that_are_wanted(
+    workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    device = workshop.device(fixture={"poses": 9, "hold_s": 2.0, "move_s": 0.8})
+    with workshop.serve(device) as served:
+        station = workshop.station({"bus": served.bus}, plan={"poses": 26, "hold_s": 1.0, "patience_s": 8.0})
+        done = triaxcal("run", station)
+    done.failed(3, "no new still pose for 8 s; 9 of 26 are there; add the poses ")
+
+
+def test_of_two_units_the_sound_one_finishes_and_the_worst_code_counts(
+    workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    good, bad = workshop.device("good.toml"), workshop.device("bad.toml", serial=4712)
+    with workshop.serve(good) as first, workshop.serve(bad, Faults(die_at_s=20.0)) as second:
+        profile = workshop.impatient_profile()
+        station = workshop.station(
+            {"name": "good", "bus": first.bus}, {"name": "bad", "profile": profile, "bus": second.bus}
+        )
+        done = triaxcal("run", station, "--json")
+        assert first.unit.eeprom != OLD.image()
+        assert second.unit.eeprom == OLD.image()
+    assert done.code == 4
+    units = {u["unit"]: u for u in done.json["units"]}
+    assert (units["good"]["exit_code"], units["bad"]["exit_code"]) == (0, 4)
+    assert units["good"]["error"] is None
+    assert units["good"]["verification"]["verdict"] == "not judged"
+    assert "unit bad (host=127.0.0.1, " in units["bad"]["error"]
+    assert units["bad"]["error"] in done.err
+    assert units["bad"]["certificate"] is None
+    json.loads(Path(units["good"]["certificate"]).read_text())
+    assert audit(Path(units["good"]["recording"])).differences == ()
+
+
+def test_another_serial_number_is_refused_before_anything_is_recorded(
+    workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    with workshop.serve(workshop.device()) as served:
+        done = triaxcal("run", workshop.station({"bus": served.bus, "serial": "0815"}))
+        assert served.unit.eeprom == OLD.image()
+    done.failed(4, "unit unit0 (", "is serial 4711, expected 0815")
+    assert list(workshop.folder.glob("*.mcap")) == []
+
+
+@pytest.mark.parametrize("folder", ["file", "file/below"])
+def test_a_folder_that_cannot_be_is_an_error_of_one_line(
+    workshop: Any, triaxcal: Callable[..., Any], folder: str
+) -> None:
+    workshop.write("file", "")
+    with workshop.serve(workshop.device()) as served:
+        done = triaxcal("run", workshop.station({"bus": served.bus}, folder=folder))
+    done.failed(2, f"{workshop.folder / folder}: no folder for recordings: ")

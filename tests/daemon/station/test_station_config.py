@@ -1,0 +1,169 @@
+"""A station file that is wrong is refused with one line: file, line, field, what was expected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from triaxcal_drivers.errors import DriverError
+from triaxcald.errors import InputError
+from triaxcald.station.config import load_station
+
+GOOD = """\
+format = "triaxcal.station/1"
+name = "bench"
+
+[plan]
+poses = 14
+hold_s = 2.0
+
+[limits]
+rms_g = 5e-5
+
+[[units]]
+name = "left"
+profile = "triax-ref-can"
+serial = "4711"
+bus = { interface = "virtual", channel = "x", node_id = 5 }
+
+[[units]]
+name = "right"
+profile = "triax-ref-modbus"
+bus = { host = "127.0.0.1", port = 502 }
+"""
+
+
+def test_a_sound_station_gives_its_places_and_its_own_text(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD)
+    station = load_station(path)
+    assert station.text == GOOD.encode()
+    assert station.folder == tmp_path / "."
+    left, right = station.places
+    assert left.where == "unit left (interface=virtual, channel=x, node_id=5)"
+    assert left.signs == right.signs == (-1, -1, -1)
+    assert station.file.plan.check_poses == 6
+    assert station.file.limits.verification_rms_g is None
+    assert station.file.provisioning.write
+    assert station.place("right") is right
+
+
+def test_signs_of_the_station_go_before_those_of_the_profile(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace('serial = "4711"', "signs = [1, -1, 1]"))
+    assert load_station(path).places[0].signs == (1, -1, 1)
+
+
+def test_a_profile_beside_the_station_goes_before_a_built_in_one(tmp_path: Path, workshop: Any) -> None:
+    name = workshop.impatient_profile()
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace('"triax-ref-modbus"', f'"{name}"'))
+    assert load_station(path).places[1].bundle.profile.sampling.silence_timeout_s == 0.5
+
+
+def test_one_of_several_units_has_to_be_named(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD)
+    station = load_station(path)
+    for name in (None, "middle"):
+        with pytest.raises(InputError, match=r"station\.toml: units: name one of left, right with --unit"):
+            station.place(name)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "bench"', 'nam = "bench"', "line 2: nam: unknown key; did you mean 'name'?"),
+        ("poses = 14", "pose = 14", "line 5: plan.pose: unknown key; did you mean 'poses'?"),
+        ("poses = 14", "poses = 8", "line 5: plan.poses: input should be greater than or equal to 9, not 8"),
+        ("poses = 14", "poses = 14.5", "line 5: plan.poses: input should be a valid integer"),
+        ("poses = 14", 'poses = "14"', "line 5: plan.poses: input should be a valid integer, not '14'"),
+        ("hold_s = 2.0", "hold_s = nan", "line 6: plan.hold_s: "),
+        ("rms_g = 5e-5", "rms_g = 0.0", "line 9: limits.rms_g: input should be greater than 0"),
+        ("rms_g = 5e-5", "rms_g = inf", "line 9: limits.rms_g: "),
+        ('serial = "4711"', "serial = 4711", "line 14: units.0.serial: input should be a valid string, not 4711"),
+        ('serial = "4711"', "signs = [1, 0, 1]", "line 14: units.0.signs.1: input should be -1 or 1, not 0"),
+        ('name = "left"', 'name = "le ft"', "line 12: units.0.name: "),
+        ('name = "left"', 'name = "../left"', "line 12: units.0.name: "),
+        ('name = "left"', 'name = "right"', "units: the name 'right' is given twice"),
+        ('format = "triaxcal.station/1"', 'format = "triaxcal.station/2"', "line 1: format: "),
+        ('format = "triaxcal.station/1"\n', "", "format: missing"),
+        ('name = "bench"', "name = bench", "not TOML: "),
+        ('name = "bench"', 'name = "b\xe9nch"', "not UTF-8 text (byte "),
+        ("node_id = 5", "node = 5", "units.0.bus: node: unknown key; did you mean 'node_id'?"),
+        ("node_id = 5", "node_id = 128", "units.0.bus: node_id: input should be less than or equal to 127"),
+        (", node_id = 5", "", "units.0.bus: node_id: missing"),
+        ("port = 502", "port = 70000", "units.1.bus: port: input should be less than or equal to 65535"),
+        ('host = "127.0.0.1", ', "", 'units.1.bus: give either host = "…" (Modbus TCP) or serial_port = "…" (RTU)'),
+        ('host = "127.0.0.1"', 'host = "a", serial_port = "/dev/b"', "units.1.bus: give either host"),
+        ('profile = "triax-ref-can"', 'profile = "triax-ref-cna"', "triax-ref-cna: No such file or directory"),
+    ],
+)
+def test_a_fault_is_said_with_file_line_and_field(tmp_path: Path, old: str, new: str, words: str) -> None:
+    path = tmp_path / "station.toml"
+    assert old in GOOD
+    path.write_bytes(GOOD.replace(old, new, 1).encode("latin-1"))
+    with pytest.raises((InputError, DriverError)) as caught:
+        load_station(path)
+    message = str(caught.value)
+    assert words in message
+    assert "\n" not in message
+    assert "profile: give" not in message
+    assert "triax-ref-cna" in message or message.startswith(str(path))
+
+
+def test_no_unit_at_all_is_a_fault(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text('format = "triaxcal.station/1"\nname = "bench"\nunits = []\n')
+    with pytest.raises(DriverError, match=r"line 3: units: .*at least 1"):
+        load_station(path)
+
+
+def test_a_station_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.toml: No such file or directory"):
+        load_station(tmp_path / "none.toml")
+
+
+DBC = "triax-ref-can.dbc"
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        ("triax-ref-can.toml", 'driver = "can"', 'driver = "cann"', "no driver named 'cann'; did you mean 'can'?"),
+        ("triax-ref-can.toml", 'driver = "can"', "driver = 5", "driver: expected the name of a driver"),
+        (
+            "triax-ref-can.toml",
+            "rate_hz = 100.0",
+            "rate = 100.0",
+            "sampling.rate: unknown key; did you mean 'rate_hz'?",
+        ),
+        ("triax-ref-can.toml", "rate_hz = 100.0", "", "sampling.rate_hz: missing"),
+        ("triax-ref-can.toml", "rate_hz = 100.0", 'rate_hz = "fast"', "sampling.rate_hz: "),
+        ("triax-ref-can.toml", "[sampling]", "[sampling", "not TOML: "),
+        ("triax-ref-can.toml", f'file = "{DBC}"', 'file = "other.dbc"', "the file 'other.dbc' that it names: No such"),
+        ("triax-ref-can.toml", 'ux = "Ux"', 'ux = "Uxx"', "Uxx"),
+        (DBC, "VERSION", "VERZION", DBC),
+        (DBC, "SG_ Ux", "SG_ Vx", "Ux"),
+        (DBC, None, "", DBC),
+        (DBC, None, "\x00\x01 no text at all", DBC),
+    ],
+)
+def test_a_fault_of_the_profile_or_its_dbc_is_found_before_any_bus_is_opened(
+    tmp_path: Path, workshop: Any, file: str, old: str | None, new: str, words: str
+) -> None:
+    workshop.impatient_profile("triax-ref-can")
+    target = tmp_path / file
+    text = target.read_text()
+    assert old is None or old in text
+    target.write_text(new if old is None else text.replace(old, new, 1))
+    station = workshop.station(
+        {"profile": "triax-ref-can.toml", "bus": {"interface": "none", "channel": 0, "node_id": 1}}
+    )
+    with pytest.raises(DriverError) as caught:
+        load_station(station)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "triax-ref-can" in str(caught.value)

@@ -1,0 +1,169 @@
+"""A certificate follows from recording, profile and station file alone, and says what the device cannot hold."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from triaxcal.errors import Refused
+from triaxcal_drivers.errors import RegisterValueError
+from triaxcal_drivers.profile import BUILT_IN, Bundle, parse_bundle
+from triaxcald.certificate import Certified, certify, roles
+from triaxcald.documents import sensor_of, to_text
+from triaxcald.inputs import CALIBRATION
+from triaxcald.pipeline import Pipeline
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.schema import RawDigest
+from triaxcald.station.config import parse_station
+
+TEXT = (BUILT_IN / "triax-ref-can.toml").read_bytes()
+FILES = {"triax-ref-can.dbc": (BUILT_IN / "triax-ref-can.dbc").read_bytes()}
+STATION = """\
+format = "triaxcal.station/1"
+name = "bench"
+limits = { LIMITS }
+units = [{ name = "can", profile = "triax-ref-can", bus = {} }]
+"""
+
+
+def _bundle(change: Callable[[str], str] = lambda text: text) -> Bundle:
+    return parse_bundle(change(TEXT.decode()).encode(), FILES, where="profile")
+
+
+def _without_second_order(text: str) -> str:
+    text = re.sub(r"(?m)^(stored_)?second_order_. = .*\n", "", text)
+    return re.sub(r'"second_order_.", ?', "", text)
+
+
+@pytest.fixture
+def certified(finished_run: Any) -> Callable[..., Certified]:
+    def make(bundle: Bundle | None = None, limits: str = "", signs: tuple[int, int, int] = (-1, -1, -1)) -> Certified:
+        bundle = bundle or _bundle()
+        text = STATION.replace("LIMITS", limits).encode()
+        pipeline, digest = Pipeline(bundle, "readings"), RawDigest()
+        with Recording.open(finished_run.can) as recording:
+            for batch in recording.raw(CALIBRATION):
+                digest.update(CALIBRATION, batch)
+                pipeline.feed(batch)
+        return certify(
+            bundle,
+            parse_station(text, where="station"),
+            text,
+            pipeline,
+            pipeline.finish(),
+            digest,
+            unit_name="can",
+            serial="4711",
+            signs=signs,
+            computed_with={"triaxcal": "9.9"},
+        )
+
+    return make
+
+
+def test_the_same_input_gives_the_same_bytes(certified: Callable[..., Certified]) -> None:
+    assert to_text(certified().document) == to_text(certified().document)
+
+
+def test_the_document_says_what_it_stands_on(certified: Callable[..., Certified], finished_run: Any) -> None:
+    document = certified().document
+    assert document["format"] == "triaxcal.certificate/1"
+    assert document["unit"] == {"name": "can", "vendor": "triaxcal", "product": "TRIAX-REF", "serial": "4711"}
+    assert document["software"] == {"triaxcal": "9.9"}
+    assert document["settings"] == {"signs": [-1, -1, -1], "reference": 1.0}
+    assert document["recording"]["missing"] == document["recording"]["duplicates"] == 0
+    assert document["recording"]["samples"] > 26 * 200
+    assert len(document["recording"]["raw_sha256"]) == 64
+    assert document["result"]["format"] == "triaxcal.loop/1"
+
+
+@pytest.mark.parametrize(
+    ("limits", "verdict", "outside"),
+    [
+        ("", "not judged", 0),
+        ("rms_g = 1e-4, cross_validated_rms_g = 1e-4", "within limits", 0),
+        ("rms_g = 1e-9", "outside limits", 1),
+        ("rms_g = 1e-9, cross_validated_rms_g = 1e-9", "outside limits", 2),
+        ("verification_rms_g = 1e-9", "not judged", 0),
+    ],
+)
+def test_the_verdict_follows_the_limits(
+    certified: Callable[..., Certified], limits: str, verdict: str, outside: int
+) -> None:
+    made = certified(limits=limits)
+    assert made.document["verdict"] == verdict
+    assert len(made.document["outside"]) == outside
+    assert made.within_limits is (outside == 0)
+    assert all(" is above the limit 1e-09" in line for line in made.document["outside"])
+
+
+def test_the_registers_hold_the_result_and_what_rounding_costs_is_said(certified: Callable[..., Certified]) -> None:
+    made = certified()
+    registers = made.document["registers"]
+    assert registers["terms"] == ["linear", "second_order_nonlinearity"]
+    assert registers["left_to_host"] == []
+    assert 0 < registers["rounding_rms_g"] < 1e-6
+    words = {w["role"]: w for w in registers["words"]}
+    sensor, _, _ = sensor_of(made.document, where="certificate")
+    for role, value in roles(sensor, {}).items():
+        assert words[role]["wanted"] == pytest.approx(value, rel=1e-10)
+        assert words[role]["held"] == pytest.approx(value, rel=2**-23)
+    assert words["temperature_bias.x"]["held"] == 0.0
+    assert made.image is not None
+    assert made.image.words[-1].role == "calibration_crc"
+
+
+def test_an_effect_without_registers_is_left_to_the_host_and_the_rest_fitted_anew(
+    certified: Callable[..., Certified],
+) -> None:
+    full, cut = certified(), certified(_bundle(_without_second_order))
+    assert cut.document["result"]["after"] == full.document["result"]["after"]
+    registers = cut.document["registers"]
+    assert registers["terms"] == ["linear"]
+    assert registers["left_to_host"] == ["second_order_nonlinearity"]
+    assert registers["rms_g"] == pytest.approx(full.document["result"]["before"]["rms_g"], rel=1e-6)
+    words = {w["role"]: w["wanted"] for w in registers["words"]}
+    linear = cut.loop.before.sensor
+    np.testing.assert_allclose([words[f"bias.{a}"] for a in "xyz"], linear.bias, rtol=1e-9)
+
+
+def test_a_device_without_calibration_registers_gets_a_certificate_all_the_same(
+    certified: Callable[..., Certified],
+) -> None:
+    def without_roles(text: str) -> str:
+        return re.sub(r', role = "(scale_factor|misalignment|bias)\.."', "", text)
+
+    made = certified(_bundle(without_roles))
+    assert made.image is None
+    assert made.document["registers"] is None
+    assert made.document["result"]["findings"]
+
+
+def test_what_no_register_can_hold_is_refused(certified: Callable[..., Certified]) -> None:
+    def narrow(text: str) -> str:
+        return text.replace("minimum = -10.0, maximum = 10.0", "minimum = -2.0, maximum = 2.0")
+
+    with pytest.raises(RegisterValueError, match="scale_factor_x"):
+        certified(_bundle(narrow))
+
+
+def test_too_few_poses_are_refused(finished_run: Any, tmp_path: Path) -> None:
+    pipeline = Pipeline(_bundle(), "readings")
+    with pytest.raises(Refused):
+        certify(
+            _bundle(),
+            parse_station(STATION.replace("LIMITS", "").encode(), where="station"),
+            b"",
+            pipeline,
+            pipeline.finish(),
+            RawDigest(),
+            unit_name="can",
+            serial=None,
+            signs=(1, 1, 1),
+            computed_with={},
+        )

@@ -1,0 +1,369 @@
+"""The documentation says what is so: links lead somewhere, files are valid, commands exist and run."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from triaxcal_drivers.profile import load_bundle
+from triaxcald.cli.commands import main, parser
+from triaxcald.documents import to_text
+from triaxcald.recording.reader import Recording
+from triaxcald.simulation.bench import load_device, simulate
+from triaxcald.station.config import load_station
+
+PROJECT = Path(__file__).parents[1]
+PAGES = sorted(
+    p
+    for p in [*PROJECT.glob("*.md"), *(PROJECT / "docs").rglob("*.md"), *(PROJECT / "recordings").glob("*.md")]
+    if p.is_file()
+)
+EXAMPLES = sorted((PROJECT / "examples").glob("*.toml"))
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+OPERATORS = {"|", "||", "&", "&&", ";", ">", ">>", "<"}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block; ``note`` is the HTML comment on the line before it, if any."""
+
+    page: Path
+    language: str
+    text: str
+    note: str
+
+    @property
+    def commands(self) -> list[str]:
+        joined = self.text.replace("\\\n", " ")
+        return [line.removeprefix("$ ") for line in joined.splitlines() if line.startswith("$ ")]
+
+    @property
+    def file(self) -> str | None:
+        return self.note.removeprefix("file:").strip() if self.note.startswith("file:") else None
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    text = page.read_text("utf-8")
+    for match in FENCE.finditer(text):
+        before = text[: match.start()].rstrip("\n").rpartition("\n")[2]
+        note = re.fullmatch(r"<!-- (.*) -->", before)
+        yield Block(page, match[1], match[2], note[1] if note else "")
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(PROJECT))
+
+
+def all_blocks() -> list[Block]:
+    return [b for page in PAGES for b in blocks(page)]
+
+
+# Links
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the page's headings, as GitHub makes them."""
+    text = FENCE.sub("", page.read_text("utf-8"))
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    plain = [re.sub(r"[^\w\- ]", "", re.sub(r"[`*]|\[([^\]]*)\]\([^)]*\)", r"\1", h)).lower() for h in headings]
+    return {h.replace(" ", "-") for h in plain}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_relative_link_leads_somewhere(page: Path) -> None:
+    lost = []
+    for target in LINK.findall(FENCE.sub("", page.read_text("utf-8"))):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        to = (page.parent / path).resolve() if path else page
+        if not to.exists() or (anchor and anchor not in anchors(to)):
+            lost.append(target)
+    assert not lost
+
+
+def test_every_page_is_reached_from_the_index() -> None:
+    reached, todo = set(), [PROJECT / "README.md"]
+    while todo:
+        page = todo.pop()
+        if page in reached or page.suffix != ".md":
+            continue
+        reached.add(page)
+        for target in LINK.findall(FENCE.sub("", page.read_text("utf-8"))):
+            if not re.match(r"[a-z]+:|#", target):
+                todo.append((page.parent / target.partition("#")[0]).resolve())
+    assert {name_of(p) for p in PAGES if p.is_relative_to(PROJECT / "docs")} <= {name_of(p) for p in reached}
+
+
+# Commands
+
+
+def arguments_of(command: str) -> list[list[str]]:
+    """The arguments of each call of triaxcal in a line of shell."""
+    lexer = shlex.shlex(command, posix=True, punctuation_chars=True)
+    lexer.whitespace_split = True
+    calls: list[list[str]] = [[]]
+    for word in lexer:
+        if word in OPERATORS:
+            calls.append([])
+        else:
+            calls[-1].append(word)
+    return [call[1:] for call in calls if call and Path(call[0]).name == "triaxcal"]
+
+
+COMMANDS = [(b, c) for b in all_blocks() if b.language in ("console", "sh") for c in b.commands]
+
+
+@pytest.mark.parametrize(("block", "command"), COMMANDS, ids=[f"{name_of(b.page)}: {c}" for b, c in COMMANDS])
+def test_every_command_shown_is_one_that_there_is(block: Block, command: str) -> None:
+    for arguments in arguments_of(command):
+        parser().parse_args(arguments)  # ends with SystemExit, hence fails, where it is none
+
+
+def test_a_command_that_there_is_not_would_be_noticed() -> None:
+    assert arguments_of("gzip -dc x | triaxcal fitt - > out") == [["fitt", "-"]]
+    with pytest.raises(SystemExit):
+        parser().parse_args(["fitt", "-"])
+
+
+@pytest.mark.parametrize("make", re.findall(r"^\$ make (\w+)$", "\n".join(b.text for b in all_blocks()), re.MULTILINE))
+def test_every_make_target_shown_is_in_the_makefile(make: str) -> None:
+    assert re.search(rf"^{make}:", (PROJECT / "Makefile").read_text("utf-8"), re.MULTILINE)
+
+
+RUNNABLE = [page for page in PAGES if any(b.note.startswith("run") for b in blocks(page))]
+
+
+@pytest.mark.parametrize("page", RUNNABLE, ids=name_of)
+def test_the_commands_of_a_page_that_are_marked_as_runnable_run(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("recordings", "examples"):
+        shutil.copytree(PROJECT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("out", "*.eeprom"))
+    monkeypatch.chdir(tmp_path)
+    ran = 0
+    for block in blocks(page):
+        if block.note.startswith("run"):
+            for command in block.commands:
+                assert run(command) == int(block.note.partition("exit")[2] or 0), command
+                ran += 1
+    assert ran
+
+
+def run(command: str) -> int:
+    """Exit code of a line of shell; without starting a process where it is one plain call."""
+    calls = arguments_of(command)
+    if len(calls) == 1 and not OPERATORS & set(shlex.split(command)) and command.startswith("triaxcal "):
+        return main(calls[0])
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    return subprocess.run(["bash", "-c", command], env=os.environ | {"PATH": path}, check=False, timeout=60).returncode
+
+
+def subcommands(top: argparse.ArgumentParser, prefix: str = "") -> dict[str, argparse.ArgumentParser]:
+    found = {}
+    for action in top._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, sub in action.choices.items():
+                inner = subcommands(sub, f"{prefix}{name} ")
+                found |= inner or {f"{prefix}{name}": sub}
+    return found
+
+
+PARSERS = subcommands(parser())
+
+
+def sections(page: Path) -> dict[str, str]:
+    parts = re.split(r"^## (.*)$", page.read_text("utf-8"), flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+@pytest.mark.parametrize("command", PARSERS)
+def test_every_command_has_a_section_that_names_all_its_options(command: str) -> None:
+    text = sections(PROJECT / "docs/reference/cli.md")[f"triaxcal {command}"]
+    options = [o for a in PARSERS[command]._actions for o in a.option_strings if o not in ("-h", "--help")]
+    assert [o for o in options if f"{o}" not in re.findall(r"(?<![\w-])--?[a-z][a-z-]*", text)] == []
+
+
+def test_the_command_line_page_describes_no_command_that_there_is_not() -> None:
+    named = {s.removeprefix("triaxcal ") for s in sections(PROJECT / "docs/reference/cli.md") if "triaxcal" in s}
+    assert named == set(PARSERS)
+
+
+# Files
+
+
+def folder_of(page: Path, folder: Path) -> Path:
+    """The page's named blocks as files."""
+    for block in blocks(page):
+        if block.file:
+            (folder / block.file).write_text(block.text, "utf-8")
+    return folder
+
+
+def check_toml(path: Path) -> None:
+    """Raises what the loader of that format raises."""
+    kind = tomllib.loads(path.read_text("utf-8"))["format"]
+    if kind == "triaxcal.station/1":
+        load_station(path)
+    elif kind == "triaxcal.device/1":
+        simulate(load_device(path), where=str(path))
+    else:
+        assert kind == "triaxcal.profile/1"
+        load_bundle(path)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.name)
+def test_every_example_is_valid(path: Path) -> None:
+    check_toml(path)
+
+
+@pytest.mark.parametrize("kind", ["can", "modbus-tcp", "modbus-rtu"])
+def test_the_station_of_an_example_finds_the_unit_of_its_device(kind: str) -> None:
+    device = load_device(PROJECT / "examples" / f"device-{kind}.toml")
+    unit = load_station(PROJECT / "examples" / f"station-{kind}.toml").file.units[0]
+    assert int(unit.serial or -1) == device.serial
+    assert unit.profile == device.profile
+    place = {k: v for k, v in unit.bus.items() if k != "parity"}
+    assert place == {k: v.removeprefix("pty:") if isinstance(v, str) else v for k, v in device.bus.items()}
+
+
+WITH_TOML = [p for p in PAGES if any(b.language == "toml" and b.text.startswith("format") for b in blocks(p))]
+OTHERS_DRIVER = PROJECT / "docs/how-to/write-a-driver.md"
+
+
+@pytest.mark.parametrize("page", [p for p in WITH_TOML if p != OTHERS_DRIVER], ids=name_of)
+def test_every_toml_file_in_the_documentation_is_valid(page: Path, tmp_path: Path) -> None:
+    folder_of(page, tmp_path)
+    for block in blocks(page):
+        if block.language == "toml" and block.text.startswith("format"):
+            assert block.file, "a file that cannot be checked: give it a name"
+            check_toml(tmp_path / block.file)
+
+
+def test_the_driver_of_the_how_to_is_found_and_decodes(tmp_path: Path) -> None:
+    """Installed as pip would, by its metadata, in a folder of its own."""
+    folder_of(OTHERS_DRIVER, tmp_path)
+    project = tomllib.loads((tmp_path / "pyproject.toml").read_text("utf-8"))["project"]
+    info = tmp_path / "acme_lines-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    points = "".join(f"{k} = {v}\n" for k, v in project["entry-points"]["triaxcal.drivers"].items())
+    (info / "entry_points.txt").write_text("[triaxcal.drivers]\n" + points)
+    (info / "RECORD").write_text("")
+    code = """
+from pathlib import Path
+from triaxcal_drivers.interface import RawBatch
+from triaxcald.pipeline import Pipeline
+from triaxcald.station.config import load_station
+(place,) = load_station(Path("station.toml")).places
+pipeline = Pipeline(place.bundle, "readings")
+lines = [b"5,1,2,9.5", b"6,1,2,9.25", b"6,1,2,9.25", b"nonsense", b"9,1,2,nan", b"8,1.5,2,9"]
+blocks = [pipeline.feed(RawBatch.of([(10**9, 0, 0, line) for line in part])) for part in (lines[:2], lines[2:])]
+print([b.readings.tolist() for b in blocks], [b.time_ns.tolist() for b in blocks])
+print({k: v for k, v in pipeline.counts.items() if v})
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    decoded, counts = done.stdout.splitlines()
+    assert decoded == (
+        "[[[1.0, 2.0, 9.5], [1.0, 2.0, 9.25]], [[1.5, 2.0, 9.0]]] [[1000000000, 1010000000], [1030000000]]"
+    )
+    assert counts == "{'samples': 3, 'missing': 1, 'duplicates': 1, 'errors': 2}"
+
+
+PYTHON = [b for b in all_blocks() if b.language == "python"]
+
+
+@pytest.mark.parametrize("block", PYTHON, ids=[f"{name_of(b.page)}, {b.text[:40]!r}" for b in PYTHON])
+def test_every_python_block_is_python(block: Block) -> None:
+    compile(block.text, str(block.page), "exec")
+
+
+def test_the_closed_form_can_be_redone_by_hand() -> None:
+    (block,) = [b for b in blocks(PROJECT / "docs/explanation/the-model.md") if b.language == "python"]
+    exec(block.text, {})
+
+
+# Documents
+
+
+def keys_of(value: object, named: frozenset[str]) -> set[str]:
+    """All keys but those under ``named``, which are names that a profile or the catalogue gives."""
+    if isinstance(value, list):
+        return {k for inner in value for k in keys_of(inner, named)}
+    if not isinstance(value, dict):
+        return set()
+    found = set(value)
+    for key, inner in value.items():
+        found |= keys_of(inner, named) if key not in named else {k for v in inner.values() for k in keys_of(v, named)}
+    return found
+
+
+NAMED = frozenset({"channels", "channel_reference", "effects", "coefficients"})
+EFFECT_LEAVES = {"x", "y", "z"}
+
+
+def documented_keys() -> set[str]:
+    text = (PROJECT / "docs/reference/certificate.md").read_text("utf-8")
+    return set(re.findall(r"[A-Za-z_0-9]+", " ".join(re.findall(r"`([^`]*)`", text))))
+
+
+@pytest.mark.parametrize("attachment", ["certificate.json", "verification.json"])
+def test_every_key_of_a_recordings_documents_is_explained(attachment: str) -> None:
+    with Recording.open(PROJECT / "recordings" / "can-second-order.mcap") as recording:
+        document = json.loads(recording.attachments[attachment])
+    assert to_text(document)
+    assert keys_of(document, NAMED) - documented_keys() - EFFECT_LEAVES == set()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "poses recordings/paper-unit.csv.gz",
+        "fit recordings/paper-unit.csv.gz",
+        "diagnose recordings/can-second-order.mcap --check recordings/can-second-order.mcap",
+        "plan --poses 14",
+        "plan recordings/paper-unit.csv.gz",
+        "audit recordings/can-second-order.mcap",
+        "devices",
+    ],
+)
+def test_every_key_of_a_commands_document_is_explained(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(PROJECT)
+    assert main([*command.split(), "--json"]) in (0, 1)
+    document = json.loads(capsys.readouterr().out)
+    assert document["format"] in (PROJECT / "docs/reference/certificate.md").read_text("utf-8")
+    assert keys_of(document, NAMED) - documented_keys() - EFFECT_LEAVES == set()
+
+
+def test_the_table_of_measured_recordings_is_there() -> None:
+    text = (PROJECT / "docs/measured.md").read_text("utf-8")
+    rows = re.findall(r"^\| (\w+/\w+) \|", text, re.MULTILINE)
+    assert len(rows) == len(set(rows)) >= 28
+
+
+def test_the_documentation_speaks_of_no_machine() -> None:
+    spoken = {name_of(p): re.findall(r"/(?:home|root|work)/\S+|pypi\S*", p.read_text("utf-8"), re.I) for p in PAGES}
+    assert not {page: found for page, found in spoken.items() if found}

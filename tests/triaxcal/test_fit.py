@@ -1,0 +1,233 @@
+"""The fit's derivatives, errors, leverage and weights, each against brute force or an outside authority."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from triaxcal.effects import CATALOGUE, TIME
+from triaxcal.errors import InvalidData
+from triaxcal.fit import Problem, State, fit, linearise, problem_of, solve, start
+from triaxcal.poses import Pose
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import noisy_poses
+
+MINUS = (-1, -1, -1)
+COEFFICIENTS: dict[str, list[float]] = {
+    "second_order_nonlinearity": [3e-3, -2e-3, 1e-3],
+    "third_order_nonlinearity": [-1e-3, 4e-3, 2e-3],
+    "temperature_bias": [1e-4, -2e-4, 3e-4],
+    "temperature_bias_quadratic": [1e-4, 1e-4, -2e-4, 1e-5, -2e-5, 3e-5],
+    "temperature_scale_factor": [2e-4, -1e-4, 3e-4],
+    "bias_drift": [1e-5, -2e-5, 1e-5],
+}
+
+
+def wandering(n: int) -> dict[str, np.ndarray]:
+    return {"temp_c": 25 + 3 * np.sin(1.7 * np.arange(n)) + np.cos(0.9 * np.arange(n))}
+
+
+def everything_on(
+    with_effects: Callable[..., Sensor], directions: np.ndarray, seed: int = 0
+) -> tuple[Problem, State, list[Pose]]:
+    sensor = with_effects(**COEFFICIENTS)
+    rng = np.random.default_rng(seed)
+    reference = {"temp_c": 25.0, TIME: 5.0 * len(directions)}
+    poses = noisy_poses(sensor, directions, 1e-4, rng, channels=wandering(len(directions)), channel_reference=reference)
+    problem = problem_of(poses, signs=MINUS)
+    linear = start(problem, poses, MINUS)
+    theta = np.concatenate([linear.theta, *(np.array(COEFFICIENTS[e.name]) for e in CATALOGUE)])
+    return problem, State(theta, CATALOGUE), poses
+
+
+def test_the_jacobian_is_that_of_central_differences_with_every_effect_on(
+    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+) -> None:
+    assert [e.name for e in CATALOGUE] == list(COEFFICIENTS)
+    problem, state, _ = everything_on(with_effects, twenty_six)
+    _, J, _ = linearise(problem, state)
+    for column in range(J.shape[1]):
+        h = np.zeros(J.shape[1])
+        # Far below any curvature, far above rounding; an effect's column is as large as its condition squared.
+        h[column] = 1e-5 / max(float(np.abs(J[:, column]).max()), 1.0)
+        up, down = (linearise(problem, State(state.theta + s * h, CATALOGUE))[0] for s in (1, -1))
+        slope = (up - down) / (2 * h[column])
+        assert J[:, column] == pytest.approx(slope, rel=1e-6, abs=1e-8 * np.abs(J[:, column]).max())
+
+
+def test_the_standard_error_of_a_residual_is_the_noise_along_its_gradient(
+    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+) -> None:
+    problem, state, poses = everything_on(with_effects, twenty_six)
+    r, _, s = linearise(problem, state)
+    rng = np.random.default_rng(1)
+    tiny = 1e-3
+    draws = []
+    for _ in range(2000):
+        noise = np.array([rng.multivariate_normal(np.zeros(3), p.covariance) for p in poses]) * tiny
+        draws.append((linearise(replace(problem, u=problem.u + noise), state, jacobian=False)[0] - r) / tiny)
+    assert np.std(draws, axis=0) / s == pytest.approx(np.ones(len(s)), abs=4.5 / np.sqrt(2 * 2000))
+
+
+def test_the_covariance_of_effects_too_is_the_spread_over_seeds(
+    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+) -> None:
+    chosen = [e for e in CATALOGUE if e.name in ("second_order_nonlinearity", "temperature_scale_factor")]
+    sensor = with_effects(**{e.name: COEFFICIENTS[e.name] for e in chosen})
+    truth = np.concatenate(
+        [sensor.scale_factor, sensor.misalignment, sensor.bias, *(COEFFICIENTS[e.name] for e in chosen)]
+    )
+    seeds, pulls = 60, []
+    for seed in range(seeds):
+        poses = noisy_poses(
+            sensor,
+            twenty_six,
+            1e-5,
+            np.random.default_rng(seed),
+            channels=wandering(26),
+            channel_reference={"temp_c": round(float(wandering(26)["temp_c"].mean()), 1)},
+        )
+        c = fit(poses, signs=MINUS, effects=chosen)
+        pulls.append((c.values - truth) / (c.standard_errors / c.inflation))
+    each = 1e-3 / len(truth)
+    low, high = stats.chi2.ppf([each / 2, 1 - each / 2], seeds - 1) / (seeds - 1)
+    variance = np.var(pulls, axis=0, ddof=1)
+    assert np.all((low < variance) & (variance < high)), variance
+    assert np.all(np.abs(np.mean(pulls, axis=0)) < stats.norm.isf(each / 2) / np.sqrt(seeds))
+
+
+def test_the_cross_validated_error_is_that_of_fits_without_each_pose(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, 1e-4, np.random.default_rng(3))
+    whole = fit(poses, signs=MINUS)
+    misses = []
+    for i, pose in enumerate(poses):
+        without = fit(poses[:i] + poses[i + 1 :], signs=MINUS)
+        misses.append(np.linalg.norm(without.specific_force(pose.mean[None], {})[0]) - 1)
+    assert whole.residual.cross_validated_rms_g == pytest.approx(np.sqrt(np.mean(np.square(misses))), rel=1e-4)
+
+
+def test_leverage_is_how_much_a_pose_pulls_its_own_residual(paper_unit: Sensor, fourteen: np.ndarray) -> None:
+    poses = noisy_poses(paper_unit, fourteen, 1e-5, np.random.default_rng(0))
+    whole = fit(poses, signs=MINUS)
+    assert sum(p.leverage for p in whole.poses) == pytest.approx(9)
+    for i in (0, 9):
+        out = whole.poses[i].direction / np.linalg.norm(whole.poses[i].direction)
+        moved = list(poses)
+        moved[i] = replace(poses[i], mean=poses[i].mean + 1e-7 * out * paper_unit.scale_factor)
+        change = fit(moved, signs=MINUS).poses[i].residual_g - whole.poses[i].residual_g
+        # 1 − leverage of what was added stays in the residual; R turns the axes by 0.4 degrees at most.
+        assert change / 1e-7 == pytest.approx(1 - whole.poses[i].leverage, abs=0.02)
+
+
+def test_poses_measured_worse_weigh_less(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    error = np.where(np.arange(26) % 2 == 0, 1e-5, 1e-3)[:, None] * np.ones(3)
+    truth = np.concatenate([paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias])
+    weighted, equal = [], []
+    for seed in range(40):
+        poses = noisy_poses(paper_unit, twenty_six, error, np.random.default_rng(seed))
+        c = fit(poses, signs=MINUS)
+        weighted.append((c.values - truth) / c.standard_errors * c.inflation)
+        flat = fit([replace(p, covariance=np.eye(3) * 1e-9) for p in poses], signs=MINUS)
+        equal.append((flat.values - truth) / c.standard_errors * c.inflation)
+    # 13 good poses leave only the weighted fit near its bound; the equal one is tens of times off.
+    assert 0.7 < np.mean(np.square(weighted)) < 1.3
+    assert np.mean(np.square(equal)) > 20
+
+
+def test_a_noisy_axis_weighs_less_and_the_errors_stay_true(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    truth = np.concatenate([paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias])
+    pulls, z_errors, flat_errors = [], [], []
+    for seed in range(60):
+        poses = noisy_poses(paper_unit, twenty_six, np.array([1e-5, 1e-5, 1e-3]), np.random.default_rng(seed))
+        c = fit(poses, signs=MINUS)
+        pulls.append((c.values - truth) / c.standard_errors * c.inflation)
+        flat = fit([replace(p, covariance=np.eye(3) * 1e-9) for p in poses], signs=MINUS)
+        z_errors.append(c.values[0] - truth[0])
+        flat_errors.append(flat.values[0] - truth[0])
+    low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], 59) / 59
+    assert np.all((low < np.var(pulls, axis=0, ddof=1)) & (np.var(pulls, axis=0, ddof=1) < high))
+    assert np.std(z_errors) < np.std(flat_errors) / 5
+
+
+def test_a_bad_pose_has_the_largest_studentised_residual(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    named = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        poses = noisy_poses(paper_unit, twenty_six, 1.5e-5, rng)
+        bad = int(rng.integers(26))
+        along = twenty_six[bad] * paper_unit.scale_factor * 12 * 1.5e-5
+        poses[bad] = replace(poses[bad], mean=poses[bad].mean + along)
+        studentized = [abs(p.studentized) for p in fit(poses, signs=MINUS).poses]
+        named += int(np.argmax(studentized)) == bad
+    assert named >= 39
+
+
+def test_residuals_far_beyond_the_noise_raise_the_standard_errors_however_small_p_is(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, 1e-3, np.random.default_rng(0))
+    # Said to be known a thousand times better than they are: p underflows to nothing.
+    c = fit([replace(p, covariance=p.covariance * 1e-6) for p in poses], signs=MINUS)
+    assert c.residual.lack_of_fit_p == pytest.approx(0, abs=1e-300)
+    assert c.inflation == pytest.approx(1000, rel=0.6)
+    assert any("times what the noise explains" in w for w in c.warnings)
+
+
+def test_the_noise_floor_is_the_rms_of_standard_errors_along_the_vector(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    c = fit(noisy_poses(paper_unit, twenty_six, 3e-5, np.random.default_rng(0)), signs=MINUS)
+    assert c.residual.noise_floor_g == pytest.approx(3e-5, rel=0.01)
+    assert c.residual.rms_g == pytest.approx(np.sqrt(np.mean([p.residual_g**2 for p in c.poses])))
+    assert c.residual.max_abs_g == max(abs(p.residual_g) for p in c.poses)
+
+
+def test_a_reference_other_than_one_scales_the_answer(fourteen: np.ndarray) -> None:
+    field = Sensor(np.array([0.02, 0.021, 0.019]), np.array([0.01, 0.02, -0.01]), np.array([3.0, -2.0, 1.0]))
+    poses = noisy_poses(field, 49.3 * fourteen, 1e-6, np.random.default_rng(0))
+    found = fit(poses, reference=49.3)
+    assert found.values == pytest.approx(
+        np.concatenate([field.scale_factor, field.misalignment, field.bias]), rel=1e-4, abs=1e-5
+    )
+    assert np.linalg.norm(found.specific_force(np.array([p.mean for p in poses]), {}), axis=1) == pytest.approx(
+        np.full(14, 49.3), abs=1e-4
+    )
+
+
+def test_the_answer_does_not_depend_on_the_order_of_the_poses(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, 1e-4, np.random.default_rng(0))
+    shuffled = [poses[i] for i in np.random.default_rng(1).permutation(26)]
+    assert fit(shuffled, signs=MINUS).values == pytest.approx(fit(poses, signs=MINUS).values, abs=1e-12)
+
+
+def test_the_solution_is_a_minimum_of_chi_square(with_effects: Callable[..., Sensor], twenty_six: np.ndarray) -> None:
+    problem, state, _ = everything_on(with_effects, twenty_six)
+    second = (CATALOGUE[0],)
+    found = solve(problem, State(state.theta[:9], ()), second)
+    r, J, s = linearise(problem, found)
+    weighted = J / s[:, None]
+    slope = weighted.T @ (r / s) / (np.linalg.norm(weighted, axis=0) * np.linalg.norm(r / s))
+    assert slope == pytest.approx(np.zeros(12), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        ({"signs": (1, 0, 1)}, "signs"),
+        ({"reference": 0.0}, "reference"),
+        ({"reference": float("nan")}, "reference"),
+        ({"effects": (CATALOGUE[2],)}, "temp_c"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_named(
+    paper_unit: Sensor, fourteen: np.ndarray, arguments: dict[str, object], why: str
+) -> None:
+    poses = noisy_poses(paper_unit, fourteen, 1e-5, np.random.default_rng(0))
+    with pytest.raises(InvalidData, match=why):
+        fit(poses, **arguments)  # type: ignore[arg-type]

@@ -1,0 +1,139 @@
+"""Measured recordings of others, judged by what others found in them (README beside the recordings).
+
+Skipped where the folder of recordings is not there.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from triaxcal.errors import Refused
+from triaxcal.fit import fit
+from triaxcal.loop import diagnose
+from triaxcal.poses import Pose, poses_of
+from triaxcal.stillness import StillnessDetector
+
+FOLDER = Path(__file__).parents[3] / "shared" / "datasets"
+pytestmark = [
+    pytest.mark.datasets,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="no measured recordings in ../shared/datasets"),
+]
+SENSORS = range(1, 9)
+
+
+@cache
+def poses(name: str) -> list[Pose]:
+    t_s, *u = np.loadtxt(FOLDER / f"{name}.csv.gz", delimiter=",", skiprows=1, unpack=True)
+    detector = StillnessDetector()
+    detector.feed(np.round(t_s * 1e9).astype(np.int64), np.stack(u, axis=1))
+    detector.finish()
+    return poses_of(detector.windows(), detector.spans())
+
+
+def equal_weights_rss(means: np.ndarray) -> float:
+    """Sum of squares of |a| − 1 under nine parameters, fitted by scipy alone."""
+    size = np.ptp(means, axis=0).max() / 2
+    u = (means - means.mean(axis=0)) / size
+
+    def miss(p: np.ndarray) -> np.ndarray:
+        A = np.array([[p[0], p[1], p[2]], [0, p[3], p[4]], [0, 0, p[5]]])
+        return np.linalg.norm((u - p[6:]) @ A.T, axis=1) - 1
+
+    first = np.array([1, 0, 0, 1, 0, 1, 0, 0, 0], dtype=float)
+    return float(np.sum(least_squares(miss, first, xtol=1e-15, ftol=1e-15, gtol=1e-15).fun ** 2))
+
+
+@pytest.mark.parametrize("run", [1, 5, 6])
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_every_sensor_of_the_array_shows_its_21_poses(run: int, sensor: int) -> None:
+    found = poses(f"mimu4444/run{run}_sensor{sensor}")
+    assert len(found) == 21
+    # Held for about 24 s each; the last stop, at the very end, was a short one.
+    assert all(p.end_s - p.start_s > 20 for p in found[:20])
+
+
+@pytest.mark.parametrize(("name", "count"), [("xsens/acc", 38), ("mpu9150/unit0", 22), ("mpu9150/unit1", 22)])
+def test_the_other_units_show_all_their_poses(name: str, count: int) -> None:
+    assert len(poses(name)) == count
+
+
+def test_six_directions_are_refused_and_counted() -> None:
+    with pytest.raises(Refused, match="6 distinct directions") as refusal:
+        fit(poses("ferraris/session"))
+    assert refusal.value.wanted
+
+
+# 1e-6 g; the outside analyses agree among themselves to about this factor.
+NEIGHBOURHOOD = 1.6
+
+
+@pytest.mark.parametrize(
+    ("names", "outside"),
+    [
+        ([f"mimu4444/run{r}_sensor{s}" for r in (1, 5, 6) for s in SENSORS], (106, 126)),
+        (["xsens/acc"], (55, 55)),
+        (["mpu9150/unit0", "mpu9150/unit1"], (300, 300)),
+    ],
+)
+def test_the_noise_of_a_pose_mean_is_near_what_others_found(names: list[str], outside: tuple[float, float]) -> None:
+    ordinary = [np.median([p.standard_error_g for p in fit(poses(n)).poses]) * 1e6 for n in names]
+    assert outside[0] / NEIGHBOURHOOD < np.median(ordinary) < outside[1] * NEIGHBOURHOOD
+
+
+@pytest.mark.parametrize(("run", "outside"), [(5, 133), (6, 590)])
+def test_residuals_of_the_array_pooled_over_its_sensors_are_what_others_found(run: int, outside: float) -> None:
+    squares = degrees = 0.0
+    for sensor in SENSORS:
+        means = np.array([p.mean for p in poses(f"mimu4444/run{run}_sensor{sensor}")[:20]])
+        squares += equal_weights_rss(means)
+        degrees += len(means) - 9
+    assert np.sqrt(squares / degrees) * 1e6 == pytest.approx(outside, rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "low", "high"), [("xsens/acc", 96, 116), ("mpu9150/unit0", 107, 246),
+                                                   ("mpu9150/unit1", 107, 246)])  # fmt: skip
+def test_the_residual_of_the_fit_is_near_what_others_found(name: str, low: float, high: float) -> None:
+    assert low < fit(poses(name)).residual.rms_g * 1e6 < high
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_run_6_holds_a_drift_and_the_residual_falls_threefold_with_it(sensor: int) -> None:
+    loop = diagnose(poses(f"mimu4444/run6_sensor{sensor}"))
+    assert [(f.effect, f.verdict) for f in loop.findings] == [("bias_drift", "adopted")]
+    assert loop.after.residual.rms_g < loop.before.residual.rms_g / 3
+
+
+def test_run_5_of_the_same_array_holds_none() -> None:
+    for sensor in SENSORS:
+        assert diagnose(poses(f"mimu4444/run5_sensor{sensor}")).findings == ()
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_no_recording_of_the_array_shows_a_nonlinearity(sensor: int) -> None:
+    for run in (1, 5, 6):
+        loop = diagnose(poses(f"mimu4444/run{run}_sensor{sensor}"))
+        assert not [f.effect for f in loop.findings if "nonlinearity" in f.effect]
+
+
+def test_the_drift_is_reported_by_axis_with_its_reason() -> None:
+    (finding,) = diagnose(poses("mimu4444/run6_sensor1")).findings
+    assert "the cross-validated error falls from" in finding.reason
+    assert set(finding.coefficients) == {"x", "y", "z"}
+    assert all(unit == "g/s" for _, _, unit in finding.coefficients.values())
+
+
+def test_the_recordings_give_the_same_poses_in_blocks_of_any_size() -> None:
+    t_s, *u = np.loadtxt(FOLDER / "mpu9150/unit0.csv.gz", delimiter=",", skiprows=1, unpack=True)
+    time_ns, readings = np.round(t_s * 1e9).astype(np.int64), np.stack(u, axis=1)
+    detector = StillnessDetector()
+    for start in range(0, len(time_ns), 137):
+        detector.feed(time_ns[start : start + 137], readings[start : start + 137])
+    detector.finish()
+    for here, there in zip(poses("mpu9150/unit0"), poses_of(detector.windows(), detector.spans()), strict=True):
+        assert np.array_equal(here.mean, there.mean)
+        assert np.array_equal(here.covariance, there.covariance)

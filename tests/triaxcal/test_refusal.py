@@ -1,0 +1,164 @@
+"""Sets of poses that cannot carry nine parameters are refused, and what is wanted mends them."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from triaxcal.errors import Refused
+from triaxcal.fit import fit
+from triaxcal.plan import cube_directions
+from triaxcal.poses import Pose
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import noisy_poses
+
+MINUS = (-1, -1, -1)
+FACES = np.concatenate([np.eye(3), -np.eye(3)])
+AROUND = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def circle(normal: np.ndarray, height: float) -> np.ndarray:
+    first, second = np.linalg.svd(unit(normal)[None])[2][1:]
+    ring = np.outer(np.cos(AROUND), first) + np.outer(np.sin(AROUND), second)
+    return unit(height * unit(normal) + np.sqrt(1 - height**2) * ring)
+
+
+def cap(degrees: float) -> np.ndarray:
+    v = unit(np.random.default_rng(0).standard_normal((20000, 3)))
+    return v[v @ unit(np.array([1.0, 2.0, 3.0])) > np.cos(np.radians(degrees))][:20]
+
+
+def clusters() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return unit(np.repeat(unit(rng.standard_normal((3, 3))), 6, axis=0) + 0.02 * rng.standard_normal((18, 3)))
+
+
+def vertices() -> np.ndarray:
+    return unit(np.array(list(itertools.product((1.0, -1.0), repeat=3))))
+
+
+POOR = {
+    "six faces, three times each": np.tile(FACES, (3, 1)),
+    "eight vertices, twice": np.tile(vertices(), (2, 1)),
+    "one plane through two axes": circle(np.array([0.0, 0.0, 1.0]), 0.0),
+    "one oblique plane": circle(np.array([1.0, 2.0, 3.0]), 0.0),
+    "one cone": circle(np.array([1.0, 2.0, 3.0]), 0.5),
+    "a cap of 10 degrees": cap(10),
+    "a cap of 30 degrees": cap(30),
+    "three clusters": clusters(),
+    "one direction, nine times": np.tile([0.6, 0.64, 0.48], (9, 1)),
+    "two opposite directions": np.tile([[0.6, 0.64, 0.48], [-0.6, -0.64, -0.48]], (7, 1)),
+    "six faces": FACES,
+    "eight poses": np.concatenate([FACES, vertices()[:2]]),
+}
+
+
+def measured(sensor: Sensor, directions: np.ndarray) -> list[Pose]:
+    return noisy_poses(sensor, directions, 1.5e-5, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", POOR)
+def test_a_poor_set_is_refused_and_the_poses_wanted_mend_it(name: str, paper_unit: Sensor) -> None:
+    with pytest.raises(Refused, match=r"cannot carry nine|need at least 9|no ellipsoid") as refusal:
+        fit(measured(paper_unit, POOR[name]), signs=MINUS)
+    assert 0 < len(refusal.value.wanted) <= 9
+    where = dict(cube_directions())
+    more = np.array([where[label] for label in refusal.value.wanted])
+    mended = fit(measured(paper_unit, np.concatenate([POOR[name], more])), signs=MINUS)
+    assert mended.dilution < 20
+    assert np.abs(mended.values[:3] - paper_unit.scale_factor) == pytest.approx(np.zeros(3), abs=1e-3)
+
+
+def test_the_message_counts_what_there_is(paper_unit: Sensor) -> None:
+    with pytest.raises(Refused, match=r"18 poses in 6 distinct directions"):
+        fit(measured(paper_unit, POOR["six faces, three times each"]), signs=MINUS)
+    with pytest.raises(Refused, match=r"^8 still poses; nine parameters need at least 9"):
+        fit(measured(paper_unit, POOR["eight poses"]), signs=MINUS)
+
+
+def test_no_pose_at_all_is_refused() -> None:
+    with pytest.raises(Refused, match="0 still poses") as refusal:
+        fit([])
+    assert len(refusal.value.wanted) == 9
+
+
+def test_the_singular_nine_pose_subsets_of_the_fourteen_and_only_they_are_refused(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    # |a| of nine poses determines a quadric unless its design [x², …, z] loses rank: judged without the fit.
+    x, y, z = fourteen.T
+    design = np.stack([x * x, y * y, z * z, x * y, y * z, x * z, x, y, z], axis=1)
+    subsets = np.array(list(itertools.combinations(range(14), 9)))
+    singular = np.linalg.matrix_rank(design[subsets], tol=1e-9) < 9
+    assert singular.mean() == pytest.approx(0.27, abs=0.005)
+    poses = measured(paper_unit, fourteen)
+
+    def refused(subset: np.ndarray) -> bool:
+        try:
+            fit([poses[i] for i in subset], signs=MINUS)
+        except Refused:
+            return True
+        return False
+
+    some = np.random.default_rng(0).permutation(len(subsets))[:400]
+    every_singular = np.flatnonzero(singular)
+    assert all(refused(subsets[i]) for i in every_singular)
+    assert [refused(subsets[i]) for i in some] == singular[some].tolist()
+
+
+def test_any_eleven_of_the_fourteen_are_enough(paper_unit: Sensor, fourteen: np.ndarray) -> None:
+    poses = measured(paper_unit, fourteen)
+    for subset in itertools.combinations(range(14), 11):
+        assert fit([poses[i] for i in subset], signs=MINUS).dilution < 5
+
+
+def still(u: np.ndarray) -> list[Pose]:
+    return [Pose(float(i), i + 1.0, 100, v, np.eye(3) * 1e-10, 99.0) for i, v in enumerate(u)]
+
+
+def test_an_axis_that_never_changes_is_named(fourteen: np.ndarray) -> None:
+    with pytest.raises(Refused, match="axis z never changes"):
+        fit(still(fourteen * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.7]))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_readings_of_no_still_triad_are_never_passed_off_as_well_calibrated(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((20, 3)) if seed % 2 else rng.uniform(-1, 1, (20, 3))
+    try:
+        found = fit(still(u))
+    except Refused:
+        return
+    # Where an ellipsoid of sorts exists, the residual says what it is worth.
+    assert found.residual.rms_g > 0.05
+    assert found.residual.lack_of_fit_p is not None
+    assert found.residual.lack_of_fit_p < 1e-6
+    assert found.inflation > 100
+
+
+def test_a_poorly_spread_set_that_just_passes_is_warned_of_and_told_what_to_add(paper_unit: Sensor) -> None:
+    found = fit(measured(paper_unit, cap(60)), signs=MINUS)
+    warning = next(w for w in found.warnings if "poorly spread" in w)
+    labels = warning.rsplit("add ", 1)[1].split(", ")
+    where = dict(cube_directions())
+    more = np.array([where[label] for label in labels])
+    better = fit(measured(paper_unit, np.concatenate([cap(60), more])), signs=MINUS)
+    assert better.dilution < found.dilution / 5
+    assert not any("poorly spread" in w for w in better.warnings)
+
+
+def test_nine_poses_that_carry_nine_parameters_say_that_the_residual_proves_nothing(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    poses = measured(paper_unit, fourteen)
+    found = fit([poses[i] for i in (0, 1, 2, 3, 4, 6, 7, 8, 10)], signs=MINUS)
+    assert found.residual.rms_g < 1e-10
+    assert found.residual.lack_of_fit_p is None
+    assert found.residual.cross_validated_rms_g is None
+    assert any("the residual proves little" in w for w in found.warnings)

@@ -1,0 +1,68 @@
+"""What a set of poses can show of an effect, against what is known of |a| (METHOD §5)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from triaxcal.effects import CATALOGUE, effect_named
+from triaxcal.fit import problem_of, start
+from triaxcal.plan import directions
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import noisy_poses
+from triaxcal.visibility import is_visible, projected, unseen_effects
+
+
+def test_fourteen_poses_show_the_second_order_but_not_the_third(fourteen: np.ndarray) -> None:
+    unseen = unseen_effects(fourteen)
+    assert "third_order_nonlinearity" in unseen
+    assert "second_order_nonlinearity" not in unseen
+
+
+@pytest.mark.parametrize("count", [26, 40, 60])
+def test_poses_enough_show_every_effect_of_the_catalogue(count: int) -> None:
+    assert unseen_effects(np.array([v for _, v in directions(count)])) == []
+
+
+@pytest.mark.parametrize("name", ["second_order_nonlinearity", "third_order_nonlinearity"])
+def test_what_is_projected_cannot_be_made_by_the_nine_parameters(
+    name: str, paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, 1e-9, np.random.default_rng(0))
+    problem = problem_of(poses, signs=(-1, -1, -1))
+    state = start(problem, poses, (-1, -1, -1))
+    rows = projected(problem, state, effect_named(name))
+    assert rows @ rows.T == pytest.approx(np.eye(3), abs=1e-9)
+    # The nine columns by themselves: on the unit sphere they are all even terms and the three odd linear ones.
+    a = twenty_six
+    quadric = np.stack([*(a.T**2), a[:, 0] * a[:, 1], a[:, 1] * a[:, 2], a[:, 0] * a[:, 2], *a.T], axis=1)
+    assert rows @ quadric / np.linalg.norm(quadric, axis=0) == pytest.approx(np.zeros((3, 9)), abs=0.02)
+
+
+def test_an_effect_whose_channel_stands_still_or_is_not_there_does_not_show(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    for channels, visible in (({}, False), ({"temp_c": np.full(26, 25.0)}, False), ({"temp_c": None}, True)):
+        held = {n: np.random.default_rng(1).normal(25, 2, 26) if v is None else v for n, v in channels.items()}
+        poses = noisy_poses(paper_unit, twenty_six, 1e-9, np.random.default_rng(0), channels=held)
+        problem = problem_of(poses, signs=(-1, -1, -1))
+        state = start(problem, poses, (-1, -1, -1))
+        assert is_visible(problem, state, effect_named("temperature_bias")) is visible
+
+
+def test_beside_the_same_thing_under_another_name_an_effect_does_not_show(
+    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+) -> None:
+    t_s = (np.arange(26) + 0.5) * 10.0
+    poses = noisy_poses(
+        with_effects(), twenty_six, 1e-9, np.random.default_rng(0), channels={"temp_c": 20 + 0.02 * t_s}
+    )
+    problem = problem_of(poses, signs=(-1, -1, -1))
+    state = start(problem, poses, (-1, -1, -1))
+    drift, warmth = effect_named("bias_drift"), effect_named("temperature_bias")
+    assert is_visible(problem, state, drift)
+    assert is_visible(problem, state, warmth)
+    assert not is_visible(problem, state, drift, given=[warmth])
+    assert len(CATALOGUE) >= 6
