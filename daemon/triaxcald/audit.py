@@ -14,12 +14,13 @@ from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.certificate import certify, software
 from triaxcald.documents import to_text
 from triaxcald.errors import RecordingError
-from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of
+from triaxcald.inputs import CALIBRATION, STATION_FILE, VERIFICATION, bundle_of, losses_of, signs_of
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.schema import Phase, RawDigest
+from triaxcald.recording.schema import RECOVERY_RECORD, Phase, RawDigest
 from triaxcald.station.config import parse_station
-from triaxcald.station.line import CERTIFICATE, REGISTERS_AFTER, STATION_FILE, VERIFICATION_FILE
+from triaxcald.station.line import CERTIFICATE
+from triaxcald.station.write_back import REGISTERS_AFTER, VERIFICATION_FILE
 from triaxcald.verification import verification_document, verify
 
 MOST = 8
@@ -68,7 +69,9 @@ def _audit(name: str, recording: Recording) -> Audit:
 
     tumble, digest = replay(CALIBRATION, (READINGS, CORRECTED))
     try:
-        signs = tuple(int(s) for s in unit.get("signs", "").split(","))
+        signs = signs_of(recording)
+        if signs is None:
+            raise ValueError("metadata unit.signs: expected three signs")
         again = certify(
             bundle,
             station,
@@ -78,10 +81,10 @@ def _audit(name: str, recording: Recording) -> Audit:
             digest,
             unit_name=unit.get("name", ""),
             serial=unit.get("serial") or None,
-            signs=(signs[0], signs[1], signs[2]),
+            signs=signs,
             computed_with=recording.metadata.get("software", {}),
         )
-    except (TriaxcalError, DriverError, ValueError, IndexError) as e:
+    except (TriaxcalError, DriverError, ValueError) as e:
         return Audit(name, tuple(checked), (f"{CERTIFICATE}: cannot be computed again: {e}",))
     differences += _compare(CERTIFICATE, recording.attachments[CERTIFICATE], to_text(again.document))
     if VERIFICATION_FILE in recording.attachments:
@@ -107,11 +110,9 @@ def _audit(name: str, recording: Recording) -> Audit:
 def _notes(recording: Recording) -> list[str]:
     then, now = recording.metadata.get("software", {}), software()
     notes = [f"{n}: {then[n]} then, {now[n]} now" for n in now if n in then and then[n] != now[n]]
-    lost = sum(loss.records for loss in recording.losses())
-    if lost:
-        notes.append(f"{lost} records were lost between bus and disk; the result stands on the others")
-    if "recovery" in recording.metadata:
-        notes.append("the recording was cut short and mended")
+    notes += losses_of(recording)
+    if RECOVERY_RECORD in recording.metadata:
+        notes.append("the recording was cut short or damaged, and mended")
     return notes
 
 

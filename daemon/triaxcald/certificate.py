@@ -89,6 +89,7 @@ def certify(
         "verdict": "outside limits" if outside else "within limits" if _judged(station.limits) else "not judged",
         "outside": outside,
         "result": loop_document(loop, data_quality=pipeline.data_quality(), output_unit=profile.output.unit),
+        "not_written": why_not_written(profile),
         "registers": _registers_document(image, held, loop, poses) if image and held else None,
     }
     return Certified(document, loop, image, not outside)
@@ -122,6 +123,13 @@ def roles(sensor: Sensor, channel_reference: Mapping[str, float]) -> dict[str, f
     return out
 
 
+def why_not_written(profile: Profile) -> str | None:
+    """Why a device cannot take a calibration at all: without one of the nine, the other eight would be wrong."""
+    linear = [f"{name}.{axis}" for name in ("scale_factor", "misalignment", "bias") for axis in "xyz"]
+    missing = [role for role in linear if profile.by_role(role) is None]
+    return f"the device has no register for {', '.join(missing)}" if missing else None
+
+
 def is_passing(effect: Effect) -> bool:
     """Whether an effect is the recording's rather than the unit's, so that no register could hold it."""
     return TIME in effect.needs
@@ -135,7 +143,7 @@ def _held_by_device(
     Refitted, not cut: without an effect the other coefficients have other best values. Effects of time stay in the
     fit, since they belong to this recording and not to the unit; the registers then hold the values at its middle.
     """
-    if any(profile.by_role(f"scale_factor.{axis}") is None for axis in "xyz"):
+    if why_not_written(profile):
         return None
     kept = [
         effect
@@ -214,6 +222,6 @@ def _outside(loop: Loop, limits: Limits) -> list[str]:
         ("rms_g", residual.rms_g, limits.rms_g),
         ("cross_validated_rms_g", residual.cross_validated_rms_g, limits.cross_validated_rms_g),
     ):
-        if limit is not None and (value is None or value > limit):
+        if limit is not None and not (value is not None and value <= limit):
             out.append(f"{name} {'unknown' if value is None else f'{value:.3g}'} is above the limit {limit:.3g}")
     return out

@@ -12,16 +12,19 @@ from typing import Any
 import numpy as np
 
 from triaxcald.errors import InputError
+from triaxcald.files import write_text
 from triaxcald.simulation.bench import DeviceFile, SimulatedUnit, simulate
 from triaxcald.station.collection import Progress
 from triaxcald.station.config import load_station
-from triaxcald.station.line import Outcome, UnitRun, run_station
+from triaxcald.station.line import INTERRUPTED, Outcome, UnitRun, run_station
+from triaxcald.station.write_back import NEW_VERIFIED
 from triaxcald.verification import Verification
 
 SPEED = 20.0
 HIDDEN = ("second_order_nonlinearity", "temperature_bias", "temperature_scale_factor")
 """Effects that the reference unit has registers for."""
 SIZES = {"second_order_nonlinearity": 4e-4, "temperature_bias": 4e-5, "temperature_scale_factor": 4e-5}
+LIMIT_G = 5e-5
 STATION = """\
 format = "triaxcal.station/1"
 name = "demo"
@@ -32,8 +35,8 @@ hold_s = 3.0
 check_poses = 8
 
 [limits]
-rms_g = 5e-5
-verification_rms_g = 5e-5
+rms_g = {limit_g}
+verification_rms_g = {limit_g}
 
 [[units]]
 name = "can"
@@ -51,12 +54,17 @@ bus = {{ host = "127.0.0.1", port = {port}, unit_id = 1 }}
 
 @dataclass(frozen=True)
 class DemoUnit:
-    """One unit's outcome beside its truth; ``found`` says that the loop named what was hidden, and nothing else."""
+    """One unit's outcome beside its truth.
+
+    ``found`` says that the loop named what was hidden, and nothing else; ``kept`` that the device's own output is
+    within the limit still after a power cycle.
+    """
 
     hidden: Mapping[str, Mapping[str, float]]
     outcome: Outcome
     after_power_cycle: Verification | None
     found: bool
+    kept: bool
 
 
 async def run_demo(folder: Path, seed: int, progress: Progress) -> list[DemoUnit]:
@@ -68,15 +76,17 @@ async def run_demo(folder: Path, seed: int, progress: Progress) -> list[DemoUnit
     channel = f"triaxcal-demo-{id(progress)}"
     devices = _devices(seed, channel)
     async with AsyncExitStack() as first:
-        units = [simulate(d, where="demo") for d in devices]
+        units = [simulate(d, where="demo", elastic=True) for d in devices]
         servers = [await first.enter_async_context(unit.serve()) for unit in units]
         path = folder / "station.toml"
-        path.write_text(_station(devices, channel, servers[1].bus.port))
+        write_text(path, _station(devices, channel, servers[1].bus.port))
         outcomes = await run_station(load_station(path), progress)
+        if any(outcome.exit_code == INTERRUPTED for outcome in outcomes):
+            return [DemoUnit(u.truth, o, None, False, False) for u, o in zip(units, outcomes, strict=True)]
     # The plug is pulled on both: what follows knows nothing but their EEPROMs.
     checks = await _after_power_cycle(devices, units, channel, path, progress, outcomes)
     return [
-        DemoUnit(unit.truth, outcome, check, _found(unit, outcome))
+        DemoUnit(unit.truth, outcome, check, _found(unit, outcome), _kept(check))
         for unit, outcome, check in zip(units, outcomes, checks, strict=True)
     ]
 
@@ -111,9 +121,8 @@ def _draw(effect: str, rng: np.random.Generator) -> dict[str, float]:
 
 
 def _station(devices: list[DeviceFile], channel: str, port: int) -> str:
-    return STATION.format(
-        can_serial=f"{devices[0].serial:04d}", modbus_serial=f"{devices[1].serial:04d}", channel=channel, port=port
-    )
+    can, modbus = (f"{d.serial:04d}" for d in devices)
+    return STATION.format(limit_g=LIMIT_G, can_serial=can, modbus_serial=modbus, channel=channel, port=port)
 
 
 async def _after_power_cycle(
@@ -125,14 +134,23 @@ async def _after_power_cycle(
     outcomes: Any,
 ) -> list[Verification | None]:
     async with AsyncExitStack() as second:
-        again = [simulate(d, where="demo", stored=u.unit.eeprom) for d, u in zip(devices, units, strict=True)]
+        stored = [u.unit.eeprom for u in units]
+        again = [simulate(d, where="demo", stored=s, elastic=True) for d, s in zip(devices, stored, strict=True)]
         servers = [await second.enter_async_context(unit.serve()) for unit in again]
-        path.write_text(_station(devices, channel, servers[1].bus.port))
+        write_text(path, _station(devices, channel, servers[1].bus.port))
         station = load_station(path)
         runs = [UnitRun(station, place, progress) for place in station.places]
-        todo = [run.check() for run, outcome in zip(runs, outcomes, strict=True) if outcome.provisioned]
+        todo = [run.check() for run, outcome in zip(runs, outcomes, strict=True) if _written(outcome)]
         done = iter(await asyncio.gather(*todo))
-        return [next(done) if outcome.provisioned else None for outcome in outcomes]
+        return [next(done) if _written(outcome) else None for outcome in outcomes]
+
+
+def _written(outcome: Outcome) -> bool:
+    return outcome.device_state == NEW_VERIFIED
+
+
+def _kept(check: Verification | None) -> bool:
+    return check is not None and check.rms_g is not None and check.rms_g <= LIMIT_G
 
 
 def _found(unit: SimulatedUnit, outcome: Outcome) -> bool:

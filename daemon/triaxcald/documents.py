@@ -60,6 +60,15 @@ def poses_document(poses: Sequence[Pose]) -> Document:
     }
 
 
+def in_units_of(unit: str, reference_unit: str) -> str:
+    """A coefficient's unit, which the metrology writes with g for the unit of the reference vector."""
+    return (
+        unit
+        if reference_unit == "g"
+        else unit.replace("g", f"({reference_unit})" if " " in reference_unit else reference_unit)
+    )
+
+
 def residual_document(residual: Residual) -> Document:
     return {
         "rms_g": number(residual.rms_g),
@@ -68,6 +77,11 @@ def residual_document(residual: Residual) -> Document:
         "noise_floor_g": number(residual.noise_floor_g),
         "lack_of_fit_p": number(residual.lack_of_fit_p),
     }
+
+
+def reference_unit_of(reference: float) -> str:
+    """g where the magnitude can be gravity in units of g, else what the caller did not name."""
+    return "g" if 0.9 <= reference <= 1.1 else "reference unit"
 
 
 def calibration_document(c: Calibration, *, output_unit: str = "", reference_unit: str = "g") -> Document:
@@ -100,7 +114,7 @@ def calibration_document(c: Calibration, *, output_unit: str = "", reference_uni
                 k.name: {
                     "value": number(float(value)),
                     "standard_error": number(float(errors[f"{effect.name}.{k.name}"])),
-                    "unit": k.unit.replace("g", reference_unit),
+                    "unit": in_units_of(k.unit, reference_unit),
                 }
                 for k, value in zip(effect.coefficients, values, strict=True)
             }
@@ -161,7 +175,7 @@ def loop_document(
                     name: {
                         "value": number(value),
                         "standard_error": number(error),
-                        "unit": unit.replace("g", reference_unit),
+                        "unit": in_units_of(unit, reference_unit),
                     }
                     for name, (value, error, unit) in f.coefficients.items()
                 },
@@ -207,7 +221,7 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
         magnitude = float(part.get("reference", 1.0))
     except KeyError as e:
         raise InputError(f"{where}: {e.args[0]}: missing, or no effect of that name is known") from e
-    except (TypeError, ValueError, AttributeError) as e:
+    except (TypeError, ValueError, AttributeError, OverflowError) as e:
         raise InputError(f"{where}: not numbers where numbers belong ({e})") from e
     if any(v.shape != (3,) or not np.isfinite(v).all() for v in (k, m, b)) or not np.all(k):
         raise InputError(
@@ -224,6 +238,9 @@ def _require_finite(
     for effect, values in effects:
         if not np.isfinite(values).all():
             raise InputError(f"{where}: effects.{effect.name}: expected finite numbers")
+        for need in effect.needs:
+            if need not in reference:
+                raise InputError(f"{where}: channel_reference.{need}: missing; the effect {effect.name} needs it")
     for name, value in reference.items():
         if not math.isfinite(value):
             raise InputError(f"{where}: channel_reference.{name}: expected a finite number")

@@ -16,40 +16,37 @@ from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.csv_text import read_csv
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.schema import Phase
+from triaxcald.recording.schema import RECOVERY_RECORD, Phase
+from triaxcald.station.config import parse_station
 
 PROFILE = "profile.toml"
 """Name under which a recording carries the profile; the files it names stand beside it under ``profile/``."""
+STATION_FILE = "station.toml"
 CALIBRATION: Phase = "calibration"
 VERIFICATION: Phase = "verification"
 
 
 @dataclass(frozen=True)
 class Measured:
-    """The still poses of a recording. ``windows`` are for pictures; ``profile`` where the recording carries one."""
+    """The still poses of a recording. ``windows`` are for pictures.
+
+    ``profile``, ``signs`` of the scale factors and ``reference`` are what the recording was made with, where it says.
+    """
 
     name: str
     poses: list[Pose]
     windows: Windows | None
     data_quality: list[str]
     profile: Profile | None = None
-
-    @property
-    def signs(self) -> tuple[int, int, int] | None:
-        """Of the scale factors, where the profile declares them."""
-        nominal = self.profile.output.nominal_scale_factor if self.profile else None
-        return tuple(1 if k > 0 else -1 for k in nominal) if nominal else None  # type: ignore[return-value]
+    signs: tuple[int, int, int] | None = None
+    reference: float | None = None
 
 
 def measure(name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS) -> Measured:
     """``name`` is a path to an `.mcap`, `.csv` or `.csv.gz`, or `-`. Raises InputError, RecordingError."""
     if name.endswith(".mcap"):
         with Recording.open(Path(name)) as recording:
-            bundle = bundle_of(recording)
-            pipeline = Pipeline(bundle, stream).feed_all(recording.raw(phase))
-        poses = pipeline.finish()
-        quality = pipeline.data_quality() + _creeping(poses)
-        return Measured(name, poses, pipeline.windows, quality, bundle.profile)
+            return _measure_recording(recording, phase, stream)
     samples = read_csv(name)
     detector = StillnessDetector()
     try:
@@ -61,6 +58,46 @@ def measure(name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS) ->
     poses = poses_of(windows, detector.spans())
     quality = [f"duplicate_samples: {samples.duplicates}"] if samples.duplicates else []
     return Measured(name, poses, windows, quality + _creeping(poses))
+
+
+def _measure_recording(recording: Recording, phase: Phase, stream: str) -> Measured:
+    bundle = bundle_of(recording)
+    pipeline = Pipeline(bundle, stream).feed_all(recording.raw(phase))
+    poses = pipeline.finish()
+    quality = pipeline.data_quality() + losses_of(recording) + _creeping(poses)
+    signs = signs_of(recording)
+    nominal = bundle.profile.output.nominal_scale_factor
+    if signs is None and nominal is not None:
+        signs = (_sign(nominal[0]), _sign(nominal[1]), _sign(nominal[2]))
+    reference = None
+    if STATION_FILE in recording.attachments:
+        where = f"{recording.name}: {STATION_FILE}"
+        reference = parse_station(recording.attachments[STATION_FILE], where=where).reference
+    return Measured(recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference)
+
+
+def signs_of(recording: Recording) -> tuple[int, int, int] | None:
+    """Of the scale factors, as the station that made the recording had them."""
+    parts = recording.metadata.get("unit", {}).get("signs", "").split(",")
+    if len(parts) != 3 or any(p not in ("1", "-1") for p in parts):
+        return None
+    return int(parts[0]), int(parts[1]), int(parts[2])
+
+
+def losses_of(recording: Recording) -> list[str]:
+    """What did not get into the recording, or was lost from it since, one line each."""
+    lost = sum(loss.records for loss in recording.losses())
+    found = [f"missing_samples: {lost} records were lost between bus and disk"] if lost else []
+    mended = recording.metadata.get(RECOVERY_RECORD, {})
+    counts = (mended.get(key, "") for key in ("raw_missing", "raw_dropped"))
+    missing = sum(int(count) for count in counts if count.isdecimal())
+    if missing:
+        found.append(f"missing_samples: {missing} records were lost when the recording was damaged")
+    return found
+
+
+def _sign(value: float) -> int:
+    return 1 if value > 0 else -1
 
 
 def _creeping(poses: list[Pose]) -> list[str]:
@@ -94,6 +131,8 @@ def read_document(path: str) -> Mapping[str, Any]:
         raise InputError(f"{path}, line {e.lineno}: not JSON: {e.msg}") from e
     except RecursionError as e:
         raise InputError(f"{path}: not JSON: nested too deeply") from e
+    except ValueError as e:  # a number of thousands of digits
+        raise InputError(f"{path}: not JSON that can be read: {e}") from e
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a JSON object")
     return document

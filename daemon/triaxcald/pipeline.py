@@ -97,4 +97,8 @@ class Pipeline:
             found.append(f"missing_samples: the receiver overflowed {self.counts['receiver_overflows']} times")
         if self.counts["duplicates"]:
             found.append(f"duplicate_samples: {self.counts['duplicates']}")
+        if self.counts["out_of_order"]:
+            found.append(f"out_of_order_samples: {self.counts['out_of_order']}, left out")
+        if self.counts["errors"]:
+            found.append(f"bus_errors: {self.counts['errors']} records")
         return found

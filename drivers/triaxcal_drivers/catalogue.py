@@ -35,11 +35,7 @@ def driver_named(name: str, *, where: str = "") -> Driver:
     points = _points()
     if name not in points:
         close = difflib.get_close_matches(name, points, n=1)
-        hint = (
-            f"; did you mean '{close[0]}'?"
-            if close
-            else f"; installed: {', '.join(sorted(points)) or 'none'}"
-        )
+        hint = f"; did you mean '{close[0]}'?" if close else f"; installed: {', '.join(sorted(points)) or 'none'}"
         raise DriverMissing(f"{lead}no driver named '{name}'{hint}")
     try:
         return cast("Driver", points[name].load()())

@@ -63,9 +63,7 @@ class Sampling(Strict):
     reply_timeout_s: Annotated[float, Field(gt=0)] = 1.0
 
 
-RawType = Literal[
-    "int16", "uint16", "int24", "uint24", "int32", "uint32", "int64", "uint64", "float32", "float64"
-]
+RawType = Literal["int16", "uint16", "int24", "uint24", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 """Types of raw values. 24-bit ones take three bytes on CAN; on Modbus use int32."""
 
 
@@ -114,9 +112,7 @@ class PollStep(Strict):
 
 
 class ReconnectStep(Strict):
-    reconnect: Annotated[
-        Literal[True], Field(description="close and open the connection, trying until it answers")
-    ]
+    reconnect: Annotated[Literal[True], Field(description="close and open the connection, trying until it answers")]
     timeout_s: Annotated[float, Field(gt=0, le=120)] = 5.0
 
 
@@ -162,11 +158,7 @@ class Profile(Strict):
     def _names_resolve(self) -> Self:
         if READINGS not in self.streams:
             raise ValueError(f"streams.{READINGS} is missing")
-        named = (
-            [("identity.serial_register", self.identity.serial_register)]
-            if self.identity.serial_register
-            else []
-        )
+        named = [("identity.serial_register", self.identity.serial_register)] if self.identity.serial_register else []
         named += [("identity.expect", n) for n in self.identity.expect]
         for label in ("unlock", "store", "lock", "reset"):
             for step in getattr(self.sequences, label):
@@ -221,9 +213,7 @@ class Bundle:
         return h.hexdigest()
 
 
-def parse_bundle(
-    text: bytes, files: Mapping[str, bytes] | None, *, where: str, folder: Path | None = None
-) -> Bundle:
+def parse_bundle(text: bytes, files: Mapping[str, bytes] | None, *, where: str, folder: Path | None = None) -> Bundle:
     """Validate a profile's text. Files come from ``files`` where given, else from ``folder``.
 
     Raises ProfileError (one line: where, line, field, what was expected), DriverMissing.
@@ -252,6 +242,8 @@ def parse_bundle(
 
 def load_bundle(path: Path) -> Bundle:
     """The profile at ``path``, or a built-in one where ``path`` is a bare name such as ``triax-ref-can``."""
+    if "\0" in str(path):
+        raise ProfileError(f"{str(path)!r}: no file has such a name")
     if not path.exists() and path.suffix in ("", ".toml") and path.parent == Path():
         built_in = BUILT_IN / (path.stem + ".toml")
         if built_in.exists():

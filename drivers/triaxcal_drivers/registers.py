@@ -49,10 +49,7 @@ def encode(register: Format, value: float, *, order: ByteOrder, name: str) -> by
     try:
         if register.type.startswith("float"):
             data = struct.pack(">" + _FORMATS[register.type], raw)
-            if (
-                struct.unpack(">" + _FORMATS[register.type], data)[0] in (float("inf"), float("-inf"))
-                or raw != raw
-            ):
+            if struct.unpack(">" + _FORMATS[register.type], data)[0] in (float("inf"), float("-inf")) or raw != raw:
                 raise OverflowError
         elif register.type.endswith("24"):
             data = round(raw).to_bytes(3, "big", signed=register.type == "int24")

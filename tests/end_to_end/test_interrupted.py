@@ -104,8 +104,10 @@ def test_an_interrupt_finishes_the_recording_and_leaves_the_unit_alone(
     wait_until(lambda: _poses_of(workshop.folder) >= 3 or not process.running)
     process.send(signal.SIGINT)
     assert process.wait() == 130
-    assert process.out == ""
-    assert process.err.endswith("triaxcal: interrupted\n")
+    if command == "run":
+        (unit,) = json.loads(process.out)["units"]
+        assert (unit["exit_code"], unit["device_state"], unit["registers_written"]) == (130, None, [])
+    assert "interrupted" in process.err.splitlines()[-1]
     assert "Traceback" not in process.err
 
     (path,) = workshop.folder.glob("*.mcap")
@@ -132,7 +134,7 @@ def test_a_unit_whose_process_dies_in_mid_recording_is_an_error(
     assert process.wait() == 4
     (unit,) = json.loads(process.out)["units"]
     assert unit["exit_code"] == 4
-    assert "unit rec (host=127.0.0.1, " in unit["error"]
+    assert "unit rec: " in unit["error"]
     assert process.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
     assert triaxcal("log", "info", unit["recording"], "--json").json["finished"] is True
     triaxcal("audit", unit["recording"]).failed(2, "holds no result")

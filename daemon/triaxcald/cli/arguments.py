@@ -42,15 +42,29 @@ def count(text: str) -> int:
     return int(text)
 
 
+def seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, not '{text}'")
+    return int(text)
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
 
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", metavar="REC", help=".mcap, .csv, .csv.gz or - for CSV on standard input")
+def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    recording = parser.add_argument("recording", metavar="REC", help=".mcap, .csv, .csv.gz or - for standard input")
+    if optional:
+        recording.nargs, recording.required = "?", False
     parser.add_argument("--sign", type=signs, metavar="S,S,S", help="signs of the scale factors; write --sign=-,-,-")
     parser.add_argument("--output-unit", metavar="UNIT", help="unit of the readings, for the documents")
-    parser.add_argument("--reference", type=positive, default=1.0, help="magnitude of the reference vector (1 g)")
+    parser.add_argument(
+        "--reference",
+        type=positive,
+        metavar="R",
+        help="magnitude of the reference vector in its own unit; default: the recording's, else 1 g",
+    )
+    parser.add_argument("--reference-unit", metavar="UNIT", help="that unit, for the documents")
     add_json(parser)
 
 

@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 
 from triaxcal.errors import InvalidData, Refused
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
-from triaxcald.cli import devices, line, measuring, recordings
+from triaxcald.cli import devices, line, measuring, planning, recordings
 from triaxcald.cli.arguments import OneLineParser
 from triaxcald.cli.console import say
+from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import DaemonError
+from triaxcald.station.write_back import UNCERTAIN
 
 DONE, OUTSIDE, BAD_INPUT, REFUSED, DEVICE, INTERRUPTED = 0, 1, 2, 3, 4, 130
 
 
 def parser() -> OneLineParser:
     top = OneLineParser(prog="triaxcal", description="Calibrates three-axis accelerometers.")
+    top.add_argument("--version", action="version", version=f"triaxcal {version('triaxcal')}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for room in (line, measuring, devices, recordings):
+    for room in (line, measuring, planning, devices, recordings):
         room.register(commands)
     return top
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs one command; gives its exit code. Errors are one line on standard error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal that knows no µ shall not end the work
     try:
         chosen = parser().parse_args(arguments)
     except SystemExit as e:
@@ -49,6 +57,9 @@ def main(arguments: Sequence[str]) -> int:
     except DaemonError as e:
         say(f"triaxcal: {e}")
         return e.exit_code
+    except Interrupted as e:
+        say(f"triaxcal: {e}")
+        return DEVICE if any(note.startswith(UNCERTAIN) for note in e.notes) else INTERRUPTED
     except KeyboardInterrupt:
         say("triaxcal: interrupted")
         return INTERRUPTED

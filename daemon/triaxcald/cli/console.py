@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from rich.console import Console
@@ -21,8 +22,10 @@ def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
 
 
 def say(text: str) -> None:
-    """A line to standard error."""
-    sys.stderr.write(text + "\n")
+    """A line to standard error; nowhere, where that has been closed: no work may fail for it."""
+    with suppress(OSError, ValueError):
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -69,7 +72,8 @@ class Bars:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._progress.stop()
+        with suppress(OSError):
+            self._progress.stop()
 
     def _task(self, unit: str) -> TaskID:
         if unit not in self._tasks:
@@ -77,15 +81,17 @@ class Bars:
         return self._tasks[unit]
 
     def stage(self, unit: str, text: str) -> None:
-        self._progress.update(self._task(unit), description=text)
+        self._show(unit, description=text)
         self._plain(unit, text)
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         what = "check poses" if phase == "verification" else "poses"
-        self._progress.update(
-            self._task(unit), completed=guide.found, total=guide.wanted, description=f"{what}: {guide.hint}"
-        )
+        self._show(unit, completed=guide.found, total=guide.wanted, description=f"{what}: {guide.hint}")
         self._plain(unit, f"{what}: {guide.found} of {guide.wanted}")
+
+    def _show(self, unit: str, **values: Any) -> None:
+        with suppress(OSError):  # the terminal has gone; the work goes on
+            self._progress.update(self._task(unit), **values)
 
     def _plain(self, unit: str, text: str) -> None:
         if not self._console.is_terminal and self._said.get(unit) != text:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,10 @@ from triaxcal.errors import Refused
 from triaxcal_drivers.catalogue import listed
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
 from triaxcal_drivers.profile import BUILT_IN, load_bundle
-from triaxcald.certificate import is_passing, roles
+from triaxcald.certificate import REFERENCE_TEMPERATURE, is_passing, roles
 from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say, table
+from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.documents import number, sensor_of
 from triaxcald.inputs import read_document
 from triaxcald.provision.explain import explain
@@ -46,8 +47,8 @@ def register(commands: Any) -> None:
 
 def provision_command(a: argparse.Namespace) -> int:
     place = load_station(a.station).place(a.unit)
-    image = image_from(a.calibration, place)
-    report = asyncio.run(_provision(place, image, a.dry_run))
+    image, serial = image_from(a.calibration, place)
+    report = run_interruptible(_provision(place, image, a.dry_run, serial))
     words = {w.register: w for w in image.words}
     document = {
         "format": "triaxcal.provisioning/1",
@@ -80,39 +81,63 @@ def provision_command(a: argparse.Namespace) -> int:
     if a.dry_run:
         print(f"dry run: {len(report.differing)} registers would be written, nothing was")
     else:
-        print(f"{len(report.written)} registers written, stored, read back after a restart and equal")
+        print(described(report))
     return 0
 
 
-def image_from(path: str, place: Place) -> RegisterImage:
-    """The registers that a calibration file asks for. Raises Refused where the device cannot hold its effects."""
-    sensor, channel_reference, _ = sensor_of(read_document(path), where=path)
+def described(report: ProvisionReport) -> str:
+    """What was done, in words."""
+    if not report.written:
+        return "the device held these registers already; nothing was written"
+    return f"{len(report.written)} registers written, stored, read back after a restart and equal"
+
+
+def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
+    """The registers that a calibration file asks for, and the serial number of the unit that it is meant for.
+
+    The serial is the station's where the file names none. Raises Refused where file, station and device do not go
+    together: another unit, another unit of the reference vector, other signs, effects that the device cannot hold.
+    """
+    document = read_document(path)
+    sensor, channel_reference, reference = sensor_of(document, where=path)
     profile = place.bundle.profile
-    homeless = [
-        f"{effect.name}.{c.name}"
-        for effect, _ in sensor.effects
-        for c in effect.coefficients
-        if not is_passing(effect) and profile.by_role(f"{effect.name}.{c.name}") is None
-    ]
+    if not 0.9 <= reference <= 1.1:
+        raise Refused(f"{path}: the reference is {reference:g}; registers are in units of g")
+    serial = _serial_of(document, path, place)
+    wanted = roles(sensor, channel_reference)
+    passing = {f"{e.name}.{c.name}" for e, _ in sensor.effects if is_passing(e) for c in e.coefficients}
+    homeless = [r for r in wanted if r not in passing and profile.by_role(r) is None and r != REFERENCE_TEMPERATURE]
     if homeless:
         raise Refused(
             f"{path}: {profile.name} has no register for {', '.join(homeless)}; without them the other coefficients "
-            "would be wrong: fit without that effect"
+            "would be wrong"
         )
-    wanted = {r: v for r, v in roles(sensor, channel_reference).items() if profile.by_role(r)}
-    return build_image(profile, wanted, date_days=days_since_1970())
+    for axis, k, sign in zip("xyz", sensor.scale_factor, place.signs, strict=True):
+        if k * sign < 0:
+            raise Refused(f"{path}: scale_factor.{axis} is {k:.4g}, of another sign than the device's: fit with --sign")
+    held = {r: v for r, v in wanted.items() if profile.by_role(r)}
+    return build_image(profile, held, date_days=days_since_1970()), serial
 
 
-async def _provision(place: Place, image: RegisterImage, dry_run: bool) -> ProvisionReport:
+def _serial_of(document: Mapping[str, Any], path: str, place: Place) -> str | None:
+    unit = document.get("unit")
+    meant = unit.get("serial") if isinstance(unit, Mapping) else None
+    expected = place.unit.serial
+    if meant is not None and expected is not None and meant != expected:
+        raise Refused(f"{path}: is for the unit with serial {meant}, the station expects {expected}")
+    return meant or expected
+
+
+async def _provision(place: Place, image: RegisterImage, dry_run: bool, serial: str | None) -> ProvisionReport:
     async with place.opened() as device:
         return await provision(
-            device, place.bundle, image, expected_serial=place.unit.serial, dry_run=dry_run, where=place.where
+            device, place.bundle, image, expected_serial=serial, dry_run=dry_run, where=place.address
         )
 
 
 def registers_command(a: argparse.Namespace) -> int:
     place = load_station(a.station).place(a.unit)
-    serial, rows = asyncio.run(_registers(place))
+    serial, rows = run_interruptible(_registers(place))
     if a.json:
         emit(
             {
@@ -140,7 +165,7 @@ def _remark(row: Any) -> str:
 
 async def _registers(place: Place) -> tuple[str | None, list[Any]]:
     async with place.opened() as device:
-        identity = await check_identity(device, place.bundle, place.unit.serial, where=place.where)
+        identity = await check_identity(device, place.bundle, place.unit.serial, where=place.address)
         return identity.serial, explain(place.bundle, await take_snapshot(device, place.bundle))
 
 

@@ -6,29 +6,31 @@ import argparse
 import asyncio
 import signal
 from collections.abc import Sequence
-from contextlib import aclosing
 from pathlib import Path
 from typing import Any
 
 from triaxcal_drivers.profile import READINGS
-from triaxcald.cli.arguments import add_json, positive, writable
+from triaxcald.cli.arguments import add_json, positive, seed, writable
 from triaxcald.cli.console import Bars, emit, micro, say, table
+from triaxcald.cli.devices import described
+from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.demo import DemoUnit, run_demo
 from triaxcald.documents import number
 from triaxcald.inputs import CALIBRATION
+from triaxcald.pipeline import Pipeline
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.eeprom import keep_eeprom, read_eeprom
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import load_station
 from triaxcald.station.line import Outcome, UnitRun, run_station
 
-SEVEREST = (4, 3, 2, 1, 0)
+SEVEREST = (4, 130, 3, 2, 1, 0)
 
 
 def register(commands: Any) -> None:
     p = commands.add_parser("demo", help="the whole line on two simulated units, in under a minute")
     p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
-    p.add_argument("--seed", type=int, default=1, help="of the units' hidden effects, noise and poses")
+    p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses")
     add_json(p)
     p.set_defaults(run=demo_command)
     p = commands.add_parser("run", help="the whole line on the devices of a station file")
@@ -49,12 +51,12 @@ def register(commands: Any) -> None:
 def run_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
     with Bars() as bars:
-        outcomes = asyncio.run(run_station(station, bars))
+        outcomes = run_interruptible(run_station(station, bars))
     if a.json:
         emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
     else:
         for o in outcomes:
-            if o.certified:
+            if o.error is None:
                 show_outcome(o)
     say_errors(outcomes)
     return worst(outcomes)
@@ -80,6 +82,8 @@ def _document(o: Outcome) -> dict[str, Any]:
         "after": result["after"] if result else None,
         "findings": result["findings"] if result else [],
         "registers_written": list(o.provisioned.written) if o.provisioned else [],
+        "device_state": o.device_state,
+        "records_lost": o.lost,
         "verification": o.verification,
     }
 
@@ -117,9 +121,15 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     if loop.unexplained.significant:
         print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms; {loop.unexplained.lead}")
     if o.provisioned:
-        print(f"  {len(o.provisioned.written)} registers written, stored, read back after a restart")
+        print(f"  {described(o.provisioned)}")
     if v:
         print(f"  verified by physics: {v['verdict']}")
+    if o.device_state:
+        print(f"  {o.device_state}")
+    elif o.certified.document["not_written"]:
+        print(f"  no registers written: {o.certified.document['not_written']}")
+    if o.lost:
+        print(f"  {o.lost} records were lost between bus and disk")
     for line in o.certified.document["outside"]:
         print(f"  outside limits: {line}")
     for what, path in (("recording", o.recording), ("certificate", o.certificate), ("report", o.report)):
@@ -128,15 +138,15 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
 
 def demo_command(a: argparse.Namespace) -> int:
     with Bars() as bars:
-        units = asyncio.run(run_demo(a.out, a.seed, bars))
+        units = run_interruptible(run_demo(a.out, a.seed, bars))
     if a.json:
         emit({"format": "triaxcal.demo/1", "units": [_demo_document(u) for u in units]})
     else:
         for u in units:
-            if u.outcome.certified:
+            if u.outcome.error is None:
                 _show_demo(u)
     say_errors([u.outcome for u in units])
-    return max(worst([u.outcome for u in units]), 0 if all(u.found for u in units) else 1)
+    return worst([u.outcome for u in units]) or (0 if all(u.found and u.kept for u in units) else 1)
 
 
 def _demo_document(u: DemoUnit) -> dict[str, Any]:
@@ -145,6 +155,7 @@ def _demo_document(u: DemoUnit) -> dict[str, Any]:
         **_document(u.outcome),
         "hidden": {name: dict(values) for name, values in u.hidden.items()},
         "found": u.found,
+        "kept": u.kept,
         "after_power_cycle_rms_g": number(cycled.rms_g) if cycled else None,
     }
 
@@ -157,7 +168,8 @@ def _show_demo(u: DemoUnit) -> None:
     show_outcome(u.outcome, extra)
     for name, values in u.hidden.items():
         truth = ", ".join(f"{axis} {value:+.4g}" for axis, value in values.items())
-        print(f"  hidden in it: {name} ({truth}): {'found' if u.found else 'NOT found'}\n")
+        print(f"  hidden in it: {name} ({truth}): {'found' if u.found else 'NOT found'}")
+    print(f"  after a power cycle: {'still within limits' if u.kept else 'NOT within limits'}\n")
 
 
 def sim_command(a: argparse.Namespace) -> int:
@@ -171,11 +183,11 @@ def sim_command(a: argparse.Namespace) -> int:
 async def _serve(simulated: SimulatedUnit, eeprom: Path | None) -> None:
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
-    async with simulated.serve():
-        settings = ", ".join(f"{k}={v}" for k, v in simulated.device.bus.items())
-        say(
-            f"serving {simulated.bundle.profile.name}, serial {simulated.device.serial}, on {settings}; Ctrl-C stops it"
-        )
+    async with simulated.serve() as server:
+        name, device = simulated.bundle.profile.name, simulated.device
+        bus = {**device.bus, **({"port": server.bus.port} if "port" in device.bus else {})}
+        settings = ", ".join(f"{k}={v}" for k, v in bus.items())
+        say(f"serving {name}, serial {device.serial:04d}, on {settings}; Ctrl-C stops it")
         async with keep_eeprom(simulated.unit, eeprom):
             await stop.wait()
 
@@ -185,22 +197,26 @@ def record_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
     place = station.place(a.unit)
     with Bars() as bars:
-        line = asyncio.run(_record(UnitRun(station, place, bars), a.output, a.seconds))
-    say(line)
+        run_interruptible(_record(UnitRun(station, place, bars), a.output, a.seconds))
     return 0
 
 
-async def _record(run: UnitRun, path: Path, seconds: float | None) -> str:
+async def _record(run: UnitRun, path: Path, seconds: float | None) -> None:
     async with run.place.opened() as device:
         identity = await run.identify(device)
-        with run.writer(path, identity) as writer:
-            collection = Collection(CALIBRATION, run.place.bundle)
-            pipeline = collection.pipelines[READINGS]
-            run.progress.stage(run.name, "recording")
-            async with aclosing(collection.records(device, writer)) as records:
-                async for _ in records:
-                    if seconds is not None and pipeline.seconds >= seconds:
-                        break
-            return f"{path}: {pipeline.counts['samples']} samples in {pipeline.seconds:.1f} s" + "".join(
-                f", {n} {kind}" for kind, n in pipeline.counts.items() if n and kind != "samples"
-            )
+        collection = Collection(CALIBRATION, run.place.bundle, run.place.address)
+        writer = run.writer(path, identity)
+        try:
+            with writer:
+                run.progress.stage(run.name, "recording")
+                await collection.for_seconds(device, writer, seconds)
+        finally:
+            say(_summary(path, collection.pipelines[READINGS], sum(writer.losses.values())))
+
+
+def _summary(path: Path, pipeline: Pipeline, lost: int) -> str:
+    parts = [f"{path}: {pipeline.counts['samples']} samples in {pipeline.seconds:.1f} s"]
+    parts += [f"{n} {kind}" for kind, n in pipeline.counts.items() if n and kind != "samples"]
+    if lost:
+        parts.append(f"{lost} records lost between bus and disk")
+    return ", ".join(parts)

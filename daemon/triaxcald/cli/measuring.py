@@ -1,23 +1,21 @@
-"""poses, fit, diagnose, verify, plan."""
+"""poses, fit, diagnose, verify."""
 
 from __future__ import annotations
 
 import argparse
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
-from triaxcal.effects import CATALOGUE
-from triaxcal.errors import InvalidData, Refused
+from triaxcal.errors import Refused
 from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose, magnitude_errors
-from triaxcal.plan import FULL, PAPER, dilution, directions, most_wanted
-from triaxcal.visibility import unseen_effects
 from triaxcald import documents
-from triaxcald.cli.arguments import add_json, add_recording, count, positive, signs, writable
+from triaxcald.cli.arguments import add_recording, positive, writable
 from triaxcald.cli.console import emit, micro, say, table
 from triaxcald.documents import number
 from triaxcald.errors import InputError
@@ -42,17 +40,9 @@ def register(commands: Any) -> None:
     p.set_defaults(run=diagnose_command)
     p = commands.add_parser("verify", help="error of the magnitude in every pose under a calibration")
     p.add_argument("calibration", metavar="CAL.json")
-    p.add_argument("recording", metavar="REC")
+    add_recording(p)
     p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this")
-    add_json(p)
     p.set_defaults(run=verify_command)
-    p = commands.add_parser("plan", help="a pose plan, and what it can and cannot see")
-    p.add_argument("recording", metavar="REC", nargs="?", help="name the poses that are still worth adding to it")
-    p.add_argument("--poses", type=count, metavar="14|26|N", help=f"default {FULL}")
-    p.add_argument("--for", dest="effects", nargs="+", metavar="EFFECT", default=[], help="effects it has to show")
-    p.add_argument("--sign", type=signs, metavar="S,S,S", help="of the scale factors of REC; write --sign=-,-,-")
-    add_json(p)
-    p.set_defaults(run=plan_command)
 
 
 def _add_results(p: argparse.ArgumentParser) -> None:
@@ -90,14 +80,17 @@ def fit_command(a: argparse.Namespace) -> int:
     writable(a.output)
     writable(a.report)
     measured = measure(a.recording)
-    calibration = fit(measured.poses, signs=_signs(a, measured), reference=a.reference)
-    document = documents.calibration_document(calibration, output_unit=_unit(a, measured))
+    choice = chosen(a, measured)
+    calibration = fit(measured.poses, signs=choice.signs, reference=choice.reference)
+    document = documents.calibration_document(
+        calibration, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+    )
     document["data_quality"] = measured.data_quality
     _write(a, measured, document)
     if a.json:
         emit(document)
     else:
-        show_calibration(calibration, _unit(a, measured))
+        show_calibration(calibration, choice)
         _warn([*calibration.warnings, *measured.data_quality])
     return _judge(a.limit, calibration.residual.rms_g)
 
@@ -107,14 +100,20 @@ def diagnose_command(a: argparse.Namespace) -> int:
     writable(a.report)
     measured = measure(a.recording)
     check = measure(a.check).poses if a.check else None
-    loop = diagnose(measured.poses, signs=_signs(a, measured), reference=a.reference, check=check)
-    document = documents.loop_document(loop, data_quality=measured.data_quality, output_unit=_unit(a, measured))
+    choice = chosen(a, measured)
+    loop = diagnose(measured.poses, signs=choice.signs, reference=choice.reference, check=check)
+    document = documents.loop_document(
+        loop,
+        data_quality=measured.data_quality,
+        output_unit=choice.output_unit,
+        reference_unit=choice.reference_unit,
+    )
     _write(a, measured, document)
     if a.json:
         emit(document)
     else:
-        show_loop(loop)
-        show_calibration(loop.after, _unit(a, measured))
+        show_loop(loop, choice)
+        show_calibration(loop.after, choice)
         _warn([*loop.after.warnings, *measured.data_quality])
     return _judge(a.limit, loop.after.residual.rms_g)
 
@@ -122,10 +121,16 @@ def diagnose_command(a: argparse.Namespace) -> int:
 def verify_command(a: argparse.Namespace) -> int:
     document = read_document(a.calibration)
     sensor, channel_reference, reference = documents.sensor_of(document, where=a.calibration)
+    if a.sign and any(k * s < 0 for k, s in zip(sensor.scale_factor, a.sign, strict=True)):
+        raise InputError(f"--sign: the scale factors in {a.calibration} have other signs")
+    if a.reference and not math.isclose(a.reference, reference, rel_tol=1e-9):
+        raise InputError(f"--reference {a.reference:g}: {a.calibration} was made for {reference:g}")
     measured = measure(a.recording)
     if not measured.poses:
         raise Refused(f"{a.recording}: no still pose")
     errors, noise = magnitude_errors(sensor, measured.poses, channel_reference=channel_reference, reference=reference)
+    if not (np.isfinite(errors).all() and np.isfinite(noise).all()):
+        raise InputError(f"{a.calibration}: its numbers and the readings of {a.recording} give no finite magnitude")
     rms = float(np.sqrt(np.mean(errors**2)))
     result = {
         "format": "triaxcal.verify/1",
@@ -157,86 +162,33 @@ def verify_command(a: argparse.Namespace) -> int:
     return _judge(a.limit, rms)
 
 
-def plan_command(a: argparse.Namespace) -> int:
-    known = [e.name for e in CATALOGUE]
-    for name in a.effects:
-        if name not in known:
-            raise InputError(f"--for {name}: no effect of that name; known: {', '.join(known)}")
-    if a.recording:
-        return _plan_for_recording(a)
-    try:
-        plan = directions(a.poses or _enough_for(a.effects))
-    except InvalidData as e:
-        raise InputError(f"--poses: {e}") from e
-    ups = np.array([v for _, v in plan])
-    blind = unseen_effects(ups)
-    document = {
-        "format": "triaxcal.plan/1",
-        "poses": [{"label": label, "up": documents.numbers(v)} for label, v in plan],
-        "dilution": number(dilution(ups)),
-        "blind_to": blind,
-    }
-    if a.json:
-        emit(document)
-    else:
-        _show_poses(f"{len(plan)} poses", plan)
-        print(f"worst parameter: {document['dilution']:.2f} standard errors of one pose")
-        print(f"cannot show: {', '.join(blind) or 'nothing of the catalogue'}")
-    missed = [e for e in a.effects if e in blind]
-    if missed:
-        raise Refused(f"a plan of {len(plan)} poses cannot show {', '.join(missed)}; take {FULL}")
-    return 0
+@dataclass(frozen=True)
+class Choice:
+    """How a recording is to be read: the user's word, else the recording's own, else the default."""
+
+    signs: tuple[int, int, int]
+    reference: float
+    output_unit: str
+    reference_unit: str
+
+    @property
+    def micro_unit(self) -> str:
+        return "µg" if self.reference_unit == "g" else f"1e-6 {self.reference_unit}"
 
 
-def _enough_for(effects: list[str]) -> int:
-    if not effects:
-        return FULL
-    return next((n for n in (PAPER, FULL) if not set(effects) & set(unseen_effects(_ups(n)))), FULL)
-
-
-def _ups(n: int) -> Floats:
-    return np.array([v for _, v in directions(n)])
-
-
-def _plan_for_recording(a: argparse.Namespace) -> int:
-    measured = measure(a.recording)
-    try:
-        have = np.array([p.direction for p in fit(measured.poses, signs=_signs(a, measured)).poses])
-        dilution_now: float | None = dilution(have)
-        wanted = most_wanted(have, enough=1.0)
-    except Refused as e:
-        dilution_now = None
-        by_label = dict(directions(FULL))
-        wanted = [(label, by_label[label]) for label in e.wanted]
-    document = {
-        "format": "triaxcal.plan/1",
-        "have": len(measured.poses),
-        "dilution": number(dilution_now),
-        "poses": [{"label": label, "up": documents.numbers(v)} for label, v in wanted],
-    }
-    if a.json:
-        emit(document)
-    else:
-        _show_poses(f"poses worth adding to the {len(measured.poses)} of {measured.name}", wanted)
-    return 0
-
-
-def _show_poses(title: str, plan: list[tuple[str, Floats]]) -> None:
-    rows = [[i + 1, label, *(f"{c:+.3f}" for c in v)] for i, (label, v) in enumerate(plan)]
-    table(title, ["pose", "up", "x", "y", "z"], rows)
-
-
-def _signs(a: argparse.Namespace, measured: Measured) -> tuple[int, int, int]:
-    return a.sign or measured.signs or (1, 1, 1)
-
-
-def _unit(a: argparse.Namespace, measured: Measured) -> str:
-    return a.output_unit or (measured.profile.output.unit if measured.profile else "")
+def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
+    reference = a.reference or measured.reference or 1.0
+    return Choice(
+        a.sign or measured.signs or (1, 1, 1),
+        reference,
+        a.output_unit or (measured.profile.output.unit if measured.profile else ""),
+        a.reference_unit or documents.reference_unit_of(reference),
+    )
 
 
 def _judge(limit: float | None, rms: float) -> int:
-    if limit is not None and rms > limit:
-        say(f"outside the limit: rms {rms:.3g} g, limit {limit:.3g} g")
+    if limit is not None and not rms <= limit:
+        say(f"outside the limit: rms {rms:.3g}, limit {limit:.3g}")
         return 1
     return 0
 
@@ -261,25 +213,29 @@ def _overview(a: argparse.Namespace, measured: Measured) -> StreamOverview | Non
         return None
     time_s, readings = thin((w.start_ns - int(w.start_ns[0])) * 1e-9, w.mean)
     spans = tuple((p.start_s, p.end_s) for p in measured.poses)
-    return StreamOverview(time_s, readings, spans, _unit(a, measured))
+    return StreamOverview(time_s, readings, spans, chosen(a, measured).output_unit)
 
 
-def show_calibration(c: Calibration, unit: str) -> None:
+def show_calibration(c: Calibration, choice: Choice) -> None:
     rows = []
-    units = {"scale_factor": f"{unit or 'output'}/g", "misalignment": "rad", "bias": "g"}
-    of_effects = {f"{e.name}.{k.name}": k.unit for e, _ in c.sensor.effects for k in e.coefficients}
+    unit = choice.reference_unit
+    units = {"scale_factor": f"{choice.output_unit or 'output'}/{unit}", "misalignment": "rad", "bias": unit}
+    of_effects = {
+        f"{e.name}.{k.name}": documents.in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients
+    }
     for name, value, error in zip(c.parameters, c.values, c.standard_errors, strict=True):
         rows.append([name, f"{value:.9g}", f"{error:.2g}", of_effects.get(name, units.get(name.split(".")[0], ""))])
     table("coefficients", ["", "value", "standard error", "unit"], rows)
-    r = c.residual
+    r, micro_unit = c.residual, choice.micro_unit
     p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
     print(
-        f"{len(c.poses)} poses: residual rms {micro(r.rms_g)} µg, cross-validated {micro(r.cross_validated_rms_g)} µg, "
-        f"noise floor {micro(r.noise_floor_g)} µg, lack of fit p {p}"
+        f"{len(c.poses)} poses: residual rms {micro(r.rms_g)} {micro_unit}, cross-validated "
+        f"{micro(r.cross_validated_rms_g)} {micro_unit}, noise floor {micro(r.noise_floor_g)} {micro_unit}, "
+        f"lack of fit p {p}"
     )
 
 
-def show_loop(loop: Loop) -> None:
+def show_loop(loop: Loop, choice: Choice) -> None:
     b, f = loop.before.residual, loop.after.residual
     rows = [
         ["residual rms", micro(b.rms_g), micro(f.rms_g)],
@@ -288,12 +244,12 @@ def show_loop(loop: Loop) -> None:
     if loop.held_out:
         rows.append(["held-out rms", micro(loop.held_out.before_rms_g), micro(loop.held_out.after_rms_g)])
     rows.append(["noise floor", micro(b.noise_floor_g), micro(f.noise_floor_g)])
-    table("error of the magnitude, µg", ["", "before", "after"], rows)
+    table(f"error of the magnitude, {choice.micro_unit}", ["", "before", "after"], rows)
     for finding in loop.findings:
         print(f"{finding.verdict}: {finding.effect} ({finding.reason})")
     if not loop.findings:
         print("no effect of the catalogue shows")
     if loop.unexplained.significant:
-        print(f"unexplained: {micro(loop.unexplained.rms_g)} µg rms; {loop.unexplained.lead}")
+        print(f"unexplained: {micro(loop.unexplained.rms_g)} {choice.micro_unit} rms; {loop.unexplained.lead}")
     for line in loop.advice:
         print(f"advice: {line}")

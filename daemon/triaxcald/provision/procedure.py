@@ -84,10 +84,10 @@ async def provision(
     except (DriverError, StationError) as e:
         if isinstance(e, WrongUnit) and not run.unlocked:
             raise
-        state = await _to_its_end(_undo(run))
+        state = await to_its_end(_undo(run))
         raise ProvisionError(f"provisioning failed at {run.steps[-1]}: {e}; {state}") from e
     except (Exception, asyncio.CancelledError, KeyboardInterrupt) as e:
-        e.add_note(await _to_its_end(_undo(run)))
+        e.add_note(await to_its_end(_undo(run)))
         raise
 
 
@@ -145,7 +145,7 @@ async def _undo(run: _Run) -> str:
     return "old calibration restored and verified"
 
 
-async def _to_its_end(work: Coroutine[object, object, str]) -> str:
+async def to_its_end(work: Coroutine[object, object, str]) -> str:
     """Awaits ``work`` and does not let a further cancellation stop it half-way."""
     task = asyncio.ensure_future(work)
     while True:

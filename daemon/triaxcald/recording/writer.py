@@ -139,7 +139,12 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except RecordingError as e:
+            if value is None:
+                raise
+            value.add_note(str(e))  # what is on its way already weighs more
 
     def _check(self) -> None:
         if self._failure is not None:

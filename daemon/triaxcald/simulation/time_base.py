@@ -34,6 +34,31 @@ class RealTimeBase:
             await asyncio.sleep(left / self.speed)
 
 
+class ElasticTimeBase:
+    """At most ``speed`` times as fast as the wall clock, and never more than ``step_s`` from one look to the next.
+
+    For units simulated in the process that reads them: where that is too slow, their time goes slower too, and nothing
+    overflows that would not in real time.
+    """
+
+    def __init__(self, speed: float = 1.0, step_s: float = 0.05) -> None:
+        if not (speed > 0 and step_s > 0):
+            raise ValueError(f"speed and step must be above 0, not {speed} and {step_s}")
+        self.speed, self.step_s = speed, step_s
+        self._now_s = 0.0
+        self._looked_s = time.monotonic()
+
+    def now_s(self) -> float:
+        looked_s = time.monotonic()
+        self._now_s += min((looked_s - self._looked_s) * self.speed, self.step_s)
+        self._looked_s = looked_s
+        return self._now_s
+
+    async def wait_until(self, unit_s: float) -> None:
+        while (left := unit_s - self.now_s()) > 0:
+            await asyncio.sleep(min(left, self.step_s) / self.speed)
+
+
 class SteppedTimeBase:
     """Stands still until a test moves it; whoever waits is woken in the order of the times waited for."""
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 from triaxcal.errors import Refused
+from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device, RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.pipeline import Pipeline
@@ -30,10 +31,14 @@ class Progress(Protocol):
 
 @dataclass
 class Collection:
-    """``pipelines`` by stream: the readings, and the corrected output where the device has one."""
+    """``pipelines`` by stream: the readings, and the corrected output where the device has one.
+
+    ``where`` says where the unit is, for messages.
+    """
 
     phase: Phase
     bundle: Bundle
+    where: str
     digest: RawDigest = field(default_factory=RawDigest)
 
     def __post_init__(self) -> None:
@@ -56,6 +61,27 @@ class Collection:
                         writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
                 yield batch
 
+    def _watch(self, stream: str, clock_s: Callable[[], float]) -> _Watch:
+        # Twice what the driver waits, which knows better what is the matter where nothing comes at all.
+        timeout_s = 2 * self.bundle.profile.sampling.silence_timeout_s
+        return _Watch(self.pipelines[stream], f"{self.where}: stream {stream}", timeout_s, clock_s)
+
+    async def for_seconds(
+        self,
+        device: Device,
+        writer: RecordingWriter,
+        seconds: float | None,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Records so many seconds of the readings' own time; for ever where None."""
+        pipeline = self.pipelines[READINGS]
+        watch = self._watch(READINGS, clock_s)
+        async with aclosing(self.records(device, writer)) as records:
+            async for _ in records:
+                watch.look()
+                if seconds is not None and pipeline.seconds >= seconds:
+                    return
+
     async def until_posed(
         self,
         device: Device,
@@ -74,8 +100,10 @@ class Collection:
         """
         pipeline = self.pipelines[stream]
         looked_s, looked_host_s, news_s, found = 0.0, -LOOK_HOST_S, 0.0, 0
+        watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:
             async for _ in records:
+                watch.look()
                 now_s, host_s = pipeline.seconds, clock_s()
                 if now_s - looked_s < LOOK_SAMPLES_S or host_s - looked_host_s < LOOK_HOST_S:
                     continue
@@ -99,3 +127,19 @@ class Collection:
                         f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there",
                         wanted=state.missing,
                     )
+
+
+class _Watch:
+    """Sees that one stream goes on; a device may go on sending another and never this one."""
+
+    def __init__(self, pipeline: Pipeline, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
+        self._pipeline, self._stream, self._timeout_s, self._clock_s = pipeline, stream, timeout_s, clock_s
+        self._samples, self._heard_s = pipeline.counts["samples"], clock_s()
+
+    def look(self) -> None:
+        """Raises DeviceSilent."""
+        now_s, samples = self._clock_s(), self._pipeline.counts["samples"]
+        if samples != self._samples:
+            self._samples, self._heard_s = samples, now_s
+        elif now_s - self._heard_s > self._timeout_s:
+            raise DeviceSilent(f"{self._stream}: the device sends, but no whole sample of it for {self._timeout_s:g} s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
@@ -13,8 +14,10 @@ from pydantic import BaseModel, Field, model_validator
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import Bundle, Strict, load_bundle, parse_toml, validate
+from triaxcal_drivers.profile import CORRECTED, Bundle, Strict, load_bundle, parse_toml, validate
 from triaxcald.errors import InputError
+
+PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 
 
 class Plan(Strict):
@@ -43,7 +46,10 @@ class Provisioning(Strict):
 
 class Unit(Strict):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
-    profile: Annotated[str, Field(description="a file beside the station file, or the name of a built-in profile")]
+    profile: Annotated[
+        str,
+        Field(pattern=r"^[^\x00]+$", description="a file beside the station file, or the name of a built-in profile"),
+    ]
     serial: Annotated[str | None, Field(description="refuse any other unit")] = None
     signs: Annotated[
         tuple[Literal[-1, 1], Literal[-1, 1], Literal[-1, 1]] | None,
@@ -55,12 +61,25 @@ class Unit(Strict):
 class StationFile(Strict):
     format: Literal["triaxcal.station/1"]
     name: str
-    folder: Annotated[str, Field(description="where recordings and results go, beside the station file")] = "."
-    reference: Annotated[float, Field(gt=0, description="magnitude of the reference vector; 1 g")] = 1.0
+    folder: Annotated[
+        str, Field(pattern=r"^[^\x00]+$", description="where recordings and results go, beside the station file")
+    ] = "."
+    reference: Annotated[
+        float, Field(ge=0.9, le=1.1, description="local gravity in units of g, which registers and limits are in too")
+    ] = 1.0
     plan: Plan = Plan()
     limits: Limits = Limits()
     provisioning: Provisioning = Provisioning()
     units: Annotated[tuple[Unit, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _poses_fit_apart(self) -> Self:
+        # Caps of half the distance around the poses cannot overlap; about 0.8 of a sphere can be covered by them.
+        room = 0.8 * 2 / (1 - math.cos(math.radians(self.plan.apart_deg / 2)))
+        for name in ("poses", "check_poses"):
+            if getattr(self.plan, name) > room:
+                raise ValueError(f"plan.{name}: there are not so many directions {self.plan.apart_deg:g} degrees apart")
+        return self
 
     @model_validator(mode="after")
     def _names_differ(self) -> Self:
@@ -80,9 +99,9 @@ class Place:
     bus: BaseModel
 
     @property
-    def where(self) -> str:
-        settings = ", ".join(f"{k}={v}" for k, v in self.unit.bus.items())
-        return f"unit {self.unit.name} ({settings})"
+    def address(self) -> str:
+        """Where the unit is, for messages."""
+        return ", ".join(f"{k}={v}" for k, v in self.unit.bus.items())
 
     def device(self) -> Device:
         return driver_named(self.bundle.profile.driver).device(self.bundle, self.bus)
@@ -147,6 +166,10 @@ def load_station(path: Path) -> Station:
         bundle = load_bundle(beside if beside.exists() else Path(unit.profile))
         driver = driver_named(bundle.profile.driver, where=str(path))
         bus = validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
+        if file.limits.verification_rms_g is not None and CORRECTED not in bundle.profile.streams:
+            raise InputError(
+                f"{path}: limits.verification_rms_g: unit {unit.name} has no corrected stream to verify it by"
+            )
         places.append(Place(unit, bundle, bus))
         places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
     return Station(path, text, file, tuple(places))

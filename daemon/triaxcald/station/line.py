@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import json
+import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,25 +19,22 @@ from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.certificate import Certified, certify, software
 from triaxcald.documents import Document, to_text
-from triaxcald.errors import DaemonError, InputError, RecordingError, StationError
+from triaxcald.errors import DaemonError, InputError, RecordingError
 from triaxcald.files import write_text
-from triaxcald.inputs import CALIBRATION, PROFILE, VERIFICATION
+from triaxcald.inputs import CALIBRATION, PROFILE, STATION_FILE, VERIFICATION
 from triaxcald.pipeline import Pipeline
-from triaxcald.provision.access import RecordedDevice, RegisterAccess
 from triaxcald.provision.identity import IdentityRead, check_identity
-from triaxcald.provision.procedure import ProvisionReport, provision
-from triaxcald.provision.restore import restore
-from triaxcald.provision.snapshot import Snapshot
+from triaxcald.provision.procedure import ProvisionReport
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import render_report
 from triaxcald.report.stream import StreamOverview, thin
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, Station
-from triaxcald.verification import Verification, verification_document, verify
+from triaxcald.station.write_back import NEW_UNCHECKED, NEW_VERIFIED, UNCERTAIN, WriteBack, corrected
+from triaxcald.verification import Verification
 
-CERTIFICATE, VERIFICATION_FILE, STATION_FILE = "certificate.json", "verification.json", "station.toml"
-RESTORED = "old calibration restored and verified"
-REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
+CERTIFICATE = "certificate.json"
+INTERRUPTED, FAILED = 130, 4
 
 _DRAWING = threading.Lock()
 """The pictures' style is the process's own: one report is drawn at a time."""
@@ -43,7 +42,11 @@ _DRAWING = threading.Lock()
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one unit's run ended. ``exit_code`` as the command line owes it; ``error`` one line where it failed."""
+    """How one unit's run ended. ``exit_code`` as the command line owes it; ``error`` one line where it failed.
+
+    ``device_state`` says in words what the device holds, None where nothing was written. ``lost`` counts records that
+    did not get to the disk.
+    """
 
     unit: str
     exit_code: int
@@ -53,8 +56,10 @@ class Outcome:
     certified: Certified | None = None
     verification: Document | None = None
     provisioned: ProvisionReport | None = None
+    device_state: str | None = None
     error: str | None = None
     wanted: tuple[str, ...] = ()
+    lost: int = 0
 
 
 class UnitRun:
@@ -66,34 +71,71 @@ class UnitRun:
         self.station, self.place, self.progress, self.clock_ns = station, place, progress, clock_ns
         self.name = place.unit.name
         self.profile = place.bundle.profile
+        self._recording: Path | None = None
+        self._certificate: Path | None = None
+        self._page: Path | None = None
+        self._certified: Certified | None = None
+        self._write_back: WriteBack | None = None
+        self._lost = 0
 
     async def run(self) -> Outcome:
-        """Never raises for what a unit, a bus or the data do; says it in the outcome."""
-        path: Path | None = None
+        """Raises nothing, not even when it is cancelled: it says everything in the outcome."""
         try:
             async with self.place.opened() as device:
                 identity = await self.identify(device)
-                path = self.recording_path(identity)
-                with self.writer(path, identity) as writer:
+                self._recording = self.recording_path(identity)
+                with self.writer(self._recording, identity) as writer:
                     try:
-                        return await self._line(device, identity, writer, path)
+                        code = await self._line(device, identity, writer)
                     except (TriaxcalError, DriverError, DaemonError) as e:
-                        writer.event("failed", {"error": str(e)})
+                        with suppress(RecordingError):
+                            writer.event("failed", {"error": str(e)})
                         raise
+                    finally:
+                        self._lost = sum(writer.losses.values())
+        except asyncio.CancelledError:
+            return self._outcome(INTERRUPTED, "interrupted")
         except Refused as e:
-            return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}", wanted=e.wanted)
-        except TriaxcalError as e:
-            return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}")
-        except RegisterValueError as e:
-            return Outcome(self.name, 3, path, error=f"{self.place.where}: {e}; nothing was written")
+            return self._outcome(3, str(e), e.wanted)
+        except (TriaxcalError, RegisterValueError) as e:
+            return self._outcome(3, str(e))
         except DriverError as e:
-            return Outcome(self.name, 4, path, error=f"{self.place.where}: {e}")
+            return self._outcome(FAILED, str(e))
         except DaemonError as e:
-            return Outcome(self.name, e.exit_code, path, error=f"{self.place.where}: {e}")
+            return self._outcome(e.exit_code, str(e))
+        except Exception as e:  # noqa: BLE001 - the one place that supervises: other units must go on
+            traceback.print_exc(file=sys.stderr)
+            return self._outcome(FAILED, f"internal error: {e!r}")
+        return self._outcome(code)
+
+    def _outcome(self, code: int, error: str | None = None, wanted: tuple[str, ...] = ()) -> Outcome:
+        """With what there is by now. Once writing has begun, an error also says what the device holds."""
+        back = self._write_back
+        state = back.state if back else None
+        if error is not None:
+            if state is not None and state not in error:
+                error = f"{error}; {state}"
+            if state is not None and (code != INTERRUPTED or state.startswith(UNCERTAIN)):
+                code = FAILED
+            error = f"unit {self.name}: {error}"
+        return Outcome(
+            unit=self.name,
+            exit_code=code,
+            recording=self._recording,
+            certificate=self._certificate,
+            report=self._page,
+            certified=self._certified,
+            verification=back.verification if back else None,
+            provisioned=back.report if back else None,
+            device_state=state,
+            error=error,
+            wanted=wanted,
+            lost=self._lost,
+        )
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")
-        return await check_identity(device, self.place.bundle, self.place.unit.serial, where=self.place.where)
+        return await check_identity(device, self.place.bundle, self.place.unit.serial, where=self.place.address)
 
     def recording_path(self, identity: IdentityRead) -> Path:
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
@@ -129,38 +171,33 @@ class UnitRun:
             names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
         return list(names)
 
-    async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter, path: Path) -> Outcome:
-        plan = self.station.file.plan
-        tumble = Collection(CALIBRATION, self.place.bundle)
+    async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> int:
+        """The exit code that the figures owe."""
+        assert self._recording is not None
+        plan, stem = self.station.file.plan, self._recording.with_suffix("")
+        tumble = Collection(CALIBRATION, self.place.bundle, self.place.address)
         await self._collect(device, writer, tumble, READINGS, plan.poses)
         self.progress.stage(self.name, "fitting")
         poses = tumble.pipelines[READINGS].finish()
-        certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
+        certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
         writer.attach(CERTIFICATE, "application/json", to_text(certified.document).encode())
-        stem = path.with_suffix("")
-        outcome = Outcome(
-            self.name,
-            0 if certified.within_limits else 1,
-            path,
-            write_text(Path(f"{stem}.certificate.json"), to_text(certified.document)),
-            certified=certified,
-        )
-        provisioned, verification = None, None
+        self._certificate = write_text(Path(f"{stem}.certificate.json"), to_text(certified.document))
+        code = 0 if certified.within_limits else 1
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
-            provisioned, verification = await self._write_back(device, writer, certified, tumble, identity)
-            if verification and verification["verdict"] == "outside limits":
-                outcome = Outcome(**{**vars(outcome), "exit_code": 1})
+
+            async def collect(check: Collection) -> None:
+                self.progress.stage(self.name, "verifying by physics")
+                await self._collect(device, writer, check, CORRECTED, plan.check_poses)
+
+            self.progress.stage(self.name, "writing the registers")
+            back = self._write_back = WriteBack(self.place, self.station.file, writer, collect)
+            await back.run(device, certified.image, identity.serial, tumble)
+            code = 0 if back.state in (NEW_VERIFIED, NEW_UNCHECKED) else 1
         self.progress.stage(self.name, "writing the report")
-        page = await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS], verification)
+        page = await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS])
         writer.attach("report.html", "text/html", page.encode())
-        return Outcome(
-            **{
-                **vars(outcome),
-                "report": write_text(Path(f"{stem}.report.html"), page),
-                "provisioned": provisioned,
-                "verification": verification,
-            }
-        )
+        self._page = write_text(Path(f"{stem}.report.html"), page)
+        return code
 
     def _certify(self, tumble: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
         return certify(
@@ -194,73 +231,17 @@ class UnitRun:
         async with self.place.opened() as device:
             await self.identify(device)
             self.progress.stage(self.name, "check poses")
-            check = Collection(VERIFICATION, self.place.bundle)
+            check = Collection(VERIFICATION, self.place.bundle, self.place.address)
             wanted = self.station.file.plan.check_poses
             await self._collect(device, None, check, CORRECTED, wanted)
-            return self._corrected(check)
+            return corrected(check, self.station.file.reference)
 
-    async def _write_back(
-        self, device: Device, writer: RecordingWriter, certified: Certified, tumble: Collection, identity: IdentityRead
-    ) -> tuple[ProvisionReport, Document | None]:
-        assert certified.image is not None
-        self.progress.stage(self.name, "writing the registers")
-        try:
-            report = await provision(
-                device,
-                self.place.bundle,
-                certified.image,
-                expected_serial=identity.serial,
-                record=_Recorder(writer),
-                where=self.place.where,
-            )
-        except RecordingError as e:  # the disk, while the device was at work; the notes say in what state it is
-            raise StationError("; ".join([str(e), *getattr(e, "__notes__", [])])) from e
-        writer.attach(REGISTERS_BEFORE, "application/json", _snapshot_text(report.before))
-        writer.attach(REGISTERS_AFTER, "application/json", _snapshot_text(report.after))
-        writer.event("provisioned", {"written": list(report.written)})
-        if CORRECTED not in self.profile.streams:
-            return report, None
-        try:
-            document = await self._verify(device, writer, tumble)
-        except (DriverError, DaemonError, TriaxcalError, asyncio.CancelledError) as e:
-            state = await self._undo(device, writer, report)
-            if isinstance(e, asyncio.CancelledError):
-                raise
-            raise StationError(f"verification failed: {e}; {state}") from e
-        if document["verdict"] == "outside limits":
-            state = await self._undo(device, writer, report)
-            writer.event("restored", {"state": state})
-            if state != RESTORED:
-                raise StationError(f"verification outside limits; {state}")
-        return report, document
-
-    async def _undo(self, device: Device, writer: RecordingWriter, report: ProvisionReport) -> str:
-        recorded = RecordedDevice(device, _Recorder(writer, lenient=True))
-        try:
-            await asyncio.shield(restore(recorded, self.place.bundle, report.before, stored=True))
-        except (DriverError, StationError) as e:
-            return f"NOT restored: {e}"
-        return RESTORED
-
-    async def _verify(self, device: Device, writer: RecordingWriter, tumble: Collection) -> Document:
-        self.progress.stage(self.name, "verifying by physics")
-        file = self.station.file
-        check = Collection(VERIFICATION, self.place.bundle)
-        await self._collect(device, writer, check, CORRECTED, file.plan.check_poses)
-        document = verification_document(
-            self._corrected(tumble), self._corrected(check), limit_g=file.limits.verification_rms_g,
-            raw_sha256=check.digest.hexdigest(),
-        )  # fmt: skip
-        writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
-        return document
-
-    def _corrected(self, phase: Collection) -> Verification:
-        return verify(phase.pipelines[CORRECTED].finish(), self.station.file.reference)
-
-    def _report(self, certified: Certified, pipeline: Pipeline, verification: Document | None) -> str:
+    def _report(self, certified: Certified, pipeline: Pipeline) -> str:
         papers = dict(certified.document)
-        if verification:
-            papers["verification"] = verification
+        if self._write_back and self._write_back.verification:
+            papers["verification"] = self._write_back.verification
+        if self._write_back:
+            papers["device"] = self._write_back.state
         with _DRAWING:
             return render_report(
                 certified.document["result"],
@@ -281,25 +262,16 @@ def overview(pipeline: Pipeline, unit: str) -> StreamOverview | None:
     return StreamOverview(time_s, readings, spans, unit)
 
 
-class _Recorder:
-    """Records register accesses; once the disk has failed, silently none, so that the device can be put back."""
+async def run_station(station: Station, progress: Progress) -> list[Outcome]:
+    """All units of a station at once; one that fails does not stop the others.
 
-    def __init__(self, writer: RecordingWriter, *, lenient: bool = False) -> None:
-        self._writer, self._lenient = writer, lenient
-
-    def __call__(self, access: RegisterAccess) -> None:
-        try:
-            self._writer.register(access.register, access.kind, access.raw, access.error or "")
-        except RecordingError:
-            if not self._lenient:
-                self._lenient = True
-                raise
-
-
-def _snapshot_text(snapshot: Snapshot) -> bytes:
-    return (json.dumps({name: raw.hex() for name, raw in snapshot.raw.items()}, indent=2) + "\n").encode()
-
-
-async def run_station(station: Station, progress: Progress) -> Sequence[Outcome]:
-    """All units of a station at once; one that fails does not stop the others."""
-    return await asyncio.gather(*(UnitRun(station, place, progress).run() for place in station.places))
+    When it is cancelled, every unit is put in order first; the outcomes then say 130.
+    """
+    units = [asyncio.ensure_future(UnitRun(station, place, progress).run()) for place in station.places]
+    try:
+        await asyncio.wait(units)
+    except asyncio.CancelledError:
+        for unit in units:
+            unit.cancel()
+        await asyncio.wait(units)
+    return [unit.result() for unit in units]

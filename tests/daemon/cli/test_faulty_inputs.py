@@ -225,7 +225,7 @@ def test_a_full_disk_for_the_result(finished_run: Any, tmp_path: Path, triaxcal:
         (["log"], "the following arguments are required: info|recover|export"),
         (["sim", "none.toml"], "none.toml: No such file or directory"),
         (["run", "none.toml"], "none.toml: No such file or directory"),
-        (["demo", "--seed", "x"], "argument --seed: invalid int value: 'x'"),
+        (["demo", "--seed", "x"], "argument --seed: expected a whole number of at least 0, not 'x'"),
     ],
 )
 def test_a_wrong_command_line(triaxcal: Run, arguments: list[str], words: str) -> None:

@@ -121,4 +121,4 @@ def test_a_whole_recording_recovers_without_a_loss(finished_run: Any, tmp_path: 
     assert not any(recovery[k] for k in ("cut_short", "raw_missing", "raw_dropped", "bytes_dropped", "chunks_failed"))
     done = triaxcal("audit", out, "--json")
     assert done.code == 0
-    assert done.json["audits"][0]["notes"] == ["the recording was cut short and mended"]
+    assert done.json["audits"][0]["notes"] == ["the recording was cut short or damaged, and mended"]

@@ -42,7 +42,7 @@ def test_a_sound_station_gives_its_places_and_its_own_text(tmp_path: Path) -> No
     assert station.text == GOOD.encode()
     assert station.folder == tmp_path / "."
     left, right = station.places
-    assert left.where == "unit left (interface=virtual, channel=x, node_id=5)"
+    assert left.address == "interface=virtual, channel=x, node_id=5"
     assert left.signs == right.signs == (-1, -1, -1)
     assert station.file.plan.check_poses == 6
     assert station.file.limits.verification_rms_g is None
