@@ -14,15 +14,17 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from pydantic import BaseModel
 
 from triaxcal_drivers.profile import load_bundle
 from triaxcald.cli.commands import main, parser
 from triaxcald.documents import to_text
 from triaxcald.recording.reader import Recording
-from triaxcald.simulation.bench import load_device, simulate
-from triaxcald.station.config import load_station
+from triaxcald.simulation.bench import DeviceFile, load_device, simulate
+from triaxcald.station.config import StationFile, load_station
 
 PROJECT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -173,7 +175,7 @@ def run(command: str) -> int:
 
 
 def subcommands(top: argparse.ArgumentParser, prefix: str = "") -> dict[str, argparse.ArgumentParser]:
-    found = {}
+    found: dict[str, argparse.ArgumentParser] = {}
     for action in top._actions:
         if isinstance(action, argparse._SubParsersAction):
             for name, sub in action.choices.items():
@@ -185,9 +187,10 @@ def subcommands(top: argparse.ArgumentParser, prefix: str = "") -> dict[str, arg
 PARSERS = subcommands(parser())
 
 
-def sections(page: Path) -> dict[str, str]:
-    parts = re.split(r"^## (.*)$", page.read_text("utf-8"), flags=re.MULTILINE)
-    return dict(zip(parts[1::2], parts[2::2], strict=True))
+def sections(page: Path, *, preface: bool = False) -> dict[str, str]:
+    """By heading; what stands before the first one under "", if asked for."""
+    before, *parts = re.split(r"^## (.*)$", page.read_text("utf-8"), flags=re.MULTILINE)
+    return dict(zip(parts[::2], parts[1::2], strict=True)) | ({"": before} if preface else {})
 
 
 @pytest.mark.parametrize("command", PARSERS)
@@ -200,6 +203,13 @@ def test_every_command_has_a_section_that_names_all_its_options(command: str) ->
 def test_the_command_line_page_describes_no_command_that_there_is_not() -> None:
     named = {s.removeprefix("triaxcal ") for s in sections(PROJECT / "docs/reference/cli.md") if "triaxcal" in s}
     assert named == set(PARSERS)
+
+
+def test_the_options_of_the_program_itself_are_named() -> None:
+    top = sections(PROJECT / "docs/reference/cli.md", preface=True)[""]
+    own = [o for a in parser()._actions for o in a.option_strings if o not in ("-h", "--help")]
+    assert own
+    assert [o for o in own if f"triaxcal {o}" not in top] == []
 
 
 # Files
@@ -356,6 +366,40 @@ def test_every_key_of_a_commands_document_is_explained(
     document = json.loads(capsys.readouterr().out)
     assert document["format"] in (PROJECT / "docs/reference/certificate.md").read_text("utf-8")
     assert keys_of(document, NAMED) - documented_keys() - EFFECT_LEAVES == set()
+
+
+def test_every_key_of_the_document_of_a_run_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of one that fails at once: its keys are those of any other."""
+    station = tmp_path / "station.toml"
+    bus = f'bus = {{ serial_port = "{tmp_path}/none" }}'
+    station.write_text(
+        f'format = "triaxcal.station/1"\nname = "b"\n[[units]]\nname = "u"\nprofile = "triax-ref-modbus"\n{bus}\n'
+    )
+    assert main(["run", str(station), "--json"]) == 4
+    document = json.loads(capsys.readouterr().out)
+    assert {"device_state", "records_lost"} <= set(document["units"][0])
+    assert keys_of(document, NAMED) - documented_keys() == set()
+
+
+def dotted_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """The keys of a file, as its page names them."""
+    for name, field in model.model_fields.items():
+        yield f"{prefix}{name}"
+        inner = [a for a in (field.annotation, *get_args(field.annotation)) if isinstance(a, type)]
+        for nested in (a for a in inner if issubclass(a, BaseModel)):
+            yield from dotted_keys(nested, f"{prefix}{name}.")
+
+
+@pytest.mark.parametrize(("page", "model"), [("station", StationFile), ("device", DeviceFile)])
+def test_every_key_of_a_file_is_in_its_table(page: str, model: type[BaseModel]) -> None:
+    rows = re.findall(r"^\| (`.*?) \|", (PROJECT / f"docs/reference/{page}.md").read_text("utf-8"), re.MULTILINE)
+    named: set[str] = set()
+    for row in rows:
+        keys = re.findall(r"`([^`]+)`", row)
+        head = keys[0].rpartition(".")[0]
+        named |= {keys[0], *(f"{head}{k}" for k in keys[1:])}
+    groups = {k.rpartition(".")[0] for k in dotted_keys(model)}
+    assert {k for k in dotted_keys(model) if k not in groups} - {re.sub(r"\.NAME$", "", k) for k in named} == set()
 
 
 def test_the_table_of_measured_recordings_is_there() -> None:

@@ -149,7 +149,7 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
         spread = dilution(a, linear_design(a / np.linalg.norm(a, axis=1, keepdims=True), x))
     except Refused as e:
         raise Refused(f"{e}; {_count(rough)}", wanted=_wanted_for(poses, signs)) from None
-    k, angles, b = coefficients(A / problem.reference, c)
+    k, angles, b = coefficients(A * problem.reference, c)
     ax, ay, az = angles
     sx, sy, sz = problem.signs
     D = problem.signs * problem.half / k

@@ -23,7 +23,7 @@ from triaxcal.loop import Loop, diagnose
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
 from triaxcal_drivers.profile import Bundle, Profile
-from triaxcald.documents import Document, loop_document, number
+from triaxcald.documents import Document, error, loop_document, number
 from triaxcald.pipeline import Pipeline
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
@@ -166,8 +166,8 @@ def _registers_document(image: RegisterImage, held: Calibration, loop: Loop, pos
     return {
         "terms": in_registers,
         "left_to_host": host,
-        "rms_g": number(held.residual.rms_g),
-        "rounding_rms_g": number(rounding_cost(image, held, poses)),
+        "rms_g": error(held.residual.rms_g),
+        "rounding_rms_g": error(rounding_cost(image, held, poses)),
         "words": [
             {
                 "register": w.register,

@@ -1,7 +1,7 @@
 """The JSON documents that others script against (`triaxcal.poses/1`, `.calibration/1`, `.loop/1`, `.verify/1`).
 
-Numbers are rounded to twelve significant digits: far below any noise, and enough to hide the last bits in which
-linear algebra libraries differ.
+Numbers are rounded far below any noise, and far above the last bits in which processors and linear algebra libraries
+differ, so that an audit on another machine gets the same bytes.
 """
 
 from __future__ import annotations
@@ -22,20 +22,36 @@ from triaxcal.sensor import Sensor
 from triaxcald.errors import InputError
 
 Document = dict[str, Any]
-DIGITS = 12
+DIGITS, UNCERTAINTY_DIGITS, PROBABILITY_DIGITS = 10, 6, 4
+GRID_G = 1e-11
+"""Errors of the magnitude are differences of numbers near 1 g: beyond this they differ from processor to processor."""
 
 
-def number(value: float | None) -> float | None:
+def number(value: float | None, digits: int = DIGITS) -> float | None:
     """A float as it stands in a document; None where there is none."""
     if value is None or not math.isfinite(value):
         return None
-    return float(f"{value:.{DIGITS}g}")
+    return float(f"{value:.{digits}g}") + 0.0
 
 
-def numbers(values: Any) -> list[Any]:
+def error(value: float | None) -> float | None:
+    """An error of the magnitude, in g."""
+    return None if value is None else number(round(value / GRID_G) * GRID_G if math.isfinite(value) else value)
+
+
+def uncertainty(value: float | None) -> float | None:
+    """A standard error, or a figure that is a ratio to one."""
+    return number(value, UNCERTAINTY_DIGITS)
+
+
+def probability(value: float | None) -> float | None:
+    return number(value, PROBABILITY_DIGITS)
+
+
+def numbers(values: Any, digits: int = DIGITS) -> list[Any]:
     """An array of any shape as nested lists."""
     array = np.asarray(values, dtype=float)
-    return [number(float(v)) for v in array] if array.ndim == 1 else [numbers(row) for row in array]
+    return [number(float(v), digits) for v in array] if array.ndim == 1 else [numbers(row, digits) for row in array]
 
 
 def to_text(document: Mapping[str, Any]) -> str:
@@ -52,7 +68,7 @@ def poses_document(poses: Sequence[Pose]) -> Document:
                 "end_s": number(p.end_s),
                 "samples": p.samples,
                 "mean": numbers(p.mean),
-                "standard_error": numbers(p.standard_error),
+                "standard_error": numbers(p.standard_error, UNCERTAINTY_DIGITS),
                 "channels": {name: number(v) for name, v in p.channels.items()},
             }
             for p in poses
@@ -69,13 +85,23 @@ def in_units_of(unit: str, reference_unit: str) -> str:
     )
 
 
+def micro_unit(reference_unit: str) -> str:
+    """The unit in which errors of the magnitude are told."""
+    return "µg" if reference_unit == "g" else f"1e-6 {reference_unit}"
+
+
+def in_words_of(text: str, reference_unit: str) -> str:
+    """What the metrology says in words, where it writes g likewise."""
+    return text.replace("µg", micro_unit(reference_unit))
+
+
 def residual_document(residual: Residual) -> Document:
     return {
-        "rms_g": number(residual.rms_g),
-        "max_abs_g": number(residual.max_abs_g),
-        "cross_validated_rms_g": number(residual.cross_validated_rms_g),
-        "noise_floor_g": number(residual.noise_floor_g),
-        "lack_of_fit_p": number(residual.lack_of_fit_p),
+        "rms_g": error(residual.rms_g),
+        "max_abs_g": error(residual.max_abs_g),
+        "cross_validated_rms_g": error(residual.cross_validated_rms_g),
+        "noise_floor_g": error(residual.noise_floor_g),
+        "lack_of_fit_p": probability(residual.lack_of_fit_p),
     }
 
 
@@ -90,7 +116,7 @@ def calibration_document(c: Calibration, *, output_unit: str = "", reference_uni
     unit = output_unit or "output"
 
     def group(name: str) -> list[Any]:
-        return numbers([errors[f"{name}.{axis}"] for axis in "xyz"])
+        return numbers([errors[f"{name}.{axis}"] for axis in "xyz"], UNCERTAINTY_DIGITS)
 
     return {
         "format": "triaxcal.calibration/1",
@@ -113,7 +139,7 @@ def calibration_document(c: Calibration, *, output_unit: str = "", reference_uni
             effect.name: {
                 k.name: {
                     "value": number(float(value)),
-                    "standard_error": number(float(errors[f"{effect.name}.{k.name}"])),
+                    "standard_error": uncertainty(float(errors[f"{effect.name}.{k.name}"])),
                     "unit": in_units_of(k.unit, reference_unit),
                 }
                 for k, value in zip(effect.coefficients, values, strict=True)
@@ -128,16 +154,16 @@ def calibration_document(c: Calibration, *, output_unit: str = "", reference_uni
                 "end_s": number(p.pose.end_s),
                 "mean": numbers(p.pose.mean),
                 "direction": numbers(p.direction),
-                "residual_g": number(p.residual_g),
-                "standard_error_g": number(p.standard_error_g),
-                "studentized": number(p.studentized),
-                "leverage": number(p.leverage),
+                "residual_g": error(p.residual_g),
+                "standard_error_g": uncertainty(p.standard_error_g),
+                "studentized": uncertainty(p.studentized),
+                "leverage": uncertainty(p.leverage),
                 "used": p.used,
             }
             for p in c.poses
         ],
-        "condition": number(c.condition),
-        "dilution": number(c.dilution),
+        "condition": uncertainty(c.condition),
+        "dilution": uncertainty(c.dilution),
         "blind_to": list(c.blind_to),
         "warnings": list(c.warnings),
     }
@@ -148,7 +174,7 @@ def loop_document(
 ) -> Document:
     calibration = calibration_document(loop.after, output_unit=output_unit, reference_unit=reference_unit)
     for pose, before in zip(calibration["poses"], loop.before.poses, strict=True):
-        pose["before_residual_g"] = number(before.residual_g)
+        pose["before_residual_g"] = error(before.residual_g)
     held = loop.held_out
     return {
         "format": "triaxcal.loop/1",
@@ -157,9 +183,9 @@ def loop_document(
         **(
             {
                 "held_out": {
-                    "before_rms_g": number(held.before_rms_g),
-                    "after_rms_g": number(held.after_rms_g),
-                    "noise_floor_g": number(held.noise_floor_g),
+                    "before_rms_g": error(held.before_rms_g),
+                    "after_rms_g": error(held.after_rms_g),
+                    "noise_floor_g": error(held.noise_floor_g),
                     "poses": held.poses,
                 }
             }
@@ -170,26 +196,26 @@ def loop_document(
             {
                 "effect": f.effect,
                 "verdict": f.verdict,
-                "p_value": number(f.p_value),
+                "p_value": probability(f.p_value),
                 "coefficients": {
                     name: {
                         "value": number(value),
-                        "standard_error": number(error),
+                        "standard_error": uncertainty(deviation),
                         "unit": in_units_of(unit, reference_unit),
                     }
-                    for name, (value, error, unit) in f.coefficients.items()
+                    for name, (value, deviation, unit) in f.coefficients.items()
                 },
                 "alternatives": list(f.alternatives),
-                "reason": f.reason,
+                "reason": in_words_of(f.reason, reference_unit),
                 "remedy": f.remedy,
             }
             for f in loop.findings
         ],
         "unexplained": {
             "significant": loop.unexplained.significant,
-            "p_value": number(loop.unexplained.p_value),
-            "rms_g": number(loop.unexplained.rms_g),
-            "lead": loop.unexplained.lead,
+            "p_value": probability(loop.unexplained.p_value),
+            "rms_g": error(loop.unexplained.rms_g),
+            "lead": in_words_of(loop.unexplained.lead, reference_unit),
         },
         "data_quality": list(data_quality),
         "advice": list(loop.advice),

@@ -30,7 +30,8 @@ VERIFICATION: Phase = "verification"
 class Measured:
     """The still poses of a recording. ``windows`` are for pictures.
 
-    ``profile``, ``signs`` of the scale factors and ``reference`` are what the recording was made with, where it says.
+    ``profile``, ``signs`` of the scale factors and ``reference`` are what the recording was made with, where it says;
+    ``unit`` is its name and serial.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Measured:
     profile: Profile | None = None
     signs: tuple[int, int, int] | None = None
     reference: float | None = None
+    unit: Mapping[str, str] | None = None
 
 
 def measure(name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS) -> Measured:
@@ -73,7 +75,9 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str) -> Measu
     if STATION_FILE in recording.attachments:
         where = f"{recording.name}: {STATION_FILE}"
         reference = parse_station(recording.attachments[STATION_FILE], where=where).reference
-    return Measured(recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference)
+    meant = recording.metadata.get("unit", {})
+    unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
+    return Measured(recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference, unit)
 
 
 def signs_of(recording: Recording) -> tuple[int, int, int] | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.poses import Pose
-from triaxcald.documents import Document, number
+from triaxcald.documents import Document, error, number, uncertainty
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,18 @@ def verification_document(
     return {
         "format": "triaxcal.verification/1",
         "raw_sha256": raw_sha256,
-        "before_rms_g": number(before.rms_g),
-        "after_rms_g": number(rms),
-        "after_max_abs_g": number(float(np.max(np.abs(after.error_g)))) if len(after.error_g) else None,
-        "noise_floor_g": number(after.noise_floor_g),
+        "before_rms_g": error(before.rms_g),
+        "after_rms_g": error(rms),
+        "after_max_abs_g": error(float(np.max(np.abs(after.error_g)))) if len(after.error_g) else None,
+        "noise_floor_g": error(after.noise_floor_g),
         "limit_rms_g": number(limit_g),
         "verdict": "not judged" if within is None else "within limits" if within else "outside limits",
         "poses": [
             {
                 "start_s": number(p.start_s),
                 "end_s": number(p.end_s),
-                "error_g": number(float(e)),
-                "standard_error_g": number(float(s)),
+                "error_g": error(float(e)),
+                "standard_error_g": uncertainty(float(s)),
             }
             for p, e, s in zip(after.poses, after.error_g, after.standard_error_g, strict=True)
         ],

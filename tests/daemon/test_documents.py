@@ -19,12 +19,15 @@ from triaxcal.synthetic import noisy_poses
 from triaxcald.documents import (
     calibration_document,
     calibration_part,
+    error,
     loop_document,
     number,
     numbers,
     poses_document,
+    probability,
     sensor_of,
     to_text,
+    uncertainty,
 )
 from triaxcald.errors import InputError
 
@@ -45,11 +48,18 @@ def poses() -> list[Pose]:
     return noisy_poses(TRUTH, ups, 1e-5, np.random.default_rng(1), channels={"temp_c": temperatures})
 
 
-def test_a_number_has_twelve_digits_and_what_is_none_is_null() -> None:
-    assert number(1 / 3) == 0.333333333333
-    assert number(-1.23456789012345e-300) == -1.23456789012e-300
+def test_a_number_has_ten_digits_and_what_is_none_is_null() -> None:
+    assert number(1 / 3) == 0.3333333333
+    assert number(-1.23456789012345e-300) == -1.23456789e-300
+    assert str(number(-0.0)) == "0.0"
     assert [number(v) for v in (None, float("nan"), float("inf"))] == [None, None, None]
     assert numbers(np.array([[1, 2], [3, np.nan]])) == [[1.0, 2.0], [3.0, None]]
+
+
+def test_an_error_of_the_magnitude_lies_on_a_grid_that_no_last_bit_reaches() -> None:
+    assert error(1.23456789e-6) == error(1.23456789e-6 + 3e-16) == 1.23457e-6
+    assert (error(3e-12), error(None), error(float("nan"))) == (0.0, None, None)
+    assert (uncertainty(1.23456789e-6), probability(0.123456789)) == (1.23457e-6, 0.1235)
 
 
 def test_a_document_reads_back_and_ends_with_a_line() -> None:
@@ -66,7 +76,7 @@ def test_poses_have_the_keys_of_the_contract(poses: list[Pose]) -> None:
     first = document["poses"][0]
     assert set(first) == {"start_s", "end_s", "samples", "mean", "standard_error", "channels"}
     assert len(first["mean"]) == len(first["standard_error"]) == 3
-    assert first["channels"] == {"temp_c": pytest.approx(poses[0].channels["temp_c"], rel=1e-11)}
+    assert first["channels"] == {"temp_c": pytest.approx(poses[0].channels["temp_c"], rel=1e-9)}
     assert poses_document([]) == {"format": "triaxcal.poses/1", "poses": []}
 
 
@@ -75,13 +85,13 @@ def test_a_calibration_comes_back_as_a_sensor(poses: list[Pose]) -> None:
     document = json.loads(to_text(calibration_document(calibration, output_unit="V")))
     sensor, reference, magnitude = sensor_of(document, where="cal.json")
     assert magnitude == 1.5
-    assert reference == {"temp_c": pytest.approx(calibration.channel_reference["temp_c"], rel=1e-11)}
-    np.testing.assert_allclose(sensor.scale_factor, calibration.sensor.scale_factor, rtol=1e-11)
-    np.testing.assert_allclose(sensor.misalignment, calibration.sensor.misalignment, rtol=1e-11)
-    np.testing.assert_allclose(sensor.bias, calibration.sensor.bias, rtol=1e-11)
+    assert reference == {"temp_c": pytest.approx(calibration.channel_reference["temp_c"], rel=1e-9)}
+    np.testing.assert_allclose(sensor.scale_factor, calibration.sensor.scale_factor, rtol=1e-9)
+    np.testing.assert_allclose(sensor.misalignment, calibration.sensor.misalignment, rtol=1e-9)
+    np.testing.assert_allclose(sensor.bias, calibration.sensor.bias, rtol=1e-9)
     assert [e.name for e, _ in sensor.effects] == ["second_order_nonlinearity", "temperature_bias"]
     for (_, held), (_, meant) in zip(sensor.effects, calibration.sensor.effects, strict=True):
-        np.testing.assert_allclose(held, meant, rtol=1e-11)
+        np.testing.assert_allclose(held, meant, rtol=1e-9)
 
 
 def test_matrix_and_centre_are_those_of_the_coefficients(poses: list[Pose]) -> None:
@@ -109,8 +119,8 @@ def test_a_loop_says_what_each_pose_was_before(poses: list[Pose]) -> None:
     assert "held_out" not in document
     before = np.array([p["before_residual_g"] for p in document["calibration"]["poses"]])
     after = np.array([p["residual_g"] for p in document["calibration"]["poses"]])
-    assert np.sqrt(np.mean(before**2)) == pytest.approx(document["before"]["rms_g"], rel=1e-9)
-    assert np.sqrt(np.mean(after**2)) == pytest.approx(document["after"]["rms_g"], rel=1e-9)
+    assert np.sqrt(np.mean(before**2)) == pytest.approx(document["before"]["rms_g"], abs=2e-11)
+    assert np.sqrt(np.mean(after**2)) == pytest.approx(document["after"]["rms_g"], abs=2e-11)
 
 
 def test_the_calibration_is_found_in_a_loop_and_in_a_certificate(poses: list[Pose]) -> None:

@@ -14,6 +14,8 @@ class OneLineParser(argparse.ArgumentParser):
     """Says what is wrong in one line and ends with 2."""
 
     def error(self, message: str) -> NoReturn:
+        if "--sign" in message and "expected one argument" in message:
+            message += "; write it with an equals sign: --sign=-,-,-"
         sys.stderr.write(f"{self.prog}: {message}\n")
         sys.exit(2)
 

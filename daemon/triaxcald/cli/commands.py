@@ -38,8 +38,9 @@ def main(arguments: Sequence[str]) -> int:
         chosen = parser().parse_args(arguments)
     except SystemExit as e:
         return int(e.code or 0)
+    code: int = DONE
     try:
-        code: int = chosen.run(chosen)
+        code = chosen.run(chosen)
         sys.stdout.flush()
         return code
     except Refused as e:
@@ -66,11 +67,11 @@ def main(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         # Whoever read our output has gone; nothing more can be said there.
         _drop_output()
-        return DONE
+        return code
     except OSError as e:
         _drop_output()
         say(f"triaxcal: {e.filename or 'standard output'}: {e.strerror}")
-        return BAD_INPUT
+        return max(code, BAD_INPUT)
 
 
 def _drop_output() -> None:

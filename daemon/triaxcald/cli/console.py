@@ -50,11 +50,17 @@ def micro(value: float | None) -> str:
     return "—" if value is None else f"{value * 1e6:.1f}"
 
 
+class _Shown(Console):
+    def on_broken_pipe(self) -> None:
+        """Nobody looks any more; rich would take standard output away too, and end the program."""
+        self.quiet = True
+
+
 class Bars:
     """Progress bars, one a unit; plain lines where standard error is no terminal."""
 
     def __init__(self) -> None:
-        self._console = Console(stderr=True)
+        self._console = _Shown(stderr=True)
         self._progress = Progress(
             TextColumn("{task.fields[unit]:<8}", markup=False),
             BarColumn(bar_width=26),

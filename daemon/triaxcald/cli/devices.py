@@ -17,14 +17,18 @@ from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.documents import number, sensor_of
+from triaxcald.errors import InputError
 from triaxcald.inputs import read_document
 from triaxcald.provision.explain import explain
-from triaxcald.provision.identity import check_identity
+from triaxcald.provision.identity import check_identity, same_serial
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.provision.procedure import ProvisionReport, provision
 from triaxcald.provision.snapshot import take_snapshot
 from triaxcald.station.config import Place, load_station
 from triaxcald.station.today import days_since_1970
+
+REGISTER_DIGITS = 12
+"""So many tell any two float32 apart, and any two integers of a register."""
 
 
 def register(commands: Any) -> None:
@@ -64,8 +68,8 @@ def provision_command(a: argparse.Namespace) -> int:
                 "before": raw.hex(),
                 "wanted": words[name].raw.hex() if name in words else None,
                 "after": report.after.raw[name].hex(),
-                "value": number(words[name].value) if name in words else None,
-                "held": number(words[name].held) if name in words else None,
+                "value": number(words[name].value, REGISTER_DIGITS) if name in words else None,
+                "held": number(words[name].held, REGISTER_DIGITS) if name in words else None,
             }
             for name, raw in report.before.raw.items()
         ],
@@ -123,7 +127,9 @@ def _serial_of(document: Mapping[str, Any], path: str, place: Place) -> str | No
     unit = document.get("unit")
     meant = unit.get("serial") if isinstance(unit, Mapping) else None
     expected = place.unit.serial
-    if meant is not None and expected is not None and meant != expected:
+    if not isinstance(meant, str | None):
+        raise InputError(f"{path}: unit.serial: expected text, not {meant!r}")
+    if meant is not None and expected is not None and not same_serial(meant, expected):
         raise Refused(f"{path}: is for the unit with serial {meant}, the station expects {expected}")
     return meant or expected
 
@@ -144,7 +150,7 @@ def registers_command(a: argparse.Namespace) -> int:
                 "format": "triaxcal.registers/1",
                 "unit": place.unit.name,
                 "serial": serial,
-                "registers": [{**dataclasses.asdict(r), "value": number(r.value)} for r in rows],
+                "registers": [{**dataclasses.asdict(r), "value": number(r.value, REGISTER_DIGITS)} for r in rows],
             }
         )
         return 0

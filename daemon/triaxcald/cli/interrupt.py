@@ -38,7 +38,8 @@ async def _guarded(work: Coroutine[Any, Any, T]) -> T:
         caught.append(number)
 
     loop = asyncio.get_running_loop()
-    for number in SIGNALS:
+    heeded = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]  # as by nohup
+    for number in heeded:
         loop.add_signal_handler(number, stop, number)
     try:
         return await task
@@ -47,5 +48,5 @@ async def _guarded(work: Coroutine[Any, Any, T]) -> T:
             raise Interrupted(tuple(getattr(e, "__notes__", ()))) from None
         raise
     finally:
-        for number in SIGNALS:
+        for number in heeded:
             loop.remove_signal_handler(number)

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import signal
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -52,12 +53,13 @@ def run_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
     with Bars() as bars:
         outcomes = run_interruptible(run_station(station, bars))
-    if a.json:
-        emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
-    else:
-        for o in outcomes:
-            if o.error is None:
-                show_outcome(o)
+    with suppress(OSError):  # where nobody reads standard output, the exit code is the outcomes' all the same
+        if a.json:
+            emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
+        else:
+            for o in outcomes:
+                if o.error is None:
+                    show_outcome(o)
     say_errors(outcomes)
     return worst(outcomes)
 
@@ -182,7 +184,8 @@ def sim_command(a: argparse.Namespace) -> int:
 
 async def _serve(simulated: SimulatedUnit, eeprom: Path | None) -> None:
     stop = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    for caught in (signal.SIGTERM, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(caught, stop.set)
     async with simulated.serve() as server:
         name, device = simulated.bundle.profile.name, simulated.device
         bus = {**device.bus, **({"port": server.bus.port} if "port" in device.bus else {})}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,7 +83,8 @@ def fit_command(a: argparse.Namespace) -> int:
     writable(a.report)
     measured = measure(a.recording)
     choice = chosen(a, measured)
-    calibration = fit(measured.poses, signs=choice.signs, reference=choice.reference)
+    with _telling_default_signs(a, measured):
+        calibration = fit(measured.poses, signs=choice.signs, reference=choice.reference)
     document = documents.calibration_document(
         calibration, output_unit=choice.output_unit, reference_unit=choice.reference_unit
     )
@@ -101,7 +104,8 @@ def diagnose_command(a: argparse.Namespace) -> int:
     measured = measure(a.recording)
     check = measure(a.check).poses if a.check else None
     choice = chosen(a, measured)
-    loop = diagnose(measured.poses, signs=choice.signs, reference=choice.reference, check=check)
+    with _telling_default_signs(a, measured):
+        loop = diagnose(measured.poses, signs=choice.signs, reference=choice.reference, check=check)
     document = documents.loop_document(
         loop,
         data_quality=measured.data_quality,
@@ -128,37 +132,42 @@ def verify_command(a: argparse.Namespace) -> int:
     measured = measure(a.recording)
     if not measured.poses:
         raise Refused(f"{a.recording}: no still pose")
-    errors, noise = magnitude_errors(sensor, measured.poses, channel_reference=channel_reference, reference=reference)
-    if not (np.isfinite(errors).all() and np.isfinite(noise).all()):
+    with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
+        errors, noise = magnitude_errors(
+            sensor, measured.poses, channel_reference=channel_reference, reference=reference
+        )
+        rms = float(np.sqrt(np.mean(errors**2)))
+    if not np.isfinite([*errors, *noise, rms]).all():
         raise InputError(f"{a.calibration}: its numbers and the readings of {a.recording} give no finite magnitude")
-    rms = float(np.sqrt(np.mean(errors**2)))
     result = {
         "format": "triaxcal.verify/1",
-        "rms_g": number(rms),
-        "max_abs_g": number(float(np.max(np.abs(errors)))),
-        "noise_floor_g": number(float(np.sqrt(np.mean(noise**2)))),
+        "rms_g": documents.error(rms),
+        "max_abs_g": documents.error(float(np.max(np.abs(errors)))),
+        "noise_floor_g": documents.error(float(np.sqrt(np.mean(noise**2)))),
         "poses": [
             {
                 "start_s": number(p.start_s),
                 "end_s": number(p.end_s),
-                "error_g": number(float(e)),
-                "standard_error_g": number(float(s)),
+                "error_g": documents.error(float(e)),
+                "standard_error_g": documents.uncertainty(float(s)),
             }
             for p, e, s in zip(measured.poses, errors, noise, strict=True)
         ],
     }
+    unit = a.reference_unit or documents.reference_unit_of(reference)
+    small = documents.micro_unit(unit)
     if a.json:
         emit(result)
     else:
         table(
-            f"|a| − {reference:g} g under {a.calibration}",
-            ["start s", "error µg", "standard error µg"],
+            f"|a| − {reference:g} {unit} under {a.calibration}",
+            ["start s", f"error {small}", f"standard error {small}"],
             [
                 [f"{p.start_s:.2f}", f"{e * 1e6:+.1f}", micro(s)]
                 for p, e, s in zip(measured.poses, errors, noise, strict=True)
             ],
         )
-        print(f"rms {micro(rms)} µg, noise floor {micro(result['noise_floor_g'])} µg")  # type: ignore[arg-type]
+        print(f"rms {micro(rms)} {small}, noise floor {micro(float(np.sqrt(np.mean(noise**2))))} {small}")
     return _judge(a.limit, rms)
 
 
@@ -173,7 +182,7 @@ class Choice:
 
     @property
     def micro_unit(self) -> str:
-        return "µg" if self.reference_unit == "g" else f"1e-6 {self.reference_unit}"
+        return documents.micro_unit(self.reference_unit)
 
 
 def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
@@ -184,6 +193,17 @@ def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
         a.output_unit or (measured.profile.output.unit if measured.profile else ""),
         a.reference_unit or documents.reference_unit_of(reference),
     )
+
+
+@contextmanager
+def _telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator[None]:
+    """A refusal names poses, and which way is up depends on signs that nobody may have given."""
+    try:
+        yield
+    except Refused as e:
+        if e.wanted and a.sign is None and measured.signs is None:
+            raise Refused(f"{e}; no --sign was given, so +,+,+ is taken", wanted=e.wanted) from e
+        raise
 
 
 def _judge(limit: float | None, rms: float) -> int:
@@ -199,6 +219,8 @@ def _warn(lines: list[str]) -> None:
 
 
 def _write(a: argparse.Namespace, measured: Measured, document: documents.Document) -> None:
+    if measured.unit:
+        document["unit"] = dict(measured.unit)  # so that it cannot be written to another
     if a.output:
         write_text(a.output, documents.to_text(document))
     if a.report:
@@ -246,10 +268,11 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     rows.append(["noise floor", micro(b.noise_floor_g), micro(f.noise_floor_g)])
     table(f"error of the magnitude, {choice.micro_unit}", ["", "before", "after"], rows)
     for finding in loop.findings:
-        print(f"{finding.verdict}: {finding.effect} ({finding.reason})")
+        print(f"{finding.verdict}: {finding.effect} ({documents.in_words_of(finding.reason, choice.reference_unit)})")
     if not loop.findings:
         print("no effect of the catalogue shows")
     if loop.unexplained.significant:
-        print(f"unexplained: {micro(loop.unexplained.rms_g)} {choice.micro_unit} rms; {loop.unexplained.lead}")
+        lead = documents.in_words_of(loop.unexplained.lead, choice.reference_unit)
+        print(f"unexplained: {micro(loop.unexplained.rms_g)} {choice.micro_unit} rms; {lead}")
     for line in loop.advice:
         print(f"advice: {line}")

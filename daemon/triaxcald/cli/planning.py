@@ -114,7 +114,7 @@ def _plan_for_recording(a: argparse.Namespace) -> int:
     else:
         print(f"the {len(measured.poses)} poses of {measured.name} are well spread; none is wanted")
     if blind is not None:
-        print(f"they cannot show: {', '.join(blind) or 'nothing of the catalogue is hidden from them'}")
+        print(f"the {len(measured.poses)} there are cannot show: {', '.join(blind) or 'nothing of the catalogue'}")
     return 0
 
 

@@ -42,7 +42,7 @@ async def check_identity(
                 f"register {name} holds {values[name]:#x}, expected {expected:#x}"
             )
     serial = await read_serial(device, bundle)
-    if expected_serial is not None and not _same_serial(serial, expected_serial):
+    if expected_serial is not None and not same_serial(serial, expected_serial):
         raise WrongUnit(f"the unit on {where} is serial {serial or 'unknown'}, expected {expected_serial}")
     return IdentityRead(serial, values)
 
@@ -59,6 +59,6 @@ async def _read_raw_number(device: Device, bundle: Bundle, name: str) -> int:
     return round((value - register.offset) / register.scale)
 
 
-def _same_serial(serial: str | None, expected: str) -> bool:
+def same_serial(serial: str | None, expected: str) -> bool:
     """Leading zeros do not count: the device holds a number."""
     return serial is not None and expected.strip().lstrip("0") == serial.lstrip("0")

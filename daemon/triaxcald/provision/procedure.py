@@ -75,8 +75,8 @@ async def provision(
 
     Raises WrongUnit (nothing was written) and ProvisionError, which says what failed at which step, and in
     what state the device is: the old calibration untouched, restored and verified, or not restored. A
-    cancellation, like any other exception, goes on only once the old calibration is back, and has that state
-    as a note.
+    cancellation, like any other exception, goes on only once the old calibration is back. All but WrongUnit
+    have that state as a note.
     """
     run = _Run(RecordedDevice(device, record) if record else device, bundle, image, pace)
     try:
@@ -85,7 +85,9 @@ async def provision(
         if isinstance(e, WrongUnit) and not run.unlocked:
             raise
         state = await to_its_end(_undo(run))
-        raise ProvisionError(f"provisioning failed at {run.steps[-1]}: {e}; {state}") from e
+        failed = ProvisionError(f"provisioning failed at {run.steps[-1]}: {e}; {state}")
+        failed.add_note(state)
+        raise failed from e
     except (Exception, asyncio.CancelledError, KeyboardInterrupt) as e:
         e.add_note(await to_its_end(_undo(run)))
         raise

@@ -63,7 +63,9 @@ class DeviceFile(Strict):
     serial: Annotated[int, Field(ge=0, lt=2**32)] = 1
     speed: Annotated[float, Field(gt=0, le=1000, description="unit seconds per second of the wall clock")] = 1.0
     seed: Annotated[int, Field(ge=0)] = 0
-    eeprom: Annotated[str | None, Field(description="file that holds the EEPROM between runs")] = None
+    eeprom: Annotated[
+        str | None, Field(pattern=r"^[^\x00]+$", description="file that holds the EEPROM between runs")
+    ] = None
     bus: dict[str, Any]
     sensor: SensorTruth = SensorTruth()
     surroundings: Surroundings = Surroundings()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, Field, model_validator
 
+from triaxcal.effects import CATALOGUE
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
@@ -170,6 +172,24 @@ def load_station(path: Path) -> Station:
             raise InputError(
                 f"{path}: limits.verification_rms_g: unit {unit.name} has no corrected stream to verify it by"
             )
+        _check_roles(bundle, where=f"{path}: units.{i}.profile")
         places.append(Place(unit, bundle, bus))
         places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
     return Station(path, text, file, tuple(places))
+
+
+_OTHER_ROLES = ("reference_temperature", "calibration_date", "calibration_crc", "serial_number", "write_counter")
+
+
+def _check_roles(bundle: Bundle, *, where: str) -> None:
+    """Only the daemon knows the effects, whose coefficients are roles. Raises InputError with the nearest one."""
+    known = [f"{name}.{axis}" for name in ("scale_factor", "misalignment", "bias") for axis in "xyz"]
+    known += [f"{e.name}.{c.name}" for e in CATALOGUE for c in e.coefficients]
+    known += _OTHER_ROLES
+    for name, register in bundle.profile.registers.items():
+        if register.role is not None and register.role not in known:
+            close = difflib.get_close_matches(register.role, known, n=1)
+            hint = f"; did you mean '{close[0]}'?" if close else ""
+            raise InputError(
+                f"{where}: {bundle.profile.name}: registers.{name}.role: unknown role '{register.role}'{hint}"
+            )

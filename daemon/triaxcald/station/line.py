@@ -104,7 +104,8 @@ class UnitRun:
         except DaemonError as e:
             return self._outcome(e.exit_code, str(e))
         except Exception as e:  # noqa: BLE001 - the one place that supervises: other units must go on
-            traceback.print_exc(file=sys.stderr)
+            with suppress(OSError, ValueError):  # a closed standard error
+                traceback.print_exc(file=sys.stderr)
             return self._outcome(FAILED, f"internal error: {e!r}")
         return self._outcome(code)
 

@@ -25,7 +25,7 @@ from triaxcald.verification import Verification, verification_document, verify
 
 VERIFICATION_FILE = "verification.json"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
-RESTORED = "old calibration restored and verified"
+UNTOUCHED, RESTORED = "old calibration untouched", "old calibration restored and verified"
 NEW_VERIFIED = "the device holds the new calibration, verified"
 NEW_UNCHECKED = "the device holds the new calibration, not verified by physics: it has no corrected stream"
 UNCERTAIN = "NOT restored"
@@ -56,8 +56,7 @@ class WriteBack:
                 where=self.place.address,
             )
         except BaseException as e:
-            notes = getattr(e, "__notes__", [])
-            self.state = notes[-1] if notes else str(e).rpartition("; ")[2]
+            self.state = getattr(e, "__notes__", [UNTOUCHED])[-1]
             raise
         self.state = f"{UNCERTAIN}: the new calibration is stored and not verified"
         try:

@@ -197,7 +197,7 @@ class ModbusProfile(Profile):
 class ModbusBus(Strict):
     """Where the unit is: over TCP at ``host``, or RTU on ``serial_port``."""
 
-    host: str | None = None
+    host: Annotated[str | None, Field(pattern=r"^[^\x00]*$")] = None
     port: Annotated[int, Field(ge=0, le=65535, description="0: a simulated unit takes any free one")] = 502
     serial_port: str | None = None
     baudrate: Annotated[int, Field(ge=300, le=4_000_000)] = 19200

@@ -6,6 +6,9 @@ import gzip
 import io
 import json
 import math
+import os
+import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from triaxcald.cli.measuring import _judge
 
 Run = Callable[..., Any]
 
@@ -97,6 +102,7 @@ def test_fit_of_the_exported_text_is_fit_of_the_recording(finished_run: Any, exp
     of_text = triaxcal("fit", exported, "--json", SIGNS, "--output-unit", "V").json
     of_text.pop("data_quality")
     of_recording.pop("data_quality")
+    assert of_recording.pop("unit") == {"name": "can", "serial": "4711"}
     assert of_text == of_recording
 
 
@@ -124,7 +130,16 @@ def test_another_reference_scales_the_answer(exported: Path, triaxcal: Run) -> N
     fifty = triaxcal("fit", exported, "--json", "--reference", "50").json
     np.testing.assert_allclose(fifty["scale_factor"], np.array(one["scale_factor"]) / 50, rtol=1e-9)
     np.testing.assert_allclose(fifty["misalignment"], one["misalignment"], rtol=1e-6)
-    assert fifty["residual"]["rms_g"] == pytest.approx(50 * one["residual"]["rms_g"], rel=1e-9)
+    assert fifty["residual"]["rms_g"] == pytest.approx(50 * one["residual"]["rms_g"], abs=50 * 1e-11)
+
+
+def test_what_diagnose_finds_does_not_hang_on_the_size_of_the_reference(exported: Path, triaxcal: Run) -> None:
+    one, fifty = (triaxcal("diagnose", exported, "--json", SIGNS, *r).json for r in ([], ["--reference", "50"]))
+    (before,), (after,) = one["findings"], fifty["findings"]
+    assert (before["effect"], after["effect"]) == 2 * ("second_order_nonlinearity",)
+    for axis, held in before["coefficients"].items():
+        assert after["coefficients"][axis]["value"] == pytest.approx(held["value"] / 50, rel=1e-6)
+    assert fifty["after"]["rms_g"] == pytest.approx(50 * one["after"]["rms_g"], rel=1e-6)
 
 
 def test_results_go_to_files_and_are_the_printed_document(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
@@ -145,7 +160,7 @@ def test_diagnose_finds_what_is_hidden_and_judges_it_on_another_recording(
     document = done.json
     assert (done.code, done.err) == (0, "")
     assert document["format"] == "triaxcal.loop/1"
-    assert set(document) == LOOP | {"held_out"}
+    assert set(document) == LOOP | {"held_out", "unit"}
     assert set(document["before"]) == set(document["after"]) == RESIDUAL
     assert set(document["held_out"]) == {"before_rms_g", "after_rms_g", "noise_floor_g", "poses"}
     assert document["held_out"]["poses"] >= 26
@@ -257,3 +272,90 @@ def test_plan_names_the_poses_that_a_recording_still_lacks(exported: Path, tmp_p
     wanted = {p["label"]: p["up"] for p in document["poses"]}
     assert wanted
     assert all(v[0] > 0 for v in wanted.values()), wanted
+
+
+def _remade(text: bytes, **settings: Any) -> bytes:
+    """A station file with further settings at its head."""
+    head, _, rest = text.decode().partition("\n")
+    return "\n".join([head, *(f"{k} = {v}" for k, v in settings.items()), rest]).encode()
+
+
+def test_fit_and_diagnose_of_a_recording_take_its_signs_and_its_reference(
+    finished_run: Any, rewrite: Callable[..., Path], triaxcal: Run
+) -> None:
+    path = rewrite(
+        finished_run.can,
+        attachment=lambda name, data: _remade(data, reference=1.002) if name == "station.toml" else data,
+        metadata=lambda name, record: {**record, "signs": "1,-1,1"} if name == "unit" else record,
+    )
+    told = [finished_run.can, "--sign=+,-,+", "--reference", "1.002", "--json"]
+    fitted = triaxcal("fit", path, "--json").json
+    assert [math.copysign(1, k) for k in fitted["scale_factor"]] == [1, -1, 1]
+    assert (fitted["reference"], fitted["units"]["reference"]) == (1.002, "g")
+    assert fitted == triaxcal("fit", *told).json
+    closed = triaxcal("diagnose", path, "--json").json
+    assert [math.copysign(1, k) for k in closed["calibration"]["scale_factor"]] == [1, -1, 1]
+    assert closed == triaxcal("diagnose", *told).json
+
+
+def test_the_users_word_goes_before_the_recordings(finished_run: Any, triaxcal: Run) -> None:
+    fitted = triaxcal("fit", finished_run.can, "--sign=+,+,-", "--reference", "1.05", "--json").json
+    assert [math.copysign(1, k) for k in fitted["scale_factor"]] == [1, 1, -1]
+    assert fitted["reference"] == 1.05
+
+
+def test_verify_accepts_what_the_calibration_was_made_with_and_nothing_else(
+    finished_run: Any, tmp_path: Path, triaxcal: Run
+) -> None:
+    cal = tmp_path / "cal.json"
+    triaxcal("fit", finished_run.can, "--reference", "1.01", "-o", cal)
+    plain = triaxcal("verify", cal, finished_run.can, "--json")
+    assert plain.code == 0
+    same = ["--sign=-,-,-", "--reference", "1.01"]
+    assert triaxcal("verify", cal, finished_run.can, *same, "--json").json == plain.json
+    for option, words in (
+        ("--sign=-,-,+", f"--sign: the scale factors in {cal} have other signs"),
+        ("--reference=1.02", f"--reference 1.02: {cal} was made for 1.01"),
+    ):
+        triaxcal("verify", cal, finished_run.can, option, "--json").failed(2, words)
+
+
+def test_the_unit_of_another_reference_is_that_of_every_coefficient(
+    exported: Path, tmp_path: Path, triaxcal: Run
+) -> None:
+    """A magnetometer, say; no coefficient is then in g."""
+    field = ["--reference", "50", "--reference-unit", "µT", "--output-unit", "V"]
+    cal = tmp_path / "cal.json"
+    document = triaxcal("diagnose", exported, SIGNS, *field, "--json", "-o", cal).json
+    units = {"output": "V", "reference": "µT", "scale_factor": "V/µT", "misalignment": "rad", "bias": "µT"}
+    assert document["calibration"]["units"] == units
+    (finding,) = document["findings"]
+    assert finding["effect"] == "second_order_nonlinearity"
+    assert re.search(r"error falls from \S+ 1e-6 µT to \S+ 1e-6 µT \(noise floor", finding["reason"])
+    (held,) = document["calibration"]["effects"].values()
+    assert {c["unit"] for c in (*finding["coefficients"].values(), *held.values())} == {"µT/µT²"}
+    fitted = triaxcal("fit", exported, SIGNS, *field, "--json").json
+    assert (fitted["units"], fitted["reference"]) == (units, 50)
+    shown = triaxcal("diagnose", exported, SIGNS, *field).out
+    assert "µT/µT²" in shown
+    assert "V/µT" in shown
+    assert "1e-6 µT" in shown
+    assert "µg" not in shown
+    unnamed = triaxcal("fit", exported, SIGNS, "--reference", "50", "--json").json
+    assert unnamed["units"]["bias"] == "reference unit"
+
+
+def test_what_is_no_number_is_within_no_limit(capsys: pytest.CaptureFixture[str]) -> None:
+    assert [_judge(1e-4, rms) for rms in (0.9e-4, 1e-4, 1.1e-4, math.inf, math.nan)] == [0, 0, 1, 1, 1]
+    assert _judge(None, math.nan) == 0
+    assert len(capsys.readouterr().err.splitlines()) == 3
+
+
+def test_a_terminal_that_knows_ascii_alone_is_shown_everything(exported: Path) -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    command = [Path(sys.executable).with_name("triaxcal"), "fit", exported, "--reference=50", "--reference-unit=µT"]
+    done = subprocess.run(command, env=environment, capture_output=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert b"output/\\xb5T" in done.stdout
+    assert b"noise floor " in done.stdout
+    assert b"Traceback" not in done.stderr

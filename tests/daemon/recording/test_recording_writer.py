@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import errno
 import io
 import threading
@@ -205,6 +206,34 @@ def test_a_disk_that_fails_reaches_the_caller_in_one_line(
         writer.close()
     assert [str(e.value) for e in (drained, next_one, closed)] == [message] * 3
     assert disks[0].closed
+
+
+@pytest.mark.parametrize("graver", [ValueError("NOT restored"), KeyboardInterrupt(), asyncio.CancelledError()])
+def test_a_disk_that_fails_on_closing_does_not_hide_what_is_graver(
+    tmp_path: Path, new_writer: NewWriter, disks: list[Disk], graver: BaseException
+) -> None:
+    def leave() -> None:
+        with new_writer() as writer:
+            writer.drain()
+            disks[0].error = OSError(errno.ENOSPC, "No space left on device")
+            raise graver
+
+    with pytest.raises(type(graver)) as raised:
+        leave()
+    assert raised.value is graver
+    assert graver.__notes__ == [f"{tmp_path / 'rec.mcap'}: writing failed: No space left on device"]
+
+
+def test_a_disk_that_fails_on_closing_is_told_where_all_else_went_well(
+    new_writer: NewWriter, disks: list[Disk]
+) -> None:
+    def leave() -> None:
+        with new_writer() as writer:
+            writer.drain()
+            disks[0].error = OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(RecordingError, match=r"rec\.mcap: writing failed: No space left on device"):
+        leave()
 
 
 def test_no_write_is_larger_than_a_chunk_however_much_is_given(

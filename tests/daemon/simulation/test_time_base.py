@@ -2,7 +2,8 @@ import asyncio
 
 import pytest
 
-from triaxcald.simulation.time_base import RealTimeBase, SteppedTimeBase
+from triaxcald.simulation import time_base
+from triaxcald.simulation.time_base import ElasticTimeBase, RealTimeBase, SteppedTimeBase
 
 
 async def test_nobody_is_woken_before_the_time_they_wait_for() -> None:
@@ -68,3 +69,72 @@ async def test_real_time_runs_at_its_speed_and_is_reached_when_waited_for() -> N
 def test_a_speed_of_zero_is_refused() -> None:
     with pytest.raises(ValueError, match="above 0"):
         RealTimeBase(speed=0.0)
+
+
+class WallClock:
+    """Moves by what is slept, and by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+        self.slept: list[float] = []
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    async def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now_s += seconds
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> WallClock:
+    clock = WallClock()
+    monkeypatch.setattr(time_base.time, "monotonic", clock.monotonic)
+    monkeypatch.setattr(time_base.asyncio, "sleep", clock.sleep)
+    return clock
+
+
+def test_elastic_time_runs_at_its_speed_where_it_is_looked_at_often_enough(wall: WallClock) -> None:
+    base = ElasticTimeBase(speed=20.0, step_s=0.05)
+    for i in range(1, 101):
+        wall.now_s += 0.002  # 0.04 s of the unit
+        assert base.now_s() == pytest.approx(0.04 * i)
+
+
+@pytest.mark.parametrize("pause_s", [0.0026, 1.0, 3600.0])
+def test_elastic_time_never_goes_further_than_a_step_from_one_look_to_the_next(wall: WallClock, pause_s: float) -> None:
+    base = ElasticTimeBase(speed=20.0, step_s=0.05)
+    seen = [base.now_s()]
+    for _ in range(5):
+        wall.now_s += pause_s
+        seen.append(base.now_s())
+    assert seen == pytest.approx([0.05 * i for i in range(6)])
+
+
+def test_elastic_time_does_not_catch_up_with_what_it_has_missed(wall: WallClock) -> None:
+    base = ElasticTimeBase(speed=20.0, step_s=0.05)
+    wall.now_s += 3600.0
+    assert base.now_s() == pytest.approx(0.05)
+    for i in range(1, 11):
+        wall.now_s += 0.001
+        assert base.now_s() == pytest.approx(0.05 + 0.02 * i)
+
+
+def test_elastic_time_stands_still_while_the_wall_clock_does(wall: WallClock) -> None:
+    base = ElasticTimeBase(speed=20.0)
+    wall.now_s += 0.001
+    assert base.now_s() == base.now_s() == base.now_s() == pytest.approx(0.02)
+
+
+async def test_elastic_time_is_waited_for_no_faster_than_its_speed_and_in_steps(wall: WallClock) -> None:
+    base = ElasticTimeBase(speed=20.0, step_s=0.05)
+    await base.wait_until(1.0)
+    assert base.now_s() >= 1.0
+    assert wall.now_s - 1000.0 == pytest.approx(1.0 / 20.0)
+    assert max(wall.slept) == pytest.approx(0.05 / 20.0)
+
+
+@pytest.mark.parametrize(("speed", "step_s"), [(0.0, 0.05), (-1.0, 0.05), (1.0, 0.0), (float("nan"), 0.05)])
+def test_elastic_time_of_no_speed_or_no_step_is_refused(speed: float, step_s: float) -> None:
+    with pytest.raises(ValueError, match="above 0"):
+        ElasticTimeBase(speed, step_s)

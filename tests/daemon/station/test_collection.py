@@ -1,0 +1,134 @@
+"""A device that goes on sending one stream and stops another keeps nobody waiting for ever."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from triaxcal_drivers.errors import DeviceSilent
+from triaxcal_drivers.interface import RawBatch
+from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle, load_bundle
+from triaxcald.inputs import CALIBRATION, VERIFICATION
+from triaxcald.recording.writer import RecordingWriter
+from triaxcald.simulation.can_unit import CanUnit, tpdos
+from triaxcald.simulation.physics import ConstantPhysics
+from triaxcald.simulation.unit import ReferenceUnit
+from triaxcald.station.collection import Collection
+from triaxcald.station.config import Plan
+
+Run = Callable[..., Any]
+STOP_S, END_S, BATCH_S = 5.0, 60.0, 0.1
+OF_READINGS, OF_CORRECTED = (0x185, 0x285), (0x385, 0x485)
+
+
+@dataclass
+class Bus:
+    """A Device that sends a still unit's frames as fast as they are taken; from 5 s on not those of ``stopped``.
+
+    They come back at ``again_s``. Its own time is the host's.
+    """
+
+    stopped: Sequence[int]
+    again_s: float = float("inf")
+    now_s: float = 0.0
+
+    def clock_s(self) -> float:
+        return self.now_s
+
+    async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+        assert list(names) == [READINGS, CORRECTED]
+        unit = ReferenceUnit(ConstantPhysics(), serial_number=1)
+        while self.now_s < END_S:
+            self.now_s += BATCH_S
+            silent = self.stopped if STOP_S <= self.now_s < self.again_s else ()
+            records = []
+            for frames in zip(*tpdos(unit.advance(self.now_s)), strict=True):
+                for identifier, data in zip((*OF_READINGS, *OF_CORRECTED), frames, strict=True):
+                    if identifier not in silent:
+                        records.append((round(self.now_s * 1e9), identifier, 0, data))
+            yield RawBatch.of(records)
+        pytest.fail("nobody has noticed that the stream has stopped")
+
+
+@pytest.fixture(scope="module")
+def bundle() -> Bundle:
+    return load_bundle(Path("triax-ref-can"))
+
+
+@pytest.fixture
+def timeout_s(bundle: Bundle) -> float:
+    return 2 * bundle.profile.sampling.silence_timeout_s
+
+
+async def _until_posed(bundle: Bundle, bus: Any, stream: str) -> None:
+    collection = Collection(VERIFICATION if stream == CORRECTED else CALIBRATION, bundle, "node 5")
+    await collection.until_posed(
+        bus,
+        None,
+        Plan(),
+        stream=stream,
+        wanted=9,
+        nominal_scale_factor=(1, 1, 1),
+        tell=lambda guide: None,
+        clock_s=bus.clock_s,
+    )
+
+
+@pytest.mark.parametrize(
+    ("stream", "stopped"),
+    [(CORRECTED, OF_CORRECTED), (CORRECTED, (0x485,)), (READINGS, OF_READINGS), (READINGS, (0x185,))],
+)
+async def test_a_stream_that_stops_while_another_goes_on_is_silence(
+    bundle: Bundle, timeout_s: float, stream: str, stopped: tuple[int, ...]
+) -> None:
+    """Also where only one of the messages that make a sample is missing."""
+    bus = Bus(stopped)
+    with pytest.raises(DeviceSilent, match=f"^node 5: stream {stream}: the device sends, but no whole sample of it"):
+        await _until_posed(bundle, bus, stream)
+    assert timeout_s <= bus.now_s - STOP_S < timeout_s + 3 * BATCH_S
+
+
+@pytest.mark.parametrize("seconds", [None, 50.0])
+async def test_recording_ends_with_the_readings_and_not_with_the_corrected_output(
+    bundle: Bundle, timeout_s: float, tmp_path: Path, seconds: float | None
+) -> None:
+    bus = Bus(OF_READINGS)
+    device: Any = bus
+    with RecordingWriter(tmp_path / "rec.mcap", metadata={}, preview_channels=["temp_c", "status"]) as writer:
+        with pytest.raises(DeviceSilent, match="node 5: stream readings: "):
+            await Collection(CALIBRATION, bundle, "node 5").for_seconds(device, writer, seconds, bus.clock_s)
+        assert timeout_s <= bus.now_s - STOP_S < timeout_s + 3 * BATCH_S
+
+
+async def test_a_pause_shorter_than_the_time_out_ends_nothing(bundle: Bundle, timeout_s: float, tmp_path: Path) -> None:
+    bus = Bus(OF_READINGS, again_s=STOP_S + timeout_s - 2 * BATCH_S)
+    device: Any = bus
+    collection = Collection(CALIBRATION, bundle, "node 5")
+    with RecordingWriter(tmp_path / "rec.mcap", metadata={}, preview_channels=["temp_c", "status"]) as writer:
+        await collection.for_seconds(device, writer, 20.0, bus.clock_s)
+    assert 20.0 <= collection.pipelines[READINGS].seconds < 20.0 + 2 * BATCH_S
+    assert collection.pipelines[READINGS].counts["missing"] > 0
+
+
+def test_record_of_so_many_seconds_ends_where_the_readings_stop(
+    workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send, sent = CanUnit._send, []
+
+    def send_corrected(self: CanUnit, identifier: int, data: bytes) -> None:
+        sent.append(identifier)
+        if not (len(sent) > 2000 and identifier in OF_READINGS):
+            send(self, identifier, data)
+
+    monkeypatch.setattr(CanUnit, "_send", send_corrected)
+    bus = {"interface": "virtual", "channel": f"half-silent-{id(sent)}", "node_id": 5}
+    path = workshop.folder / "rec.mcap"
+    with workshop.serve(workshop.device(profile="triax-ref-can", bus=bus)):
+        station = workshop.station({"bus": bus, "profile": workshop.impatient_profile("triax-ref-can")})
+        done = triaxcal("record", station, "-o", path, "--seconds", "600")
+    done.failed(4, "node_id=5: stream readings: the device sends, but no whole sample of it for 1 s")
+    assert triaxcal("log", "info", path, "--json").json["finished"] is True

@@ -1,0 +1,249 @@
+"""No way out of writing back leaves the device with a calibration that nobody vouches for."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from triaxcal.errors import Refused
+from triaxcal_drivers.errors import DeviceSilent
+from triaxcal_drivers.interface import Device
+from triaxcald.errors import ProvisionError, RecordingError, StationError
+from triaxcald.inputs import CALIBRATION as TUMBLE
+from triaxcald.provision.image import RegisterImage, build_image
+from triaxcald.provision.restore import restore
+from triaxcald.recording.writer import RecordingWriter
+from triaxcald.simulation.memory import CALIBRATION, TABLE, Stored, factory_calibration
+from triaxcald.simulation.unit import Faults
+from triaxcald.station.collection import Collection
+from triaxcald.station.config import Place, Station, load_station
+from triaxcald.station.line import UnitRun
+from triaxcald.station.write_back import NEW_VERIFIED, RESTORED, UNCERTAIN, WriteBack
+
+OLD = Stored(factory_calibration())
+QUICK = {"speed": 60.0}
+BIAS = 0.005
+WANTED = {
+    **{f"scale_factor.{axis}": -2.41 for axis in "xyz"},
+    **{f"misalignment.{axis}": 0.001 for axis in "xyz"},
+    **{f"bias.{axis}": BIAS for axis in "xyz"},
+}
+NO_ROOM = "rec.mcap: writing failed: No space left on device"
+
+
+@pytest.fixture(autouse=True)
+def _short_wait_for_a_dead_unit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("triaxcald.provision.restore.RECONNECT_S", 0.3)
+
+
+class Quiet:
+    """Shows nobody how it goes."""
+
+    def stage(self, unit: str, text: str) -> None: ...
+
+    def poses(self, unit: str, phase: Any, guide: Any) -> None: ...
+
+
+def _holds_old(served: Any) -> None:
+    """In use and stored; writing it back may have counted."""
+    held = Stored.from_image(served.unit.eeprom)
+    assert held.valid
+    assert held.calibration == OLD.calibration
+    assert {name: served.unit._ram[name] for name in CALIBRATION} == OLD.calibration
+
+
+def _stored_bias(served: Any) -> float:
+    return TABLE["bias_x"].decode(Stored.from_image(served.unit.eeprom).calibration["bias_x"])
+
+
+@dataclass
+class Bench:
+    """A unit that holds the old calibration, and everything that it takes to write it another."""
+
+    served: Any
+    place: Place
+    station: Station
+    device: Device
+    writer: RecordingWriter
+    image: RegisterImage
+
+    def write_back(self, collect: Callable[[Collection], Awaitable[None]]) -> WriteBack:
+        return WriteBack(self.place, self.station.file, self.writer, collect)
+
+    async def run(self, back: WriteBack) -> None:
+        tumble = Collection(TUMBLE, self.place.bundle, self.place.address)
+        await back.run(self.device, self.image, "4711", tumble)
+
+
+OpenBench = Callable[..., contextlib.AbstractAsyncContextManager[Bench]]
+
+
+@pytest.fixture
+def open_bench(workshop: Any) -> OpenBench:
+    @contextlib.asynccontextmanager
+    async def opened(faults: Faults | None = None, **settings: Any) -> AsyncIterator[Bench]:
+        with workshop.serve(workshop.device(**QUICK), faults) as served:
+            unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
+            station = load_station(workshop.station(unit, **settings))
+            (place,) = station.places
+            async with place.opened() as device:
+                run = UnitRun(station, place, Quiet())
+                writer = run.writer(workshop.folder / "rec.mcap", await run.identify(device))
+                image = build_image(place.bundle.profile, WANTED, date_days=20_000)
+                try:
+                    yield Bench(served, place, station, device, writer, image)
+                finally:
+                    with contextlib.suppress(RecordingError):
+                        writer.close()
+
+    return opened
+
+
+async def _no_pose(check: Collection) -> None:
+    """Check poses that nobody judges."""
+
+
+async def test_what_is_verified_stays_and_is_said_to_be_verified(open_bench: OpenBench) -> None:
+    async with open_bench() as bench:
+        back = bench.write_back(_no_pose)
+        assert back.state is None
+        await bench.run(back)
+        assert back.state == NEW_VERIFIED
+        assert _stored_bias(bench.served) == pytest.approx(BIAS)
+
+
+@pytest.mark.parametrize(
+    ("failure", "raised"),
+    [
+        (asyncio.CancelledError(), asyncio.CancelledError),
+        (BrokenPipeError("standard error"), BrokenPipeError),
+        (ValueError("nobody has thought of this"), ValueError),
+        (Refused("no new still pose"), StationError),
+        (DeviceSilent("the device has sent nothing"), StationError),
+        (RecordingError(NO_ROOM), StationError),
+    ],
+)
+async def test_whatever_stops_the_check_poses_the_old_calibration_is_back(
+    open_bench: OpenBench, failure: BaseException, raised: type[BaseException]
+) -> None:
+    async def fails(check: Collection) -> None:
+        assert _stored_bias(bench.served) == pytest.approx(BIAS)
+        raise failure
+
+    async with open_bench() as bench:
+        back = bench.write_back(fails)
+        with pytest.raises(raised):
+            await bench.run(back)
+        assert back.state == RESTORED
+        _holds_old(bench.served)
+
+
+async def test_no_number_of_cancellations_stops_the_old_calibration_from_coming_back(
+    open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    struck = []
+
+    async def striking(device: Device, *arguments: Any, **options: Any) -> None:
+        read = device.read
+
+        async def strike(register: str) -> bytes:
+            struck.append(task.cancel())
+            return await read(register)
+
+        monkeypatch.setattr(device, "read", strike)
+        await restore(device, *arguments, **options)
+
+    async def collect(check: Collection) -> None:
+        task.cancel()
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr("triaxcald.station.write_back.restore", striking)
+    async with open_bench() as bench:
+        back = bench.write_back(collect)
+        task = asyncio.ensure_future(bench.run(back))
+        await asyncio.wait([task])
+        assert task.cancelled()
+        assert len(struck) > 3
+        assert back.state == RESTORED
+        _holds_old(bench.served)
+
+
+async def test_a_unit_that_cannot_be_put_back_is_said_to_be_uncertain(open_bench: OpenBench) -> None:
+    async def dies(check: Collection) -> None:
+        bench.served.unit._died_s = 0.0
+        raise asyncio.CancelledError
+
+    async with open_bench() as bench:
+        back = bench.write_back(dies)
+        with pytest.raises(asyncio.CancelledError):
+            await bench.run(back)
+        assert back.state is not None
+        assert back.state.startswith(UNCERTAIN)
+        assert "register serial_number" in back.state or "nothing answers" in back.state
+
+
+@pytest.mark.parametrize(
+    ("faults", "state"),
+    [
+        (Faults(refuse_registers=frozenset({"bias_y"})), RESTORED),
+        (Faults(forget_store=True), RESTORED),
+        (Faults(refuse_registers=frozenset({"scale_factor_x"})), RESTORED),
+        (Faults(die_on_write="bias_y"), UNCERTAIN),
+        (Faults(die_on_write="store"), UNCERTAIN),
+    ],
+)
+async def test_writing_that_fails_says_what_the_device_holds(open_bench: OpenBench, faults: Faults, state: str) -> None:
+    async with open_bench(faults) as bench:
+        back = bench.write_back(_no_pose)
+        with pytest.raises(ProvisionError) as failed:
+            await bench.run(back)
+        assert back.state is not None
+        assert back.state.startswith(state)
+        assert back.state in str(failed.value)
+        assert Stored.from_image(bench.served.unit.eeprom).calibration == OLD.calibration
+
+
+@pytest.mark.parametrize(
+    ("method", "at"),
+    [
+        ("attach", "registers-before.json"),
+        ("attach", "verification.json"),
+        ("event", "provisioned"),
+    ],
+)
+async def test_a_disk_that_fails_once_the_new_calibration_is_stored_brings_the_old_one_back(
+    open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch, method: str, at: str
+) -> None:
+    failed = _disk_fails(monkeypatch, method, at)
+    async with open_bench() as bench:
+        back = bench.write_back(_no_pose)
+        with pytest.raises(StationError, match="No space left on device"):
+            await bench.run(back)
+        assert failed
+        assert back.state == RESTORED
+        _holds_old(bench.served)
+
+
+def _disk_fails(monkeypatch: pytest.MonkeyPatch, method: str, at: str) -> list[str]:
+    """From ``at`` on, for whatever is to be recorded."""
+    failed: list[str] = []
+
+    def failing(name: str) -> Callable[..., Any]:
+        real = getattr(RecordingWriter, name)
+
+        def call(self: RecordingWriter, first: str = "", *more: Any) -> Any:
+            if failed or (name, first) == (method, at):
+                failed.append(name)
+                raise RecordingError(NO_ROOM)
+            return real(self, first, *more)
+
+        return call
+
+    for name in ("attach", "event", "register"):
+        monkeypatch.setattr(RecordingWriter, name, failing(name))
+    return failed
