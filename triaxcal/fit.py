@@ -11,7 +11,7 @@ and the effects' coefficients; all derivatives are exact.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -21,6 +21,7 @@ from triaxcal.calibration import Calibration, PoseResult, Residual, channels_of,
 from triaxcal.effects.contract import Effect
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.errors import InvalidData, Refused
+from triaxcal.outliers import Spoiled, spoiled
 from triaxcal.plan import dilution, distinct, linear_design, most_wanted
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
@@ -31,6 +32,7 @@ DILUTION_WARNING = 10.0
 NOISE_LIMIT = 0.1
 """Poses are refused where noise alone, times the dilution, is this share of the reference."""
 POSES_LEAST = 9
+SPOILED_ROUNDS = 4
 NOT_STILL = "the poses do not look like those of one still triad"
 STEPS_MOST = 60
 CONVERGED = 1e-12
@@ -125,18 +127,66 @@ def fit(
     signs: Sequence[float] = (1, 1, 1),
     reference: float = 1.0,
     effects: Sequence[Effect] = (),
+    aside: Sequence[int] | None = None,
 ) -> Calibration:
     """Fit the linear model, and the effects given, to still poses.
 
-    ``signs`` (3,) of the scale factors, which |a| does not show. Raises Refused where the poses cannot carry the
-    parameters, InvalidData where a channel that an effect needs is not there.
+    ``signs`` (3,) of the scale factors, which |a| does not show. ``aside`` are indices of poses to leave out; where it
+    is None, poses that something spoiled are found and left out (`triaxcal.outliers`). Raises Refused where the poses
+    cannot carry the parameters, InvalidData where a channel that an effect needs is not there.
     """
-    problem = problem_of(poses, signs=signs, reference=reference)
-    missing = {n for e in effects for n in e.needs if n not in problem.channel_reference}
+    everything = problem_of(poses, signs=signs, reference=reference)
+    missing = {n for e in effects for n in e.needs if n not in everything.channel_reference}
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
-    state = solve(problem, start(problem, poses, signs), tuple(effects))
-    return _conclude(problem, poses, state)
+    begin = start(everything, poses, signs)
+    verdict = _spoiled(everything, begin, tuple(effects), poses) if aside is None else Spoiled(tuple(sorted(aside)))
+    found = verdict.rows
+    kept = [p for i, p in enumerate(poses) if i not in found]
+    problem = problem_of(kept, signs=signs, reference=reference) if found else everything
+    if found:
+        begin = start(problem, kept, signs)
+    calibration = _conclude(problem, kept, solve(problem, begin, tuple(effects)))
+    if verdict.rivals:
+        sets = " or ".join(" and ".join(f"{poses[i].start_s:.1f} s" for i in rows) for rows in verdict.rivals)
+        warning = f"some poses were spoiled, and these cannot be told from each other, so none is left out: {sets}"
+        return replace(calibration, warnings=(warning, *calibration.warnings))
+    return _with_aside(calibration, poses, found) if found else calibration
+
+
+def _spoiled(problem: Problem, begin: State, effects: tuple[Effect, ...], poses: Sequence[Pose]) -> Spoiled:
+    """Indices of spoiled poses. Sought anew without those found, until the same are found again.
+
+    A pose spoiled by a thousand times its noise bends the fit so far that linear reckoning is off.
+    """
+    pure = max(float(sum(min(p.dof, 1e6) for p in poses)), 1.0)
+    found = Spoiled()
+    for _ in range(SPOILED_ROUNDS):
+        rest: Ints = np.delete(np.arange(len(poses)), found.rows)
+        r, J, s = linearise(problem, solve(problem.only(rest), begin, effects))
+        again = spoiled(r / s, J / s[:, None], pure)
+        if again == found:
+            break
+        found = again
+    return found
+
+
+def _with_aside(calibration: Calibration, poses: Sequence[Pose], aside: Sequence[int]) -> Calibration:
+    """The calibration with the poses left out among its results, in order of time, and a warning that names them."""
+    held = channels_of(list(poses))
+    u = np.array([p.mean for p in poses])
+    conditioned = conditions(held, calibration.channel_reference)
+    length, by_u = calibration.sensor.magnitude(u, conditioned)
+    a = calibration.sensor.specific_force(u, conditioned)
+    results = list(calibration.poses)
+    names = []
+    for i in aside:
+        error = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
+        miss = float(length[i] - calibration.reference)
+        results.insert(i, PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, error, miss / error, 0.0, used=False))
+        names.append(f"at {poses[i].start_s:.1f} s ({miss / error:+.0f} standard errors)")
+    warning = f"left out as spoiled: the pose {', the pose '.join(names)}"
+    return replace(calibration, poses=tuple(results), warnings=(warning, *calibration.warnings))
 
 
 def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> State:
@@ -289,7 +339,7 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State) -> Calibrat
         dilution=spread,
         inflation=inflation,
     )
-    return Calibration(**{**vars(calibration), "warnings": tuple(_warnings(calibration))})
+    return replace(calibration, warnings=tuple(_warnings(calibration)))
 
 
 def pure_error_p(chi2: float, left: int, poses: Sequence[Pose]) -> float:

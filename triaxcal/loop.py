@@ -23,6 +23,9 @@ from triaxcal.search import FAMILYWISE, Search
 from triaxcal.sensor import Sensor
 from triaxcal.visibility import is_visible
 
+ROUNDS_MOST = 3
+"""Effects and spoiled poses are sought in turn so often."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -84,15 +87,23 @@ def diagnose(
 
     Raises as `triaxcal.fit.fit` does. ``check`` are poses of another recording, for the held-out error.
     """
-    before = fit(poses, signs=signs, reference=reference)
-    problem = problem_of(poses, signs=signs, reference=reference)
-    linear = solve(problem, start(problem, poses, signs), ())
-    seen = [e for e in catalogue if is_visible(problem, linear, e)]
-    search = Search(problem, poses, signs, reference, seen, before)
-    adopted = search.run(linear)
-    after = search.best
-    blind = tuple(e.name for e in catalogue if e not in seen)
-    findings = tuple(_finding(search, e, adopted) for e in adopted)
+    aside = _aside(fit(poses, signs=signs, reference=reference))
+    if aside:
+        # What looks like spoiled poses may be an effect that the linear model lacks.
+        whole = _searched(poses, (), signs, reference, catalogue)
+        without = _searched(poses, aside, signs, reference, catalogue)
+        aside = aside if _criterion(without, len(poses)) < _criterion(whole, len(poses)) else ()
+    for _ in range(ROUNDS_MOST):
+        found = _searched(poses, aside, signs, reference, catalogue)
+        # Beside an effect a spoiled pose may not have shown; with the effect in the model it does.
+        again = _aside(fit(poses, signs=signs, reference=reference, effects=found.adopted))
+        if again == aside or not found.adopted:
+            break
+        aside = again
+    search, before = found.search, found.search.before
+    after = search.best = fit(poses, signs=signs, reference=reference, effects=found.adopted, aside=aside)
+    blind = tuple(e.name for e in catalogue if e not in search.seen)
+    findings = tuple(_finding(search, e, found.adopted) for e in found.adopted)
     unexplained = _unexplained(after, search)
     return Loop(
         before=before.with_blind_to(blind),
@@ -102,6 +113,43 @@ def diagnose(
         held_out=_held_out(before, after, check) if check is not None else None,
         advice=tuple(_advice(findings, unexplained, blind)),
     )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What the search found with so many poses left out."""
+
+    search: Search
+    adopted: list[Effect]
+    aside: tuple[int, ...]
+
+
+def _aside(c: Calibration) -> tuple[int, ...]:
+    return tuple(i for i, p in enumerate(c.poses) if not p.used)
+
+
+def _searched(
+    poses: Sequence[Pose],
+    aside: tuple[int, ...],
+    signs: Sequence[float],
+    reference: float,
+    catalogue: Sequence[Effect],
+) -> _Found:
+    before = fit(poses, signs=signs, reference=reference, aside=aside)
+    kept = [p for i, p in enumerate(poses) if i not in aside]
+    problem = problem_of(kept, signs=signs, reference=reference)
+    linear = solve(problem, start(problem, kept, signs), ())
+    seen = [e for e in catalogue if is_visible(problem, linear, e)]
+    search = Search(problem, kept, signs, reference, seen, before)
+    return _Found(search, search.run(linear), aside)
+
+
+def _criterion(found: _Found, n: int) -> float:
+    """Schwarz's: a pose left out costs a parameter, and the choice of it as much again."""
+    search = found.search
+    chi2 = search.chi2(search.with_effects(search.linear, found.adopted))
+    effects = sum(len(e.coefficients) for e in found.adopted)
+    return chi2 + (effects + 2 * len(found.aside)) * float(np.log(n))
 
 
 def _finding(search: Search, effect: Effect, adopted: list[Effect]) -> Finding:
@@ -149,8 +197,9 @@ def _unexplained(after: Calibration, search: Search) -> Unexplained:
 
 
 def _lead(after: Calibration, search: Search) -> str:
-    worst = max(after.poses, key=lambda p: abs(p.studentized))
-    squares = np.array([p.studentized**2 for p in after.poses])
+    used = [p for p in after.poses if p.used]
+    worst = max(used, key=lambda p: abs(p.studentized))
+    squares = np.array([p.studentized**2 for p in used])
     parts = []
     if worst.studentized**2 > 0.5 * squares.sum():
         parts.append(
@@ -158,8 +207,8 @@ def _lead(after: Calibration, search: Search) -> str:
         )
     for name, why in search.passed_over.items():
         parts.append(f"the nearest effect is {name}, not adopted: {why}")
-    miss = np.array([p.residual_g for p in after.poses])
-    for name, values in search.problem.channels.items():
+    miss = np.array([p.residual_g for p in used])
+    for name, values in channels_of([p.pose for p in used]).items():
         if np.ptp(values) > 0:
             r = float(np.corrcoef(values, miss)[0, 1])
             if abs(r) > 0.6:

@@ -124,7 +124,7 @@ class Search:
 
     def fitted(self, effects: Sequence[Effect]) -> Calibration | None:
         try:
-            return fit(self.poses, signs=self.signs, reference=self.reference, effects=effects)
+            return fit(self.poses, signs=self.signs, reference=self.reference, effects=effects, aside=())
         except Refused:
             return None
 

@@ -279,16 +279,17 @@ def test_check_poses_without_the_channel_that_was_needed_are_refused_by_name(
         diagnose(poses, signs=MINUS, check=[])
 
 
-def test_a_single_bad_pose_is_the_lead(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+def test_a_single_bad_pose_is_left_out_and_no_effect_is_made_of_it(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     for seed in range(10):
         poses = noisy_poses(paper_unit, twenty_six, SIGMA_G, np.random.default_rng(seed))
         bad = 4 + seed
         along = 40 * SIGMA_G * twenty_six[bad] * paper_unit.scale_factor
         poses[bad] = replace(poses[bad], mean=poses[bad].mean + along)
         loop = diagnose(poses, signs=MINUS)
-        assert loop.unexplained.significant
-        assert f"one pose, at {poses[bad].start_s:.1f} s" in loop.unexplained.lead
-        assert not [f for f in loop.findings if f.verdict == "adopted"]
+        assert [i for i, p in enumerate(loop.after.poses) if not p.used] == [bad]
+        assert f"at {poses[bad].start_s:.1f} s" in loop.after.warnings[0]
+        assert not loop.findings
+        assert not loop.unexplained.significant
 
 
 def test_the_linear_result_of_the_loop_is_the_fit_s(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
