@@ -190,13 +190,18 @@ def test_a_unit_whose_profile_can_be_no_file(workshop: Any, triaxcal: Run) -> No
     triaxcal("run", station).failed(2, f"{station}, line 7: units.0.profile: string should match pattern")
 
 
-def test_a_run_that_nobody_reads_the_result_of_fails_all_the_same(workshop: Any) -> None:
-    station = workshop.station({"bus": NOBODY})
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_run_that_nobody_reads_the_result_of_fails_all_the_same(workshop: Any, unbuffered: str) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    program = Path(sys.executable).with_name("triaxcal")
-    run = [program, "run", station, "--json"]
-    done = subprocess.run(run, stdout=writing, stderr=subprocess.PIPE, text=True, timeout=60)
+    done = subprocess.run(
+        [Path(sys.executable).with_name("triaxcal"), "run", workshop.station({"bus": NOBODY}), "--json"],
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        stdout=writing,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=60,
+    )
     os.close(writing)
     assert done.returncode == 4
     assert done.stderr.splitlines()[-1].startswith("triaxcal: unit unit0: cannot connect to ")
