@@ -58,6 +58,9 @@ def warnings(loop: Loop, measured: Measured) -> str:
     found = [f"noise ×{loop.after.inflation:.1f}"] if loop.after.inflation > 1 else []
     found += [line.split(",")[0].replace("_", " ") for line in measured.data_quality]
     found += [w.split(":")[0] for w in loop.after.warnings if "poorly spread" in w or "alone carries" in w]
+    aside = sum(not p.used for p in loop.after.poses)
+    found += [f"{aside} poses set aside" if aside > 1 else "1 pose set aside"] if aside else []
+    found += ["spoiled poses that cannot be told apart" for w in loop.after.warnings if w.startswith("some poses")]
     return "; ".join(found) or "none"
 
 

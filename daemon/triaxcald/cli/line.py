@@ -134,6 +134,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         print(f"  {o.lost} records were lost between bus and disk")
     for line in o.certified.document["outside"]:
         print(f"  outside limits: {line}")
+    for line in loop.after.warnings:
+        print(f"  warning: {line}")
     for what, path in (("recording", o.recording), ("certificate", o.certificate), ("report", o.report)):
         print(f"  {what:<12}{path}")
 
