@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 
@@ -12,4 +13,17 @@ def entry() -> None:
     except ModuleNotFoundError as e:
         sys.stderr.write(f"triaxcal: the module {e.name} is missing; pip install 'triaxcal[station]' brings it\n")
         sys.exit(2)
-    sys.exit(main(sys.argv[1:]))
+    code = main(sys.argv[1:])
+    _leave_nothing_unsaid()
+    sys.exit(code)
+
+
+def _leave_nothing_unsaid() -> None:
+    """Flushes what was said to standard error; where that has been closed, the interpreter shall not stumble over it.
+
+    It would end with 120, whatever the command had to say by its exit code.
+    """
+    try:
+        sys.stderr.flush()
+    except (OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
