@@ -67,10 +67,7 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str) -> Measu
     pipeline = Pipeline(bundle, stream).feed_all(recording.raw(phase))
     poses = pipeline.finish()
     quality = pipeline.data_quality() + losses_of(recording) + _creeping(poses)
-    signs = signs_of(recording)
-    nominal = bundle.profile.output.nominal_scale_factor
-    if signs is None and nominal is not None:
-        signs = (_sign(nominal[0]), _sign(nominal[1]), _sign(nominal[2]))
+    signs = signs_of(recording) or bundle.profile.output.signs
     reference = None
     if STATION_FILE in recording.attachments:
         where = f"{recording.name}: {STATION_FILE}"
@@ -98,10 +95,6 @@ def losses_of(recording: Recording) -> list[str]:
     if missing:
         found.append(f"missing_samples: {missing} records were lost when the recording was damaged")
     return found
-
-
-def _sign(value: float) -> int:
-    return 1 if value > 0 else -1
 
 
 def _creeping(poses: list[Pose]) -> list[str]:

@@ -56,6 +56,14 @@ class Output(Strict):
             raise ValueError("nominal_scale_factor must not be zero")
         return self
 
+    @property
+    def signs(self) -> tuple[Literal[-1, 1], Literal[-1, 1], Literal[-1, 1]] | None:
+        """Of the scale factors, where they are declared."""
+        if self.nominal_scale_factor is None:
+            return None
+        x, y, z = self.nominal_scale_factor
+        return (1 if x > 0 else -1, 1 if y > 0 else -1, 1 if z > 0 else -1)
+
 
 class Sampling(Strict):
     rate_hz: Annotated[float, Field(gt=0, description="samples a second that the device delivers")]

@@ -24,7 +24,7 @@ from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, measure, read_document
 from triaxcald.report.page import render_report
-from triaxcald.report.stream import StreamOverview, thin
+from triaxcald.report.stream import overview_of
 
 
 def register(commands: Any) -> None:
@@ -225,17 +225,9 @@ def _write(a: argparse.Namespace, measured: Measured, document: documents.Docume
         write_text(a.output, documents.to_text(document))
     if a.report:
         limits = {"limits": {"rms_g": a.limit}} if a.limit else None
-        page = render_report(document, title=measured.name, stream=_overview(a, measured), certificate=limits)
+        overview = overview_of(measured.windows, measured.poses, chosen(a, measured).output_unit)
+        page = render_report(document, title=measured.name, stream=overview, certificate=limits)
         write_text(a.report, page)
-
-
-def _overview(a: argparse.Namespace, measured: Measured) -> StreamOverview | None:
-    w = measured.windows
-    if w is None:
-        return None
-    time_s, readings = thin((w.start_ns - int(w.start_ns[0])) * 1e-9, w.mean)
-    spans = tuple((p.start_s, p.end_s) for p in measured.poses)
-    return StreamOverview(time_s, readings, spans, chosen(a, measured).output_unit)
 
 
 def show_calibration(c: Calibration, choice: Choice) -> None:

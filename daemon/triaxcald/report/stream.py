@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from triaxcal.poses import Pose
+from triaxcal.stillness import Windows
 
 
 @dataclass(frozen=True)
@@ -51,3 +55,11 @@ def thin(time_s: ArrayLike, readings: ArrayLike, points: int = 2000) -> tuple[ND
         kept.append(start + np.where(np.isnan(block), -np.inf, block).argmax(axis=0))
     rows = np.unique(np.concatenate(kept))
     return times[rows], values[rows]
+
+
+def overview_of(windows: Windows | None, poses: Sequence[Pose], unit: str) -> StreamOverview | None:
+    """The stream from its windows' means; None where there is not one whole window."""
+    if windows is None:
+        return None
+    time_s, readings = thin((windows.start_ns - int(windows.start_ns[0])) * 1e-9, windows.mean)
+    return StreamOverview(time_s, readings, tuple((p.start_s, p.end_s) for p in poses), unit)

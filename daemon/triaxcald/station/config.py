@@ -121,10 +121,7 @@ class Place:
 
     @property
     def signs(self) -> tuple[int, int, int]:
-        nominal = self.bundle.profile.output.nominal_scale_factor
-        if self.unit.signs:
-            return self.unit.signs
-        return tuple(1 if k > 0 else -1 for k in nominal) if nominal else (1, 1, 1)  # type: ignore[return-value]
+        return self.unit.signs or self.bundle.profile.output.signs or (1, 1, 1)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.provision.procedure import ProvisionReport
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import render_report
-from triaxcald.report.stream import StreamOverview, thin
+from triaxcald.report.stream import overview_of
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, Station
 from triaxcald.station.write_back import NEW_UNCHECKED, NEW_VERIFIED, UNCERTAIN, WriteBack, corrected
@@ -243,24 +243,14 @@ class UnitRun:
             papers["verification"] = self._write_back.verification
         if self._write_back:
             papers["device"] = self._write_back.state
+        overview = overview_of(pipeline.windows, pipeline.poses(), self.profile.output.unit)
         with _DRAWING:
             return render_report(
                 certified.document["result"],
                 title=f"{papers['unit']['product']} {papers['unit']['serial']}",
-                stream=overview(pipeline, self.profile.output.unit),
+                stream=overview,
                 certificate=papers,
             )
-
-
-def overview(pipeline: Pipeline, unit: str) -> StreamOverview | None:
-    """The stream for a picture, from the windows' means."""
-    windows = pipeline.windows
-    if windows is None:
-        return None
-    start = int(windows.start_ns[0])
-    time_s, readings = thin((windows.start_ns - start) * 1e-9, windows.mean)
-    spans = tuple((p.start_s, p.end_s) for p in pipeline.poses())
-    return StreamOverview(time_s, readings, spans, unit)
 
 
 async def run_station(station: Station, progress: Progress) -> list[Outcome]:
