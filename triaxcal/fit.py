@@ -1,17 +1,9 @@
-"""The weighted maximum-likelihood fit of a triad's model to still poses.
-
-Every pose says that ``|a| = reference``; its attitude is a nuisance. With the attitude profiled out, the likelihood
-of a pose is that of ``r = |a(u)| − reference`` with the variance that the noise of its mean has along the gradient
-of r. What this neglects is of the order of the noise squared.
-
-The parameters of the search are ``v = D x − w`` (x the outputs scaled to the range of the data), the three angles
-and the effects' coefficients; all derivatives are exact.
-"""
+"""The weighted maximum-likelihood fit of a triad's model to still poses, and how far it may be trusted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
@@ -19,106 +11,15 @@ from scipy import stats
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration, PoseResult, Residual, channels_of, conditions
 from triaxcal.effects.contract import Effect
-from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.outliers import Spoiled, spoiled
-from triaxcal.plan import dilution, distinct, linear_design, most_wanted
+from triaxcal.plan import dilution, linear_design, most_wanted
 from triaxcal.poses import Pose
-from triaxcal.sensor import Sensor
+from triaxcal.problem import NOT_STILL, Problem, State, linearise, solve
+from triaxcal.start import DILUTION_LIMIT, problem_of, start
 
-DILUTION_LIMIT = 100.0
-"""Above this a set of poses is refused: some combination of parameters is a hundred times worse than one pose."""
 DILUTION_WARNING = 10.0
-NOISE_LIMIT = 0.1
-"""Poses are refused where noise alone, times the dilution, is this share of the reference."""
-POSES_LEAST = 9
 SPOILED_ROUNDS = 4
-NOT_STILL = "the poses do not look like those of one still triad"
-STEPS_MOST = 60
-CONVERGED = 1e-12
-"""Relative step at which the search ends; the noise of any real pose is a million times larger."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each."""
-
-    u: Floats
-    covariance: Floats
-    channels: Mapping[str, Floats]
-    channel_reference: Mapping[str, float]
-    middle: Floats
-    half: Floats
-    signs: Floats
-    reference: float
-
-    @property
-    def conditions(self) -> dict[str, Floats]:
-        return conditions(self.channels, self.channel_reference)
-
-    def only(self, rows: Ints | slice) -> Problem:
-        """The same problem with some of its poses."""
-        return Problem(
-            self.u[rows],
-            self.covariance[rows],
-            {n: v[rows] for n, v in self.channels.items()},
-            self.channel_reference,
-            self.middle,
-            self.half,
-            self.signs,
-            self.reference,
-        )
-
-
-@dataclass(frozen=True)
-class State:
-    """A point of the search: ``theta`` (9 + p,) as D (3), w (3), angles (3), effects' coefficients."""
-
-    theta: Floats
-    effects: tuple[Effect, ...]
-
-    def sensor(self, problem: Problem) -> Sensor:
-        D, w, angles = self.theta[:3], self.theta[3:6], self.theta[6:9]
-        pairs = []
-        at = 9
-        for effect in self.effects:
-            pairs.append((effect, self.theta[at : at + len(effect.coefficients)]))
-            at += len(effect.coefficients)
-        return Sensor(problem.half / D, angles, w + problem.middle * D / problem.half, tuple(pairs))
-
-
-def problem_of(poses: Sequence[Pose], *, signs: Sequence[float] = (1, 1, 1), reference: float = 1.0) -> Problem:
-    """Raises InvalidData, Refused where there are fewer than nine poses."""
-    if len(poses) < POSES_LEAST:
-        raise Refused(
-            f"{len(poses)} still poses; nine parameters need at least {POSES_LEAST}, 14 or 26 are better",
-            wanted=_wanted_for(poses, signs),
-        )
-    u = np.array([p.mean for p in poses])
-    low, high = u.min(axis=0), u.max(axis=0)
-    flat = [axis for axis, same in zip("xyz", high - low <= 0, strict=True) if same]
-    if flat:
-        raise Refused(f"the output of axis {', '.join(flat)} never changes; it cannot be calibrated")
-    if not all(s in (1, -1) for s in signs):
-        raise InvalidData(f"signs must be +1 or −1, not {signs}")
-    if not (np.isfinite(reference) and reference > 0):
-        raise InvalidData(f"the reference must be a positive number, not {reference}")
-    channels = channels_of(list(poses))
-    return Problem(
-        u=u,
-        covariance=np.array([p.covariance for p in poses]),
-        channels=channels,
-        channel_reference={n: _round(float(np.mean(v))) for n, v in channels.items() if np.isfinite(v).all()},
-        middle=(low + high) / 2,
-        half=(high - low) / 2,
-        signs=np.asarray(signs, dtype=float),
-        reference=reference,
-    )
-
-
-def _round(value: float) -> float:
-    """To a tenth, so that a reference temperature reads well and fits a float32 register."""
-    return round(value, 1)
 
 
 def fit(
@@ -187,114 +88,6 @@ def _with_aside(calibration: Calibration, poses: Sequence[Pose], aside: Sequence
         names.append(f"at {poses[i].start_s:.1f} s ({miss / error:+.0f} standard errors)")
     warning = f"left out as spoiled: the pose {', the pose '.join(names)}"
     return replace(calibration, poses=tuple(results), warnings=(warning, *calibration.warnings))
-
-
-def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> State:
-    """The closed form as a starting point, after it is sure that the poses can carry nine parameters."""
-    x = (problem.u - problem.middle) / problem.half
-    rough = x / np.linalg.norm(x, axis=1, keepdims=True)
-    try:
-        A, c = closed_form(problem.u)
-        a = (problem.u - c) @ A.T
-        spread = dilution(a, linear_design(a / np.linalg.norm(a, axis=1, keepdims=True), x))
-    except Refused as e:
-        raise Refused(f"{e}; {_count(rough)}", wanted=_wanted_for(poses, signs)) from None
-    k, angles, b = coefficients(A * problem.reference, c)
-    ax, ay, az = angles
-    sx, sy, sz = problem.signs
-    D = problem.signs * problem.half / k
-    w = problem.signs * b - problem.middle * D / problem.half
-    state = State(np.concatenate([D, w, [ax * sy * sz, ay * sx * sz, az * sx * sy]]), ())
-    noise = float(np.sqrt(np.mean(linearise(problem, state)[2] ** 2))) / problem.reference
-    known = spread * noise < NOISE_LIMIT
-    if not spread < DILUTION_LIMIT:
-        raise Refused(
-            f"the poses cannot carry nine parameters: some combination of them would be {spread:.3g} times as "
-            f"uncertain as one pose (limit {DILUTION_LIMIT:g}); {_count(a)}",
-            wanted=_labels(a * problem.signs) if known else _wanted_for(poses, signs),
-        )
-    if not known:
-        raise Refused(
-            f"the poses cannot carry nine parameters: they differ by little more than their noise; {_count(a)}",
-            wanted=_wanted_for(poses, signs),
-        )
-    return state
-
-
-def _count(a: Floats) -> str:
-    return f"{len(a)} poses in {distinct(a)} distinct directions"
-
-
-def _wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]:
-    """The poses that would mend a set, as far as its directions can be told without a fit."""
-    if not poses:
-        return _labels(np.zeros((0, 3)))
-    u = np.array([p.mean for p in poses])
-    middle = (u.max(axis=0) + u.min(axis=0)) / 2
-    # Without a scale an axis that hardly moved would look like one that swung from end to end.
-    half = float(np.max((u.max(axis=0) - u.min(axis=0)) / 2))
-    error = float(np.sqrt(np.mean([np.trace(p.covariance) for p in poses])))
-    if half <= error / NOISE_LIMIT:
-        return _labels(np.zeros((0, 3)))
-    return _labels((u - middle) / half * np.asarray(signs) + 1e-12)
-
-
-def _labels(a: Floats) -> tuple[str, ...]:
-    return tuple(label for label, _ in most_wanted(a))
-
-
-def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: int = STEPS_MOST) -> State:
-    """Gauss–Newton with halved steps; the weights follow the gradient of r from step to step.
-
-    Raises Refused where it does not converge within the limit (with ``steps`` at its default).
-    """
-    extra = sum(len(e.coefficients) for e in effects) - (len(state.theta) - 9)
-    theta = np.concatenate([state.theta, np.zeros(max(extra, 0))])
-    for _ in range(steps):
-        r, J, s = linearise(problem, State(theta, effects))
-        if not (np.isfinite(J).all() and np.isfinite(r).all()):
-            raise Refused(f"the fit ran away; {NOT_STILL}")
-        norm = np.linalg.norm(J / s[:, None], axis=0)
-        norm[norm == 0] = 1.0
-        step = -np.linalg.lstsq(J / s[:, None] / norm, r / s, rcond=1e-14)[0] / norm
-        cost = float(np.sum((r / s) ** 2))
-        scale = 1.0
-        for _ in range(12):
-            trial, _, _ = linearise(problem, State(theta + scale * step, effects), jacobian=False)
-            if np.sum((trial / s) ** 2) <= cost * (1 + 1e-9) + 1e-12:
-                break
-            scale /= 2
-        theta = theta + scale * step
-        size = np.linalg.norm(step * norm) / max(float(np.linalg.norm(theta * norm)), 1e-300)
-        if size < CONVERGED:
-            return State(theta, effects)
-    if steps == STEPS_MOST and size > 1e-9:
-        raise Refused(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e}); {NOT_STILL}")
-    return State(theta, effects)
-
-
-def linearise(problem: Problem, state: State, jacobian: bool = True) -> tuple[Floats, Floats, Floats]:
-    """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise (n,)."""
-    sensor = state.sensor(problem)
-    held = problem.conditions
-    x = (problem.u - problem.middle) / problem.half
-    s = sensor.along_axes(problem.u, held)
-    inverse_axes = np.linalg.inv(sensor.axes)
-    a = s @ inverse_axes.T
-    length = np.linalg.norm(a, axis=1)
-    r = length - problem.reference
-    if not jacobian:
-        return r, np.empty((0, 0)), np.empty(0)
-    by_s = (a / length[:, None]) @ inverse_axes
-    E = sensor.departure_slope(s, held) + np.eye(3)
-    by_v = np.linalg.solve(E.transpose(0, 2, 1), by_s[..., None])[..., 0]
-    angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
-    effects = [-np.einsum("ni,nip->np", by_v, e.basis(s, held)) for e in state.effects]
-    J = np.concatenate([by_v * x, -by_v, angles, *effects], axis=1)
-    by_u = by_v / sensor.scale_factor
-    variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
-    # Poses without any scatter (made up, or below the resolution) would otherwise weigh infinitely.
-    return r, J, np.sqrt(np.maximum(variance, (1e-12 * problem.reference) ** 2))
 
 
 def _conclude(problem: Problem, poses: Sequence[Pose], state: State) -> Calibration:

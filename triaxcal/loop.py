@@ -17,10 +17,12 @@ from triaxcal.calibration import Calibration, channels_of, conditions
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import InvalidData
-from triaxcal.fit import fit, problem_of, solve, start
+from triaxcal.fit import fit
 from triaxcal.poses import Pose
+from triaxcal.problem import solve
 from triaxcal.search import FAMILYWISE, Search
 from triaxcal.sensor import Sensor
+from triaxcal.start import problem_of, start
 from triaxcal.visibility import is_visible
 
 ROUNDS_MOST = 3

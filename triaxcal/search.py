@@ -12,8 +12,9 @@ from scipy import stats
 from triaxcal.calibration import Calibration
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
-from triaxcal.fit import Problem, State, fit, linearise, solve
+from triaxcal.fit import fit
 from triaxcal.poses import Pose
+from triaxcal.problem import Problem, State, linearise, solve
 from triaxcal.visibility import projected
 
 FAMILYWISE = 0.01

@@ -9,8 +9,9 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
-from triaxcal.fit import Problem, State, linearise, problem_of, solve, start
+from triaxcal.problem import Problem, State, linearise, solve
 from triaxcal.sensor import Sensor
+from triaxcal.start import problem_of, start
 from triaxcal.synthetic import noisy_poses
 
 VISIBLE = 0.02

@@ -11,9 +11,11 @@ from scipy import stats
 
 from triaxcal.effects import CATALOGUE, TIME
 from triaxcal.errors import InvalidData
-from triaxcal.fit import Problem, State, fit, linearise, problem_of, solve, start
+from triaxcal.fit import fit
 from triaxcal.poses import Pose
+from triaxcal.problem import Problem, State, linearise, solve
 from triaxcal.sensor import Sensor
+from triaxcal.start import problem_of, start
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)

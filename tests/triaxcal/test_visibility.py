@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import CATALOGUE, effect_named
-from triaxcal.fit import problem_of, start
 from triaxcal.plan import directions
 from triaxcal.sensor import Sensor
+from triaxcal.start import problem_of, start
 from triaxcal.synthetic import noisy_poses
 from triaxcal.visibility import is_visible, projected, unseen_effects
 

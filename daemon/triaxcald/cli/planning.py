@@ -16,7 +16,7 @@ from triaxcal.visibility import unseen_effects
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, count
 from triaxcald.cli.console import emit, table
-from triaxcald.cli.measuring import chosen
+from triaxcald.cli.showing import chosen
 from triaxcald.documents import number
 from triaxcald.errors import InputError
 from triaxcald.inputs import measure

@@ -1,0 +1,88 @@
+"""Results as a person reads them at the console, and in which units."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+
+from triaxcal.calibration import Calibration
+from triaxcal.loop import Loop
+from triaxcald import documents
+from triaxcald.cli.console import micro, say, table
+from triaxcald.inputs import Measured
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How a recording is to be read: the user's word, else the recording's own, else the default."""
+
+    signs: tuple[int, int, int]
+    reference: float
+    output_unit: str
+    reference_unit: str
+
+    @property
+    def micro_unit(self) -> str:
+        return documents.micro_unit(self.reference_unit)
+
+
+def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
+    reference = a.reference or measured.reference or 1.0
+    return Choice(
+        a.sign or measured.signs or (1, 1, 1),
+        reference,
+        a.output_unit or (measured.profile.output.unit if measured.profile else ""),
+        a.reference_unit or documents.reference_unit_of(reference),
+    )
+
+
+def show_calibration(c: Calibration, choice: Choice) -> None:
+    rows = []
+    unit = choice.reference_unit
+    units = {"scale_factor": f"{choice.output_unit or 'output'}/{unit}", "misalignment": "rad", "bias": unit}
+    of_effects = {
+        f"{e.name}.{k.name}": documents.in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients
+    }
+    for name, value, error in zip(c.parameters, c.values, c.standard_errors, strict=True):
+        rows.append([name, f"{value:.9g}", f"{error:.2g}", of_effects.get(name, units.get(name.split(".")[0], ""))])
+    table("coefficients", ["", "value", "standard error", "unit"], rows)
+    r, micro_unit = c.residual, choice.micro_unit
+    p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
+    print(
+        f"{len(c.poses)} poses: residual rms {micro(r.rms_g)} {micro_unit}, cross-validated "
+        f"{micro(r.cross_validated_rms_g)} {micro_unit}, noise floor {micro(r.noise_floor_g)} {micro_unit}, "
+        f"lack of fit p {p}"
+    )
+
+
+def show_loop(loop: Loop, choice: Choice) -> None:
+    b, f = loop.before.residual, loop.after.residual
+    rows = [
+        ["residual rms", micro(b.rms_g), micro(f.rms_g)],
+        ["cross-validated rms", micro(b.cross_validated_rms_g), micro(f.cross_validated_rms_g)],
+    ]
+    if loop.held_out:
+        rows.append(["held-out rms", micro(loop.held_out.before_rms_g), micro(loop.held_out.after_rms_g)])
+    rows.append(["noise floor", micro(b.noise_floor_g), micro(f.noise_floor_g)])
+    table(f"error of the magnitude, {choice.micro_unit}", ["", "before", "after"], rows)
+    for finding in loop.findings:
+        print(f"{finding.verdict}: {finding.effect} ({documents.in_words_of(finding.reason, choice.reference_unit)})")
+    if not loop.findings:
+        print("no effect of the catalogue shows")
+    if loop.unexplained.significant:
+        lead = documents.in_words_of(loop.unexplained.lead, choice.reference_unit)
+        print(f"unexplained: {micro(loop.unexplained.rms_g)} {choice.micro_unit} rms; {lead}")
+    for line in loop.advice:
+        print(f"advice: {line}")
+
+
+def judge(limit: float | None, rms: float) -> int:
+    if limit is not None and not rms <= limit:
+        say(f"outside the limit: rms {rms:.3g}, limit {limit:.3g}")
+        return 1
+    return 0
+
+
+def warn(lines: list[str]) -> None:
+    for line in lines:
+        say(f"warning: {line}")

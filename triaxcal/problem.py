@@ -1,0 +1,129 @@
+"""The likelihood of still poses under a model, its derivatives, and the search for its maximum.
+
+Every pose says that ``|a| = reference``; its attitude is a nuisance. With the attitude profiled out, the likelihood
+of a pose is that of ``r = |a(u)| − reference`` with the variance that the noise of its mean has along the gradient
+of r. What this neglects is of the order of the noise squared.
+
+The parameters of the search are ``v = D x − w`` (x the outputs scaled to the range of the data), the three angles
+and the effects' coefficients; all derivatives are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.calibration import conditions
+from triaxcal.effects.contract import Effect
+from triaxcal.errors import Refused
+from triaxcal.sensor import Sensor
+
+NOT_STILL = "the poses do not look like those of one still triad"
+STEPS_MOST = 60
+CONVERGED = 1e-12
+"""Relative step at which the search ends; the noise of any real pose is a million times larger."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each."""
+
+    u: Floats
+    covariance: Floats
+    channels: Mapping[str, Floats]
+    channel_reference: Mapping[str, float]
+    middle: Floats
+    half: Floats
+    signs: Floats
+    reference: float
+
+    @property
+    def conditions(self) -> dict[str, Floats]:
+        return conditions(self.channels, self.channel_reference)
+
+    def only(self, rows: Ints | slice) -> Problem:
+        """The same problem with some of its poses."""
+        return Problem(
+            self.u[rows],
+            self.covariance[rows],
+            {n: v[rows] for n, v in self.channels.items()},
+            self.channel_reference,
+            self.middle,
+            self.half,
+            self.signs,
+            self.reference,
+        )
+
+
+@dataclass(frozen=True)
+class State:
+    """A point of the search: ``theta`` (9 + p,) as D (3), w (3), angles (3), effects' coefficients."""
+
+    theta: Floats
+    effects: tuple[Effect, ...]
+
+    def sensor(self, problem: Problem) -> Sensor:
+        D, w, angles = self.theta[:3], self.theta[3:6], self.theta[6:9]
+        pairs = []
+        at = 9
+        for effect in self.effects:
+            pairs.append((effect, self.theta[at : at + len(effect.coefficients)]))
+            at += len(effect.coefficients)
+        return Sensor(problem.half / D, angles, w + problem.middle * D / problem.half, tuple(pairs))
+
+
+def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: int = STEPS_MOST) -> State:
+    """Gauss–Newton with halved steps; the weights follow the gradient of r from step to step.
+
+    Raises Refused where it does not converge within the limit (with ``steps`` at its default).
+    """
+    extra = sum(len(e.coefficients) for e in effects) - (len(state.theta) - 9)
+    theta = np.concatenate([state.theta, np.zeros(max(extra, 0))])
+    for _ in range(steps):
+        r, J, s = linearise(problem, State(theta, effects))
+        if not (np.isfinite(J).all() and np.isfinite(r).all()):
+            raise Refused(f"the fit ran away; {NOT_STILL}")
+        norm = np.linalg.norm(J / s[:, None], axis=0)
+        norm[norm == 0] = 1.0
+        step = -np.linalg.lstsq(J / s[:, None] / norm, r / s, rcond=1e-14)[0] / norm
+        cost = float(np.sum((r / s) ** 2))
+        scale = 1.0
+        for _ in range(12):
+            trial, _, _ = linearise(problem, State(theta + scale * step, effects), jacobian=False)
+            if np.sum((trial / s) ** 2) <= cost * (1 + 1e-9) + 1e-12:
+                break
+            scale /= 2
+        theta = theta + scale * step
+        size = np.linalg.norm(step * norm) / max(float(np.linalg.norm(theta * norm)), 1e-300)
+        if size < CONVERGED:
+            return State(theta, effects)
+    if steps == STEPS_MOST and size > 1e-9:
+        raise Refused(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e}); {NOT_STILL}")
+    return State(theta, effects)
+
+
+def linearise(problem: Problem, state: State, jacobian: bool = True) -> tuple[Floats, Floats, Floats]:
+    """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise (n,)."""
+    sensor = state.sensor(problem)
+    held = problem.conditions
+    x = (problem.u - problem.middle) / problem.half
+    s = sensor.along_axes(problem.u, held)
+    inverse_axes = np.linalg.inv(sensor.axes)
+    a = s @ inverse_axes.T
+    length = np.linalg.norm(a, axis=1)
+    r = length - problem.reference
+    if not jacobian:
+        return r, np.empty((0, 0)), np.empty(0)
+    by_s = (a / length[:, None]) @ inverse_axes
+    E = sensor.departure_slope(s, held) + np.eye(3)
+    by_v = np.linalg.solve(E.transpose(0, 2, 1), by_s[..., None])[..., 0]
+    angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
+    effects = [-np.einsum("ni,nip->np", by_v, e.basis(s, held)) for e in state.effects]
+    J = np.concatenate([by_v * x, -by_v, angles, *effects], axis=1)
+    by_u = by_v / sensor.scale_factor
+    variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
+    # Poses without any scatter (made up, or below the resolution) would otherwise weigh infinitely.
+    return r, J, np.sqrt(np.maximum(variance, (1e-12 * problem.reference) ** 2))
