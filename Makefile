@@ -19,6 +19,9 @@ demo: $(READY)  ## the whole line on two simulated units
 test: $(READY)  ## the whole test suite
 	$(BIN)/python -m pytest -q -n 2
 
+bench: $(READY)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)
+
 check: $(READY)  ## lint, format, types, import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

@@ -1,7 +1,7 @@
-"""Writes the table of docs/measured.md: what `fit` and `diagnose` say of the measured recordings.
+"""Writes the table and the pictures of docs/measured.md: what is found in the measured recordings.
 
     python benchmarks/measured.py            # prints the table
-    python benchmarks/measured.py --write    # puts it into docs/measured.md
+    python benchmarks/measured.py --write    # puts it into docs/measured.md, and the pictures into docs/pictures
 
 The recordings are expected in ../shared/datasets, beside the project; --datasets names another folder.
 """
@@ -13,12 +13,15 @@ import re
 import sys
 from pathlib import Path
 
+from pictures import draw
+
 from triaxcal.errors import Refused
 from triaxcal.loop import Loop, diagnose
 from triaxcald.inputs import Measured, measure
+from triaxcald.recording.csv_text import read_csv
 
 PROJECT = Path(__file__).parents[1]
-BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+PICTURES = PROJECT / "docs" / "pictures"
 HEAD = (
     "| recording | poses | noise floor | residual | cross-validated | findings "
     "| residual after | cross-validated after | left over | warnings |"
@@ -55,13 +58,43 @@ def findings(loop: Loop) -> str:
 
 def warnings(loop: Loop, measured: Measured) -> str:
     """In few words: by how much residuals exceed the noise in the end, and what the raw stream is blamed for."""
-    found = [f"noise ×{loop.after.inflation:.1f}"] if loop.after.inflation > 1 else []
+    found = [f"noise ×{loop.after.inflation:.1f}"] if loop.after.inflation >= 1.05 else []
     found += [line.split(",")[0].replace("_", " ") for line in measured.data_quality]
     found += [w.split(":")[0] for w in loop.after.warnings if "poorly spread" in w or "alone carries" in w]
     aside = sum(not p.used for p in loop.after.poses)
     found += [f"{aside} poses set aside" if aside > 1 else "1 pose set aside"] if aside else []
     found += ["spoiled poses that cannot be told apart" for w in loop.after.warnings if w.startswith("some poses")]
     return "; ".join(found) or "none"
+
+
+def pictures(folder: Path, files: list[Path], found: dict[Path, Measured]) -> str:
+    """Draws each recording, the sensors of one board together; the lines of the page that show them."""
+    PICTURES.mkdir(exist_ok=True)
+    groups: dict[str, list[Path]] = {}
+    for file in files:
+        groups.setdefault(re.sub(r"_sensor\d+$", "", name_of(folder, file)), []).append(file)
+    lines = []
+    for name, members in groups.items():
+        first = members[0]
+        shown = read_csv(str(first))
+        of_many = f", outputs of {name_of(folder, first)}, spans of all {len(members)}" if len(members) > 1 else ""
+        each = [(name_of(folder, f).removeprefix(name).lstrip("_") or "poses", found[f].poses) for f in members]
+        path = PICTURES / f"{name.replace('/', '-')}.png"
+        draw(path, f"{name}{of_many}", shown, each)
+        lines.append(f"![{name}{of_many}](pictures/{path.name})")
+    return "\n\n".join(lines)
+
+
+def name_of(folder: Path, file: Path) -> str:
+    return str(file.relative_to(folder)).removesuffix(".csv.gz")
+
+
+def replaced(text: str, mark: str, content: str) -> str:
+    """``text`` with what stands between the marks replaced. Raises ValueError where they are missing."""
+    begin, end = f"<!-- {mark}: begin -->", f"<!-- {mark}: end -->"
+    if begin not in text or end not in text:
+        raise ValueError(f"the marks {begin} and {end} are missing")
+    return re.sub(f"{begin}.*{end}", lambda _: f"{begin}\n{content}\n{end}", text, flags=re.DOTALL)
 
 
 def main() -> int:
@@ -73,17 +106,18 @@ def main() -> int:
     if not files:
         sys.stderr.write(f"{chosen.datasets}: no recordings (*.csv.gz) there\n")
         return 2
-    rows = [row(str(f.relative_to(chosen.datasets)).removesuffix(".csv.gz"), measure(str(f))) for f in files]
-    table = "\n".join([HEAD, RULE, *rows])
+    found = {f: measure(str(f)) for f in files}
+    table = "\n".join([HEAD, RULE, *(row(name_of(chosen.datasets, f), m) for f, m in found.items())])
     print(table)
     if chosen.write:
         page = PROJECT / "docs" / "measured.md"
-        text = page.read_text("utf-8")
-        if BEGIN not in text or END not in text:
-            sys.stderr.write(f"{page}: the marks {BEGIN} and {END} are missing\n")
+        try:
+            text = replaced(page.read_text("utf-8"), "table", table)
+            text = replaced(text, "pictures", pictures(chosen.datasets, files, found))
+        except ValueError as e:
+            sys.stderr.write(f"{page}: {e}\n")
             return 2
-        whole = f"{BEGIN}\n{table}\n{END}"
-        page.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: whole, text, flags=re.DOTALL), "utf-8")
+        page.write_text(text, "utf-8")
     return 0
 
 

@@ -65,7 +65,7 @@ def device_of(name: str) -> DeviceFile:
             "serial": 1001 + list(UNITS).index(name),
             "speed": 10.0,
             "seed": 20,
-            "fixture": {"hold_s": 1.8, "move_s": 0.8},
+            "fixture": {"hold_s": 2.4, "move_s": 0.8},
             **UNITS[name],
         },
         strict=False,

@@ -329,7 +329,7 @@ def keys_of(value: object, named: frozenset[str]) -> set[str]:
     return found
 
 
-NAMED = frozenset({"channels", "channel_reference", "effects", "coefficients"})
+NAMED = frozenset({"channels", "channel_reference", "effects", "coefficients", "sees", "levels", "promised", "moves"})
 EFFECT_LEAVES = {"x", "y", "z"}
 
 
@@ -353,7 +353,9 @@ def test_every_key_of_a_recordings_documents_is_explained(attachment: str) -> No
         "fit recordings/paper-unit.csv.gz",
         "diagnose recordings/can-second-order.mcap --check recordings/can-second-order.mcap",
         "plan --poses 14",
+        "plan --poses 14 --for temperature_bias bias_drift",
         "plan recordings/paper-unit.csv.gz",
+        "plan recordings/paper-unit.csv.gz --for third_order_nonlinearity temperature_bias",
         "audit recordings/can-second-order.mcap",
         "devices",
     ],
@@ -383,7 +385,8 @@ def test_every_key_of_the_document_of_a_run_is_explained(tmp_path: Path, capsys:
 
 def dotted_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
     """The keys of a file, as its page names them."""
-    for name, field in model.model_fields.items():
+    for attribute, field in model.model_fields.items():
+        name = field.alias or attribute
         yield f"{prefix}{name}"
         inner = [a for a in (field.annotation, *get_args(field.annotation)) if isinstance(a, type)]
         for nested in (a for a in inner if issubclass(a, BaseModel)):

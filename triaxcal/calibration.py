@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME
+from triaxcal.errors import InvalidData
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
 
@@ -47,8 +49,9 @@ class Calibration:
     """A fitted sensor. ``covariance`` is of `parameters`, in that order.
 
     ``reference`` is the magnitude of the reference vector; ``channel_reference`` the values from which the effects'
-    conditions are counted; ``inflation`` ≥ 1 by how much the standard errors were raised because residuals exceed
-    the noise.
+    conditions are counted; ``inflation`` is the factor on the standard errors by which residuals exceed the noise:
+    at least 1, unless no pose knows its noise (then the residuals alone set it). ``dof`` are the effective degrees of
+    freedom behind the standard errors.
     """
 
     sensor: Sensor
@@ -60,6 +63,7 @@ class Calibration:
     condition: float
     dilution: float
     inflation: float
+    dof: float
     blind_to: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -82,6 +86,20 @@ class Calibration:
     def standard_errors(self) -> Floats:
         """Of `parameters`."""
         return np.sqrt(np.diag(self.covariance))
+
+    def coverage_factor(self, level: float = 0.95) -> float:
+        """By what a standard error is multiplied for an interval that holds the truth with probability ``level``.
+
+        Student's t for `dof`, as JCGM 100, G.3, has it. Raises InvalidData for a level outside 0 to 1.
+        """
+        if not 0 < level < 1:
+            raise InvalidData(f"a level of confidence lies between 0 and 1, not at {level}")
+        return float(stats.t.ppf((1 + level) / 2, self.dof))
+
+    def interval(self, level: float = 0.95) -> tuple[Floats, Floats]:
+        """Lower and upper ends for `parameters`, each of which holds its truth with probability ``level``."""
+        half = self.coverage_factor(level) * self.standard_errors
+        return self.values - half, self.values + half
 
     def specific_force(self, readings: Floats, channels: Mapping[str, Floats]) -> Floats:
         """a (n,3) for readings (n,3) in output units and the channels (n,) that the effects need.

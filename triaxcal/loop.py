@@ -98,12 +98,17 @@ def diagnose(
     for _ in range(ROUNDS_MOST):
         found = _searched(poses, aside, signs, reference, catalogue)
         # Beside an effect a spoiled pose may not have shown; with the effect in the model it does.
-        again = _aside(fit(poses, signs=signs, reference=reference, effects=found.adopted))
+        sought = fit(poses, signs=signs, reference=reference, effects=found.adopted)
+        again = _aside(sought)
         if again == aside or not found.adopted:
             break
         aside = again
     search, before = found.search, found.search.before
-    after = search.best = fit(poses, signs=signs, reference=reference, effects=found.adopted, aside=aside)
+    after = search.best = (
+        sought
+        if _aside(sought) == aside
+        else fit(poses, signs=signs, reference=reference, effects=found.adopted, aside=aside)
+    )
     blind = tuple(e.name for e in catalogue if e not in search.seen)
     findings = tuple(_finding(search, e, found.adopted) for e in found.adopted)
     unexplained = _unexplained(after, search)

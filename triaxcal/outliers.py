@@ -20,27 +20,46 @@ ALARM = 0.005
 """Probability that a clean set loses a pose, or a pair."""
 LEFT_LEAST = 3
 """So many degrees of freedom must be left, or there is nothing to judge a pose by."""
-RIVAL = 4.6
-"""Sums of squares that differ by less than this (a likelihood ratio of 10) do not tell one set from another."""
+RIVAL = 2.2
+"""Sums of squares that differ by less than this for each pose of a set (a likelihood ratio of 3) do not tell one set
+from another."""
+LEAST = 6.0
+"""Poses that are off by less than so many standard errors stay: that may be a stand that does not come back."""
+EXCESS = 0.003
+"""Where what is left of the residuals has less than this probability, it is more than noise."""
+DOUBT = 0.01
+"""Probability above which a pose does not stand out from the others' residuals."""
+PAIRED_MOST = 300
+"""So many poses are tried in pairs; where there are more, hardly any hides another."""
 CARRIES = 1e-6
 """Poses whose share of (1 − H) is below this alone carry a parameter, and cannot be judged."""
 
 
 @dataclass(frozen=True)
 class Spoiled:
-    """``rows`` were spoiled; none where ``rivals``, sets of rows that explain it as well, cannot be told apart."""
+    """``rows`` were spoiled. Besides, one of ``rivals`` was: sets of rows that explain it as well as each other.
+
+    Where only the noise inside the poses says so, because the rows do not stand out from the other residuals,
+    ``doubtful`` is what they take out of the sum of squares: it may be that the poses come back less well than that.
+    """
 
     rows: tuple[int, ...] = ()
     rivals: tuple[tuple[int, ...], ...] = ()
+    doubtful: float = 0.0
 
 
 @dataclass(frozen=True)
 class _Judge:
-    """Residuals ``rest`` (n,) after the fit, ``free`` (n,n) = 1 − H, both in units of the poses' standard errors."""
+    """Residuals ``rest`` (n,) after the fit in units of the poses' standard errors, ``q`` (n,p) whose product with its
+    transpose is the hat matrix H.
+
+    ``dof`` (n,) behind each standard error, ``pure_dof`` behind them together; zero where the noise is not known.
+    """
 
     rest: Floats
-    free: Floats
+    q: Floats
     left: int
+    dof: Floats
     pure_dof: float
 
     @property
@@ -49,62 +68,100 @@ class _Judge:
 
     def singles(self) -> tuple[Ints, Floats]:
         """Rows (n,1), and what each takes out of the sum of squares."""
-        share = np.diag(self.free)
+        share = 1 - (self.q**2).sum(axis=1)
         taken = np.where(share > CARRIES, self.rest**2 / np.maximum(share, CARRIES), 0.0)
         return np.arange(len(self.rest))[:, None], taken
 
     def pairs(self) -> tuple[Ints, Floats]:
-        """Likewise for pairs of rows, (m,2)."""
-        i, j = np.triu_indices(len(self.rest), 1)
-        a, b, c = self.free[i, i], self.free[j, j], self.free[i, j]
+        """Likewise for pairs of rows, (m,2), among those that take most alone."""
+        rows = np.sort(np.argsort(-self.singles()[1], kind="stable")[:PAIRED_MOST])
+        free = self.free(rows)
+        first, second = np.triu_indices(len(rows), 1)
+        a, b, c = free[first, first], free[second, second], free[first, second]
+        i, j = rows[first], rows[second]
         r, s = self.rest[i], self.rest[j]
         determinant = a * b - c**2
         sound = determinant > CARRIES * np.maximum(a, b)
         taken = (b * r**2 - 2 * c * r * s + a * s**2) / np.where(sound, determinant, 1.0)
         return np.stack([i, j], axis=1), np.where(sound, taken, 0.0)
 
-    def p(self, taken: float, size: int, before: float, left: int) -> float:
-        """Of ``size`` rows that take so much of ``before``: against the noise, or what is left where that is more."""
-        p = float(stats.f.sf(taken / size, size, self.pure_dof))
+    def off(self, rows: Ints) -> Floats:
+        """By how much the poses in ``rows`` are off, from the fit to the others."""
+        return np.linalg.solve(self.free(rows), self.rest[rows])
+
+    def free(self, rows: Ints) -> Floats:
+        """(1 − H) among ``rows``."""
+        return np.eye(len(rows)) - self.q[rows] @ self.q[rows].T
+
+    def taken(self, rows: Ints) -> float:
+        """What ``rows`` take out of the sum of squares."""
+        return float(self.rest[rows] @ self.off(rows))
+
+    def excess(self, after: float, left: int) -> float:
+        """What is left, ``after`` in ``left`` degrees of freedom, over the noise; 1 where that explains it."""
+        known = self.pure_dof >= 1
+        return 1.0 if known and stats.f.sf(after / left, left, self.pure_dof) >= EXCESS else after / left
+
+    def by_rest(self, taken: float, size: int) -> float:
+        """Probability that ``size`` rows take so much, against what is left without them alone."""
+        after, left = max(self.chi2 - taken, 1e-300), self.left - size
+        return float(stats.f.sf(taken / size / (after / left), size, left))
+
+    def p(self, taken: float, rows: Ints, before: float, left: int) -> float:
+        """Of ``rows`` that take so much of ``before``: against the noise, or what is left where that is more."""
+        size = len(rows)
         after, left_after = max(before - taken, 0.0), left - size
-        if stats.f.sf(after / left_after, left_after, self.pure_dof) < 0.01:
-            p = max(p, float(stats.f.sf(taken / size / (after / left_after), size, left_after)))
+        excess = self.excess(after, left_after)
+        dof = float(self.dof[rows].min())
+        p = float(stats.f.sf(taken / size, size, dof)) if dof >= 1 else 0.0
+        if excess != 1.0:
+            p = max(p, float(stats.f.sf(taken / size / excess, size, left_after)))
         return max(p, 1e-300) * (1 + 1e-9 * after)  # of two that are beyond doubt, the one that leaves less
 
 
-def spoiled(r: Floats, J: Floats, pure_dof: float) -> Spoiled:
+def spoiled(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> Spoiled:
     """Rows that were spoiled, at most two; often none.
 
-    ``r`` (n,) residuals and ``J`` (n,p) their derivatives, both in units of each pose's standard error; ``pure_dof``
-    degrees of freedom behind these.
+    ``r`` (n,) residuals and ``J`` (n,p) their derivatives, both in units of each pose's standard error; ``dof`` (n,)
+    degrees of freedom behind each of these, ``pure_dof`` behind them together.
     """
     n, parameters = J.shape
     left = n - parameters
     q, _ = np.linalg.qr(J)
-    free = np.eye(n) - q @ q.T
-    judge = _Judge(free @ r, free, left, pure_dof)
+    judge = _Judge(r - q @ (q.T @ r), q, left, dof, pure_dof)
     best, best_p = Spoiled(), ALARM
     for size, (rows, taken) in enumerate((judge.singles(), judge.pairs()), 1):
         if left - size < LEFT_LEAST:
             break
         most = int(np.argmax(taken))
-        p = min(1.0, judge.p(float(taken[most]), size, judge.chi2, left) * len(rows))
-        if p < best_p and (size == 1 or _each_stands_alone(judge, rows[most], float(taken[most]))):
-            best, best_p = _unless_rivalled(rows, taken, most), p
+        p = min(1.0, judge.p(float(taken[most]), rows[most], judge.chi2, left) * len(rows))
+        if p < best_p and _each_stands_alone(judge, rows[most], float(taken[most])):
+            best, best_p = _unless_rivalled(judge, rows, taken), p
     return best
 
 
-def _unless_rivalled(rows: Ints, taken: Floats, most: int) -> Spoiled:
-    near = rows[taken > taken[most] - RIVAL]
+def _unless_rivalled(judge: _Judge, rows: Ints, taken: Floats) -> Spoiled:
+    size = rows.shape[1]
+    most = float(taken.max())
+    excess = judge.excess(max(judge.chi2 - most, 0.0), judge.left - size)
+    near = rows[taken >= most - RIVAL * size * excess]
     sets = tuple(tuple(int(i) for i in row) for row in near)
-    return Spoiled(sets[0]) if len(sets) == 1 else Spoiled((), sets)
+    certain = tuple(sorted(set.intersection(*map(set, sets))))
+    rivals = tuple(tuple(i for i in each if i not in certain) for each in sets) if len(sets) > 1 else ()
+    doubtful = judge.by_rest(most, size) * len(rows) > DOUBT
+    return Spoiled(certain, rivals, judge.taken(np.array(certain)) if certain and doubtful else 0.0)
 
 
-def _each_stands_alone(judge: _Judge, pair: Ints, both: float) -> bool:
-    """Whether either of a pair would be suspect if the other had never been there."""
+def _each_stands_alone(judge: _Judge, rows: Ints, both: float) -> bool:
+    """Whether each is off by enough, and either of a pair would be suspect if the other had never been there."""
+    excess = judge.excess(max(judge.chi2 - both, 0.0), judge.left - len(rows))
+    if np.min(np.abs(judge.off(rows))) < LEAST * np.sqrt(excess):
+        return False
+    if len(rows) == 1:
+        return True
     _, singles = judge.singles()
-    for other in pair:
+    for one, other in (rows, rows[::-1]):
         alone = float(singles[other])
-        if judge.p(both - alone, 1, judge.chi2 - alone, judge.left - 1) * len(singles) > ALARM:
+        if judge.p(both - alone, np.array([one]), judge.chi2 - alone, judge.left - 1) * len(singles) > ALARM:
             return False
     return True

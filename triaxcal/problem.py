@@ -109,21 +109,28 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> tuple[Fl
     """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise (n,)."""
     sensor = state.sensor(problem)
     held = problem.conditions
-    x = (problem.u - problem.middle) / problem.half
-    s = sensor.along_axes(problem.u, held)
-    inverse_axes = np.linalg.inv(sensor.axes)
-    a = s @ inverse_axes.T
-    length = np.linalg.norm(a, axis=1)
-    r = length - problem.reference
     if not jacobian:
-        return r, np.empty((0, 0)), np.empty(0)
-    by_s = (a / length[:, None]) @ inverse_axes
-    E = sensor.departure_slope(s, held) + np.eye(3)
-    by_v = np.linalg.solve(E.transpose(0, 2, 1), by_s[..., None])[..., 0]
+        length = np.linalg.norm(sensor.specific_force(problem.u, held), axis=1)
+        return length - problem.reference, np.empty((0, 0)), np.empty(0)
+    length, s, a, by_s, by_v = sensor.radius(problem.u, held)
+    x = (problem.u - problem.middle) / problem.half
     angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
     effects = [-np.einsum("ni,nip->np", by_v, e.basis(s, held)) for e in state.effects]
     J = np.concatenate([by_v * x, -by_v, angles, *effects], axis=1)
     by_u = by_v / sensor.scale_factor
     variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
     # Poses without any scatter (made up, or below the resolution) would otherwise weigh infinitely.
-    return r, J, np.sqrt(np.maximum(variance, (1e-12 * problem.reference) ** 2))
+    return length - problem.reference, J, np.sqrt(np.maximum(variance, (1e-12 * problem.reference) ** 2))
+
+
+def parameters_by_theta(problem: Problem, state: State) -> Floats:
+    """(9+p, 9+p) derivative of scale factor, misalignment, bias and the effects' coefficients by theta."""
+    D = state.theta[:3]
+    G = np.eye(len(state.theta))
+    G[0:9, 0:9] = 0
+    for i in range(3):
+        G[i, i] = -problem.half[i] / D[i] ** 2  # k = h / D
+        G[3 + i, 6 + i] = 1  # angles
+        G[6 + i, 3 + i] = 1  # b = w + m D / h
+        G[6 + i, i] = problem.middle[i] / problem.half[i]
+    return G

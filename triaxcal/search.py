@@ -15,6 +15,7 @@ from triaxcal.errors import Refused
 from triaxcal.fit import fit
 from triaxcal.poses import Pose
 from triaxcal.problem import Problem, State, linearise, solve
+from triaxcal.pure_error import pure_error_dof
 from triaxcal.visibility import projected
 
 FAMILYWISE = 0.01
@@ -46,7 +47,7 @@ class Search:
         self.problem, self.poses, self.signs, self.reference = problem, poses, signs, reference
         self.seen = seen
         self.before = self.best = before
-        self.pure = max(float(sum(min(p.dof, 1e6) for p in poses)), 1.0)
+        self.pure = max(pure_error_dof(poses), 1.0)
         self.passed_over: dict[str, str] = {}
 
     def chi2(self, state: State) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,19 @@ from triaxcal.effects.contract import Effect
 
 SOLVE_TOLERANCE = 1e-13
 """Relative step, of the reference vector, at which the inverse of a nonlinear model counts as found."""
+
+
+class Radius(NamedTuple):
+    """|a| (n,) and what it follows from: ``s`` = R a and ``a`` (n,3) in g.
+
+    ``by_s`` (n,3) is its gradient by s, ``by_v`` (n,3) by the reading in g less the bias, v = K⁻¹ u − b.
+    """
+
+    length: Floats
+    s: Floats
+    a: Floats
+    by_s: Floats
+    by_v: Floats
 
 
 @dataclass(frozen=True)
@@ -84,13 +98,19 @@ class Sensor:
         """a (n,3) in g, sensor frame."""
         return np.linalg.solve(self.axes, self.along_axes(u, conditions).T).T
 
-    def magnitude(self, u: Floats, conditions: Mapping[str, Floats]) -> tuple[Floats, Floats]:
-        """|a| (n,) and its gradient by the outputs (n,3)."""
+    def radius(self, u: Floats, conditions: Mapping[str, Floats]) -> Radius:
+        """The magnitude of the specific force and its gradients."""
         s = self.along_axes(u, conditions)
         inverse = np.linalg.inv(self.axes)
         a = s @ inverse.T
         length = np.linalg.norm(a, axis=1)
-        by_s = (a / length[:, None]) @ inverse
-        slope = np.eye(3) + self.departure_slope(s, conditions)
-        by_v = np.linalg.solve(slope.transpose(0, 2, 1), by_s[..., None])[..., 0]
-        return length, by_v / self.scale_factor
+        by_s = by_v = (a / length[:, None]) @ inverse
+        if self.effects:
+            slope = np.eye(3) + self.departure_slope(s, conditions)
+            by_v = np.linalg.solve(slope.transpose(0, 2, 1), by_s[..., None])[..., 0]
+        return Radius(length, s, a, by_s, by_v)
+
+    def magnitude(self, u: Floats, conditions: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+        """|a| (n,) and its gradient by the outputs (n,3)."""
+        found = self.radius(u, conditions)
+        return found.length, found.by_v / self.scale_factor

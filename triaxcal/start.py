@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import stats
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import channels_of
@@ -16,9 +17,12 @@ from triaxcal.problem import Problem, State, linearise
 
 DILUTION_LIMIT = 100.0
 """Above this a set of poses is refused: some combination of parameters is a hundred times worse than one pose."""
-NOISE_LIMIT = 0.1
+NOISE_LIMIT = 0.05
 """Poses are refused where noise alone, times the dilution, is this share of the reference."""
 POSES_LEAST = 9
+ROUGH_LEAST, ROUGH_APART_DEG, ROUGH_LIMIT_RAD, TRIAD_UNLIKE_SPHERE = 6, 10.0, 0.2, 0.03
+"""Directions are told without a fit from so many poses so far apart, where they are not less sure than this; and by how
+much at least scale factors of the axes are taken to differ."""
 
 
 def problem_of(poses: Sequence[Pose], *, signs: Sequence[float] = (1, 1, 1), reference: float = 1.0) -> Problem:
@@ -26,7 +30,7 @@ def problem_of(poses: Sequence[Pose], *, signs: Sequence[float] = (1, 1, 1), ref
     if len(poses) < POSES_LEAST:
         raise Refused(
             f"{len(poses)} still poses; nine parameters need at least {POSES_LEAST}, 14 or 26 are better",
-            wanted=_wanted_for(poses, signs),
+            wanted=wanted_for(poses, signs),
         )
     u = np.array([p.mean for p in poses])
     low, high = u.min(axis=0), u.max(axis=0)
@@ -64,7 +68,7 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
         a = (problem.u - c) @ A.T
         spread = dilution(a, linear_design(a / np.linalg.norm(a, axis=1, keepdims=True), x))
     except Refused as e:
-        raise Refused(f"{e}; {_count(rough)}", wanted=_wanted_for(poses, signs)) from None
+        raise Refused(f"{e}; {_count(rough)}", wanted=wanted_for(poses, signs)) from None
     k, angles, b = coefficients(A * problem.reference, c)
     ax, ay, az = angles
     sx, sy, sz = problem.signs
@@ -77,12 +81,12 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
         raise Refused(
             f"the poses cannot carry nine parameters: some combination of them would be {spread:.3g} times as "
             f"uncertain as one pose (limit {DILUTION_LIMIT:g}); {_count(a)}",
-            wanted=_labels(a * problem.signs) if known else _wanted_for(poses, signs),
+            wanted=wanted_for(poses, signs),
         )
     if not known:
         raise Refused(
             f"the poses cannot carry nine parameters: they differ by little more than their noise; {_count(a)}",
-            wanted=_wanted_for(poses, signs),
+            wanted=wanted_for(poses, signs),
         )
     return state
 
@@ -91,19 +95,44 @@ def _count(a: Floats) -> str:
     return f"{len(a)} poses in {distinct(a)} distinct directions"
 
 
-def _wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]:
-    """The poses that would mend a set, as far as its directions can be told without a fit."""
-    if not poses:
-        return _labels(np.zeros((0, 3)))
+def wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]:
+    """The poses that would mend a set, as far as its directions can be told without a fit.
+
+    Where they cannot, a whole set is wanted, which carries nine parameters whatever the poses there are.
+    """
+    up, unsure_rad = rough_directions(poses, signs)
+    return _labels(up, unsure_rad)
+
+
+def rough_directions(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[Floats, float]:
+    """Up (n,3) in poses that need not carry a fit, and how unsure it is; (0,3) where it cannot be told.
+
+    By a sphere through the outputs. How far a triad is from a sphere shows in the residual, given poses to spare.
+    """
+    nothing = np.zeros((0, 3)), 0.0
+    if len(poses) < ROUGH_LEAST:
+        return nothing
     u = np.array([p.mean for p in poses])
-    middle = (u.max(axis=0) + u.min(axis=0)) / 2
-    # Without a scale an axis that hardly moved would look like one that swung from end to end.
-    half = float(np.max((u.max(axis=0) - u.min(axis=0)) / 2))
     error = float(np.sqrt(np.mean([np.trace(p.covariance) for p in poses])))
+    half = float(np.max(np.ptp(u, axis=0))) / 2
     if half <= error / NOISE_LIMIT:
-        return _labels(np.zeros((0, 3)))
-    return _labels((u - middle) / half * np.asarray(signs) + 1e-12)
+        return nothing
+    v = (u - u.mean(axis=0)) / half
+    rows = np.concatenate([2 * v, np.ones((len(v), 1))], axis=1)
+    centre = np.linalg.lstsq(rows, (v**2).sum(axis=1), rcond=1e-9)[0][:3]
+    radii = np.linalg.norm(v - centre, axis=1)
+    a = (v - centre) / np.maximum(radii, 1e-300)[:, None]
+    smallest = float(np.linalg.svd(np.concatenate([a, np.ones((len(a), 1))], axis=1), compute_uv=False)[-1])
+    if (many := distinct(a, ROUGH_APART_DEG)) < ROUGH_LEAST:
+        return nothing
+    # With few degrees of freedom left a triad that is no sphere may pass for one: the least that 5 % of them show.
+    shown = float(np.sqrt(many / stats.chi2.ppf(0.05, many - 4)))
+    unlike = max(TRIAD_UNLIKE_SPHERE, shown * float(np.std(radii) / np.mean(radii)))
+    unsure_rad = unlike / max(smallest, 1e-9)
+    return (a * np.asarray(signs), unsure_rad) if unsure_rad < ROUGH_LIMIT_RAD else nothing
 
 
-def _labels(a: Floats) -> tuple[str, ...]:
-    return tuple(label for label, _ in most_wanted(a))
+def _labels(a: Floats, unsure_rad: float = 0.0) -> tuple[str, ...]:
+    # Directions of a refused set that seem to want nothing are wrong.
+    wanted = most_wanted(a, unsure_rad=unsure_rad) or most_wanted(np.zeros((0, 3)))
+    return tuple(label for label, _ in wanted)

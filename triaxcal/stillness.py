@@ -1,62 +1,42 @@
-"""Where the unit stood still: a streaming detector that learns the noise.
+"""Where the unit stood still: a detector that learns the noise from the stream itself.
 
-The stream is cut into windows of a tenth of a second (at least six samples), whose times, mean and scatter are
-all that is kept: memory grows by about a hundred bytes a window, whatever the sample rate. The windows depend on
-the samples alone, not on how they were fed, so live and replayed streams give the same spans.
-
-A window is still when its scatter, and the step of its mean from the window before, are what the unit's own
-noise makes; the scale of both is learned from the quietest windows by iterated clipping. A slight or slow move
-that no window shows alone is found afterwards, on the windows' means, at every scale up to the span itself.
+It works on the windows of `triaxcal.windows`, in three steps. What scatters inside a window as the quietest windows do
+is calm. Among calm windows a move shows in the difference of neighbouring averages over one window and more, judged by
+how such differences scatter in this very stream, whatever the colour of its noise. What is left are runs, trimmed where
+a move sets out or settles, and put together where only a bump parts them. Where a machine shakes the stand, the same
+is done once more with the noise that the shaking makes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import itertools
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from triaxcal.arrays import Bools, Floats, Ints
-from triaxcal.errors import InvalidData
+from triaxcal.edges import SPAN_LEAST_WINDOWS, trimmed
+from triaxcal.noise_scales import SCALES, NoiseScales, contrasts
+from triaxcal.windows import WindowCutter, Windows, resolution, rounding_variance
 
-WINDOW_S = 0.1
-WINDOW_LEAST = 6
-GAP = 4.0
-"""A silence longer than this many sample periods ends a window, and a span."""
-SPAN_LEAST_S = 0.6
-SPAN_LEAST_WINDOWS = 3
+__all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
+
+SPAN_LEAST_S = 0.4
+LOUD_LEAST_S = 1.0
 REJOIN_S = 1.5
 """A disturbance shorter than this, with the same mean before and after, is a bump inside one pose."""
-REJOIN_SIGMA = 5.0
 FALSE_ALARM = 1e-6
+MOVE_SIGMA = 5.0
 STEP_SIGMA = 7.0
-"""Steps of window means are tested many times a pose, on noise that need not be white; hence not 3."""
-MOTION = 6.0
-"""Steadily moving outputs step 12 times as far from window to window, squared, as they scatter inside one; a random
-walk, the strongest colour that noise has, 4 times."""
-RATE_SAMPLES = 64
-
-
-@dataclass(frozen=True)
-class Windows:
-    """Summaries of consecutive windows of ``size`` samples, (m,) or (m,3) each.
-
-    ``start_ns`` and ``end_ns`` are the times of a window's first and last sample; ``variance`` of a sample by axis,
-    ``cross`` covariance of axes xy, yz, zx; ``joined`` says that no gap lies between it and the one before.
-    """
-
-    size: int
-    start_ns: Ints
-    end_ns: Ints
-    mean: Floats
-    variance: Floats
-    cross: Floats
-    channels: Mapping[str, Floats]
-    joined: Bools
-
-    def __len__(self) -> int:
-        return len(self.start_ns)
+"""Of a single step, tested on noise that need not be Gaussian."""
+BESIDE = 6
+"""Windows beside a run in which a move shows."""
+MOTION = 2.0
+"""Of a random walk, the strongest colour that noise has, a quarter of the squared steps is below 0.4 of the scatter."""
+LOUD_SPREAD = 5.0
+LOUD_SHARE = 0.01
+"""Shaking makes the outputs scatter by no more than this share of the range of the poses."""
 
 
 @dataclass(frozen=True)
@@ -75,95 +55,8 @@ class Span:
 
 
 @dataclass
-class StillnessDetector:
+class StillnessDetector(WindowCutter):
     """Feed it blocks of any size; ask for `windows` and `spans` at any time."""
-
-    _pending: list[tuple[Ints, Floats, dict[str, Floats]]] = field(default_factory=list)
-    _size: int = 0
-    _period_ns: float = 0.0
-    _done: list[tuple[Ints, Ints, Floats, Floats, Floats, dict[str, Floats], Bools]] = field(default_factory=list)
-    _last_ns: int | None = None
-    _broken: bool = False
-
-    def feed(self, time_ns: Ints, readings: Floats, channels: Mapping[str, Floats] | None = None) -> None:
-        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3), ``channels`` each (n,).
-
-        Raises InvalidData for a reading that is not a finite number: it would hide every pose.
-        """
-        if not len(time_ns):
-            return
-        if not np.isfinite(readings).all():
-            at = int(np.flatnonzero(~np.isfinite(readings).all(axis=1))[0])
-            raise InvalidData(f"the reading at {int(time_ns[at])} ns is not a finite number")
-        held = {name: np.asarray(v, dtype=float) for name, v in (channels or {}).items()}
-        self._pending.append((np.asarray(time_ns, dtype=np.int64), np.asarray(readings, dtype=float), held))
-        if not self._size and sum(len(p[0]) for p in self._pending) >= RATE_SAMPLES:
-            self._learn_rate()
-        if self._size:
-            self._close_windows()
-
-    def finish(self) -> None:
-        """No more samples come: what is pending is cut into windows as far as it goes."""
-        if not self._size and sum(len(p[0]) for p in self._pending) >= 2 * WINDOW_LEAST:
-            self._learn_rate()
-            self._close_windows()
-
-    def _learn_rate(self) -> None:
-        time_ns = np.concatenate([p[0] for p in self._pending])[:RATE_SAMPLES]
-        self._period_ns = float(np.median(np.diff(time_ns)))
-        if self._period_ns <= 0:
-            raise InvalidData("time does not increase from sample to sample")
-        self._size = max(WINDOW_LEAST, round(WINDOW_S * 1e9 / self._period_ns))
-
-    def _close_windows(self) -> None:
-        time_ns = np.concatenate([p[0] for p in self._pending])
-        readings = np.concatenate([p[1] for p in self._pending])
-        channels = {n: np.concatenate([p[2][n] for p in self._pending]) for n in self._pending[0][2]}
-        before = self._last_ns if self._last_ns is not None else int(time_ns[0]) - int(self._period_ns)
-        gaps = np.flatnonzero(np.diff(time_ns, prepend=before) > GAP * self._period_ns)
-        start = 0
-        for stop in (*gaps[gaps > 0], len(time_ns)):
-            if start in gaps:
-                self._broken = True
-            whole = (stop - start) // self._size
-            if whole:
-                at = slice(start, start + whole * self._size)
-                self._summarise(time_ns[at], readings[at], {n: v[at] for n, v in channels.items()}, whole)
-                self._last_ns = int(time_ns[at.stop - 1])
-            start = stop if stop < len(time_ns) else start + whole * self._size
-        rest = slice(start, len(time_ns))
-        self._pending = [(time_ns[rest], readings[rest], {n: v[rest] for n, v in channels.items()})]
-
-    def _summarise(self, time_ns: Ints, u: Floats, channels: dict[str, Floats], count: int) -> None:
-        blocks = u.reshape(count, self._size, 3)
-        # Sums over a contiguous last axis, so that a window's figures do not depend on how many come at once.
-        columns = np.ascontiguousarray(blocks.transpose(0, 2, 1))
-        mean = columns.mean(axis=2)
-        rest = columns - mean[:, :, None]
-        variance = (rest * rest).sum(axis=2) / (self._size - 1)
-        cross = (rest * rest[:, [1, 2, 0]]).sum(axis=2) / (self._size - 1)
-        times = time_ns.reshape(count, self._size)
-        joined = np.ones(count, dtype=bool)
-        joined[0] = not self._broken and bool(self._done)
-        self._broken = False
-        means = {n: v.reshape(count, self._size).mean(axis=1) for n, v in channels.items()}
-        self._done.append((times[:, 0], times[:, -1], mean, variance, cross, means, joined))
-
-    def windows(self) -> Windows:
-        """Raises InvalidData where there is not one whole window yet."""
-        if not self._done:
-            raise InvalidData(f"too few samples for one window (at least {RATE_SAMPLES})")
-        if len(self._done) > 1:
-            names = self._done[0][5]
-            self._done = [
-                (
-                    *(np.concatenate([d[i] for d in self._done]) for i in range(5)),
-                    {n: np.concatenate([d[5][n] for d in self._done]) for n in names},
-                    np.concatenate([d[6] for d in self._done]),
-                )  # type: ignore[list-item]
-            ]
-        start, end, mean, variance, cross, channels, joined = self._done[0]
-        return Windows(self._size, start, end, mean, variance, cross, channels, joined)
 
     def spans(self) -> list[Span]:
         """The still spans so far, in order."""
@@ -171,65 +64,71 @@ class StillnessDetector:
 
 
 def find_spans(w: Windows) -> list[Span]:
-    """The still spans of a stream of windows, at least 0.6 s long."""
+    """The still spans of a stream of windows, at least 0.4 s long."""
     # Rounding of a digital output leaves windows without any scatter; a step of it is noise all the same.
-    w = replace(w, variance=np.maximum(w.variance, resolution(w) ** 2 / 4))
-    still = _still(w)
-    if _only_moves(w, still):
+    raw, step = w.variance, resolution(w)
+    w = replace(w, variance=np.maximum(raw, step**2 / 4))
+    calm = np.asarray((w.variance <= quiet_limit(w.variance, w.size - 1)).all(axis=1))
+    if _only_moves(w, calm):
         return []
-    runs = _runs(still, w.joined)
-    noise = _step_scale(w, still)
-    pieces = [p for run in runs for p in _cut_at_steps(w, _trim(w, run, noise), noise) if len(p)]
-    return [s for s in _rejoin(w, pieces) if _long_enough(w, s)]
+    residue = rounding_variance(step, np.median(raw[calm], axis=0)) if calm.any() else np.zeros(3)
+    found, noise = _still_runs(w, calm, residue)
+    for _ in range(2):
+        inside = _inside(w, found)
+        if inside.sum() < 2 * SPAN_LEAST_WINDOWS:
+            break
+        calm = np.asarray((w.variance <= _limit_within(w.variance[inside], w.size - 1)).all(axis=1))
+        found, noise = _still_runs(w, calm, residue)
+    pieces = [trimmed(w, run, noise) for run in found if not _under_way(w, run, noise)]
+    pieces = [p for p in pieces if len(p) >= SPAN_LEAST_WINDOWS]
+    pieces += _loud_pieces(w, calm, pieces, noise)
+    disturbed = ~_steady(w, calm, noise)
+    pieces.sort(key=lambda p: int(p[0]))
+    return [s for s in _rejoin(w, pieces, noise, disturbed) if _long_enough(w, s.used)]
 
 
-def _still(w: Windows) -> Bools:
-    """Which windows scatter, and step from their neighbours, as the quietest ones do."""
-    limit = np.array([_quiet_limit(w.variance[:, axis], w.size - 1) for axis in range(3)])
-    still = np.asarray((w.variance <= limit).all(axis=1))
-    both = _neighbours(w, still)
-    if both.sum() < SPAN_LEAST_WINDOWS:
-        return still
-    step = np.diff(w.mean, axis=0, prepend=w.mean[:1]) ** 2
-    least = np.median(w.variance[still], axis=0) / w.size
-    scale = np.maximum(np.median(step[both], axis=0) / stats.chi2.median(1), least)
-    jump: Bools = both & (step > scale * STEP_SIGMA**2).any(axis=1)
-    # A jump lies between two windows: neither can be trusted to its edge.
-    still &= ~jump & ~np.append(jump[1:], False)
-    return still
+def _still_runs(w: Windows, calm: Bools, residue: Floats) -> tuple[list[Ints], NoiseScales]:
+    """Runs of windows that are calm and do not move, and the noise they were judged by."""
+    noise = NoiseScales.learned(w, calm, residue, first=True)
+    for _ in range(2):
+        noise = NoiseScales.learned(w, _steady(w, calm, noise), residue)
+    still = _steady(w, calm, noise)
+    return [run for run in runs(still, w.joined) if len(run) >= SPAN_LEAST_WINDOWS], noise
 
 
-def _neighbours(w: Windows, still: Bools) -> Bools:
-    """Which windows follow without a gap on a still one, and are still too."""
-    both: Bools = still & np.roll(still, 1) & w.joined
-    both[0] = False
-    return both
-
-
-def _only_moves(w: Windows, still: Bools) -> bool:
-    """Whether the quietest windows are those of a motion, and nothing in the stream stands still."""
-    both = _neighbours(w, still)
-    if not both.any():
+def _under_way(w: Windows, run: Ints, noise: NoiseScales) -> bool:
+    """Whether a run that climbs steadily is the middle of a move: a pose that creeps lies between faster moves."""
+    x = run - run.mean()
+    pace = x @ w.mean[run] / max(float(x @ x), 1.0) / noise.step[1]
+    if np.abs(pace).max() < 1:
         return False
-    step = np.median(np.diff(w.mean, axis=0, prepend=w.mean[:1])[both] ** 2, axis=0) / stats.chi2.median(1)
-    return bool((step > MOTION * np.median(w.variance[both], axis=0)).any())
+    for beside in (run[0] - np.arange(BESIDE), run[-1] + 1 + np.arange(BESIDE)):
+        if beside.min() < 1 or beside.max() >= len(w) or not w.joined[beside].all():
+            continue
+        speed = np.abs(w.mean[beside] - w.mean[beside - 1]).max(axis=0) / noise.step[1]
+        if speed.max() < 2 * np.abs(pace).max():
+            return True
+    return False
 
 
-def _quiet_limit(variance: Floats, dof: int) -> float:
-    """The largest scatter that noise alone makes in a window, learned from the quietest windows.
+def quiet_limit(variance: Floats, dof: int) -> Floats:
+    """(3,) the largest scatter that noise alone makes in a window, learned from the quietest windows.
 
     Still windows crowd around one scatter while moving ones spread over decades above it: the mode of the logarithm
     is the noise, and how far the windows below it reach tells its effective degrees of freedom, which are fewer than
     the samples where the noise is coloured.
     """
-    log = np.sort(np.log(np.maximum(variance, 1e-300)))
-    mode = _half_sample_mode(log)
-    below = log[log < mode]
-    reach = float(mode - np.median(below)) if len(below) else 0.0
-    tried = np.unique(np.r_[np.geomspace(2, max(dof, 2), 40), dof])
+    limit = np.zeros(3)
+    tried = np.unique(np.r_[np.geomspace(1, max(dof, 2), 40), dof])
     reaches = -np.log(stats.chi2.ppf(stats.chi2.cdf(tried, tried) / 2, tried) / tried)
-    effective = tried[int(np.argmin(np.abs(reaches - reach)))]
-    return float(np.exp(mode) * stats.chi2.isf(FALSE_ALARM, effective) / effective)
+    for axis in range(3):
+        log = np.sort(np.log(np.maximum(variance[:, axis], 1e-300)))
+        mode = _half_sample_mode(log)
+        below = log[log < mode]
+        reach = float(mode - np.median(below)) if len(below) else 0.0
+        effective = tried[int(np.argmin(np.abs(reaches - reach)))]
+        limit[axis] = np.exp(mode) * stats.chi2.isf(FALSE_ALARM, effective) / effective
+    return limit
 
 
 def _half_sample_mode(ordered: Floats) -> float:
@@ -242,19 +141,48 @@ def _half_sample_mode(ordered: Floats) -> float:
     return float(np.mean(ordered))
 
 
-def resolution(w: Windows) -> Floats:
-    """(3,) the smallest difference that any two readings show, judged by the sums of windows; never quite zero."""
-    sums = w.mean * w.size
-    least: Floats = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
-    out = least.copy()
-    for i in range(3):
-        gaps = np.diff(np.unique(sums[:, i]))
-        gaps = gaps[gaps > least[i]]
-        out[i] = gaps.min() if len(gaps) else least[i]
-    return out
+def _limit_within(variance: Floats, most: int) -> Floats:
+    """(3,) the same limit from windows of which all but a few are known to be still: chi-square with the degrees of
+    freedom, ``most`` at most, that the spread between the quartiles of the logarithm shows.
+    """
+    log = np.log(np.maximum(variance, 1e-300))
+    low, middle, high = np.quantile(log, [0.25, 0.5, 0.75], axis=0)
+    tried = np.geomspace(0.5, most, 80)
+    spreads = np.log(stats.chi2.ppf(0.75, tried) / stats.chi2.ppf(0.25, tried))
+    dof = np.interp(-(high - low), -spreads, tried)
+    return np.asarray(np.exp(middle) * stats.chi2.isf(FALSE_ALARM, dof) / stats.chi2.median(dof))
 
 
-def _runs(still: Bools, joined: Bools) -> list[Ints]:
+def _inside(w: Windows, pieces: list[Ints]) -> Bools:
+    """Windows from the first to the last of each span, those that were left out as well."""
+    inside = np.zeros(len(w), dtype=bool)
+    for piece in pieces:
+        inside[piece] = True
+    for here, there in itertools.pairwise(pieces):
+        if there[0] - here[-1] <= 4:
+            inside[here[-1] : there[0]] = True
+    return inside
+
+
+def _only_moves(w: Windows, calm: Bools) -> bool:
+    """Whether the quietest windows are those of a motion, and nothing in the stream stands still.
+
+    Steadily moving outputs step 12 times as far from window to window, squared, as they scatter inside one. Slow
+    vibration does so too, but it is small beside the differences of poses, and leads nowhere.
+    """
+    at, step = contrasts(w.mean, calm, w.joined, 1, 1)
+    if not len(at):
+        return False
+    share = step**2 / np.maximum((w.variance[at] + w.variance[at - 1]) / 2, 1e-300)
+    if not (np.quantile(share, 0.25, axis=0) > MOTION).any():
+        return False
+    _, far = contrasts(w.mean, calm, w.joined, SCALES[-1], SCALES[-1])
+    pace = np.median(np.abs(step), axis=0)
+    leads = len(far) > 0 and (np.median(np.abs(far), axis=0) > 3 * pace).any()
+    return bool(leads or pace.max() > LOUD_SHARE * np.ptp(w.mean, axis=0).max())
+
+
+def runs(still: Bools, joined: Bools) -> list[Ints]:
     """Indices of unbroken runs of still windows."""
     index = np.flatnonzero(still)
     if not len(index):
@@ -263,65 +191,112 @@ def _runs(still: Bools, joined: Bools) -> list[Ints]:
     return [np.asarray(run, dtype=np.int64) for run in np.split(index, breaks)]
 
 
-def _step_scale(w: Windows, still: Bools) -> Floats:
-    """(3,) standard deviation of a still window's mean about its neighbours'."""
-    steps = np.diff(w.mean, axis=0, prepend=w.mean[:1])[_neighbours(w, still)]
-    if not len(steps):
-        return np.asarray(np.sqrt(np.median(w.variance, axis=0) / w.size))
-    floor = np.sqrt(np.median(w.variance[still], axis=0) / w.size)
-    return np.asarray(np.maximum(stats.median_abs_deviation(steps, axis=0, scale="normal") / np.sqrt(2), floor))
-
-
-def _trim(w: Windows, run: Ints, noise: Floats) -> Ints:
-    """Without one guard window at either end, nor those that still settle."""
-    run = run[1:-1]
-    while len(run) > 2 * SPAN_LEAST_WINDOWS:
-        inner = np.median(w.mean[run[len(run) // 4 : -(len(run) // 4)]], axis=0)
-        off = np.any(np.abs(w.mean[run[[0, -1]]] - inner) > 3.5 * noise, axis=1)
-        if not off.any():
+def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
+    """The calm windows at which no difference of neighbouring averages, short or long, is more than noise."""
+    steady = calm.copy()
+    for scale in SCALES:
+        at, difference = contrasts(w.mean, steady, w.joined, scale, scale)
+        if not len(at):
             break
-        run = run[int(off[0]) : len(run) - int(off[1])]
-    return run
+        sigma = noise.step[scale]
+        if scale == 1:
+            moved = at[(np.abs(difference) > STEP_SIGMA * sigma).any(axis=1)]
+        else:
+            difference = difference - _common_climb(at, difference / sigma) * sigma
+            moved = at[(np.abs(difference) > MOVE_SIGMA * sigma).any(axis=1)]
+        half = max(scale // 2, 1)
+        for shift in range(-half, half):
+            steady[moved + shift] = False
+        steady[_bumped(w, steady, noise, scale)] = False
+    return steady
 
 
-def _cut_at_steps(w: Windows, run: Ints, noise: Floats) -> list[Ints]:
-    """Parts of a run between steps of its mean that no window alone shows (a slow or slight move)."""
-    n = len(run)
-    if n < 4 * SPAN_LEAST_WINDOWS:
-        return [run]
-    means = w.mean[run]
-    total = np.cumsum(means - means.mean(axis=0), axis=0)[:-1]
-    left = np.arange(1, n)[:, None]
-    score = np.max(np.abs(total) / (noise * np.sqrt(left * (n - left) / n)), axis=1)
-    at = int(np.argmax(score))
-    cut = at + 1
-    # A move is many times as high as what is left on either side of it; drift and coloured noise are not.
-    height = np.abs(means[:cut].mean(axis=0) - means[cut:].mean(axis=0))
-    left_over = np.sqrt((means[:cut].var(axis=0) * cut + means[cut:].var(axis=0) * (n - cut)) / n)
-    if score[at] < 2 * STEP_SIGMA or (height < STEP_SIGMA * np.maximum(noise, left_over)).all():
-        return [run]
-    return _cut_at_steps(w, _trim(w, run[:cut], noise), noise) + _cut_at_steps(w, _trim(w, run[cut:], noise), noise)
+def _common_climb(at: Ints, z: Floats) -> Floats:
+    """(len, 3) what the quietest quarter of the differences of each run have in common: the pace of a steady creep."""
+    out = np.zeros_like(z)
+    for part in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) > 1) + 1):
+        quiet = part[np.argsort(np.abs(z[part]).max(axis=1), kind="stable")[: max(len(part) // 4, 1)]]
+        climb = z[quiet].mean(axis=0)
+        out[part] = np.where(np.abs(climb) > 1, climb, 0.0)
+    return out
 
 
-def _rejoin(w: Windows, pieces: list[Ints]) -> list[Span]:
-    """Pieces of one pose on either side of a bump, put together."""
-    if not pieces:
+def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
+    """Windows of short bumps: averages that differ from those before and from those after alike."""
+    if scale not in noise.edge:
+        return np.zeros(0, dtype=np.int64)
+    limit = MOVE_SIGMA * noise.edge[scale]
+    at, before = contrasts(w.mean, steady, w.joined, 4 * scale, scale)
+    to, after = contrasts(w.mean, steady, w.joined, scale, 4 * scale)
+    _, i, j = np.intersect1d(at, to - scale, return_indices=True)
+    out = ((np.abs(before[i]) > limit) & (np.abs(after[j]) > limit) & (before[i] * after[j] < 0)).any(axis=1)
+    hit = at[i[out]]
+    return np.asarray(np.unique(hit[:, None] + np.arange(scale)), dtype=np.int64)
+
+
+def _loud_pieces(w: Windows, calm: Bools, pieces: list[Ints], noise: NoiseScales) -> list[Ints]:
+    """Spans in which the mean stands still while something shakes the unit, among the windows that are not calm.
+
+    Shaking raises the scatter inside windows and, in proportion at most, that of their means; a move shifts the means
+    by more than it scatters inside a window. Only what is small beside the differences of poses can be told from a hand
+    that shakes the unit.
+    """
+    if len(pieces) < 2:
         return []
-    within = np.concatenate([w.mean[p] - w.mean[p].mean(axis=0) for p in pieces])
-    scatter = np.sqrt((within**2).sum(axis=0) / max(len(within) - len(pieces), 1))
+    levels = np.array([w.mean[p].mean(axis=0) for p in pieces])
+    most = LOUD_SHARE * float(np.linalg.norm(np.ptp(levels, axis=0)))
+    rest = np.ones(len(w), dtype=bool)
+    for piece in pieces:
+        rest[max(piece[0] - 1, 0) : piece[-1] + 2] = False
+    for scale in SCALES:
+        at, difference = contrasts(w.mean, rest, w.joined, scale, scale)
+        _, ahead = contrasts(w.variance, rest, w.joined, 0, scale, at)
+        _, behind = contrasts(w.variance, rest, w.joined, scale, 0, at)
+        share = np.maximum((noise.step[scale] / noise.scatter) ** 2, 2 / (w.size * scale))
+        moved = at[(difference**2 > MOVE_SIGMA**2 * share * (ahead - behind) / 2).any(axis=1)]
+        for shift in range(-max(scale // 2, 1), max(scale // 2, 1)):
+            rest[moved + shift] = False
+    found = []
+    for run in runs(rest, w.joined):
+        level = np.median(w.variance[run], axis=0)
+        even = np.asarray(
+            ((w.variance[run] < LOUD_SPREAD * level) & (w.variance[run] > level / LOUD_SPREAD)).all(axis=1)
+        )
+        if np.sqrt(level.max()) > most or calm[run].mean() > 0.5:
+            continue
+        for part in runs(even, np.ones(len(run), dtype=bool)):
+            piece = trimmed(w, run[part], noise.louder(level))
+            if _long_enough(w, piece, LOUD_LEAST_S):
+                found.append(piece)
+    return found
+
+
+def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools) -> list[Span]:
+    """Pieces of one pose on either side of a bump, put together."""
+    period_s = w.period_ns * 1e-9
     spans: list[Span] = []
     for piece in pieces:
-        if spans:
-            before = spans[-1].used
-            gap_s = (w.start_ns[piece[0]] - w.end_ns[before[-1]]) * 1e-9
-            apart = np.abs(w.mean[before[-20:]].mean(axis=0) - w.mean[piece[:20]].mean(axis=0))
-            if gap_s < REJOIN_S and (apart <= REJOIN_SIGMA * scatter).all():
-                spans[-1] = Span(np.concatenate([before, piece]))
-                continue
-        spans.append(Span(piece))
+        here = spans[-1].last if spans else 0
+        silent_s = (w.start_ns[piece[0]] - w.start_ns[here]) * 1e-9 - (piece[0] - here) * period_s
+        between = np.flatnonzero(disturbed[here : piece[0]])
+        bump_s = float(np.ptp(between) + 1 if len(between) else 0) * period_s + max(silent_s, 0.0)
+        if spans and bump_s < REJOIN_S and _same_pose(w, spans[-1].used, piece, noise):
+            spans[-1] = Span(np.concatenate([spans[-1].used, piece]))
+        else:
+            spans.append(Span(piece))
     return spans
 
 
-def _long_enough(w: Windows, span: Span) -> bool:
-    seconds = (w.end_ns[span.last] - w.start_ns[span.first]) * 1e-9
-    return len(span.used) >= SPAN_LEAST_WINDOWS and seconds >= SPAN_LEAST_S
+def _same_pose(w: Windows, before: Ints, after: Ints, noise: NoiseScales) -> bool:
+    """Whether the means on either side of a disturbance agree."""
+    scale = max(s for s in SCALES if s <= min(len(before), len(after)))
+    here, there = before[-scale:], after[:scale]
+    apart = np.abs(w.mean[here].mean(axis=0) - w.mean[there].mean(axis=0))
+    level = np.median(w.variance[np.concatenate([here, there])], axis=0)
+    return bool((apart <= MOVE_SIGMA * noise.louder(level).step[scale]).all())
+
+
+def _long_enough(w: Windows, used: Ints, least_s: float = SPAN_LEAST_S) -> bool:
+    if len(used) < SPAN_LEAST_WINDOWS:
+        return False
+    return bool((w.end_ns[used[-1]] - w.start_ns[used[0]]) * 1e-9 >= least_s)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.design import combinations, profile_times, radial
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
-from triaxcal.problem import Problem, State, linearise, solve
-from triaxcal.sensor import Sensor
-from triaxcal.start import problem_of, start
-from triaxcal.synthetic import noisy_poses
+from triaxcal.plan import linear_design
+from triaxcal.problem import Problem, State, linearise
 
 VISIBLE = 0.02
 """An effect is visible when the part of it that the model cannot absorb is at least this share of it."""
@@ -43,8 +43,10 @@ def projected(problem: Problem, state: State, effect: Effect, given: Sequence[Ef
     own = len(effect.coefficients)
     J, Z = np.concatenate([J, Z[:, :-own]], axis=1), Z[:, -own:]
     size = np.linalg.norm(Z, axis=0)
-    if not np.all(size > 1e-9):
+    Z = Z[:, size > 1e-9]  # a coefficient whose column is zero does not show; others of its effect may
+    if not Z.size:
         return np.empty((0, len(problem.u)))
+    size = size[size > 1e-9]
     norms = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     rest = Z / size - J / norms @ np.linalg.lstsq(J / norms, Z / size, rcond=1e-12)[0]
     _, singular, rows = np.linalg.svd(rest.T @ rest)
@@ -53,12 +55,54 @@ def projected(problem: Problem, state: State, effect: Effect, given: Sequence[Ef
     return np.asarray((basis / np.sqrt(singular[kept])).T)
 
 
-def unseen_effects(directions: Floats, catalogue: Sequence[Effect] = CATALOGUE) -> list[str]:
-    """Names of the effects that poses in these directions (n,3) cannot show, were every channel moving freely."""
+@dataclass(frozen=True)
+class Sight:
+    """What a plan shows of one effect: ``visible`` of its ``of`` independent coefficients.
+
+    ``hidden`` are the combinations of coefficients that do not show, name → weight, unit vectors.
+    """
+
+    visible: int
+    of: int
+    hidden: tuple[Mapping[str, float], ...]
+
+
+def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None = None) -> Sight:
+    """What poses in these directions (n,3), in this order and evenly in time, show of an effect by itself.
+
+    Every channel is taken to move freely, but for those ``held`` (n,).
+    """
+    n = len(directions)
     rng = np.random.default_rng(0)
-    ideal = Sensor(np.ones(3), np.zeros(3), np.zeros(3))
-    channels = {n: rng.standard_normal(len(directions)) for e in catalogue for n in e.needs if n != TIME}
-    poses = noisy_poses(ideal, directions, 1e-9, rng, channels=channels)
-    problem = problem_of(poses)
-    state = solve(problem, start(problem, poses, (1, 1, 1)), ())
-    return [e.name for e in catalogue if not is_visible(problem, state, e)]
+    conditions = {TIME: profile_times(n)} | {c: rng.standard_normal(n) for c in effect.needs if c != TIME}
+    conditions |= {c: v for c, v in (held or {}).items() if c in conditions}
+    seen, hidden = combinations(
+        linear_design(directions, directions), radial([effect], directions, conditions), VISIBLE
+    )
+    names = [c.name for c in effect.coefficients]
+    named = tuple({k: float(w) for k, w in zip(names, v, strict=True) if abs(w) > 1e-9} for v in _plainly(hidden.T))
+    return Sight(seen.shape[1], len(names), named)
+
+
+def _plainly(hidden: Floats) -> Floats:
+    """The same space of combinations (k,p), with as many weights zero as the reduced echelon form has."""
+    rows = hidden.copy()
+    pivots = 0
+    for column in range(rows.shape[1]):
+        rest = np.abs(rows[pivots:, column])
+        if pivots == len(rows) or rest.max(initial=0.0) < 1e-6:
+            continue
+        k = pivots + int(np.argmax(rest))
+        rows[[pivots, k]] = rows[[k, pivots]]
+        rows[pivots] /= rows[pivots, column]
+        others = np.arange(len(rows)) != pivots
+        rows[others] -= np.outer(rows[others, column], rows[pivots])
+        pivots += 1
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))
+
+
+def unseen_effects(directions: Floats, catalogue: Sequence[Effect] = CATALOGUE) -> list[str]:
+    """Names of the effects that poses in these directions (n,3) cannot show in full, were every channel moving
+    freely."""
+    sights = [sight(directions, e) for e in catalogue]
+    return [e.name for e, s in zip(catalogue, sights, strict=True) if s.visible < s.of]

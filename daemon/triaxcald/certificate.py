@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
@@ -22,8 +22,9 @@ from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
+from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
-from triaxcald.documents import Document, error, loop_document, number
+from triaxcald.documents import Document, budget_document, error, loop_document, number
 from triaxcald.pipeline import Pipeline
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
@@ -88,9 +89,11 @@ def certify(
         "limits": {k: number(v) for k, v in station.limits.model_dump(exclude={"verification_rms_g"}).items() if v},
         "verdict": "outside limits" if outside else "within limits" if _judged(station.limits) else "not judged",
         "outside": outside,
-        "result": loop_document(loop, data_quality=pipeline.data_quality(), output_unit=profile.output.unit),
+        "result": loop_document(
+            loop, data_quality=pipeline.data_quality(), output_unit=profile.output.unit, stated=station.stated
+        ),
         "not_written": why_not_written(profile),
-        "registers": _registers_document(image, held, loop, poses) if image and held else None,
+        "registers": _registers_document(image, held, loop, poses, station.stated) if image and held else None,
     }
     return Certified(document, loop, image, not outside)
 
@@ -160,7 +163,9 @@ def _image(profile: Profile, held: Calibration, date_days: int) -> RegisterImage
     return build_image(profile, wanted, date_days=date_days)
 
 
-def _registers_document(image: RegisterImage, held: Calibration, loop: Loop, poses: list[Pose]) -> Document:
+def _registers_document(
+    image: RegisterImage, held: Calibration, loop: Loop, poses: list[Pose], stated: Stated
+) -> Document:
     in_registers = ["linear", *(e.name for e, _ in held.sensor.effects if not is_passing(e))]
     host = [name for name in loop.after.terms if name not in in_registers]
     return {
@@ -168,6 +173,7 @@ def _registers_document(image: RegisterImage, held: Calibration, loop: Loop, pos
         "left_to_host": host,
         "rms_g": error(held.residual.rms_g),
         "rounding_rms_g": error(rounding_cost(image, held, poses)),
+        "uncertainty": budget_document(held, budget(held, replace(stated, rounding=_steps(image)))),
         "words": [
             {
                 "register": w.register,
@@ -180,6 +186,10 @@ def _registers_document(image: RegisterImage, held: Calibration, loop: Loop, pos
             for w in image.words
         ],
     }
+
+
+def _steps(image: RegisterImage) -> dict[str, float]:
+    return {word.role: word.step for word in image.words}
 
 
 def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) -> float:

@@ -19,10 +19,12 @@ from triaxcal.effects import Effect, effect_named
 from triaxcal.loop import Loop
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
+from triaxcal.uncertainty import Budget, Stated, budget
 from triaxcald.errors import InputError
 
 Document = dict[str, Any]
 DIGITS, UNCERTAINTY_DIGITS, PROBABILITY_DIGITS = 10, 6, 4
+LINEAR = ("scale_factor", "misalignment", "bias")
 GRID_G = 1e-11
 """Errors of the magnitude are differences of numbers near 1 g: beyond this they differ from processor to processor."""
 
@@ -54,6 +56,17 @@ def numbers(values: Any, digits: int = DIGITS) -> list[Any]:
     return [number(float(v), digits) for v in array] if array.ndim == 1 else [numbers(row, digits) for row in array]
 
 
+def correlation(covariance: Floats) -> list[Any]:
+    """(p,p) from a covariance, to a millionth: near zero the digits beyond differ from processor to processor."""
+    deviation = np.maximum(np.sqrt(np.diag(covariance)), 1e-300)
+    return list((np.round(covariance / np.outer(deviation, deviation), 6) + 0.0).tolist())
+
+
+def direction(unit_vector: Floats) -> list[float]:
+    """To a billionth: its small components are differences of large ones, as errors are."""
+    return [round(float(v), 9) + 0.0 for v in unit_vector]
+
+
 def to_text(document: Mapping[str, Any]) -> str:
     """The document as it is written and compared: UTF-8, two spaces, one key a line, a newline at the end."""
     return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -78,11 +91,12 @@ def poses_document(poses: Sequence[Pose]) -> Document:
 
 def in_units_of(unit: str, reference_unit: str) -> str:
     """A coefficient's unit, which the metrology writes with g for the unit of the reference vector."""
-    return (
-        unit
-        if reference_unit == "g"
-        else unit.replace("g", f"({reference_unit})" if " " in reference_unit else reference_unit)
-    )
+    return unit if reference_unit == "g" else unit.replace("g", grouped(reference_unit))
+
+
+def grouped(unit: str) -> str:
+    """A unit as it stands below a fraction bar."""
+    return f"({unit})" if set(unit) & set(" /") else unit
 
 
 def micro_unit(reference_unit: str) -> str:
@@ -110,8 +124,16 @@ def reference_unit_of(reference: float) -> str:
     return "g" if 0.9 <= reference <= 1.1 else "reference unit"
 
 
-def calibration_document(c: Calibration, *, output_unit: str = "", reference_unit: str = "g") -> Document:
-    """``reference_unit`` names the unit of the reference vector; keys keep their ``_g`` whatever it is."""
+def calibration_document(
+    c: Calibration,
+    *,
+    output_unit: str = "",
+    reference_unit: str = "g",
+    stated: Stated | None = None,
+    budgeted: bool = True,
+) -> Document:
+    """``reference_unit`` names the unit of the reference vector; keys keep their ``_g`` whatever it is. ``stated`` are
+    uncertainties that no recording can tell. ``budgeted``: with the budget, which is that of a fit to still poses."""
     errors = dict(zip(c.parameters, c.standard_errors, strict=True))
     unit = output_unit or "output"
 
@@ -124,7 +146,7 @@ def calibration_document(c: Calibration, *, output_unit: str = "", reference_uni
         "units": {
             "output": output_unit,
             "reference": reference_unit,
-            "scale_factor": f"{unit}/{reference_unit}",
+            "scale_factor": f"{unit}/{grouped(reference_unit)}",
             "misalignment": "rad",
             "bias": reference_unit,
         },
@@ -146,14 +168,17 @@ def calibration_document(c: Calibration, *, output_unit: str = "", reference_uni
             }
             for effect, values in c.sensor.effects
         },
-        "standard_error": {name: group(name) for name in ("scale_factor", "misalignment", "bias")},
+        "standard_error": {name: group(name) for name in LINEAR},
+        "parameters": list(c.parameters),
+        "correlation": correlation(c.covariance),
+        **({"uncertainty": budget_document(c, budget(c, stated))} if budgeted else {}),
         "residual": residual_document(c.residual),
         "poses": [
             {
                 "start_s": number(p.pose.start_s),
                 "end_s": number(p.pose.end_s),
                 "mean": numbers(p.pose.mean),
-                "direction": numbers(p.direction),
+                "direction": direction(p.direction),
                 "residual_g": error(p.residual_g),
                 "standard_error_g": uncertainty(p.standard_error_g),
                 "studentized": uncertainty(p.studentized),
@@ -169,10 +194,55 @@ def calibration_document(c: Calibration, *, output_unit: str = "", reference_uni
     }
 
 
+def budget_document(c: Calibration, b: Budget) -> Document:
+    """Expanded uncertainties and where they come from. Standard uncertainties in the budget's lines."""
+
+    def by_parameter(values: Floats) -> Document:
+        held = dict(zip(c.parameters, (uncertainty(float(v)) for v in values), strict=True))
+        groups = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
+        effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
+        return groups | ({"effects": effects} if effects else {})
+
+    whole = b.magnitude
+    return {
+        "level": b.parameters.level,
+        "expanded": by_parameter(b.parameters.expanded),
+        "coverage_factor": by_parameter(b.parameters.coverage),
+        "magnitude": {
+            "standard_g": uncertainty(float(whole.standard)),
+            "coverage_factor": uncertainty(float(whole.coverage)),
+            "expanded_g": uncertainty(float(whole.expanded)),
+        },
+        "budget": [
+            {
+                "source": line.source,
+                "evaluation": line.evaluation,
+                "degrees_of_freedom": uncertainty(line.dof),
+                **by_parameter(line.parameters),
+                "magnitude_g": uncertainty(line.magnitude),
+                "share": uncertainty(b.share(line)),
+                "how": line.how,
+            }
+            for line in b.components
+        ],
+        "dominant": b.dominant.source,
+        "halved_by": b.dominant.halved_by,
+        "magnitude_if_halved_g": uncertainty(b.magnitude_if_halved),
+        "not_evaluated": list(b.not_evaluated),
+    }
+
+
 def loop_document(
-    loop: Loop, *, data_quality: Sequence[str] = (), output_unit: str = "", reference_unit: str = "g"
+    loop: Loop,
+    *,
+    data_quality: Sequence[str] = (),
+    output_unit: str = "",
+    reference_unit: str = "g",
+    stated: Stated | None = None,
 ) -> Document:
-    calibration = calibration_document(loop.after, output_unit=output_unit, reference_unit=reference_unit)
+    calibration = calibration_document(
+        loop.after, output_unit=output_unit, reference_unit=reference_unit, stated=stated
+    )
     for pose, before in zip(calibration["poses"], loop.before.poses, strict=True):
         pose["before_residual_g"] = error(before.residual_g)
     held = loop.held_out

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal.errors import InvalidData
+from triaxcal.moments import Moments
 from triaxcal.poses import Pose, poses_of
 from triaxcal.stillness import StillnessDetector, Windows
+from triaxcal.uncertainty import Stated
 from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline
@@ -42,19 +44,27 @@ class Measured:
     signs: tuple[int, int, int] | None = None
     reference: float | None = None
     unit: Mapping[str, str] | None = None
+    stated: Stated | None = None
 
 
-def measure(name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS) -> Measured:
-    """``name`` is a path to an `.mcap`, `.csv` or `.csv.gz`, or `-`. Raises InputError, RecordingError."""
+def measure(
+    name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS, moments: Moments | None = None
+) -> Measured:
+    """``name`` is a path to an `.mcap`, `.csv` or `.csv.gz`, or `-`. Raises InputError, RecordingError.
+
+    ``moments`` are fed all raw samples on the way, block by block.
+    """
     if name.endswith(".mcap"):
         with Recording.open(Path(name)) as recording:
-            return _measure_recording(recording, phase, stream)
+            return _measure_recording(recording, phase, stream, moments)
     samples = read_csv(name)
     detector = StillnessDetector()
     try:
         detector.feed(samples.time_ns, samples.readings, samples.channels)
         detector.finish()
         windows = detector.windows()
+        if moments is not None:
+            moments.feed(samples.readings)
     except InvalidData as e:
         raise InputError(f"{name}: {e}") from e
     poses = poses_of(windows, detector.spans())
@@ -62,19 +72,24 @@ def measure(name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS) ->
     return Measured(name, poses, windows, quality + _creeping(poses))
 
 
-def _measure_recording(recording: Recording, phase: Phase, stream: str) -> Measured:
+def _measure_recording(recording: Recording, phase: Phase, stream: str, moments: Moments | None) -> Measured:
     bundle = bundle_of(recording)
-    pipeline = Pipeline(bundle, stream).feed_all(recording.raw(phase))
+    pipeline = Pipeline(bundle, stream)
+    for batch in recording.raw(phase):
+        block = pipeline.feed(batch)
+        if moments is not None:
+            moments.feed(block.readings)
     poses = pipeline.finish()
     quality = pipeline.data_quality() + losses_of(recording) + _creeping(poses)
     signs = signs_of(recording) or bundle.profile.output.signs
-    reference = None
+    station = None
     if STATION_FILE in recording.attachments:
         where = f"{recording.name}: {STATION_FILE}"
-        reference = parse_station(recording.attachments[STATION_FILE], where=where).reference
+        station = parse_station(recording.attachments[STATION_FILE], where=where)
+    reference, stated = (station.reference, station.stated) if station else (None, None)
     meant = recording.metadata.get("unit", {})
     unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
-    return Measured(recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference, unit)
+    return Measured(recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference, unit, stated)
 
 
 def signs_of(recording: Recording) -> tuple[int, int, int] | None:

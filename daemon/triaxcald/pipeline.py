@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.errors import InvalidData
-from triaxcal.poses import Pose, poses_of
+from triaxcal.poses import Held, Pose, held_of, poses_of
 from triaxcal.stillness import StillnessDetector, Windows
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
@@ -81,6 +81,11 @@ class Pipeline:
         """The still poses so far."""
         windows = self.windows
         return [] if windows is None else poses_of(windows, self._detector.spans())
+
+    def held(self) -> list[Held]:
+        """The same without their noise, which takes longer than all the rest: enough to guide an operator by."""
+        windows = self.windows
+        return [] if windows is None else held_of(windows, self._detector.spans())
 
     def finish(self) -> list[Pose]:
         """The still poses of the whole stream."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from typing import Literal, Protocol
@@ -58,6 +59,15 @@ def encode(register: Format, value: float, *, order: ByteOrder, name: str) -> by
     except (OverflowError, struct.error, ValueError) as e:
         raise RegisterValueError(f"register {name}: {value!r} does not fit {register.type}") from e
     return data if order == "big" else data[::-1]
+
+
+def step(register: Format, value: float) -> float:
+    """How far apart the numbers are that a register can hold near ``value``, in its unit."""
+    if not register.type.startswith("float"):
+        return abs(register.scale)
+    raw = abs((value - register.offset) / register.scale)
+    digits = 24 if register.type == "float32" else 53
+    return abs(register.scale) * math.ulp(raw) * 2.0 ** (53 - digits)
 
 
 def decode(register: Format, raw: bytes, *, order: ByteOrder, name: str) -> float:

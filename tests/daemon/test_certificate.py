@@ -167,3 +167,13 @@ def test_too_few_poses_are_refused(finished_run: Any, tmp_path: Path) -> None:
             signs=(1, 1, 1),
             computed_with={},
         )
+
+
+def test_the_registers_have_a_budget_of_their_own_with_their_steps_in_it(certified: Callable[..., Certified]) -> None:
+    document = certified().document
+    free = {x["source"]: x for x in document["result"]["calibration"]["uncertainty"]["budget"]}
+    held = {x["source"]: x for x in document["registers"]["uncertainty"]["budget"]}
+    assert set(held) - set(free) == {"register_rounding"}
+    # float32 near 2.4 has steps of 2^-22
+    assert held["register_rounding"]["scale_factor"] == pytest.approx([2**-22 / 12**0.5] * 3, rel=1e-5)
+    assert 0 < held["register_rounding"]["magnitude_g"] < 1e-6

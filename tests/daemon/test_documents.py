@@ -16,6 +16,7 @@ from triaxcal.plan import directions
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
+from triaxcal.uncertainty import Stated
 from triaxcald.documents import (
     calibration_document,
     calibration_part,
@@ -179,3 +180,31 @@ def test_a_malformed_calibration_is_an_error_that_names_file_and_field(
     assert str(caught.value).startswith("cal.json: ")
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_the_budget_stands_beside_the_standard_errors(poses: list[Pose]) -> None:
+    fitted = fit(poses, signs=SIGNS, effects=[SECOND])
+    said = calibration_document(fitted, stated=Stated(reference=1e-4, reference_source="a guess"))["uncertainty"]
+    lines = {x["source"]: x for x in said["budget"]}
+    assert said["dominant"] == said["budget"][0]["source"] == "reference"
+    assert lines["reference"]["how"] == "a guess"
+    assert lines["reference"]["degrees_of_freedom"] is None
+    assert sum(x["share"] for x in said["budget"]) == pytest.approx(1, abs=1e-5)
+    for name, index in (("scale_factor", 0), ("misalignment", 3), ("bias", 6)):
+        squares = np.sum([np.square(x[name]) for x in said["budget"]], axis=0)
+        factors = np.array(said["coverage_factor"][name])
+        np.testing.assert_allclose(said["expanded"][name], factors * np.sqrt(squares), rtol=1e-4)
+        assert np.all(squares >= (fitted.standard_errors[index : index + 3] ** 2) * (1 - 1e-6))
+    assert set(said["expanded"]["effects"]["second_order_nonlinearity"]) == {"x", "y", "z"}
+    assert "not_evaluated" in said
+
+
+def test_the_correlation_is_that_of_the_fit(poses: list[Pose]) -> None:
+    fitted = fit(poses, signs=SIGNS, effects=[SECOND])
+    document = calibration_document(fitted)
+    assert document["parameters"] == list(fitted.parameters)
+    held = np.array(document["correlation"])
+    assert np.array_equal(held, held.T)
+    np.testing.assert_allclose(np.diag(held), 1.0)
+    back = held * np.outer(fitted.standard_errors, fitted.standard_errors)
+    np.testing.assert_allclose(back, fitted.covariance, atol=1e-6 * np.max(np.diag(fitted.covariance)))

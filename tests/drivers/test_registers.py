@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.profile import Register
-from triaxcal_drivers.registers import SIZES, crc, decode, encode
+from triaxcal_drivers.registers import SIZES, crc, decode, encode, step
 
 INTEGERS = [t for t in SIZES if "int" in t]
 ORDERS = st.sampled_from(["big", "little"])
@@ -154,3 +154,23 @@ def test_whole_numbers_are_decoded_whole():
     """2^53 + 1 is no float: an identity must not come back changed."""
     raw = struct.pack(">Q", 2**53 + 1)
     assert decode(Register(type="uint64"), raw, order="big", name="serial_number") == 2**53 + 1
+
+
+@pytest.mark.parametrize(
+    ("type_", "scale", "value", "step_"),
+    [
+        ("int16", 1e-3, 0.2, 1e-3),
+        ("int32", -(2.0**-20), 0.2, 2.0**-20),
+        ("float32", 1.0, 1.0, 2.0**-23),
+        ("float32", 1.0, -2.41, 2.0**-22),
+        ("float32", 1e-6, 1e-6, 1e-6 * 2.0**-23),
+        ("float64", 1.0, 1.0, 2.0**-52),
+    ],
+)
+def test_the_step_of_a_register_is_the_distance_to_the_next_value_that_it_can_hold(type_, scale, value, step_):
+    register = Register(type=type_, scale=scale)
+    assert step(register, value) == pytest.approx(step_, rel=1e-12)
+    raw = int.from_bytes(encode(register, value, order="big", name="r"), "big")
+    size = SIZES[type_]
+    beside = decode(register, (raw + 1).to_bytes(size, "big"), order="big", name="r")
+    assert abs(beside - decode(register, raw.to_bytes(size, "big"), order="big", name="r")) == pytest.approx(step_)

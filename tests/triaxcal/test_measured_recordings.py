@@ -76,7 +76,8 @@ NEIGHBOURHOOD = 1.6
     ("names", "outside"),
     [
         ([f"mimu4444/run{r}_sensor{s}" for r in (1, 5, 6) for s in SENSORS], (106, 126)),
-        (["xsens/acc"], (55, 55)),
+        # The outside figure is that of white noise; what slow noise adds is in the residuals, 101 by the same analysis.
+        (["xsens/acc"], (55, 101)),
         (["mpu9150/unit0", "mpu9150/unit1"], (300, 300)),
     ],
 )

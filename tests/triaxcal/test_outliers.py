@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.spoiled import clean_loses, measure
+from benchmarks.truth import plan
 from triaxcal.calibration import Calibration
 from triaxcal.fit import fit
 from triaxcal.loop import diagnose
+from triaxcal.outliers import spoiled
+from triaxcal.plan import linear_design
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -47,53 +51,37 @@ def test_one_or_two_spoiled_poses_of_the_26_are_named(
         named += left_out(found) == bad
         pulls.append((found.values - true) / clean.standard_errors)
         clean_pulls.append((clean.values - true) / clean.standard_errors)
-    assert named >= 38
+    assert named >= stats.binom.ppf(1e-3, 40, 0.95)
     assert np.sqrt(np.mean(np.square(pulls))) <= 1.1 * np.sqrt(np.mean(np.square(clean_pulls)))
 
 
-@pytest.mark.parametrize("directions", ["fourteen", "twenty_six"])
-def test_a_clean_set_hardly_ever_loses_a_pose(
-    request: pytest.FixtureRequest, paper_unit: Sensor, directions: str
-) -> None:
-    ups = request.getfixturevalue(directions)
-    runs = 300
-    lost = sum(
-        bool(left_out(fit(noisy_poses(paper_unit, ups, SIGMA, np.random.default_rng(seed)), signs=SIGNS)))
-        for seed in range(runs)
-    )
+@pytest.mark.parametrize(
+    ("poses", "excess", "dof"), [(14, 1.0, 1e6), (26, 1.0, 1e6), (26, 1.0, 8.0), (50, 1.5, 1e6), (26, 1.0, 0.0)]
+)
+def test_a_clean_set_hardly_ever_loses_a_pose(poses: int, excess: float, dof: float) -> None:
+    runs = 160
     # One in a hundred is promised; so many or fewer are seen in all but one of a thousand sets of runs.
-    assert lost <= stats.binom.ppf(0.999, runs, 0.01)
+    assert clean_loses(poses, runs, excess, dof) <= stats.binom.ppf(0.999, runs, 0.01) / runs
 
 
-def test_a_spoiled_pose_of_the_14_is_named_or_said_to_be_ambiguous_and_never_another(
-    paper_unit: Sensor, fourteen: np.ndarray
-) -> None:
-    named = ambiguous = 0
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        poses = noisy_poses(paper_unit, fourteen, SIGMA, rng)
-        bad = int(rng.integers(14))
-        poses[bad] = spoil(poses[bad], paper_unit, fourteen[bad], 20)
-        found = fit(poses, signs=SIGNS)
-        named += left_out(found) == [bad]
-        ambiguous += any("cannot be told from each other" in w for w in found.warnings)
-        assert left_out(found) in ([], [bad])
-    assert named >= 54
-    assert named + ambiguous >= 58
+@pytest.mark.parametrize("sigmas", [10.0, 30.0, 1000.0])
+def test_a_spoiled_pose_of_the_14_is_named_nearly_as_often_as_it_can_be(sigmas: float) -> None:
+    runs = 120
+    found = measure(14, 1, sigmas, runs, peer=False)
+    assert found.named >= stats.binom.ppf(1e-3, runs, 0.95) / runs
+    assert found.wrong <= stats.binom.ppf(1 - 1e-3, runs, 0.01) / runs
+    assert found.error_named <= 1.1
+    # Nor can a rule that knows the noise, the unit, and that it is one pose do much better.
+    assert found.optimum - found.named < 0.05
 
 
-def test_two_spoiled_poses_of_the_14_that_cannot_be_told_from_others_are_not_guessed(
-    paper_unit: Sensor, fourteen: np.ndarray
-) -> None:
-    wrong = 0
-    for seed in range(60):
-        rng = np.random.default_rng([seed, 2])
-        poses = noisy_poses(paper_unit, fourteen, SIGMA, rng)
-        bad = sorted(int(i) for i in rng.choice(14, 2, replace=False))
-        for i in bad:
-            poses[i] = spoil(poses[i], paper_unit, fourteen[i], 30 * rng.choice([-1, 1]))
-        wrong += left_out(fit(poses, signs=SIGNS)) not in ([], bad)
-    assert wrong <= 1
+def test_two_spoiled_poses_of_the_14_that_cannot_be_told_from_others_are_not_guessed() -> None:
+    runs = 60
+    found = measure(14, 2, 30.0, runs, peer=False)
+    # Not even the most likely pair is the right one in a quarter of the runs.
+    assert found.optimum < 0.9
+    assert found.wrong <= stats.binom.ppf(1 - 1e-3, runs, 0.03) / runs
+    assert found.ambiguous > 0.2
 
 
 def test_a_spoiled_pose_is_named_in_a_warning_and_keeps_its_place_among_the_results(
@@ -137,3 +125,53 @@ def test_a_spoiled_pose_shows_beside_an_effect_once_the_effect_is_in_the_model(
         effects = [f.effect for f in loop.findings]
         named += (effects, left_out(loop.after)) == (["second_order_nonlinearity"], [bad])
     assert named >= 18
+
+
+def test_a_spoiled_pose_is_named_where_only_the_other_residuals_tell_the_noise(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    named = 0
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 3])
+        poses = noisy_poses(paper_unit, twenty_six, SIGMA, rng)
+        bad = int(rng.integers(26))
+        poses[bad] = spoil(poses[bad], paper_unit, twenty_six[bad], 15)
+        named += left_out(fit([replace(p, covariance=p.covariance * 100, dof=0.0) for p in poses], signs=SIGNS)) == [
+            bad
+        ]
+    assert named >= stats.binom.ppf(1e-3, 40, 0.95)
+
+
+def test_a_pose_that_only_the_noise_inside_the_poses_calls_spoiled_leaves_the_errors_wide(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    doubtful = {12: 0, 300: 0}
+    for seed in range(20):
+        poses = noisy_poses(paper_unit, fourteen, SIGMA, np.random.default_rng(seed))
+        for sigmas in doubtful:
+            found = fit([*poses[:4], spoil(poses[4], paper_unit, fourteen[4], sigmas), *poses[5:]], signs=SIGNS)
+            told = fit([p.pose for p in found.poses], signs=SIGNS, aside=[4])
+            if left_out(found) == [4] and "allow for both" in found.warnings[0]:
+                doubtful[sigmas] += 1
+                assert found.inflation > 1.5 * told.inflation
+            elif left_out(found) == [4]:
+                assert found.inflation == pytest.approx(told.inflation)
+    assert doubtful[12] >= 8
+    assert doubtful[300] == 0
+
+
+def test_the_pose_that_every_likely_pair_contains_is_left_out() -> None:
+    n = 14
+    design = linear_design(plan(n), plan(n))
+    shown = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        r = rng.standard_normal(n)
+        r[3] += 200
+        r[int(rng.integers(4, n))] += 8
+        verdict = spoiled(r, design, np.full(n, 1e6), 1e6)
+        if verdict.rivals:
+            assert verdict.rows == (3,)
+            assert all(3 not in each for each in verdict.rivals)
+            shown += 1
+    assert shown > 5

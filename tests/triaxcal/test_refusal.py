@@ -6,12 +6,14 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from triaxcal.errors import Refused
 from triaxcal.fit import fit
-from triaxcal.plan import cube_directions
+from triaxcal.plan import cube_directions, dilution
 from triaxcal.poses import Pose
 from triaxcal.sensor import Sensor
+from triaxcal.start import problem_of, start
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)
@@ -73,6 +75,138 @@ def test_a_poor_set_is_refused_and_the_poses_wanted_mend_it(name: str, paper_uni
     mended = fit(measured(paper_unit, np.concatenate([POOR[name], more])), signs=MINUS)
     assert mended.dilution < 20
     assert np.abs(mended.values[:3] - paper_unit.scale_factor) == pytest.approx(np.zeros(3), abs=1e-3)
+
+
+def a_triad(rng: np.random.Generator, alike: bool) -> tuple[Sensor, tuple[int, ...]]:
+    """Of scale factors and biases that nobody knows; not ``alike``: sensitivities up to 10 : 1, 0.5 g, 23°."""
+    signs = rng.choice([-1, 1], 3)
+    if alike:
+        k, angles, bias = 1 + rng.uniform(-0.1, 0.1, 3), rng.uniform(-0.02, 0.02, 3), rng.uniform(-0.1, 0.1, 3)
+    else:
+        k, angles, bias = 10 ** rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.4, 0.4, 3), rng.uniform(-0.5, 0.5, 3)
+    return Sensor(2.4 * signs * k, angles, bias), tuple(int(s) for s in signs)
+
+
+def deficient(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Directions that do not suffice, or may not."""
+    ball, axis = unit(rng.standard_normal((4000, 3))), unit(rng.standard_normal(3))
+    cube = np.array([v for _, v in cube_directions()])
+    many = int(rng.integers(9, 27))
+    flat = unit(ball - np.outer(ball @ axis, axis))[:many]
+    match kind:
+        case "few":
+            return ball[: rng.integers(0, 9)]
+        case "few of the cube":
+            return cube[rng.permutation(26)[: rng.integers(0, 9)]]
+        case "cap":
+            return ball[ball @ axis > np.cos(np.radians(rng.uniform(10, 60)))][:many]
+        case "plane":
+            return unit(flat + np.radians(rng.choice([0.0, 0.5, 2.0])) * rng.standard_normal(flat.shape))
+        case "cone":
+            height = rng.uniform(-0.8, 0.8)
+            return unit(height * axis + np.sqrt(1 - height**2) * flat)
+        case "clusters":
+            spots = np.repeat(ball[: rng.integers(1, 8)], 4, axis=0)
+            return unit(spots + 0.02 * rng.standard_normal(spots.shape))
+        case "nine of fourteen":
+            return cube[rng.permutation(14)[:9]]
+        case _:
+            return unit(np.tile(FACES, (3, 1)) + np.radians(rng.choice([0.0, 1.0])) * rng.standard_normal((18, 3)))
+
+
+KINDS = ["few", "few of the cube", "cap", "plane", "cone", "clusters", "nine of fourteen", "faces"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("alike", [True, False], ids=["triads alike", "triads of any kind"])
+def test_the_poses_wanted_mend_a_deficient_set_in_one_round(kind: str, alike: bool) -> None:
+    """Whatever the unit's scale and bias, poses taken 2° off, noise up to 3e-4 g."""
+    rng = np.random.default_rng(KINDS.index(kind))
+    where = dict(cube_directions())
+    refused = 0
+    for _ in range(25):
+        sensor, signs = a_triad(rng, alike)
+        there, error = deficient(kind, rng), 10 ** rng.uniform(-6, -3.5)
+        wanted = wanted_by(noisy_poses(sensor, there, error, rng), signs)
+        if wanted is not None:
+            refused += 1
+            assert 0 < len(wanted) <= 9
+            more = np.array([where[label] for label in wanted])
+            more = unit(more + np.radians(2) * rng.standard_normal(more.shape))
+            everything = np.concatenate([there, more])
+            assert dilution(everything) < 5, (kind, wanted)
+            assert wanted_by(noisy_poses(sensor, everything, error, rng), signs) is None
+    assert refused > 5
+
+
+def wanted_by(poses: list[Pose], signs: tuple[int, ...]) -> tuple[str, ...] | None:
+    """What a refusal wants; None where there is none."""
+    try:
+        start(problem_of(poses, signs=signs), poses, signs)
+    except Refused as e:
+        return e.wanted
+    return None
+
+
+def test_the_nine_pose_subsets_that_are_singular_are_mended_by_few_poses(paper_unit: Sensor) -> None:
+    rng = np.random.default_rng(0)
+    cube = np.array([v for _, v in cube_directions()[:14]])
+    where = dict(cube_directions())
+    seen = 0
+    for subset in rng.permutation(list(itertools.combinations(range(14), 9)))[:120]:
+        wanted = wanted_by(noisy_poses(paper_unit, cube[subset], 1e-5, rng), MINUS)
+        if wanted is not None:
+            seen += 1
+            assert 0 < len(wanted) <= 4
+            assert dilution(np.concatenate([cube[subset], [where[label] for label in wanted]])) <= 2.0
+    assert seen > 15
+
+
+NEARLY = {
+    "a cap of 50 degrees": lambda: cap(50),
+    "a cap of 60 degrees": lambda: cap(60),
+    "an octant": lambda: np.abs(cap(180)),
+    "a plane, wobbling by 5 degrees": lambda: wobbling(5),
+    "a plane, wobbling by 10 degrees": lambda: wobbling(10),
+    "six faces, off by 1 degree": lambda: unit(
+        np.tile(FACES, (3, 1)) + np.radians(1) * np.random.default_rng(1).standard_normal((18, 3))
+    ),
+}
+
+
+def wobbling(degrees: float) -> np.ndarray:
+    ring = circle(np.array([1.0, 2.0, 3.0]), 0.0)
+    return unit(ring + np.radians(degrees) * np.random.default_rng(1).standard_normal(ring.shape))
+
+
+@pytest.mark.parametrize("name", NEARLY)
+@pytest.mark.parametrize("noise_g", [1e-6, 3e-4])
+def test_a_set_that_is_nearly_singular_is_warned_of_and_its_errors_are_true(
+    name: str, noise_g: float, paper_unit: Sensor
+) -> None:
+    there, rng = NEARLY[name](), np.random.default_rng(4)
+    truth = np.concatenate([paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias])
+    squares = []
+    for _ in range(25):
+        found = fit(noisy_poses(paper_unit, there, noise_g, rng), signs=MINUS, aside=())
+        assert any("poorly spread" in w and "add " in w for w in found.warnings)
+        missed = (found.values - truth) / found.inflation
+        covariance = found.covariance / found.inflation**2
+        scale = np.sqrt(np.diag(covariance))
+        missed, correlation = missed / scale, covariance / np.outer(scale, scale)
+        values, vectors = np.linalg.eigh(correlation)
+        # The worst combination of the parameters, which is the one that such a set leaves open.
+        squares.append((vectors[:, -1] @ missed) ** 2 / values[-1])
+    low, high = stats.chi2.ppf([1e-4, 1 - 1e-4], 25)
+    assert low < np.sum(squares) < high
+
+
+def test_poses_that_noise_could_carry_anywhere_are_refused(paper_unit: Sensor) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(8):
+        with pytest.raises(Refused, match="differ by little more than their noise") as refusal:
+            fit(noisy_poses(paper_unit, cap(60), 3e-3, rng), signs=MINUS)
+        assert refusal.value.wanted
 
 
 def test_the_message_counts_what_there_is(paper_unit: Sensor) -> None:

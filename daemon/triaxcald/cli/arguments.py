@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
+from triaxcal.gravity import HEIGHTS_M
 from triaxcald.errors import InputError
 
 
@@ -14,8 +15,9 @@ class OneLineParser(argparse.ArgumentParser):
     """Says what is wrong in one line and ends with 2."""
 
     def error(self, message: str) -> NoReturn:
-        if "--sign" in message and "expected one argument" in message:
-            message += "; write it with an equals sign: --sign=-,-,-"
+        for option, example in (("--sign", "-,-,-"), ("--faces", "-X,-X"), ("--datum", "-Z,-X")):
+            if option in message and "expected one argument" in message:
+                message += f"; write it with an equals sign: {option}={example}"
         sys.stderr.write(f"{self.prog}: {message}\n")
         sys.exit(2)
 
@@ -38,6 +40,28 @@ def positive(text: str) -> float:
     return value
 
 
+def not_negative(text: str) -> float:
+    return _within(text, 0.0, sys.float_info.max, "a number of at least 0")
+
+
+def latitude(text: str) -> float:
+    return _within(text, -90.0, 90.0, "degrees between -90 and 90")
+
+
+def height(text: str) -> float:
+    return _within(text, *HEIGHTS_M, f"metres between {HEIGHTS_M[0]:g} and {HEIGHTS_M[1]:g}")
+
+
+def _within(text: str, low: float, high: float, wanted: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"expected {wanted}, not '{text}'")
+    return value
+
+
 def count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, not '{text}'")
@@ -54,10 +78,12 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
 
 
-def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
     recording = parser.add_argument("recording", metavar="REC", help=".mcap, .csv, .csv.gz or - for standard input")
     if optional:
         recording.nargs, recording.required = "?", False
+    if several:
+        recording.nargs = "+"
     parser.add_argument("--sign", type=signs, metavar="S,S,S", help="signs of the scale factors; write --sign=-,-,-")
     parser.add_argument("--output-unit", metavar="UNIT", help="unit of the readings, for the documents")
     parser.add_argument(
@@ -68,6 +94,20 @@ def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False) ->
     )
     parser.add_argument("--reference-unit", metavar="UNIT", help="that unit, for the documents")
     add_json(parser)
+
+
+def add_uncertainty(parser: argparse.ArgumentParser) -> None:
+    """What is known of the reference and the thermometer, for the budget."""
+    parser.add_argument(
+        "--latitude", type=latitude, metavar="DEG", help="with --height: gravity there is the reference"
+    )
+    parser.add_argument("--height", type=height, metavar="M", help="above sea level")
+    parser.add_argument(
+        "--reference-uncertainty", type=not_negative, metavar="U", help="its standard uncertainty, in its unit"
+    )
+    parser.add_argument(
+        "--thermometer-uncertainty", type=not_negative, metavar="K", help="its standard uncertainty, in kelvin"
+    )
 
 
 def writable(path: Path | None) -> None:

@@ -10,7 +10,7 @@ from importlib.metadata import version
 
 from triaxcal.errors import InvalidData, Refused
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
-from triaxcald.cli import devices, fitting, line, measuring, planning, recordings
+from triaxcald.cli import devices, fitting, framing, line, measuring, planning, recordings
 from triaxcald.cli.arguments import OneLineParser
 from triaxcald.cli.console import say
 from triaxcald.cli.interrupt import Interrupted
@@ -24,7 +24,7 @@ def parser() -> OneLineParser:
     top = OneLineParser(prog="triaxcal", description="Calibrates three-axis accelerometers.")
     top.add_argument("--version", action="version", version=f"triaxcal {version('triaxcal')}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for room in (line, measuring, fitting, planning, devices, recordings):
+    for room in (line, measuring, fitting, framing, planning, devices, recordings):
         room.register(commands)
     return top
 

@@ -3,121 +3,288 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 
+from triaxcal.addition import Addition
 from triaxcal.arrays import Floats
-from triaxcal.effects import CATALOGUE
-from triaxcal.errors import InvalidData, Refused
-from triaxcal.fit import fit
-from triaxcal.plan import FULL, PAPER, dilution, directions, most_wanted
-from triaxcal.visibility import unseen_effects
-from triaxcald import documents
+from triaxcal.design import Asked, ask, needs_time
+from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
+from triaxcal.errors import InvalidData
+from triaxcal.optimal import OptimalPlan, optimal
+from triaxcal.plan import FULL, LEAST, PAPER, Direction, closed, dilution, directions
+from triaxcal.visibility import Sight, sight, unseen_effects
 from triaxcald.cli.arguments import add_recording, count
-from triaxcald.cli.console import emit, table
+from triaxcald.cli.console import emit, say, table
+from triaxcald.cli.lacking import Lacking, lacking
 from triaxcald.cli.showing import chosen
-from triaxcald.documents import number
+from triaxcald.documents import Document, number, numbers, uncertainty
 from triaxcald.errors import InputError
 from triaxcald.inputs import measure
 
-POSES_MOST = 1000
-ENOUGH = 1.1
-"""A set is good whose worst parameter is no more uncertain than this many poses' standard errors; the 14 have 1.06."""
+POSES_MOST, POSES_MOST_FOR = 1000, 200
 
 
 def register(commands: Any) -> None:
     p = commands.add_parser("plan", help="a pose plan, and what it can and cannot see")
-    p.add_argument("--poses", type=count, metavar="14|26|N", help=f"default {FULL}")
+    p.add_argument(
+        "--poses", type=count, metavar="14|26|N", help=f"distinct directions, the first repeated at the end; {FULL}"
+    )
     p.add_argument("--for", dest="effects", nargs="+", metavar="EFFECT", default=[], help="effects it has to show")
     add_recording(p, optional=True)
     p.set_defaults(run=plan_command)
 
 
 def plan_command(a: argparse.Namespace) -> int:
-    known = [e.name for e in CATALOGUE]
-    if a.effects and a.recording is None and a.effects[-1] not in known and _looks_like_recording(a.effects[-1]):
+    if a.effects and a.recording is None and not _known(a.effects[-1]) and _looks_like_recording(a.effects[-1]):
         a.recording = a.effects.pop()  # --for takes all that follows, the recording too
     for name in a.effects:
-        if name not in known:
-            raise InputError(f"--for {name}: no effect of that name; known: {', '.join(known)}")
+        if not _known(name):
+            raise InputError(f"--for {name}: no effect of that name; known: {', '.join(e.name for e in CATALOGUE)}")
+    effects = [effect_named(name) for name in dict.fromkeys(a.effects)]
     if a.poses and a.poses > POSES_MOST:
         raise InputError(f"--poses {a.poses}: at most {POSES_MOST}")
+    if a.poses and effects and a.poses > POSES_MOST_FOR:
+        raise InputError(f"--poses {a.poses}: at most {POSES_MOST_FOR} with --for")
     if a.recording:
-        return _plan_for_recording(a)
+        return _plan_for_recording(a, effects)
     try:
-        plan = directions(a.poses or _enough_for(a.effects))
+        return _plan_for(a, effects) if effects else _plain_plan(a)
     except InvalidData as e:
         raise InputError(f"--poses: {e}") from e
-    ups = np.array([v for _, v in plan])
-    blind = unseen_effects(ups)
-    document = {
-        "format": "triaxcal.plan/1",
-        "poses": [{"label": label, "up": documents.numbers(v)} for label, v in plan],
-        "dilution": number(dilution(ups)),
-        "blind_to": blind,
-    }
-    if a.json:
-        emit(document)
-    else:
-        _show_poses(f"{len(plan)} poses", plan)
-        print(f"worst parameter: {document['dilution']:.2f} standard errors of one pose")
-        print(f"cannot show: {', '.join(blind) or 'nothing of the catalogue'}")
-    missed = [e for e in a.effects if e in blind]
-    if missed:
-        raise Refused(f"a plan of {len(plan)} poses cannot show {', '.join(missed)}; take {FULL}")
-    return 0
 
 
-def _enough_for(effects: list[str]) -> int:
-    if not effects:
-        return FULL
-    return next((n for n in (PAPER, FULL) if not set(effects) & set(unseen_effects(_ups(n)))), FULL)
-
-
-def _ups(n: int) -> Floats:
-    return np.array([v for _, v in directions(n)])
+def _known(name: str) -> bool:
+    try:
+        effect_named(name)
+    except KeyError:
+        return False
+    return True
 
 
 def _looks_like_recording(word: str) -> bool:
     return word == "-" or word.endswith((".mcap", ".csv", ".csv.gz"))
 
 
-def _plan_for_recording(a: argparse.Namespace) -> int:
-    measured = measure(a.recording)
-    choice = chosen(a, measured)
-    blind: list[str] | None = None
-    dilution_now: float | None = None
-    try:
-        have = np.array([p.direction for p in fit(measured.poses, signs=choice.signs).poses])
-        dilution_now, blind = dilution(have), unseen_effects(have)
-        wanted = most_wanted(have, enough=ENOUGH)
-    except Refused as e:
-        by_label = dict(directions(FULL))
-        wanted = [(label, by_label[label]) for label in e.wanted]
-    missed = [e for e in a.effects if blind is None or e in blind]
-    if missed:
-        have_labels = {label for label, _ in wanted}
-        wanted += [(label, v) for label, v in directions(FULL)[PAPER:] if label not in have_labels]
-    document = {
-        "format": "triaxcal.plan/1",
-        "have": len(measured.poses),
-        "dilution": number(dilution_now),
-        "blind_to": blind,
-        "poses": [{"label": label, "up": documents.numbers(v)} for label, v in wanted],
-    }
+# Without a recording
+
+
+def _plain_plan(a: argparse.Namespace) -> int:
+    plan = closed(directions(a.poses or FULL))
+    document = _document(plan, _sights(plan, CATALOGUE))
     if a.json:
         emit(document)
-        return 0
-    if wanted:
-        _show_poses(f"poses worth adding to the {len(measured.poses)} of {measured.name}", wanted)
     else:
-        print(f"the {len(measured.poses)} poses of {measured.name} are well spread; none is wanted")
-    if blind is not None:
-        print(f"the {len(measured.poses)} there are cannot show: {', '.join(blind) or 'nothing of the catalogue'}")
+        _show(plan, document)
     return 0
 
 
-def _show_poses(title: str, plan: list[tuple[str, Floats]]) -> None:
+def _plan_for(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
+    found = optimal(a.poses or _enough_for(effects), effects)
+    plan = list(found.plan)
+    others = [e for e in CATALOGUE if e.name not in [asked.name for asked in effects]]
+    document = _document(plan, _sights(plan, [*effects, *others], found.levels))
+    for i, pose in enumerate(document["poses"]):
+        if found.levels:
+            pose["levels"] = {name: number(float(v[i])) for name, v in found.levels.items()}
+    document |= {
+        "for": [e.name for e in effects],
+        "together": _together(found.asked),
+        "efficiency": uncertainty(found.efficiency),
+        "promised": _errors(found.errors),
+        "moves": _moves(found),
+    }
+    if a.json:
+        emit(document)
+    else:
+        _show(plan, document)
+        print(f"{found.efficiency:.0%} of what any plan of as many poses could tell of {', '.join(document['for'])}")
+        _show_errors(
+            found.errors, 1.0, "in poses' standard errors" + (", by half the range" if document["moves"] else "")
+        )
+        for name, text in document["moves"].items():
+            print(f"{name}: {text}")
+    for line in _never_seen(document):
+        say(f"warning: {line}")
+    return 0
+
+
+def _enough_for(effects: Sequence[Effect]) -> int:
+    """The smaller of the plain plans that shows the effects; more where they have more coefficients than it poses."""
+    names = {e.name for e in effects}
+    plain = (n for n in (PAPER, FULL) if not names & set(unseen_effects(_ups(closed(directions(n))), effects)))
+    return max(next(plain, FULL), LEAST + ask(effects).rank)
+
+
+def _ups(plan: Sequence[Direction]) -> Floats:
+    return np.array([v for _, v in plan])
+
+
+def _sights(
+    plan: Sequence[Direction], effects: Sequence[Effect], held: Mapping[str, Floats] | None = None
+) -> dict[str, Sight]:
+    return {e.name: sight(_ups(plan), e, held) for e in effects}
+
+
+def _document(plan: Sequence[Direction], sights: Mapping[str, Sight]) -> Document:
+    poses: list[Document] = [{"label": label, "up": numbers(v)} for label, v in plan]
+    poses[-1]["repeat"] = True
+    return {
+        "format": "triaxcal.plan/1",
+        "poses": poses,
+        "directions": len(plan) - 1,
+        "dilution": number(dilution(_ups(plan))),
+        **_seen(sights),
+    }
+
+
+def _seen(sights: Mapping[str, Sight]) -> Document:
+    return {
+        "blind_to": [name for name, s in sights.items() if s.visible < s.of],
+        "sees": {
+            name: {
+                "visible": s.visible,
+                "of": s.of,
+                "hidden": [{"coefficients": {k: uncertainty(w) for k, w in h.items()}} for h in s.hidden],
+            }
+            for name, s in sights.items()
+        },
+    }
+
+
+def _together(asked: Asked) -> Document:
+    return {"visible": asked.rank, "of": len(asked.seen)}
+
+
+def _errors(errors: Mapping[str, Mapping[str, float | None]], scale: float | None = 1.0) -> Document:
+    return {
+        name: {c: None if e is None or scale is None else uncertainty(e * scale) for c, e in of.items()}
+        for name, of in errors.items()
+    }
+
+
+def _moves(found: OptimalPlan) -> dict[str, str]:
+    out = {}
+    for name, levels in found.levels.items():
+        steps, at = [], 1
+        for level, group in groupby(levels):
+            size = len(list(group))
+            steps.append(f"{_level(level)} for poses {at} to {at + size - 1}" if size > 1 else f"{_level(level)} {at}")
+            at += size
+        out[name] = f"over as wide a range as can be had: {', '.join(steps)}"
+    if needs_time(found.asked.effects):
+        out[TIME] = "the poses at even intervals and in this order, the first again at the end"
+    return out
+
+
+def _level(level: float) -> str:
+    named = {-1.0: "lowest", 0.0: "middle", 1.0: "highest"}
+    return named.get(round(level, 6), f"{(1 + level) / 2:.0%} of the range")
+
+
+def _never_seen(document: Document) -> list[str]:
+    out = []
+    for name in document["for"]:
+        s = document["sees"][name]
+        if s["visible"] < s["of"]:
+            out.append(f"{name}: |a| shows {s['visible']} of its {s['of']} coefficients or combinations of them")
+    whole = sum(document["sees"][name]["visible"] for name in document["for"])
+    if document["together"]["visible"] < whole:
+        out.append(
+            f"the effects asked for share {whole - document['together']['visible']} combinations of coefficients"
+        )
+    return out
+
+
+# With one
+
+
+def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
+    measured = measure(a.recording)
+    choice = chosen(a, measured)
+    found = lacking(measured.poses, effects, signs=choice.signs, reference=choice.reference)
+    sights = None if found.had is None else {e.name: sight(found.had.up, e) for e in CATALOGUE}
+    document: Document = {
+        "format": "triaxcal.plan/1",
+        "have": len(measured.poses),
+        "dilution": number(found.dilution),
+        **(_seen(sights) if sights else {"blind_to": None, "sees": None}),
+        "poses": [_added(found, pose) for pose in found.wanted],
+    }
+    if effects:
+        document |= {
+            "for": [e.name for e in effects],
+            "promised": _errors(found.now, found.noise),
+            "moves": found.moves,
+        }
+    if a.json:
+        emit(document)
+        return 0
+    title = f"the {len(measured.poses)} of {measured.name}"
+    if found.wanted:
+        _show_wanted(f"poses worth adding to {title}", found)
+    else:
+        print(f"{title.replace('of', 'poses of', 1)} are well spread; none is wanted")
+    for name, text in found.moves.items():
+        print(f"{name}: {text}")
+    if sights is not None:
+        print(f"the {len(measured.poses)} there are cannot show: {_list(document['blind_to'])}")
+    return 0
+
+
+def _added(found: Lacking, pose: Addition) -> Document:
+    noise = found.noise
+    out: Document = {
+        "label": pose.label,
+        "up": numbers(pose.up),
+        "dilution": number(pose.dilution),
+        "standard_error_g": None if noise is None else uncertainty(pose.dilution * noise),
+    }
+    if pose.errors:
+        out["promised"] = _errors(pose.errors, noise)
+    if pose.levels:
+        out["levels"] = {name: number(v) for name, v in pose.levels.items()}
+    return out
+
+
+def _show_wanted(title: str, found: Lacking) -> None:
+    channels = list(found.wanted[0].levels)
+    rows = [
+        [
+            i + 1,
+            p.label,
+            *(f"{c:+.3f}" for c in p.up),
+            *(_level(p.levels[c]) for c in channels),
+            f"{p.dilution:.3g}" if np.isfinite(p.dilution) else "—",
+        ]
+        for i, p in enumerate(found.wanted)
+    ]
+    table(title, ["pose", "up", "x", "y", "z", *channels, "worst parameter then"], rows)
+    if found.wanted[-1].errors:
+        _show_errors(found.wanted[-1].errors, found.noise, "with them")
+
+
+def _show_errors(errors: Mapping[str, Mapping[str, float | None]], scale: float | None, note: str) -> None:
+    for name, of in errors.items():
+        values = ", ".join(f"{c} {'—' if e is None or scale is None else f'{e * scale:.3g}'}" for c, e in of.items())
+        print(f"standard errors of {name} ({note}): {values}")
+
+
+def _show(plan: Sequence[Direction], document: Document) -> None:
+    title = f"{document['directions']} directions, the first repeated at the end"
     rows = [[i + 1, label, *(f"{c:+.3f}" for c in v)] for i, (label, v) in enumerate(plan)]
     table(title, ["pose", "up", "x", "y", "z"], rows)
+    print(f"worst parameter: {document['dilution']:.2f} standard errors of one pose")
+    print(f"cannot show: {_list(document['blind_to'])}")
+    for name in document["blind_to"]:
+        s = document["sees"][name]
+        if s["visible"]:
+            hidden = "; ".join(" ".join(f"{w:+.2f} {k}" for k, w in h["coefficients"].items()) for h in s["hidden"])
+            print(f"{name}: {s['visible']} of {s['of']} coefficients show; not {hidden}")
+
+
+def _list(names: Sequence[str]) -> str:
+    return ", ".join(names) or "nothing of the catalogue"

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from triaxcal.calibration import Calibration
+from triaxcal.gravity import local_gravity_g
 from triaxcal.loop import Loop
+from triaxcal.uncertainty import Budget, Stated, budget
 from triaxcald import documents
 from triaxcald.cli.console import micro, say, table
+from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
 
 
@@ -20,6 +23,7 @@ class Choice:
     reference: float
     output_unit: str
     reference_unit: str
+    stated: Stated
 
     @property
     def micro_unit(self) -> str:
@@ -27,25 +31,43 @@ class Choice:
 
 
 def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
-    reference = a.reference or measured.reference or 1.0
+    """Raises InputError where what was said of the reference does not go together."""
+    latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
+    if (latitude is None) != (height is None):
+        raise InputError("--latitude, --height: give both, or neither")
+    if latitude is not None and a.reference:
+        raise InputError("--reference: --latitude and --height say it already; give one or the other")
+    if latitude is not None and a.reference_unit not in (None, "g"):
+        raise InputError(f"--reference-unit {a.reference_unit}: --latitude and --height give the reference in g")
+    local = None if latitude is None or height is None else local_gravity_g(latitude, height)[0]
+    reference = a.reference or local or measured.reference or 1.0
     return Choice(
         a.sign or measured.signs or (1, 1, 1),
         reference,
         a.output_unit or (measured.profile.output.unit if measured.profile else ""),
         a.reference_unit or documents.reference_unit_of(reference),
+        _stated(a, measured),
     )
 
 
+def _stated(a: argparse.Namespace, measured: Measured) -> Stated:
+    """What the recording's station says holds where the user says nothing, but for another reference."""
+    latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
+    own = measured.stated or Stated()
+    thermometer = getattr(a, "thermometer_uncertainty", None)
+    said = Stated.at(
+        latitude,
+        height,
+        getattr(a, "reference_uncertainty", None),
+        thermometer_k=own.thermometer_k if thermometer is None else thermometer,
+    )
+    if said.reference is None and a.reference is None:
+        return replace(said, reference=own.reference, reference_source=own.reference_source)
+    return said
+
+
 def show_calibration(c: Calibration, choice: Choice) -> None:
-    rows = []
-    unit = choice.reference_unit
-    units = {"scale_factor": f"{choice.output_unit or 'output'}/{unit}", "misalignment": "rad", "bias": unit}
-    of_effects = {
-        f"{e.name}.{k.name}": documents.in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients
-    }
-    for name, value, error in zip(c.parameters, c.values, c.standard_errors, strict=True):
-        rows.append([name, f"{value:.9g}", f"{error:.2g}", of_effects.get(name, units.get(name.split(".")[0], ""))])
-    table("coefficients", ["", "value", "standard error", "unit"], rows)
+    show_coefficients(c, choice)
     r, micro_unit = c.residual, choice.micro_unit
     p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
     print(
@@ -53,6 +75,37 @@ def show_calibration(c: Calibration, choice: Choice) -> None:
         f"{micro(r.cross_validated_rms_g)} {micro_unit}, noise floor {micro(r.noise_floor_g)} {micro_unit}, "
         f"lack of fit p {p}"
     )
+    show_budget(budget(c, choice.stated), choice)
+
+
+def show_coefficients(c: Calibration, choice: Choice) -> None:
+    rows = []
+    unit = choice.reference_unit
+    of_scale = f"{choice.output_unit or 'output'}/{documents.grouped(unit)}"
+    units = {"scale_factor": of_scale, "misalignment": "rad", "bias": unit}
+    of_effects = {
+        f"{e.name}.{k.name}": documents.in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients
+    }
+    for name, value, error in zip(c.parameters, c.values, c.standard_errors, strict=True):
+        rows.append([name, f"{value:.9g}", f"{error:.2g}", of_effects.get(name, units.get(name.split(".")[0], ""))])
+    table("coefficients", ["", "value", "standard error", "unit"], rows)
+
+
+def show_budget(b: Budget, choice: Choice) -> None:
+    unit = choice.micro_unit
+    rows = [[line.source, line.evaluation, micro(line.magnitude), f"{b.share(line):.0%}"] for line in b.components]
+    whole = b.magnitude
+    rows.append(["combined", "", micro(float(whole.standard)), ""])
+    rows.append(
+        [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", micro(float(whole.expanded)), ""]
+    )
+    table(f"uncertainty of the magnitude, over all orientations, {unit}", ["source", "type", "standard", "share"], rows)
+    print(
+        f"dominant: {b.dominant.source}; to halve it: {b.dominant.halved_by} "
+        f"(combined then {micro(b.magnitude_if_halved)} {unit})"
+    )
+    for line in b.not_evaluated:
+        print(f"not evaluated: {line}")
 
 
 def show_loop(loop: Loop, choice: Choice) -> None:

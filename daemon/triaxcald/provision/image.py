@@ -25,6 +25,8 @@ class Word:
     value: float
     held: float
     unit: str
+    step: float
+    """How far apart the values are that the register can hold there."""
 
     @property
     def cost(self) -> float:
@@ -87,7 +89,7 @@ def _refuse_gaps(roles: set[str], coefficients: Mapping[str, float]) -> None:
 def _word(profile: Profile, name: str, value: float) -> Word:
     register = profile.registers[name]
     raw = profile.encode(name, value)
-    return Word(name, register.role, raw, value, profile.decode(name, raw), register.unit)
+    return Word(name, register.role, raw, value, profile.decode(name, raw), register.unit, codec.step(register, value))
 
 
 def checksum_of(profile: Profile, raw: Mapping[str, bytes]) -> int:

@@ -111,6 +111,7 @@ class Outcome:
     matrix: tuple[Vector, ...] | None
     centre: Vector | None
     output_unit: str
+    reference_unit: str
     poses: tuple[Pose, ...]
     condition: float | None
     blind_to: tuple[str, ...]
@@ -150,6 +151,7 @@ def read_document(document: Mapping[str, object]) -> Outcome:
         matrix=matrix,
         centre=centre,
         output_unit=_output_unit(units),
+        reference_unit=str(mapping(units).get("reference") or "g"),
         poses=poses,
         condition=number(calibration.get("condition")),
         blind_to=texts(calibration.get("blind_to")),

@@ -6,9 +6,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
+from triaxcald.documents import micro_unit
 from triaxcald.report import figures
+from triaxcald.report.budget import read_uncertainty
 from triaxcald.report.charts import bars_picture, stream_picture, time_picture
 from triaxcald.report.document import mapping, read_document
 from triaxcald.report.sphere import sphere_picture
@@ -38,16 +40,22 @@ def render_report(
     outcome, papers = read_document(document), certificate or {}
     limits = {name: figures.number(value) for name, value in mapping(papers.get("limits")).items()}
     floor_g = outcome.final.noise_floor_g
-    return _ENVIRONMENT.get_template("report.html").render(
+    calibration = mapping(document.get("calibration")) or document
+    page = _ENVIRONMENT.get_template("report.html").render(
         title=title,
         outcome=outcome,
         verdict=judge(outcome, limits),
+        uncertainty=read_uncertainty(calibration),
         bars=bars_picture(outcome.stages, outcome.held_out),
         sphere=sphere_picture(outcome.poses, outcome.stages, floor_g),
         over_time=time_picture(outcome.poses, outcome.stages, floor_g),
         streams=stream_picture(stream) if stream is not None else None,
         provenance=list(_entries(papers)),
     )
+    # Pictures and sentences are written for g, which nearly all references are in.
+    if outcome.reference_unit == "g":
+        return page
+    return page.replace("µg", str(escape(figures.clean(micro_unit(outcome.reference_unit)))))
 
 
 def _entries(papers: Mapping[str, object], above: str = "") -> Iterator[tuple[str, str]]:

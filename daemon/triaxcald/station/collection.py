@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 from triaxcal.errors import Refused
+from triaxcal.plan import directions
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device, RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
@@ -20,6 +21,8 @@ from triaxcald.station.guidance import Guide, guide
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the host's, whichever is longer."""
+LOOK_SHARE = 5.0
+"""A look is followed by a pause of so many times what it took, or samples would be lost meanwhile."""
 
 
 class Progress(Protocol):
@@ -94,35 +97,44 @@ class Collection:
         tell: Callable[[Guide], None],
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Records until ``stream`` shows ``wanted`` distinct poses; ``tell`` is told how it goes.
+        """Records until ``stream`` shows ``wanted`` distinct poses, and of the readings the first of them once more, if
+        the plan says so; ``tell`` is told how it goes.
 
-        Raises Refused when no new pose has come for the plan's patience, and what the device's stream raises.
+        Raises Refused when no new pose has come for the plan's patience, and what the device's stream raises. Where
+        only the repeat does not come, it goes on without.
         """
         pipeline = self.pipelines[stream]
-        looked_s, looked_host_s, news_s, found = 0.0, -LOOK_HOST_S, 0.0, 0
+        looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
+        if stream == READINGS:
+            directions(wanted)  # put in order once, before there are samples to lose
         watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:
             async for _ in records:
                 watch.look()
                 now_s, host_s = pipeline.seconds, clock_s()
-                if now_s - looked_s < LOOK_SAMPLES_S or host_s - looked_host_s < LOOK_HOST_S:
+                if now_s - looked_s < LOOK_SAMPLES_S or host_s < next_host_s:
                     continue
-                looked_s, looked_host_s = now_s, host_s
+                looked_s = now_s
                 state = guide(
-                    pipeline.poses(),
+                    pipeline.held(),
                     wanted=wanted,
                     hold_s=plan.hold_s,
                     apart_deg=plan.apart_deg,
                     now_s=now_s,
                     nominal_scale_factor=nominal_scale_factor,
                     plan=stream == READINGS,
+                    repeat=plan.repeat and stream == READINGS,
                 )
+                took_s = clock_s() - host_s
+                next_host_s = host_s + took_s + max(LOOK_HOST_S, LOOK_SHARE * took_s)
                 tell(state)
                 if state.complete:
                     return
                 if state.found > found:
                     found, news_s = state.found, now_s
                 if now_s - news_s > plan.patience_s:
+                    if state.repeat_due:
+                        return
                     raise Refused(
                         f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there",
                         wanted=state.missing,

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, Field, model_validator
 
 from triaxcal.effects import CATALOGUE
+from triaxcal.gravity import local_gravity_g
+from triaxcal.uncertainty import Stated
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
@@ -27,6 +29,7 @@ class Plan(Strict):
 
     poses: Annotated[int, Field(ge=9, le=1000)] = 26
     hold_s: Annotated[float, Field(ge=0.6, le=3600)] = 3.0
+    repeat: Annotated[bool, Field(description="ask for the first pose once more at the end")] = True
     check_poses: Annotated[int, Field(ge=1, le=100)] = 6
     apart_deg: Annotated[float, Field(ge=1, le=60, description="poses nearer than this count once")] = 10.0
     patience_s: Annotated[
@@ -66,20 +69,56 @@ class StationFile(Strict):
     folder: Annotated[
         str, Field(pattern=r"^[^\x00]+$", description="where recordings and results go, beside the station file")
     ] = "."
-    reference: Annotated[
-        float, Field(ge=0.9, le=1.1, description="local gravity in units of g, which registers and limits are in too")
-    ] = 1.0
+    given_reference: Annotated[
+        float | None,
+        Field(
+            alias="reference",
+            ge=0.9,
+            le=1.1,
+            description="local gravity in units of g, which registers and limits are in too",
+        ),
+    ] = None
+    latitude_deg: Annotated[
+        float | None, Field(ge=-90, le=90, description="with height_m, instead of reference: gravity by formula")
+    ] = None
+    height_m: Annotated[float | None, Field(ge=-500, le=9000, description="above sea level")] = None
+    reference_uncertainty: Annotated[
+        float | None, Field(ge=0, le=0.1, description="standard uncertainty of the reference, in units of g")
+    ] = None
+    thermometer_uncertainty_k: Annotated[
+        float | None, Field(ge=0, le=100, description="standard uncertainty of the units' thermometers")
+    ] = None
     plan: Plan = Plan()
     limits: Limits = Limits()
     provisioning: Provisioning = Provisioning()
     units: Annotated[tuple[Unit, ...], Field(min_length=1)]
 
+    @property
+    def reference(self) -> float:
+        """Local gravity in g: as given, or by the place's normal gravity, or 1 where the unit is local gravity."""
+        if self.latitude_deg is not None and self.height_m is not None:
+            return local_gravity_g(self.latitude_deg, self.height_m)[0]
+        return 1.0 if self.given_reference is None else self.given_reference
+
+    @property
+    def stated(self) -> Stated:
+        """What the station says of uncertainties."""
+        return Stated.at(
+            self.latitude_deg, self.height_m, self.reference_uncertainty, thermometer_k=self.thermometer_uncertainty_k
+        )
+
+    @model_validator(mode="after")
+    def _one_reference(self) -> Self:
+        if (self.latitude_deg is None) != (self.height_m is None):
+            raise ValueError("latitude_deg and height_m: give both, or neither")
+        if self.latitude_deg is not None and self.given_reference is not None:
+            raise ValueError("reference: latitude_deg and height_m say it already; give one or the other")
+        return self
+
     @model_validator(mode="after")
     def _poses_fit_apart(self) -> Self:
-        # Caps of half the distance around the poses cannot overlap; about 0.8 of a sphere can be covered by them.
-        room = 0.8 * 2 / (1 - math.cos(math.radians(self.plan.apart_deg / 2)))
         for name in ("poses", "check_poses"):
-            if getattr(self.plan, name) > room:
+            if self.plan.apart_deg > _farthest_apart_deg(getattr(self.plan, name)):
                 raise ValueError(f"plan.{name}: there are not so many directions {self.plan.apart_deg:g} degrees apart")
         return self
 
@@ -90,6 +129,14 @@ class StationFile(Strict):
             if names.count(name) > 1:
                 raise ValueError(f"units: the name '{name}' is given twice")
         return self
+
+
+def _farthest_apart_deg(count: int) -> float:
+    """No ``count`` points of a sphere are all farther apart than this (Fejes Tóth 1943; reached by 3, 4, 6 and 12)."""
+    if count < 3:
+        return 180.0
+    chord = math.sqrt(4 - 1 / math.sin(math.pi * count / (6 * (count - 2))) ** 2)
+    return math.degrees(2 * math.asin(chord / 2))
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.plan import directions
-from triaxcal.poses import Pose
+from triaxcal.plan import Direction, directions
+from triaxcal.poses import Held
 
 COVERED_DEG = 25.0
+"""A pose covers the direction of the plan that it is nearest to, up to this far off."""
+SAME_DEG = 10.0
+"""A repeated pose need not be nearer to the first than this, however near others may be to each other."""
 
 
 @dataclass(frozen=True)
 class Guide:
     """``found`` of ``wanted`` distinct poses; ``held_s`` how long the unit has been still now (0 when it moves).
 
-    ``missing`` are the labels of the plan's poses that none has come near to.
+    ``missing`` are the labels of the plan's poses that none has come near to, in the plan's order. ``repeat_due`` says
+    that the first pose is wanted once more, after all others.
     """
 
     found: int
@@ -26,14 +30,15 @@ class Guide:
     held_s: float
     hint: str
     missing: tuple[str, ...] = ()
+    repeat_due: bool = False
 
     @property
     def complete(self) -> bool:
-        return self.found >= self.wanted
+        return self.found >= self.wanted and not self.repeat_due
 
 
 def guide(
-    poses: Sequence[Pose],
+    poses: Sequence[Held],
     *,
     wanted: int,
     hold_s: float,
@@ -41,36 +46,64 @@ def guide(
     now_s: float,
     nominal_scale_factor: Sequence[float] | None,
     plan: bool = True,
+    repeat: bool = False,
 ) -> Guide:
-    """Judge the poses so far. ``now_s`` is the time of the latest sample, counted as the poses' times are."""
-    held = [p for p in poses if p.end_s - p.start_s >= hold_s]
+    """Judge the poses so far, which may come in any order; ``repeat`` asks for the first of them again at the end.
+
+    ``now_s`` is the time of the latest sample, counted as the poses' times are.
+    """
     last = poses[-1] if poses else None
     # A pose that is still growing ends a guard window before the latest sample.
     still_s = last.end_s - last.start_s if last is not None and now_s - last.end_s < 0.5 else 0.0
     up = _directions(poses, nominal_scale_factor)
-    rows = [i for i, p in enumerate(poses) if p in held]
+    held = [v for v, p in zip(up, poses, strict=True) if p.end_s - p.start_s >= hold_s]
     distinct: list[Floats] = []
-    for v in up[rows]:
-        if all(float(v @ d) < np.cos(np.radians(apart_deg)) for d in distinct):
+    since: list[Floats] = []
+    for v in held:
+        if len(distinct) < wanted and not _near(v, distinct, apart_deg):
             distinct.append(v)
-    found = min(len(distinct), wanted)
-    if found >= wanted:
-        return Guide(found, wanted, still_s, "done")
-    missing = tuple(
-        label
-        for label, v in (directions(wanted) if plan else ())
-        if all(float(v @ d) < np.cos(np.radians(COVERED_DEG)) for d in distinct)
-    )
-    if 0 < still_s < hold_s:
+            since = []
+        else:
+            since.append(v)
+    found = len(distinct)
+    targets = directions(wanted) if plan else []
+    missing = _uncovered(targets, held) if found < wanted else ()
+    due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
+    if found >= wanted and not due:
+        hint = "done"
+    elif 0 < still_s < hold_s:
         hint = f"hold still, {still_s:.1f} of {hold_s:.1f} s"
+    elif due:
+        hint = f"next: {_nearest(targets, distinct[0])}once more, as at first"
     elif missing:
         hint = f"next: {missing[0]} up"
     else:
         hint = "turn the unit to a pose not taken yet"
-    return Guide(found, wanted, still_s, hint, missing)
+    return Guide(found, wanted, still_s, hint, missing, due)
 
 
-def _directions(poses: Sequence[Pose], nominal: Sequence[float] | None) -> Floats:
+def _near(v: Floats, others: Sequence[Floats], degrees: float) -> bool:
+    return any(float(v @ d) >= np.cos(np.radians(degrees)) for d in others)
+
+
+def _uncovered(targets: Sequence[Direction], held: Sequence[Floats]) -> tuple[str, ...]:
+    if not targets or not held:
+        return tuple(label for label, _ in targets)
+    cosines = np.array(held) @ np.array([v for _, v in targets]).T
+    nearest = np.argmax(cosines, axis=1)
+    close = cosines[np.arange(len(held)), nearest] >= np.cos(np.radians(COVERED_DEG))
+    covered = set(nearest[close].tolist())
+    return tuple(label for i, (label, _) in enumerate(targets) if i not in covered)
+
+
+def _nearest(targets: Sequence[Direction], v: Floats) -> str:
+    if not targets:
+        return ""
+    label, _ = max(targets, key=lambda target: float(target[1] @ v))
+    return f"{label} up "
+
+
+def _directions(poses: Sequence[Held], nominal: Sequence[float] | None) -> Floats:
     """Up in the unit's frame, roughly: by the nominal scale factor, else by the range of the outputs so far."""
     if not poses:
         return np.zeros((0, 3))

@@ -235,8 +235,9 @@ def test_plan_in_its_forms(triaxcal: Run, arguments: list[str], poses: int) -> N
     done = triaxcal("plan", *arguments, "--json")
     assert (done.code, done.err) == (0, "")
     assert done.json["format"] == "triaxcal.plan/1"
-    assert len(done.json["poses"]) == poses
-    assert len({p["label"] for p in done.json["poses"]}) == poses
+    assert done.json["directions"] == len({p["label"] for p in done.json["poses"]}) == poses
+    assert [i for i, p in enumerate(done.json["poses"]) if p.get("repeat")] == [poses]
+    assert done.json["poses"][-1]["up"] == done.json["poses"][0]["up"]
     np.testing.assert_allclose([np.linalg.norm(p["up"]) for p in done.json["poses"]], 1.0, rtol=1e-9)
     assert done.json["dilution"] > 0
     assert not set(arguments[1:]) & set(done.json["blind_to"])
@@ -359,3 +360,37 @@ def test_a_terminal_that_knows_ascii_alone_is_shown_everything(exported: Path) -
     assert b"output/\\xb5T" in done.stdout
     assert b"noise floor " in done.stdout
     assert b"Traceback" not in done.stderr
+
+
+def test_a_place_gives_the_reference_and_its_uncertainty(exported: Path, triaxcal: Run) -> None:
+    plain = triaxcal("fit", exported, SIGNS, "--json").json
+    placed = triaxcal("fit", exported, SIGNS, "--latitude", "50.45", "--height", "179", "--json").json
+    g = placed["reference"]
+    assert g == pytest.approx(1.00038, abs=2e-5)
+    np.testing.assert_allclose(np.array(placed["scale_factor"]) * g, plain["scale_factor"], rtol=1e-7)
+    lines = {x["source"]: x for x in placed["uncertainty"]["budget"]}
+    assert lines["reference"]["magnitude_g"] == pytest.approx(43e-6, rel=0.01)
+    assert plain["uncertainty"]["not_evaluated"][0].startswith("reference: taken as exact")
+    stated = triaxcal("diagnose", exported, SIGNS, "--reference-uncertainty", "1e-4", "--json").json
+    lines = {x["source"]: x for x in stated["calibration"]["uncertainty"]["budget"]}
+    assert lines["reference"]["magnitude_g"] == pytest.approx(1e-4, rel=0.01)
+    shown = triaxcal("diagnose", exported, SIGNS, "--latitude", "50.45", "--height", "179")
+    assert "dominant: reference; to halve it: know the reference to 2.2e-05" in shown.out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--latitude", "50"], "--latitude, --height: give both, or neither"),
+        (["--latitude", "50", "--height", "1", "--reference", "1"], "--reference: --latitude and --height say it"),
+        (["--latitude", "50", "--height", "1", "--reference-unit", "m/s2"], "--reference-unit m/s2: --latitude"),
+        (["--latitude", "x", "--height", "1"], "--latitude: expected degrees between -90 and 90, not 'x'"),
+        (["--latitude", "1", "--height", "1e6"], "--height: expected metres between -500 and 9000, not '1e6'"),
+        (["--reference-uncertainty", "-1"], "--reference-uncertainty: expected a number of at least 0, not '-1'"),
+        (["--thermometer-uncertainty", "nan"], "--thermometer-uncertainty: expected a number of at least 0"),
+    ],
+)
+def test_a_reference_that_cannot_be_is_refused_in_one_line(
+    exported: Path, triaxcal: Run, options: list[str], words: str
+) -> None:
+    triaxcal("fit", exported, *options).failed(2, words)

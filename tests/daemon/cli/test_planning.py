@@ -57,10 +57,124 @@ def test_poses_that_cannot_show_an_effect_are_told_which_others_do(fourteen: Pat
     plain = triaxcal("plan", fourteen, "--json").json
     assert plain["poses"] == []
     assert "third_order_nonlinearity" in plain["blind_to"]
-    wanted = triaxcal("plan", "--for", "third_order_nonlinearity", fourteen, "--json").json["poses"]
-    assert {p["label"] for p in wanted} == {label for label, _ in directions(26)[14:]}
+    assert plain["sees"]["third_order_nonlinearity"]["visible"] == 1
+    document = triaxcal("plan", "--for", "third_order_nonlinearity", fourteen, "--json").json
+    edges = [label for label, v in directions(26) if np.sum(np.abs(v) > 0.1) == 2]
+    assert {p["label"] for p in document["poses"]} <= set(edges)
+    assert document["promised"]["third_order_nonlinearity"] == {"x": None, "y": None, "z": None}
+    after = [p["promised"]["third_order_nonlinearity"]["x"] for p in document["poses"]]
+    assert 0 < after[-1] < 1e-4
     shown = triaxcal("plan", "--for", "second_order_nonlinearity", fourteen, "--json").json
     assert shown["poses"] == []
+    assert all(v is not None for v in shown["promised"]["second_order_nonlinearity"].values())
+
+
+def test_what_each_added_pose_would_do_is_said(half: Path, triaxcal: Run) -> None:
+    document = triaxcal("plan", half, "--json").json
+    dilutions = [document["dilution"], *(p["dilution"] for p in document["poses"])]
+    assert dilutions == sorted(dilutions, reverse=True)
+    assert dilutions[-1] <= 1.25 < dilutions[-2]
+    fitted = triaxcal("fit", half, "--json").json
+    noise = np.median([p["standard_error_g"] for p in fitted["poses"]])
+    # The noise of a typical pose, raised where the residuals are larger than it explains.
+    assert 0.99 < document["poses"][-1]["standard_error_g"] / dilutions[-1] / noise < 1.5
+
+
+def test_the_poses_wanted_of_a_recording_that_is_refused_mend_it(tmp_path: Path, triaxcal: Run) -> None:
+    faces = [v for label, v in directions(14) if len(label) == 2]
+    where = dict(directions(26))
+    for name, ups in {"none": faces[:1], "four": faces[:4], "faces": faces * 2}.items():
+        path = _csv(tmp_path / f"{name}.csv", ups)
+        assert triaxcal("fit", path, "--json").code == 3
+        document = triaxcal("plan", path, "--json").json
+        assert document["dilution"] is document["blind_to"] is document["sees"] is None
+        mended = _csv(tmp_path / f"{name}-mended.csv", [*ups, *(where[p["label"]] for p in document["poses"])])
+        after = triaxcal("plan", mended, "--json").json
+        assert after["dilution"] < 2.3
+        assert triaxcal("fit", mended, "--json").code == 0
+
+
+def test_a_channel_that_is_not_logged_is_asked_for(fourteen: Path, triaxcal: Run) -> None:
+    document = triaxcal("plan", fourteen, "--for", "temperature_bias", "--json").json
+    assert document["moves"] == {"temp_c": "is not in the recording: log it, and move it"}
+    assert document["poses"] == []
+
+
+# Plans for effects
+
+
+def _plan(triaxcal: Run, *arguments: str) -> Any:
+    done = triaxcal("plan", *arguments, "--json")
+    assert (done.code, done.err) == (0, "")
+    return done.json
+
+
+@pytest.mark.parametrize(
+    ("poses", "effects"),
+    [
+        (20, ["third_order_nonlinearity"]),
+        (14, ["third_order_nonlinearity"]),
+        (17, ["second_order_nonlinearity", "third_order_nonlinearity"]),
+        (16, ["temperature_scale_factor"]),
+        (15, ["bias_drift"]),
+    ],
+)
+def test_a_plan_for_effects_has_as_many_directions_as_asked_for_and_shows_them(
+    triaxcal: Run, poses: int, effects: list[str]
+) -> None:
+    document = _plan(triaxcal, "--poses", str(poses), "--for", *effects)
+    assert document["directions"] == poses
+    assert len(document["poses"]) == poses + 1
+    assert len({p["label"] for p in document["poses"]}) == len({tuple(p["up"]) for p in document["poses"]}) == poses
+    assert document["for"] == effects
+    assert not set(effects) & set(document["blind_to"])
+    assert 0.7 < document["efficiency"] <= 1
+    for effect in effects:
+        assert document["sees"][effect]["visible"] == document["sees"][effect]["of"]
+        assert all(0 < v < 4 for v in document["promised"][effect].values())
+
+
+def test_a_plan_for_temperature_says_how_it_has_to_move(triaxcal: Run) -> None:
+    document = _plan(triaxcal, "--poses", "16", "--for", "temperature_bias")
+    levels = [p["levels"]["temp_c"] for p in document["poses"]]
+    assert set(levels) == {-1.0, 1.0}
+    assert levels[0] == levels[-1]
+    assert (
+        "lowest for poses 1 to 5, highest for poses 6 to 13, lowest for poses 14 to 17" in document["moves"]["temp_c"]
+    )
+    assert "t_s" in _plan(triaxcal, "--poses", "15", "--for", "bias_drift")["moves"]
+
+
+def test_effects_that_share_a_part_are_warned_of(triaxcal: Run) -> None:
+    done = triaxcal("plan", "--poses", "16", "--for", "temperature_bias", "temperature_bias_quadratic", "--json")
+    assert done.code == 0
+    assert "the effects asked for share 3 combinations of coefficients" in done.err
+    assert done.json["together"] == {"visible": 6, "of": 9}
+    assert done.json["promised"]["temperature_bias"]["x"] is None
+
+
+def test_the_same_effect_twice_is_asked_for_once(triaxcal: Run) -> None:
+    twice = _plan(triaxcal, "--poses", "14", "--for", "second_order_nonlinearity", "second_order_nonlinearity")
+    assert twice["for"] == ["second_order_nonlinearity"]
+
+
+def test_too_few_poses_for_the_effects_are_refused_with_the_number_that_does(triaxcal: Run) -> None:
+    words = ("a plan of 11 poses cannot show third_order_nonlinearity; at least 12",)
+    triaxcal("plan", "--poses", "11", "--for", "third_order_nonlinearity").failed(3, *words)
+    assert _plan(triaxcal, "--poses", "12", "--for", "third_order_nonlinearity")["directions"] == 12
+
+
+def test_people_read_the_same(triaxcal: Run, fourteen: Path) -> None:
+    out = triaxcal("plan", "--poses", "14").out
+    assert "14 directions, the first repeated at the end" in out
+    assert "third_order_nonlinearity: 1 of 3 coefficients show" in out
+    out = triaxcal("plan", "--poses", "16", "--for", "temperature_bias").out
+    assert "of what any plan of as many poses could tell of temperature_bias" in out
+    assert "temp_c: over as wide a range as can be had: lowest for poses 1 to" in out
+    assert "worst parameter then" in triaxcal("plan", fourteen, "--for", "third_order_nonlinearity").out
+
+
+# What cannot be
 
 
 @pytest.mark.parametrize("name", ["missing.csv", "missing.mcap", "missing.csv.gz"])
@@ -102,3 +216,8 @@ def test_the_signs_and_the_reference_are_those_of_the_recording(
 @pytest.mark.parametrize("poses", ["1001", "9999999", "99999999999999999999999"])
 def test_more_poses_than_anybody_would_take_are_refused(triaxcal: Run, poses: str) -> None:
     triaxcal("plan", "--poses", poses, "--json").failed(2, f"--poses {poses}: at most 1000")
+
+
+def test_a_plan_for_effects_has_two_hundred_poses_at_most(triaxcal: Run) -> None:
+    arguments = ("--poses", "201", "--for", "bias_drift")
+    triaxcal("plan", *arguments).failed(2, "--poses 201: at most 200 with --for")

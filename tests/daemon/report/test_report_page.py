@@ -299,3 +299,51 @@ def test_four_hundred_poses_stay_below_a_megabyte_and_a_half() -> None:
     page = render(document, stream=overview)
     assert len(page.html.encode()) < 1_500_000
     assert page.row("400")[10] == "yes"
+
+
+@pytest.fixture(scope="module")
+def budgeted(loop: dict[str, Any]) -> dict[str, Any]:
+    document = copy.deepcopy(loop)
+    nine = {"scale_factor": [1e-5] * 3, "misalignment": [2e-6] * 3, "bias": [3e-6] * 3}
+    document["calibration"]["uncertainty"] = {
+        "level": 0.95,
+        "expanded": nine,
+        "coverage_factor": nine,
+        "magnitude": {"standard_g": 4.4e-5, "coverage_factor": 1.96, "expanded_g": 8.6e-5},
+        "budget": [
+            {"source": "reference", "evaluation": "B", "magnitude_g": 4.3e-5, "share": 0.995, "how": "a <map>"},
+            {"source": "lack_of_fit", "evaluation": "A", "magnitude_g": 3e-6, "share": 0.005, "how": "residuals"},
+        ],
+        "dominant": "reference",
+        "halved_by": "know it better",
+        "magnitude_if_halved_g": 2.2e-5,
+        "not_evaluated": ["thermometer: not stated"],
+    }
+    return document
+
+
+def test_the_budget_is_a_table_with_the_largest_source_first(budgeted: dict[str, Any]) -> None:
+    page = render(budgeted)
+    assert page.row("Reference") == ["Reference", "B", "43.0 µg", "100 %", "a <map>"]
+    assert page.row("Lack of fit")[3] == "< 1 %"
+    assert "Dominant: reference. To halve it: know it better; combined then 22.0 µg." in page.text
+    assert "thermometer: not stated" in page.text
+    assert page.row("Misalignment, rad")[1:] == ["± 2.0 × 10⁻⁶"] * 3
+
+
+def test_a_page_without_a_budget_has_no_section_on_it(page: Page) -> None:
+    assert "Uncertainty" not in page.text
+
+
+@pytest.mark.parametrize("damage", [{"budget": "none"}, {"budget": [3, None]}, {"magnitude": 7}, {"expanded": []}])
+def test_a_damaged_budget_still_gives_a_page(budgeted: dict[str, Any], damage: dict[str, Any]) -> None:
+    document = copy.deepcopy(budgeted)
+    document["calibration"]["uncertainty"] |= damage
+    assert "Nothing left unexplained" in render(document).text
+
+
+def test_another_reference_has_its_own_unit_everywhere(changed: dict[str, Any]) -> None:
+    changed["calibration"]["units"] = {**changed["calibration"].get("units", {}), "reference": "<uT>", "output": "V"}
+    page = render(changed)
+    assert "µg" not in page.html
+    assert "1e-6 <uT> rms" in page.text

@@ -77,6 +77,39 @@ def test_enough_distinct_poses_are_done_and_more_do_not_count() -> None:
     assert (more.found, more.complete) == (14, True)
 
 
+def test_the_first_pose_is_wanted_again_when_all_others_are_there_and_not_before() -> None:
+    taken = [_pose(u, 5.0 * i) for i, u in enumerate(UP)]
+    almost = _guide([*taken[:13], _pose(UP[0], 100.0)], repeat=True)
+    assert (almost.found, almost.repeat_due, almost.missing) == (13, False, (LABELS[13],))
+    due = _guide(taken, repeat=True)
+    assert (due.found, due.repeat_due, due.complete) == (14, True, False)
+    assert due.hint == f"next: {LABELS[0]} up once more, as at first"
+    near = UP[0] + np.array([0, np.sin(np.radians(6)), 0])
+    done = _guide([*taken, _pose(near, 100.0)], repeat=True)
+    assert (done.repeat_due, done.complete, done.hint) == (False, True, "done")
+    assert _guide([*taken, _pose(UP[1], 100.0)], repeat=True).repeat_due
+    assert _guide([*taken, _pose(UP[0], 100.0, seconds=1.0)], repeat=True).repeat_due
+
+
+def test_the_pose_to_repeat_is_the_first_that_was_taken_in_whatever_order() -> None:
+    other = [UP[3], *UP[:3], *UP[4:]]
+    due = _guide([_pose(u, 5.0 * i) for i, u in enumerate(other)], repeat=True)
+    assert due.hint == f"next: {LABELS[3]} up once more, as at first"
+    assert _guide([_pose(u, 5.0 * i) for i, u in enumerate([*other, UP[3]])], repeat=True).complete
+
+
+def test_poses_in_any_order_leave_the_rest_of_the_plan_in_its_order() -> None:
+    state = _guide([_pose(UP[i], 5.0 * i) for i in (7, 2, 11)])
+    assert list(state.missing) == [label for i, label in enumerate(LABELS) if i not in (2, 7, 11)]
+    assert state.hint == f"next: {LABELS[0]} up"
+
+
+def test_in_a_dense_plan_a_pose_covers_the_direction_that_it_is_nearest_to_alone() -> None:
+    plan = directions(60)
+    state = _guide([_pose(plan[10][1])], wanted=60)
+    assert [label for label, _ in plan if label not in state.missing] == [plan[10][0]]
+
+
 def test_without_a_plan_any_pose_will_do() -> None:
     state = _guide([_pose(UP[0])], plan=False, wanted=3)
     assert state.missing == ()

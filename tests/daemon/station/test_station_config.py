@@ -167,3 +167,49 @@ def test_a_fault_of_the_profile_or_its_dbc_is_found_before_any_bus_is_opened(
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     assert "triax-ref-can" in str(caught.value)
+
+
+def test_a_place_on_earth_says_what_the_reference_is_and_how_well(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace('name = "bench"', 'name = "bench"\nlatitude_deg = 50.45\nheight_m = 179', 1))
+    file = load_station(path).file
+    assert file.reference == pytest.approx(9.8104 / 9.80665, abs=1e-4)
+    assert file.stated.reference == pytest.approx(43e-6, rel=0.01)
+    path.write_text(GOOD.replace('name = "bench"', 'name = "bench"\nreference = 1.0004\nreference_uncertainty = 2e-6'))
+    file = load_station(path).file
+    assert (file.reference, file.stated.reference) == (1.0004, 2e-6)
+    path.write_text(GOOD)
+    file = load_station(path).file
+    assert (file.reference, file.stated.reference, file.stated.thermometer_k) == (1.0, None, None)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("latitude_deg = 50.0", "latitude_deg and height_m: give both, or neither"),
+        ("latitude_deg = 50.0\nheight_m = 1\nreference = 1.0", "reference: latitude_deg and height_m say it already"),
+        ("latitude_deg = 91\nheight_m = 1", "line 3: latitude_deg: input should be less than or equal to 90"),
+        ("reference = 9.81", "line 3: reference: input should be less than or equal to 1.1"),
+        ("reference_uncertainty = -1e-6", "line 3: reference_uncertainty: input should be greater than or equal to 0"),
+    ],
+)
+def test_a_reference_that_cannot_be_is_said(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace('name = "bench"', f'name = "bench"\n{line}', 1))
+    with pytest.raises(DriverError) as caught:
+        load_station(path)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(("poses", "apart", "fits"), [(12, 60.0, True), (14, 60.0, False), (9, 60.0, True)])
+def test_as_many_poses_as_a_sphere_has_room_for_are_allowed(
+    tmp_path: Path, poses: int, apart: float, fits: bool
+) -> None:
+    """Twelve: an icosahedron's corners are 63.4 degrees apart."""
+    path = tmp_path / "station.toml"
+    path.write_text(GOOD.replace("poses = 14", f"poses = {poses}\napart_deg = {apart}", 1))
+    if fits:
+        assert load_station(path).file.plan.repeat
+    else:
+        with pytest.raises(DriverError, match=r"plan\.poses: there are not so many directions 60 degrees apart"):
+            load_station(path)

@@ -1,0 +1,25 @@
+"""Every table of `make bench`, one after the other; ``--quick`` for fewer runs of each."""
+
+from __future__ import annotations
+
+import sys
+
+from benchmarks import coverage, efficiency, frame, peers, raw_rotation, speed, spoiled, stillness, ways_in
+from benchmarks.table import chosen
+
+
+def main(arguments: list[str] | None = None) -> int:
+    quick = chosen(__doc__, arguments)
+    for module in (efficiency, coverage, spoiled, peers, raw_rotation, speed, ways_in):
+        module.main(["--quick"] if quick else [])
+        sys.stdout.flush()
+    print("\n### The frame of the mounting faces\n")
+    frame.main(30 if quick else 300)
+    print("\n### Stillness and poses\n", flush=True)
+    # By itself, with all its seeds, it takes longer than everything else together.
+    stillness.main(["--quick"])
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,362 @@
+"""How well still poses are found, and how true the standard errors of their means are, where the truth is known.
+
+    python benchmarks/stillness.py            # some minutes
+    python benchmarks/stillness.py --quick    # fewer seeds
+
+One line a condition, over all seeds: poses there were / found / split / merged / invented; how far the worst boundary
+lies outside its hold; the variance of the pulls (error of a mean over its standard error; 1 is right) by axis and
+along the measured vector; the largest bias that edges and bumps put into a mean, and its rms, in standard errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.coloured_noise import first_order, flicker, moving_average, white
+from triaxcal.poses import Pose, poses_of
+from triaxcal.sensor import Sensor
+from triaxcal.stillness import Span, StillnessDetector, Windows
+
+PAPER_UNIT = Sensor(
+    np.array([-2.410618, -2.403823, -2.371761]),
+    np.array([625.454406e-5, 404.734018e-5, -65.046441e-5]),
+    np.array([564.518583e-5, -288.4559e-5, 463.952349e-5]),
+)
+Noise = Callable[[int, np.random.Generator], Floats]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a stream is made of. Accelerations in g, times in seconds."""
+
+    name: str
+    rate_hz: float = 100.0
+    hold_s: tuple[float, float] = (5.0, 5.0)
+    move_s: tuple[float, float] = (1.5, 1.5)
+    poses: int = 26
+    apart_deg: float | None = None
+    """None: spread over the sphere."""
+    noise: Noise = white
+    noise_g: float | tuple[float, float, float] = 2e-4
+    by_hand: bool = False
+    vibration_g: float = 0.0
+    vibration_hz: float = 29.7
+    machine: str = "steady"
+    """steady, switching (between and within poses), or impulses."""
+    bump_g: float = 0.0
+    bump_s: float = 0.1
+    ringing_g: float = 0.0
+    ringing_s: float = 0.3
+    creep_g: float = 0.0
+    """In every third pose, across the measured vector."""
+    step_g: float = 0.0
+    """Of the output; 0 for none."""
+    offset: float = 0.0
+    pulls: bool = True
+
+
+@dataclass(frozen=True)
+class Stream:
+    t_s: Floats
+    readings: Floats
+    clean: Floats
+    holds: list[tuple[float, float]]
+    truth: Floats
+
+
+def directions_of(c: Condition, rng: np.random.Generator) -> Floats:
+    if c.apart_deg is not None:
+        angle = np.radians(c.apart_deg) * np.arange(c.poses)
+        return np.stack([np.cos(angle), np.sin(angle) * 0.8, np.sin(angle) * 0.6], axis=1)
+    v = rng.standard_normal((20 * c.poses, 3))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    chosen = [v[0]]
+    for here in v[1:]:
+        if here @ chosen[-1] < np.cos(np.radians(5.0)):
+            chosen.append(here)
+    return np.array(chosen[: c.poses])
+
+
+def made(c: Condition, seed: int) -> Stream:
+    """A stream of a condition, and its truth."""
+    rng = np.random.default_rng([seed, *c.name.encode()])
+    directions = directions_of(c, rng)
+    holds, moves = rng.uniform(*c.hold_s, c.poses), rng.uniform(*c.move_s, c.poses - 1)
+    start = np.r_[0, np.cumsum(holds[:-1] + moves)]
+    end = start + holds
+    t = np.arange(int(end[-1] * c.rate_hz)) / c.rate_hz
+    pose = np.searchsorted(start, t, side="right") - 1
+    a = directions[pose]
+    moving = t >= end[pose]
+    for i in range(c.poses - 1):
+        at = np.flatnonzero(moving & (pose == i))
+        a[at] = path(directions[i], directions[i + 1], (t[at] - end[i]) / moves[i], moves[i], c.by_hand, rng)
+    a += after_moves(c, t, start, pose, rng) + bumps(c, t, start, holds, rng)
+    creep = np.zeros_like(a)
+    for i in range(1, c.poses, 3):
+        across = np.cross(directions[i], rng.standard_normal(3))
+        across *= c.creep_g / np.linalg.norm(across)
+        into = ((t - start[i]) / holds[i] - 0.5)[:, None]
+        creep += np.where((pose == i)[:, None] & ~moving[:, None], into, 0) * across
+    clean = PAPER_UNIT.output(a + creep, {})
+    noise = c.noise(len(t), rng) * c.noise_g + vibration(c, t, start, holds, rng)
+    u = clean + noise * PAPER_UNIT.scale_factor + c.offset
+    if c.step_g:
+        step = c.step_g * 2.4
+        u = np.round(u / step) * step
+    truth = PAPER_UNIT.output(directions, {}) + c.offset
+    return Stream(t, u, clean + c.offset, list(zip(start, end, strict=True)), truth)
+
+
+def path(here: Floats, there: Floats, x: Floats, seconds: float, by_hand: bool, rng: np.random.Generator) -> Floats:
+    """Specific force on the way: a minimum-jerk arc, or the irregular path and the tremor of a hand."""
+    smooth = 10 * x**3 - 15 * x**4 + 6 * x**5
+    angle = float(np.arccos(np.clip(here @ there, -1, 1)))
+    across = there - (here @ there) * here
+    if np.linalg.norm(across) < 1e-6:
+        across = np.cross(here, [0.3, 0.5, 0.8])
+    across /= np.linalg.norm(across)
+    a = np.cos(angle * smooth)[:, None] * here + np.sin(angle * smooth)[:, None] * across
+    if by_hand:
+        middle = (x * (1 - x) * 4)[:, None]
+        for _ in range(3):
+            wave = np.sin(2 * np.pi * rng.uniform(0.3, 1.5) * x * seconds + rng.uniform(0, 6))[:, None]
+            a += middle**1.5 * wave * rng.normal(0, 0.25, 3)
+        a /= np.linalg.norm(a, axis=1, keepdims=True)
+        tremor = np.sin(2 * np.pi * (9 * x * seconds + 0.3 * np.sin(5 * x)) + rng.uniform(0, 6))[:, None]
+        a += np.sqrt(middle) * tremor * rng.normal(0, 0.02, 3)
+    rate = angle * (30 * x**2 - 60 * x**3 + 30 * x**4) / seconds
+    acceleration = angle * (60 * x - 180 * x**2 + 120 * x**3) / seconds**2
+    lever = 0.1 / 9.80665
+    return np.asarray(
+        a * (1 - lever * rate**2)[:, None] + np.cross(np.cross(here, across), a) * lever * acceleration[:, None]
+    )
+
+
+def after_moves(c: Condition, t: Floats, start: Floats, pose: Floats, rng: np.random.Generator) -> Floats:
+    """Ringing that dies away from the moment the unit is put down."""
+    out = np.zeros((len(t), 3))
+    if not c.ringing_g:
+        return out
+    into = t - start[pose]
+    way = rng.standard_normal((len(start), 3))[pose]
+    ring = np.exp(-into / c.ringing_s) * np.sin(2 * np.pi * 7.3 * into)
+    return np.asarray(np.where((pose > 0)[:, None], c.ringing_g * ring[:, None] * way, 0.0))
+
+
+def bumps(c: Condition, t: Floats, start: Floats, holds: Floats, rng: np.random.Generator) -> Floats:
+    """Knocks inside every fourth pose."""
+    out = np.zeros((len(t), 3))
+    if c.bump_g:
+        for i in range(0, len(start), 4):
+            at = t - start[i] - holds[i] * rng.uniform(0.3, 0.7)
+            out += (c.bump_g * np.exp(-0.5 * (at / c.bump_s) ** 2) * np.cos(25 * at))[:, None] * rng.standard_normal(3)
+    return out
+
+
+def vibration(c: Condition, t: Floats, start: Floats, holds: Floats, rng: np.random.Generator) -> Floats:
+    """A machine beside the stand: two lines and a band about them, by axis."""
+    if not c.vibration_g:
+        return np.zeros((len(t), 3))
+    wander = 1 + 0.2 * first_order(len(t), c.rate_hz, rng)
+    lines = sum(
+        np.sin(2 * np.pi * f * t[:, None] + rng.uniform(0, 6, 3)) * rng.uniform(0.3, 1, 3)
+        for f in (c.vibration_hz, 2.07 * c.vibration_hz)
+    )
+    out = c.vibration_g * wander * lines
+    if c.machine == "switching":
+        edges = np.cumsum(rng.uniform(8, 30, 200))
+        out *= (np.searchsorted(edges, t) % 2)[:, None]
+    if c.machine == "impulses":
+        since = t % 3.37
+        out = 5 * c.vibration_g * np.exp(-since / 0.02)[:, None] * lines
+    return np.asarray(out)
+
+
+@dataclass
+class Tally:
+    """What was found, over the seeds of a condition."""
+
+    true: int = 0
+    found: int = 0
+    split: int = 0
+    merged: int = 0
+    invented: int = 0
+    missed: int = 0
+    overshoot_s: float = 0.0
+    pulls: list[Floats] = field(default_factory=list)
+    along: list[float] = field(default_factory=list)
+    bias: list[Floats] = field(default_factory=list)
+    creeping: int = 0
+    used: list[float] = field(default_factory=list)
+    seeds: int = 0
+
+    def add(self, stream: Stream, w: Windows, spans: list[Span], poses: list[Pose]) -> None:
+        hits: dict[int, int] = {}
+        self.true += len(stream.holds)
+        self.found += len(poses)
+        self.seeds += 1
+        begin = np.array([h[0] for h in stream.holds])
+        end = np.array([h[1] for h in stream.holds])
+        for span, pose in zip(spans, poses, strict=True):
+            shared = np.minimum(end, pose.end_s) - np.maximum(begin, pose.start_s)
+            inside = np.flatnonzero(shared > 0.1)
+            if not len(inside):
+                self.invented += 1
+                continue
+            self.merged += len(inside) - 1
+            i = int(np.argmax(shared))
+            hits[i] = hits.get(i, 0) + 1
+            if len(inside) > 1:
+                for j in inside:
+                    hits.setdefault(int(j), 1)
+                continue
+            self.overshoot_s = max(self.overshoot_s, begin[i] - pose.start_s, pose.end_s - end[i])
+            self._judge(stream, w, span, pose, i)
+        self.split += sum(n - 1 for n in hits.values())
+        self.missed += len(stream.holds) - len(hits)
+
+    def _judge(self, stream: Stream, w: Windows, span: Span, pose: Pose, i: int) -> None:
+        miss = pose.mean - stream.truth[i]
+        gradient = (stream.truth[i] - np.mean(stream.truth, axis=0)) if len(stream.truth) < 6 else stream.truth[i]
+        gradient = (gradient - PAPER_UNIT.output(np.zeros((1, 3)), {})[0]) / PAPER_UNIT.scale_factor**2
+        self.pulls.append(miss / pose.standard_error)
+        self.along.append(float(miss @ gradient / np.sqrt(gradient @ pose.covariance @ gradient)))
+        first = np.searchsorted(stream.t_s, w.start_ns[span.used] * 1e-9 - 1e-9)
+        at = (first[:, None] + np.arange(w.size)).ravel()
+        self.bias.append((stream.clean[at].mean(axis=0) - stream.truth[i]) / pose.standard_error)
+        self.used.append((pose.end_s - pose.start_s) / (stream.holds[i][1] - stream.holds[i][0]))
+        self.creeping += bool(np.any(pose.creep))
+
+
+def measured(c: Condition, seeds: range) -> Tally:
+    tally = Tally()
+    for seed in seeds:
+        stream = made(c, seed)
+        detector = StillnessDetector()
+        detector.feed(np.round(stream.t_s * 1e9).astype(np.int64), stream.readings)
+        detector.finish()
+        w, spans = detector.windows(), detector.spans()
+        tally.add(stream, w, spans, poses_of(w, spans))
+    return tally
+
+
+def coloured(kind: Callable[..., Floats], parameter: float) -> Noise:
+    return lambda n, rng: kind(n, parameter, rng)
+
+
+def _average(n: int, length: float, rng: np.random.Generator) -> Floats:
+    return moving_average(n, int(length), rng)
+
+
+CONDITIONS = [
+    Condition("white, 100 Hz"),
+    *(Condition(f"white, {r:g} Hz", r, poses=26 if r < 2000 else 14) for r in (20.0, 50.0, 1000.0)),
+    Condition("white, 10 kHz", 10_000.0, poses=9, hold_s=(3.0, 3.0)),
+    Condition("poses of 1 s, 100 Hz", hold_s=(1.0, 1.0), move_s=(0.8, 1.2)),
+    Condition("poses of 1 s, 20 Hz", 20.0, hold_s=(1.0, 1.0), move_s=(0.8, 1.2)),
+    Condition("poses of 1 s, 1 kHz", 1000.0, hold_s=(1.0, 1.0), move_s=(0.8, 1.2)),
+    Condition("poses of 10 min", hold_s=(600.0, 600.0), poses=6),
+    Condition("poses of 1 s to 60 s", hold_s=(1.0, 60.0), move_s=(0.8, 4.0)),
+    Condition("moving average of 0.1 s", noise=coloured(_average, 10)),
+    Condition("moving average of 0.3 s", noise=coloured(_average, 30)),
+    Condition("AR(1), 0.1 s", noise=coloured(first_order, 10)),
+    Condition("AR(1), 0.3 s", noise=coloured(first_order, 30)),
+    Condition("AR(1), 0.5 s", noise=coloured(first_order, 50)),
+    Condition("AR(1), 0.5 s, poses of 20 s", noise=coloured(first_order, 50), hold_s=(20.0, 20.0)),
+    Condition("1/f below 0.01 Hz", noise=coloured(flicker, 0.0001)),
+    Condition("1/f below 0.1 Hz", noise=coloured(flicker, 0.001)),
+    Condition("1/f below 1 Hz", noise=coloured(flicker, 0.01)),
+    Condition("1/f below 10 Hz", noise=coloured(flicker, 0.1)),
+    Condition("noise 1 µg", noise_g=1e-6),
+    Condition("noise 10 mg", noise_g=1e-2),
+    Condition("noise 10 mg, slow moves", noise_g=1e-2, move_s=(3.0, 4.0)),
+    Condition("noise unequal by axis", noise_g=(1e-5, 2e-4, 5e-3)),
+    Condition("5° apart", apart_deg=5.0),
+    Condition("5° apart, 10 mg", apart_deg=5.0, noise_g=1e-2),
+    Condition("5° apart, 1 s, 5 mg", apart_deg=5.0, noise_g=5e-3, hold_s=(1.0, 2.0)),
+    Condition("2° apart", apart_deg=2.0),
+    Condition("by hand", by_hand=True, move_s=(0.8, 4.0), hold_s=(2.0, 8.0)),
+    Condition("by hand, 10 µg", by_hand=True, move_s=(0.8, 4.0), hold_s=(2.0, 8.0), noise_g=1e-5),
+    Condition("by hand, 5 mg", by_hand=True, move_s=(0.8, 4.0), hold_s=(2.0, 8.0), noise_g=5e-3),
+    Condition("bumps 1 g, 20 ms", bump_g=1.0, bump_s=0.02, hold_s=(4.0, 8.0)),
+    Condition("bumps 10 mg, 0.2 s", bump_g=0.01, bump_s=0.2, hold_s=(4.0, 8.0)),
+    Condition("bumps 1 mg, 0.1 s", bump_g=0.001, bump_s=0.1, hold_s=(4.0, 8.0)),
+    Condition("ringing 50 mg, 0.3 s", ringing_g=0.05, ringing_s=0.3),
+    Condition("ringing 0.5 g, 0.1 s", ringing_g=0.5, ringing_s=0.1),
+    Condition("vibration 2 mg", vibration_g=2e-3),
+    Condition("vibration 20 mg, 1 kHz", 1000.0, vibration_g=2e-2),
+    Condition("vibration 2 mg at 4 Hz", vibration_g=2e-3, vibration_hz=4.3),
+    Condition("vibration 5 mg on and off", vibration_g=5e-3, machine="switching"),
+    Condition("vibration 5 mg on and off, 1 kHz", 1000.0, vibration_g=5e-3, machine="switching"),
+    Condition("impulses 25 mg every 3.4 s", vibration_g=5e-3, machine="impulses"),
+    Condition("coarse steps of 1 mg", step_g=1e-3),
+    Condition("coarse steps of 10 mg", step_g=1e-2, pulls=False),
+    Condition("counts of 24 bits", noise_g=1e-4, step_g=1e-6, offset=2.0**23 * 2.4e-6),
+    Condition("creep 2 mg in every third", creep_g=2e-3, pulls=False),
+    Condition("creep 20 mg in every third", creep_g=2e-2, pulls=False),
+]
+HEAD = (
+    f"{'condition':36} {'true':>5} {'found':>5} {'split':>5} {'merged':>6} {'invented':>8} {'missed':>6} "
+    f"{'overshoot s':>11} {'used':>5} {'pulls²':>7} {'along':>6} {'bias max':>8} {'rms':>6} {'creeping':>8}"
+)
+
+
+def line(c: Condition, t: Tally) -> str:
+    pulls, along, bias = np.array(t.pulls), np.array(t.along), np.array(t.bias)
+    if not len(pulls):
+        return f"{c.name:36} {t.true:5} {t.found:5} {t.split:5} {t.merged:6} {t.invented:8} {t.missed:6}"
+    return (
+        f"{c.name:36} {t.true:5} {t.found:5} {t.split:5} {t.merged:6} {t.invented:8} {t.missed:6} "
+        f"{t.overshoot_s:11.3f} {np.mean(t.used):5.2f} {np.mean(pulls**2):7.3f} {np.mean(along**2):6.2f} "
+        f"{np.abs(bias).max():8.3f} {np.sqrt(np.mean(bias**2)):6.3f} {t.creeping:8}"
+    )
+
+
+def speed(rate_hz: float, seconds: float = 60.0) -> str:
+    c = Condition("speed", rate_hz, hold_s=(5.0, 5.0), poses=max(2, int(seconds / 6.5)))
+    stream = made(c, 0)
+    time_ns = np.round(stream.t_s * 1e9).astype(np.int64)
+    begin = time.process_time()
+    detector = StillnessDetector()
+    for at in range(0, len(time_ns), 4096):
+        detector.feed(time_ns[at : at + 4096], stream.readings[at : at + 4096])
+    detector.finish()
+    w, spans = detector.windows(), detector.spans()
+    found = time.process_time()
+    poses_of(w, spans)
+    done = time.process_time()
+    return (
+        f"{rate_hz:6g} Hz: {len(time_ns) / (found - begin) / 1e6:6.2f} M samples/s of processor time, blocks of 4096; "
+        f"standard errors of {len(spans)} poses in {(done - found) * 1e3:.0f} ms"
+    )
+
+
+def report(*, quick: bool = False, only: str = "") -> str:
+    """The table and the speeds, as text."""
+    lines = [HEAD]
+    for c in CONDITIONS:
+        if only in c.name:
+            lines.append(line(c, measured(c, range(2 if quick else 20))))
+    lines += ["", *(speed(rate) for rate in (100.0, 1000.0, 10_000.0))]
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="Stillness and standard errors of poses, where the truth is known.")
+    parser.add_argument("--quick", action="store_true", help="fewer seeds")
+    parser.add_argument("--only", default="", help="conditions whose name contains this")
+    chosen = parser.parse_args(arguments)
+    print(report(quick=chosen.quick, only=chosen.only))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

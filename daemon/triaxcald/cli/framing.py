@@ -1,0 +1,270 @@
+"""frame: units on one fixture in the frame of its faces."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from triaxcal.errors import InvalidData, Refused
+from triaxcal.faces import LABELS, Labelling, labelled, opposite, recognise
+from triaxcal.fit import fit
+from triaxcal.frame import Datum, Frames, frames
+from triaxcal.orientations import Assumed
+from triaxcal.plan import directions
+from triaxcal.standing import Standing, stand
+from triaxcald import documents
+from triaxcald.cli.arguments import add_recording, positive, writable
+from triaxcald.cli.console import emit, say, table
+from triaxcald.cli.showing import chosen, warn
+from triaxcald.errors import InputError
+from triaxcald.files import write_text
+from triaxcald.framing import Source, frame_document, own_source, source_under
+from triaxcald.inputs import measure, read_document
+
+OWN = "own"
+NO_FACE = "*"
+LABEL = re.compile(r"(\*|(?:[+-][XYZ]){1,3}|N[0-9]+)(?:@(-?[0-9]+(?:\.[0-9]+)?))?")
+LEAST_SQUARES = "least_squares"
+
+Labels = list[tuple[str, float | None]]
+
+
+def register(commands: Any) -> None:
+    p = commands.add_parser("frame", help="units on one fixture in the frame of its faces")
+    add_recording(p, several=True)
+    p.add_argument(
+        "--calibration",
+        action="append",
+        metavar="CAL.json|own",
+        help="one for each REC in order; default: each is fitted from its own recording",
+    )
+    known = p.add_mutually_exclusive_group()
+    known.add_argument(
+        "--faces",
+        action="append",
+        type=_faces,
+        metavar="L,L,…",
+        help="sides that were up in order of time, +X@90 with the heading in degrees, * for no face; once for all REC "
+        "or once for each; write --faces=-X,… with the equals sign",
+    )
+    known.add_argument("--plan", metavar="PLAN.json", help="a triaxcal.plan/1 document: its labels in order")
+    p.add_argument(
+        "--datum",
+        type=_datum,
+        default=Datum(),
+        metavar="FACE,FACE",
+        help="primary and secondary face, as --datum=-Z,-X; default least_squares",
+    )
+    p.add_argument("--table-tilt", type=_angle, metavar="RAD", help="how far the table may be from level, at most")
+    p.add_argument("--seating-error", type=_angle, metavar="RAD", help="standard error of one seating of the fixture")
+    p.add_argument("--turn-error", type=_angle, default=0.0, metavar="RAD", help="standard error of a turn; default 0")
+    p.add_argument("--limit", type=positive, metavar="RAD", help="exit 1 where a standard error is above this")
+    p.add_argument("-o", "--output", type=Path, metavar="FRAME.json")
+    p.set_defaults(run=frame_command)
+
+
+def _faces(text: str) -> Labels:
+    out: Labels = []
+    for word in text.split(","):
+        match = LABEL.fullmatch(word.strip().upper())
+        if not match:
+            raise argparse.ArgumentTypeError(f"expected labels as in +X,+X,-X@180,*, not '{word}'")
+        out.append((match[1], None if match[2] is None else math.radians(float(match[2]))))
+    return out
+
+
+def _datum(text: str) -> Datum:
+    if text == LEAST_SQUARES:
+        return Datum()
+    parts = [part.strip().upper() for part in text.split(",")]
+    try:
+        if len(parts) != 2:
+            raise InvalidData("")
+        return Datum((parts[0], parts[1]))
+    except InvalidData:
+        raise argparse.ArgumentTypeError(
+            f"expected {LEAST_SQUARES}, or two faces at right angles as in -Z,-X, not '{text}'"
+        ) from None
+
+
+def _angle(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < 1:
+        raise argparse.ArgumentTypeError(f"expected an angle of 0 to 1 rad, not '{text}'")
+    return value
+
+
+def frame_command(a: argparse.Namespace) -> int:
+    writable(a.output)
+    names = list(a.recording)
+    if names.count("-") > 1:
+        raise InputError("-: standard input can be one recording, not several")
+    calibrations = _for_each(a.calibration, names, "--calibration") or [OWN] * len(names)
+    labels = _for_each(a.faces, names, "--faces", one_for_all=True) or _planned(a.plan, names)
+    assumed = Assumed(a.seating_error, a.table_tilt, a.turn_error)
+    sources: list[Source] = []
+    standings: list[Standing] = []
+    for name, calibration, given in zip(names, calibrations, labels, strict=True):
+        with _of(name):
+            source = _source(a, name, calibration, [s.name for s in sources])
+            sources.append(source)
+            standings.append(_stand(source, given, assumed))
+    result = frames(standings, datum=a.datum)
+    document = frame_document(sources, result)
+    if a.output:
+        write_text(a.output, documents.to_text(document))
+    if a.json:
+        emit(document)
+    else:
+        _show(sources, result)
+        for unit in document["units"]:
+            prefix = f"{unit['name']}: " if len(sources) > 1 else ""
+            warn([f"{prefix}{line}" for line in [*unit["warnings"], *unit["data_quality"]]])
+        warn(document["warnings"])
+    worst = float(max(unit.standard_error.max() for unit in result.units))
+    if a.limit is not None and not worst <= a.limit:
+        say(f"outside the limit: standard error {worst:.3g} rad, limit {a.limit:.3g}")
+        return 1
+    return 0
+
+
+def _for_each(given: list[Any] | None, names: Sequence[str], option: str, *, one_for_all: bool = False) -> list[Any]:
+    if not given:
+        return []
+    if one_for_all and len(given) == 1:
+        return given * len(names)
+    if len(given) != len(names):
+        once = "once, or once for each recording" if one_for_all else "once for each recording"
+        raise InputError(f"{option}: given {len(given)} times for {len(names)} recordings; expected {once}")
+    return given
+
+
+def _planned(path: str | None, names: Sequence[str]) -> list[Labels | None]:
+    if path is None:
+        return [None] * len(names)
+    document = read_document(path)
+    if document.get("format") != "triaxcal.plan/1":
+        raise InputError(f"{path}: format: expected triaxcal.plan/1")
+    poses = document.get("poses")
+    if not isinstance(poses, list) or not poses:
+        raise InputError(f"{path}: poses: expected a list of poses")
+    labels: Labels = []
+    for i, pose in enumerate(poses):
+        label = pose.get("label") if isinstance(pose, dict) else None
+        if not isinstance(label, str):
+            raise InputError(f"{path}: poses[{i}].label: expected a label as +X")
+        labels.append((label, None))
+    return [labels] * len(names)
+
+
+@contextmanager
+def _of(name: str) -> Iterator[None]:
+    """Says which recording it is that something is wrong with."""
+    try:
+        yield
+    except Refused as e:
+        raise Refused(f"{name}: {e}", wanted=e.wanted) from e
+    except InvalidData as e:
+        raise InputError(f"{name}: {e}") from e
+
+
+def _source(a: argparse.Namespace, name: str, calibration: str, taken: Sequence[str]) -> Source:
+    measured = measure(name)
+    choice = chosen(a, measured)
+    unit = measured.unit or {}
+    called = unit.get("serial") or re.sub(r"(\.csv\.gz|\.csv|\.mcap)$", "", Path(name).name)
+    if called in taken:
+        called = next(f"{called} ({n})" for n in range(2, len(taken) + 3) if f"{called} ({n})" not in taken)
+    if calibration == OWN:
+        fitted = fit(measured.poses, signs=choice.signs, reference=choice.reference)
+        return own_source(
+            called, measured, fitted, output_unit=choice.output_unit, reference_unit=choice.reference_unit
+        )
+    document = read_document(calibration)
+    sensor, _, reference = documents.sensor_of(document, where=calibration)
+    signs = a.sign or measured.signs
+    if signs and any(k * s < 0 for k, s in zip(sensor.scale_factor, signs, strict=True)):
+        whose = "--sign" if a.sign else f"{name}: signs"
+        raise InputError(f"{whose}: the scale factors in {calibration} have other signs")
+    if a.reference and not math.isclose(a.reference, reference, rel_tol=1e-9):
+        raise InputError(f"--reference {a.reference:g}: {calibration} was made for {reference:g}")
+    theirs = document.get("unit")
+    serial = theirs.get("serial") if isinstance(theirs, dict) else None
+    if serial and unit.get("serial") and serial != unit["serial"]:
+        raise InputError(f"{calibration}: unit.serial is {serial}; {name} is of {unit['serial']}")
+    if not measured.poses:
+        raise Refused("no still pose", wanted=LABELS)
+    return source_under(
+        called,
+        measured,
+        document,
+        where=calibration,
+        output_unit=choice.output_unit,
+        reference_unit=a.reference_unit or documents.reference_unit_of(reference),
+    )
+
+
+def _stand(source: Source, given: Labels | None, assumed: Assumed) -> Standing:
+    found = source.found
+    labelling: Labelling
+    if given is None:
+        labelling = recognise(found.direction, found.used)
+    else:
+        known = {label for label, _ in directions()} | {NO_FACE}
+        strange = [label for label, _ in given if label not in known and not label.startswith("N")]
+        if strange:
+            raise InputError(f"label {strange[0]}: no such side; known: {', '.join(LABELS)}, * for no face")
+        labelling = labelled(found.direction, found.used, [x for x, _ in given], [h for _, h in given])
+    return stand(found, labelling, assumed)
+
+
+def _show(sources: Sequence[Source], result: Frames) -> None:
+    rotations, stood = [], []
+    for source, unit in zip(sources, result.units, strict=True):
+        errors = unit.standard_error
+        expanded = errors * unit.coverage_factor()
+        for k, axis in enumerate("xyz"):
+            vector = unit.rotation_vector[k]
+            rotations.append(
+                [
+                    "" if k else source.name,
+                    axis,
+                    _mrad(vector),
+                    _mrad(errors[k]),
+                    _mrad(expanded[k]),
+                    f"{np.degrees(vector):.4f}",
+                ]
+            )
+        seen, standing = unit.standing.table, unit.standing
+        tilt = [_mrad(seen.tilt), _mrad(seen.standard_error), seen.source]
+        stood.append([source.name, ", ".join(standing.faces), *tilt, _mrad(standing.seating)])
+    table(
+        f"rotation vector from the sensor's frame to the body's, datum {result.datum.name}, mrad",
+        ["unit", "about", "value", "standard error", "expanded (95 %)", "value °"],
+        rotations,
+    )
+    table("tilt of the table, mrad", ["unit", "sides up", "tilt", "standard error", "from", "seating error"], stood)
+    fixture = result.fixture
+    faces = [
+        [opposite(label), *(f"{_mrad(-e)} ± {_mrad(s)}" for e, s in zip(error, errors, strict=True))]
+        for label, error, errors in zip(fixture.faces, fixture.error, fixture.standard_error, strict=True)
+    ]
+    table("errors of the faces' outward normals, mrad ± standard error", ["face", "x", "y", "z"], faces)
+    for axes, q in fixture.squareness.items():
+        print(f"squareness {axes}: {_mrad(q.value)} ± {_mrad(q.standard_error)} mrad")
+    if result.left:
+        print(f"do the units agree on the faces: p {result.lack_of_fit_p:.2g} in {result.left} degrees of freedom")
+
+
+def _mrad(value: float | None) -> str:
+    return "—" if value is None else f"{value * 1e3:.4f}"

@@ -1,0 +1,226 @@
+"""fit by other ways: a turning unit, poses of known attitude, refinement of passport values."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from triaxcal.attitude import AttitudeFit, fit_attitudes
+from triaxcal.calibration import Calibration
+from triaxcal.errors import Refused
+from triaxcal.moments import Moments
+from triaxcal.passport import Refinement, refine
+from triaxcal.rotation import RotationFit, fit_rotation
+from triaxcald import documents, ways_in
+from triaxcald.attitudes import match, read_attitudes
+from triaxcald.cli.console import micro, table
+from triaxcald.cli.showing import Choice, chosen, show_coefficients
+from triaxcald.errors import InputError
+from triaxcald.inputs import Measured, measure, read_document
+
+POSES_ENOUGH = 9
+Way = tuple[Measured, documents.Document, Calibration, Callable[[], None]]
+"""What was measured, the document, the calibration, and how it is shown at the console."""
+
+
+def add_ways(parser: argparse.ArgumentParser) -> None:
+    ways = parser.add_mutually_exclusive_group()
+    ways.add_argument("--turning", action="store_true", help="the unit turned and never rested: fit all samples")
+    ways.add_argument("--attitudes", metavar="ATT.csv", help="which way was up in each pose, from a turntable")
+    ways.add_argument("--passport", metavar="CAL.json", help="values known from before, to be refined by the poses")
+    parser.add_argument(
+        "--attitude-error",
+        type=_angle,
+        metavar="RAD",
+        help="standard error of the attitudes by axis; default: estimated",
+    )
+    parser.add_argument(
+        "--passport-error",
+        type=_three_errors,
+        metavar="REL,RAD,G",
+        help="standard errors of the passport's scale factors (relative), misalignments, biases; default: its own",
+    )
+
+
+def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | None:
+    """The way that the options ask for; None for still poses alone. Raises InputError for options without their way."""
+    if a.attitude_error is not None and not a.attitudes:
+        raise InputError("--attitude-error: there are no --attitudes")
+    if a.passport_error is not None and not a.passport:
+        raise InputError("--passport-error: there is no --passport")
+    return _turning if a.turning else _attitudes if a.attitudes else _passport if a.passport else None
+
+
+@contextmanager
+def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator[None]:
+    """A refusal names poses, and which way is up depends on signs that nobody may have given."""
+    try:
+        yield
+    except Refused as e:
+        if e.wanted and a.sign is None and measured.signs is None:
+            raise Refused(f"{e}; no --sign was given, so +,+,+ is taken", wanted=e.wanted) from e
+        raise
+
+
+def _angle(text: str) -> float:
+    value = _not_negative(text)
+    if value is None or value > 0.3:
+        raise argparse.ArgumentTypeError(f"expected radians between 0 and 0.3, not '{text}'")
+    return value
+
+
+def _three_errors(text: str) -> tuple[float, float, float]:
+    values = [_not_negative(part) for part in text.split(",")]
+    if len(values) != 3 or any(v is None for v in values):
+        raise argparse.ArgumentTypeError(f"expected three numbers of at least 0 as in 1e-3,1e-3,2e-3, not '{text}'")
+    relative, angle, bias = (v for v in values if v is not None)
+    return relative, angle, bias
+
+
+def _not_negative(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if 0 <= value < float("inf") else None
+
+
+def _turning(a: argparse.Namespace) -> Way:
+    moments = Moments()
+    measured = measure(a.recording, moments=moments)
+    # What turns slowly enough passes for a pose that creeps.
+    quality = [line for line in measured.data_quality if not line.startswith("creeping_pose")]
+    measured = replace(measured, data_quality=quality)
+    choice = chosen(a, measured)
+    with telling_default_signs(a, measured):
+        found = fit_rotation(moments, signs=choice.signs, reference=choice.reference)
+    document = ways_in.turning_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    calibration = found.calibration
+    still = [p for p in measured.poses if not p.creep.any()]
+    if len(still) >= POSES_ENOUGH:
+        advice = f"there are {len(still)} still poses in it: without --turning the fit would use their quiet"
+        document["warnings"] = [*document["warnings"], advice]
+        calibration = replace(calibration, warnings=(*calibration.warnings, advice))
+    return measured, document, calibration, lambda: _show_turning(found, choice)
+
+
+def _show_turning(found: RotationFit, choice: Choice) -> None:
+    show_coefficients(found.calibration, choice)
+    r, unit = found.calibration.residual, choice.micro_unit
+    p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
+    noise = ", ".join(f"{v:.3g}" for v in found.noise_g)
+    print(f"{found.samples} samples, whose noise is {noise} {choice.reference_unit} in x, y, z")
+    print(
+        f"{found.stretches} stretches: |a| off by {micro(r.rms_g)} {unit} rms, of which noise is "
+        f"{micro(r.noise_floor_g)} {unit}, lack of fit p {p}"
+    )
+
+
+def _attitudes(a: argparse.Namespace) -> Way:
+    rows = read_attitudes(a.attitudes)
+    measured = measure(a.recording)
+    choice = chosen(a, measured)
+    poses, rows = match(rows, measured.poses, path=a.attitudes, recording=measured.name)
+    found = fit_attitudes(
+        poses,
+        np.array([row.up for row in rows]),
+        names=[row.name for row in rows],
+        signs=a.sign or measured.signs,
+        reference=choice.reference,
+        attitude_error_rad=a.attitude_error,
+    )
+    document = ways_in.attitudes_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    return measured, document, found.calibration, lambda: _show_attitudes(found, choice)
+
+
+def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
+    c = found.calibration
+    show_coefficients(c, choice)
+    table(
+        "attitudes",
+        ["", "start s", "off µrad", "off, standard errors", f"|a| off {choice.micro_unit}", "used"],
+        [
+            [
+                row.name,
+                f"{pose.pose.start_s:.1f}",
+                micro(row.off_rad),
+                f"{row.off:.1f}",
+                micro(pose.residual_g),
+                "yes" if pose.used else "no",
+            ]
+            for row, pose in zip(found.attitudes, c.poses, strict=True)
+        ],
+    )
+    table(
+        "rotation from the table's frame to the sensor's",
+        ["", "x", "y", "z", "standard error µrad"],
+        [
+            [axis, *(f"{v:+.7f}" for v in line), micro(float(error))]
+            for axis, line, error in zip("xyz", found.rotation, found.rotation_error_rad, strict=True)
+        ],
+    )
+    how = "estimated from the residuals" if found.estimated else "as declared" if found.attitude_error_rad else "none"
+    cost = float(np.max(c.standard_errors[:9] / found.noise_error))
+    print(
+        f"error of the attitudes by axis: {micro(found.attitude_error_rad)} µrad ({how}); with what residuals say it "
+        f"raises the standard errors by a factor of up to {cost:.2f}"
+    )
+    r, p = c.residual, "—" if c.residual.lack_of_fit_p is None else f"{c.residual.lack_of_fit_p:.2g}"
+    print(
+        f"{len(c.poses)} poses: |a| off by {micro(r.rms_g)} {choice.micro_unit} rms, cross-validated "
+        f"{micro(r.cross_validated_rms_g)} {choice.micro_unit}, noise floor {micro(r.noise_floor_g)} "
+        f"{choice.micro_unit}, lack of fit p {p}"
+    )
+
+
+def _passport(a: argparse.Namespace) -> Way:
+    held = read_document(a.passport)
+    measured = measure(a.recording)
+    choice = chosen(a, measured)
+    said = a.reference or measured.reference or getattr(a, "latitude", None)
+    passport, units = ways_in.read_passport(
+        held, where=a.passport, errors=a.passport_error, reference=choice.reference if said is not None else None
+    )
+    if a.sign and any(k * s < 0 for k, s in zip(passport.sensor.scale_factor, a.sign, strict=True)):
+        raise InputError(f"--sign: the scale factors in {a.passport} have other signs")
+    choice = replace(
+        choice,
+        reference=passport.reference,
+        output_unit=choice.output_unit or units.get("output", ""),
+        reference_unit=a.reference_unit or units.get("reference") or choice.reference_unit,
+    )
+    found = refine(measured.poses, passport)
+    document = ways_in.passport_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    return measured, document, found.calibration, lambda: _show_passport(found, choice)
+
+
+def _show_passport(found: Refinement, choice: Choice) -> None:
+    c = found.calibration
+    table(
+        f"passport values, refined by {len(c.poses)} poses",
+        ["", "passport", "standard error", "refined", "standard error", "shift, by chance 1", "poses' share", "from"],
+        [
+            [name, f"{old:.9g}", f"{error:.2g}", f"{new:.9g}", f"{now:.2g}", f"{shift:+.1f}", f"{share:.0%}", source]
+            for name, old, error, new, now, shift, share, source in zip(
+                c.parameters,
+                found.passport.values,
+                found.passport.standard_error,
+                c.values,
+                c.standard_errors,
+                found.shift,
+                found.share,
+                found.sources,
+                strict=True,
+            )
+        ],
+    )
+    r, unit = c.residual, choice.micro_unit
+    p = "—" if found.conflict_p is None else f"{found.conflict_p:.2g}"
+    print(
+        f"|a| off by {micro(r.rms_g)} {unit} rms, noise floor {micro(r.noise_floor_g)} {unit}; passport and poses "
+        f"agree with p {p}"
+    )

@@ -1,0 +1,280 @@
+"""Units on the faces of a fixture: what goes into their common frame, and the document that comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration
+from triaxcal.effects.contract import TIME
+from triaxcal.faces import LABELS, TURNS, axis_of, opposite
+from triaxcal.fixture import Fixture, Quantity
+from triaxcal.frame import Frames, UnitFrame
+from triaxcal.sensor import Sensor
+from triaxcal.verticals import Verticals, information, verticals, verticals_under
+from triaxcald.documents import (
+    UNCERTAINTY_DIGITS,
+    Document,
+    calibration_part,
+    number,
+    numbers,
+    probability,
+    sensor_of,
+    uncertainty,
+)
+from triaxcald.errors import InputError
+from triaxcald.inputs import Measured
+
+ANGLE_DIGITS = 8
+GRID_RAD = 1e-12
+ROUND_TURN_DEG = 360.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """One unit: its recording, the sensor that turns readings into g, and up in its poses.
+
+    ``calibration`` is ``own``, or the file that it was read from; ``fitted`` the calibration in the former case.
+    """
+
+    name: str
+    measured: Measured
+    calibration: str
+    sensor: Sensor
+    found: Verticals
+    output_unit: str
+    reference_unit: str
+    fitted: Calibration | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def own_source(name: str, measured: Measured, fitted: Calibration, *, output_unit: str, reference_unit: str) -> Source:
+    """A unit whose calibration was fitted to the recording itself."""
+    return Source(
+        name,
+        measured,
+        "own",
+        fitted.sensor,
+        verticals(fitted),
+        output_unit,
+        reference_unit,
+        fitted,
+        fitted.warnings,
+    )
+
+
+def source_under(
+    name: str, measured: Measured, document: Mapping[str, Any], *, where: str, output_unit: str, reference_unit: str
+) -> Source:
+    """A unit with a calibration document. Raises InputError, InvalidData."""
+    sensor, channel_reference, reference = sensor_of(document, where=where)
+    covariance, warnings = covariance_of(document, sensor, channel_reference, where=where)
+    with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
+        found = verticals_under(
+            sensor, measured.poses, covariance, channel_reference=channel_reference, reference=reference
+        )
+    if not (np.isfinite(found.direction).all() and np.isfinite(found.covariance).all()):
+        raise InputError(f"{where}: its numbers and the readings of {measured.name} give no finite direction of up")
+    return Source(name, measured, where, sensor, found, output_unit, reference_unit, None, tuple(warnings))
+
+
+def covariance_of(
+    document: Mapping[str, Any], sensor: Sensor, channel_reference: Mapping[str, float], *, where: str
+) -> tuple[Floats, list[str]]:
+    """(p,p) of the parameters of a calibration document, and warnings. Raises InputError.
+
+    The document holds standard errors; how they go together follows from its poses. Effects of logged channels, whose
+    values in the poses it does not hold, count as independent of the rest.
+    """
+    part = calibration_part(document, where=where)
+    count = 9 + sum(len(c) for _, c in sensor.effects)
+    if "standard_error" not in part:
+        return np.zeros((count, count)), [f"{where} holds no standard errors: the calibration counts as exact"]
+    try:
+        errors = [float(v) for name in ("scale_factor", "misalignment", "bias") for v in part["standard_error"][name]]
+        for effect, _ in sensor.effects:
+            errors += [float(part["effects"][effect.name][c.name]["standard_error"]) for c in effect.coefficients]
+        used = [p for p in part.get("poses", []) if p.get("used", True)]
+        means = np.array([p["mean"] for p in used], dtype=float).reshape(-1, 3)
+        noise = np.array([p["standard_error_g"] for p in used], dtype=float)
+        middle = np.array([(p["start_s"] + p["end_s"]) / 2 for p in used], dtype=float)
+    except KeyError as e:
+        raise InputError(f"{where}: standard_error, poses: {e.args[0]}: missing") from e
+    except (TypeError, ValueError, AttributeError, OverflowError) as e:
+        raise InputError(f"{where}: standard_error, poses: not numbers where numbers belong ({e})") from e
+    sigma = np.array(errors)
+    sound = sigma.shape == (count,) and np.all(sigma >= 0) and np.isfinite(sigma).all() and np.isfinite(means).all()
+    if not sound or not np.all(noise > 0):
+        raise InputError(f"{where}: standard_error, poses: expected finite numbers, no standard error below zero")
+    correlation = np.eye(count)
+    if len(used) < 9:
+        return correlation * sigma**2, [f"{where} holds no poses: its standard errors count as independent"]
+    known = [(e, c) for e, c in sensor.effects if set(e.needs) <= {TIME}]
+    rows = np.concatenate(
+        [np.ones(9, dtype=bool), *(np.full(len(c), set(e.needs) <= {TIME}) for e, c in sensor.effects)]
+    )
+    reduced = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias, tuple(known))
+    held = {TIME: middle - channel_reference.get(TIME, 0.0)}
+    J = information(reduced, means, held, noise)
+    norm = np.sqrt(np.maximum(np.diag(J), 1e-300))
+    P = np.linalg.pinv(J / np.outer(norm, norm), rcond=1e-14) / np.outer(norm, norm)
+    spread = np.sqrt(np.maximum(np.diag(P), 1e-300))
+    correlation[np.ix_(rows, rows)] = P / np.outer(spread, spread)
+    return correlation * np.outer(sigma, sigma), []
+
+
+def frame_document(sources: Sequence[Source], frames: Frames) -> Document:
+    units = [_unit(source, unit) for source, unit in zip(sources, frames.units, strict=True)]
+    pairs = [(i, j) for i in range(len(units)) for j in range(i + 1, len(units))]
+    return {
+        "format": "triaxcal.frame/1",
+        "datum": frames.datum.name,
+        "units": units,
+        "between": [_between(sources, frames, i, j) for i, j in pairs],
+        "fixture": _fixture(frames.fixture),
+        "agreement": {
+            "chi2": uncertainty(frames.chi2) if frames.left else None,
+            "degrees_of_freedom": frames.left,
+            "p_value": probability(frames.lack_of_fit_p),
+            "inflation": uncertainty(frames.inflation),
+        },
+        "warnings": list(frames.warnings),
+    }
+
+
+def _angles(values: Any) -> list[Any]:
+    """Angles are differences of unit vectors: beyond the grid they differ from processor to processor."""
+    return numbers(np.round(np.asarray(values, dtype=float) / GRID_RAD) * GRID_RAD, ANGLE_DIGITS)
+
+
+def _angle(value: float | None) -> float | None:
+    return None if value is None else number(round(value / GRID_RAD) * GRID_RAD, ANGLE_DIGITS)
+
+
+def _unit(source: Source, unit: UnitFrame) -> Document:
+    standing, measured = unit.standing, source.measured
+    factor = unit.coverage_factor()
+    fitted = source.fitted
+    return {
+        "name": source.name,
+        **({"unit": dict(measured.unit)} if measured.unit else {}),
+        "recording": measured.name,
+        "calibration": source.calibration,
+        "terms": ["linear", *(effect.name for effect, _ in source.sensor.effects)],
+        "output_unit": source.output_unit,
+        "reference_unit": source.reference_unit,
+        **(
+            {"rms_g": uncertainty(fitted.residual.rms_g), "noise_floor_g": uncertainty(fitted.residual.noise_floor_g)}
+            if fitted
+            else {}
+        ),
+        "rotation": numbers(unit.rotation),
+        "rotation_vector_rad": _angles(unit.rotation_vector),
+        "standard_error_rad": numbers(unit.standard_error, UNCERTAINTY_DIGITS),
+        "degrees_of_freedom": numbers(unit.dof, UNCERTAINTY_DIGITS),
+        "coverage_factor": numbers(factor, UNCERTAINTY_DIGITS),
+        "expanded_rad": numbers(factor * unit.standard_error, UNCERTAINTY_DIGITS),
+        "covariance_rad2": numbers(unit.covariance, UNCERTAINTY_DIGITS),
+        "matrix_body": numbers(unit.rotation @ source.sensor.matrix),
+        "centre": numbers(source.sensor.centre),
+        "nearest_axes": _nearest_axes(unit.rotation),
+        "mounting_assumed": standing.labelling.assumed,
+        "poses": _poses(source, unit),
+        "table": _table(unit),
+        "seating_error_rad": uncertainty(standing.seating),
+        "seating_degrees_of_freedom": standing.seating_dof,
+        "data_quality": list(measured.data_quality),
+        "warnings": [*source.warnings, *standing.labelling.warnings, *standing.warnings],
+    }
+
+
+def _nearest_axes(rotation: Floats) -> list[str]:
+    """The body's axis nearest to each of the sensor's."""
+    nearest = TURNS[int(np.argmax(np.einsum("tij,ij->t", TURNS, rotation)))]
+    return [LABELS[int(np.argmax([axis_of(label) @ nearest[:, k] for label in LABELS]))] for k in range(3)]
+
+
+def _poses(source: Source, unit: UnitFrame) -> list[Document]:
+    labelling, found = unit.standing.labelling, source.found
+    out = []
+    for i, pose in enumerate(found.poses):
+        label, heading = labelling.labels[i], labelling.headings[i]
+        up = unit.rotation @ found.direction[i]
+        off = float(np.linalg.norm(np.cross(axis_of(label), up))) if label else None
+        out.append(
+            {
+                "start_s": number(pose.start_s),
+                "end_s": number(pose.end_s),
+                "label": label,
+                "heading_deg": None if heading is None else number(float(np.degrees(heading)) % ROUND_TURN_DEG),
+                "up": _angles(up),
+                "from_face_rad": _angle(off),
+                "used": bool(found.used[i]),
+            }
+        )
+    return out
+
+
+def _table(unit: UnitFrame) -> Document:
+    standing = unit.standing
+    table = standing.table
+    ends = [np.radians(1.0) / 2 * t.magnitude for t in standing.tilts if t.resolved]
+    return {
+        "tilt_rad": _angle(table.tilt),
+        "standard_error_rad": uncertainty(table.standard_error),
+        "source": table.source,
+        "shows": table.shows,
+        "p_value": probability(table.p_value),
+        "up": None if table.vector is None else _angles(table.vector),
+        "turn_remainder_rad_per_deg": uncertainty(max(ends)) if ends else None,
+        "faces": [
+            {
+                "label": t.label,
+                "resolved": t.resolved,
+                "poses": len(t.poses),
+                "tilt_rad": _angles(unit.rotation @ standing.basis[k] @ t.tilt) if t.resolved else None,
+                "magnitude_rad": _angle(t.magnitude) if t.resolved else None,
+                "standard_error_rad": uncertainty(t.standard_error) if t.resolved else None,
+            }
+            for k, t in enumerate(standing.tilts)
+        ],
+    }
+
+
+def _between(sources: Sequence[Source], frames: Frames, i: int, j: int) -> Document:
+    vector, covariance = frames.between(i, j)
+    return {
+        "from": sources[i].name,
+        "to": sources[j].name,
+        "rotation": numbers(frames.units[j].rotation.T @ frames.units[i].rotation),
+        "rotation_vector_rad": _angles(vector),
+        "standard_error_rad": numbers(np.sqrt(np.maximum(np.diag(covariance), 0.0)), UNCERTAINTY_DIGITS),
+    }
+
+
+def _fixture(fixture: Fixture) -> Document:
+    def quantity(q: Quantity) -> Document:
+        return {"value": _angle(q.value), "standard_error": uncertainty(q.standard_error)}
+
+    return {
+        "faces": [
+            {
+                "face": opposite(label),
+                "up": label,
+                "normal": _angles(-fixture.up[k]),
+                "error_rad": _angles(-fixture.error[k]),
+                "standard_error_rad": numbers(
+                    np.where(fixture.standard_error[k] > GRID_RAD, fixture.standard_error[k], 0.0), UNCERTAINTY_DIGITS
+                ),
+            }
+            for k, label in enumerate(fixture.faces)
+        ],
+        "independent_errors": 2 * len(fixture.faces) - 3,
+        "squareness_rad": {axes: quantity(q) for axes, q in fixture.squareness.items()},
+        "parallelism_rad": {axis: [quantity(q) for q in both] for axis, both in fixture.parallelism.items()},
+        "datum_standard_error_rad": None if fixture.offset is None else numbers(fixture.offset, UNCERTAINTY_DIGITS),
+    }

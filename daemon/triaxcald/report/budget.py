@@ -1,0 +1,78 @@
+"""The uncertainty budget of a calibration document, read without trust like the rest of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from triaxcald.report.document import mapping, texts, vector
+from triaxcald.report.figures import effect_title, number
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """``magnitude_g`` is a standard uncertainty of |a|; ``share`` of its variance, 0…1."""
+
+    source: str
+    evaluation: str
+    magnitude_g: float | None
+    share: float | None
+    how: str
+
+    @property
+    def percent(self) -> str:
+        if self.share is None:
+            return ""
+        return "< 1 %" if 0 < self.share < 0.01 else f"{self.share:.0%}".replace("%", " %")
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    lines: tuple[BudgetLine, ...]
+    standard_g: float | None
+    coverage_factor: float | None
+    expanded_g: float | None
+    level_percent: float | None
+    expanded: tuple[tuple[str, tuple[float | None, ...]], ...]
+    dominant: str
+    halved_by: str
+    if_halved_g: float | None
+    not_evaluated: tuple[str, ...]
+
+
+def read_uncertainty(calibration: Mapping[str, object]) -> Uncertainty | None:
+    """None where the document has no budget."""
+    known = mapping(calibration.get("uncertainty"))
+    entries = known.get("budget")
+    if not isinstance(entries, (list, tuple)) or not entries:
+        return None
+    whole, level = mapping(known.get("magnitude")), number(known.get("level"))
+    return Uncertainty(
+        lines=tuple(_line(mapping(entry)) for entry in entries),
+        standard_g=number(whole.get("standard_g")),
+        coverage_factor=number(whole.get("coverage_factor")),
+        expanded_g=number(whole.get("expanded_g")),
+        level_percent=None if level is None else 100 * level,
+        expanded=tuple(
+            (effect_title(name), vector(mapping(known.get("expanded")).get(name)) or (None, None, None))
+            for name in ("scale_factor", "misalignment", "bias")
+        ),
+        dominant=_words(known.get("dominant")),
+        halved_by=str(known.get("halved_by") or ""),
+        if_halved_g=number(known.get("magnitude_if_halved_g")),
+        not_evaluated=texts(known.get("not_evaluated")),
+    )
+
+
+def _line(entry: Mapping[str, object]) -> BudgetLine:
+    return BudgetLine(
+        _words(entry.get("source")),
+        str(entry.get("evaluation") or ""),
+        number(entry.get("magnitude_g")),
+        number(entry.get("share")),
+        str(entry.get("how") or ""),
+    )
+
+
+def _words(name: object) -> str:
+    return str(name or "").replace("_", " ")

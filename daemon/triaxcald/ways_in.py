@@ -1,0 +1,138 @@
+"""Calibrations that come by other ways than still poses of unknown attitude: their documents, and passports as read.
+
+All are `triaxcal.calibration/1`, with what the way adds under a key of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.attitude import AttitudeFit
+from triaxcal.calibration import Calibration
+from triaxcal.passport import Passport, Refinement
+from triaxcal.rotation import RotationFit
+from triaxcald.documents import (
+    LINEAR,
+    UNCERTAINTY_DIGITS,
+    Document,
+    calibration_document,
+    calibration_part,
+    number,
+    numbers,
+    probability,
+    sensor_of,
+    uncertainty,
+)
+from triaxcald.errors import InputError
+
+
+def turning_document(found: RotationFit, *, output_unit: str, reference_unit: str) -> Document:
+    document = calibration_document(
+        found.calibration, output_unit=output_unit, reference_unit=reference_unit, budgeted=False
+    )
+    document["samples"] = found.samples
+    document["stretches"] = found.stretches
+    document["noise_g"] = numbers(found.noise_g, UNCERTAINTY_DIGITS)
+    document["noise_unseen_share"] = uncertainty(found.unseen_share)
+    return document
+
+
+def attitudes_document(found: AttitudeFit, *, output_unit: str, reference_unit: str) -> Document:
+    c = found.calibration
+    document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
+    document["attitudes"] = {
+        "error_rad": uncertainty(found.attitude_error_rad),
+        "estimated": found.estimated,
+        "rotation": numbers(found.rotation),
+        "rotation_standard_error_rad": numbers(found.rotation_error_rad, UNCERTAINTY_DIGITS),
+        "standard_error_if_exact": {
+            name: numbers(found.noise_error[3 * i : 3 * i + 3], UNCERTAINTY_DIGITS) for i, name in enumerate(LINEAR)
+        },
+        "rows": [
+            {
+                "name": row.name,
+                "up": numbers(row.up),
+                "off_rad": uncertainty(row.off_rad),
+                "off_standard_errors": uncertainty(row.off),
+                "used": pose.used,
+            }
+            for row, pose in zip(found.attitudes, c.poses, strict=True)
+        ],
+    }
+    return document
+
+
+def passport_document(found: Refinement, *, output_unit: str, reference_unit: str) -> Document:
+    c = found.calibration
+    document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
+    document["passport"] = {
+        "conflict_p": probability(found.conflict_p),
+        "value": _by_parameter(c, [number(float(v)) for v in found.passport.values]),
+        "standard_error": _by_parameter(c, [uncertainty(float(v)) for v in found.passport.standard_error]),
+        "shift_standard_errors": _by_parameter(c, [uncertainty(float(v)) for v in found.shift]),
+        "share_of_poses": _by_parameter(c, [uncertainty(float(v)) for v in found.share]),
+        "source": _by_parameter(c, found.sources),
+    }
+    return document
+
+
+def _by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
+    held = dict(zip(c.parameters, values, strict=True))
+    groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
+    effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
+    return groups | ({"effects": effects} if effects else {})
+
+
+def read_passport(
+    document: Mapping[str, Any], *, where: str, errors: tuple[float, float, float] | None, reference: float | None
+) -> tuple[Passport, Mapping[str, str]]:
+    """The passport values in a calibration, loop or certificate document, and its units.
+
+    ``errors`` stand for the document's: of the scale factors relative to them, of the misalignments in rad, of the
+    biases in the unit of the reference. ``reference`` is the magnitude in the poses, where it is not the document's.
+    Raises InputError.
+    """
+    sensor, channel_reference, own = sensor_of(document, where=where)
+    part = calibration_part(document, where=where)
+    if reference is not None and not 0.9 < reference / own < 1.1:
+        raise InputError(f"--reference {reference:g}: {where} was made for {own:g}, in another unit it seems")
+    if errors is not None:
+        relative, angle, bias = errors
+        linear = np.concatenate([np.abs(sensor.scale_factor) * relative, np.full(3, angle), np.full(3, bias)])
+    else:
+        linear = np.concatenate([_errors(part, name, where) for name in LINEAR])
+    of_effects = [_effect_errors(part, e.name, [k.name for k in e.coefficients], where) for e, _ in sensor.effects]
+    standard_error = np.concatenate([linear, *of_effects])
+    if not np.any(standard_error > 0):
+        raise InputError(f"{where}: standard_error: all are 0, so that nothing is left to refine")
+    units = part.get("units")
+    held = {str(k): str(v) for k, v in units.items()} if isinstance(units, Mapping) else {}
+    return Passport(sensor, standard_error, channel_reference, own if reference is None else reference), held
+
+
+def _errors(part: Mapping[str, Any], name: str, where: str) -> Floats:
+    held = part.get("standard_error")
+    values = held.get(name) if isinstance(held, Mapping) else None
+    try:
+        out = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        out = np.zeros(0)
+    if out.shape != (3,) or not (np.isfinite(out).all() and np.all(out >= 0)):
+        raise InputError(
+            f"{where}: standard_error.{name}: expected three numbers of at least 0; without them give --passport-error"
+        )
+    return out
+
+
+def _effect_errors(part: Mapping[str, Any], effect: str, names: Sequence[str], where: str) -> Floats:
+    out = []
+    for name in names:
+        value = part["effects"][effect][name].get("standard_error")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
+            raise InputError(f"{where}: effects.{effect}.{name}.standard_error: expected a number of at least 0")
+        out.append(float(value))
+    return np.array(out)

@@ -1,0 +1,194 @@
+"""The budget, judged by propagating distributions: every source drawn at random, fitted, and set against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from triaxcal.calibration import Calibration
+from triaxcal.effects import effect_named
+from triaxcal.errors import InvalidData
+from triaxcal.fit import fit
+from triaxcal.plan import directions
+from triaxcal.poses import Pose
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import noisy_poses
+from triaxcal.uncertainty import SENSITIVITY_PER_K, Stated, budget
+
+NOISE = 2e-5
+SIGNS = (-1, -1, -1)
+TEMPERATURES_C = 25 + 0.8 * np.sin(np.arange(26) * 1.7)
+DRAWS = 400
+
+
+def _within_chance(values: np.ndarray, truth: np.ndarray, standard: np.ndarray) -> bool:
+    """Whether the scatter of ``values`` (m,p) about the truth is ``standard`` (p,): chi-square, 1e-4 over all."""
+    m, p = values.shape
+    low, high = stats.chi2.ppf([0.5e-4 / p, 1 - 0.5e-4 / p], m) / m
+    ratio = np.mean((values - truth) ** 2, axis=0) / standard**2
+    return bool(np.all((ratio > low) & (ratio < high)))
+
+
+def _sphere_rms(c: Calibration, truth: Sensor) -> float:
+    """rms error of |a| over 500 orientations that no plan has, at the reference conditions."""
+    up = np.array([v for _, v in directions(500)])
+    held = {n: np.zeros(len(up)) for n in c.channel_reference}
+    length, _ = c.sensor.magnitude(truth.output(up, {}), held)
+    return float(np.sqrt(np.mean((length - 1) ** 2)))
+
+
+def test_noise_alone_is_what_the_fit_itself_says(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(1))
+    c = fit(poses, signs=SIGNS, aside=())
+    assert c.inflation == 1
+    b = budget(c)
+    assert [line.source for line in b.components] == ["noise"]
+    np.testing.assert_allclose(b.parameters.standard, c.standard_errors, rtol=1e-9)
+    np.testing.assert_allclose(b.parameters.coverage, c.coverage_factor(), rtol=1e-6)
+    assert b.dominant.magnitude == float(b.magnitude.standard)
+
+
+def test_fourteen_poses_leave_0_80_of_a_poses_noise_in_the_magnitude(paper_unit: Sensor, fourteen: np.ndarray) -> None:
+    poses = noisy_poses(paper_unit, fourteen, 1.5e-5, np.random.default_rng(3))
+    noise = next(line for line in budget(fit(poses, signs=SIGNS, aside=())).components if line.source == "noise")
+    assert noise.magnitude / 1.5e-5 == pytest.approx(0.80, abs=0.01)  # METHOD, section 5
+
+
+def test_all_sources_together_scatter_as_the_budget_says(
+    monkeypatch: pytest.MonkeyPatch, paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """JCGM 101: noise, creep, the reference and thermal effects that the model lacks, drawn 400 times."""
+    rng = np.random.default_rng(7)
+    reference, thermal_share = 15e-6, 0.04
+    monkeypatch.setattr(
+        "triaxcal.uncertainty.SENSITIVITY_PER_K", {n: v * thermal_share for n, v in SENSITIVITY_PER_K.items()}
+    )
+    creep = np.zeros((26, 3))
+    creep[::4] = rng.uniform(-1, 1, (7, 3)) * 4e-4
+    found, errors, said = [], [], []
+    for _ in range(DRAWS):
+        pairs = tuple(
+            (effect_named(n), v * thermal_share * rng.standard_normal(3)) for n, v in SENSITIVITY_PER_K.items()
+        )
+        unit = Sensor(paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias, pairs)
+        up = twenty_six * (1 + reference * rng.standard_normal())
+        warm = {"temp_c": TEMPERATURES_C}
+        poses = noisy_poses(unit, up, NOISE, rng, channels=warm, channel_reference={"temp_c": 25.0})
+        poses = [_creeping(p, change, rng) for p, change in zip(poses, creep, strict=True)]
+        c = fit(poses, signs=SIGNS, aside=())
+        found.append(c.values)
+        errors.append(_sphere_rms(c, paper_unit) ** 2)
+        # Residuals that happen to exceed the noise are no source of their own here.
+        lines = [x for x in budget(c, Stated(reference=reference)).components if x.source != "lack_of_fit"]
+        assert {x.source for x in lines} == {"noise", "creep", "reference", "temperature"}
+        said.append(np.sum([np.r_[x.parameters, x.magnitude] ** 2 for x in lines], axis=0))
+    truth = np.concatenate([paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias])
+    expected = np.mean(said, axis=0)
+    assert _within_chance(np.array(found), truth, np.sqrt(expected[:9]))
+    assert abs(np.mean(errors) - expected[9]) < 4 * np.std(errors) / np.sqrt(DRAWS)
+
+
+def _creeping(pose: Pose, change: np.ndarray, rng: np.random.Generator) -> Pose:
+    """A pose whose mean is somewhere along its creep."""
+    mean = pose.mean + change * rng.uniform(-0.5, 0.5)
+    moved = replace(pose, mean=mean, creep=change)
+    return replace(moved, covariance=pose.covariance + moved.creep_covariance)
+
+
+def test_an_error_of_the_reference_moves_scale_factors_alike(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2))
+    c = fit(poses, signs=SIGNS, aside=())
+    other = fit(poses, signs=SIGNS, reference=1 + 1e-5, aside=())
+    line = next(x for x in budget(c, Stated(reference=1e-5)).components if x.source == "reference")
+    np.testing.assert_allclose(line.parameters, np.abs(other.values - c.values), rtol=1e-3, atol=1e-12)
+    assert line.magnitude == pytest.approx(1e-5, rel=1e-3)
+
+
+def test_a_thermometer_matters_once_thermal_effects_are_in_the_model(
+    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+) -> None:
+    unit = with_effects(temperature_bias=[3e-4, -2e-4, 1e-4])
+    swing = {"temp_c": 25 + 6 * np.sin(np.arange(26) * 1.7)}
+    poses = noisy_poses(unit, twenty_six, NOISE, np.random.default_rng(5), channels=swing)
+    c = fit(poses, signs=SIGNS, effects=[effect_named("temperature_bias")], aside=())
+    line = next(x for x in budget(c, Stated(thermometer_k=0.4)).components if x.source == "thermometer")
+    coefficients = c.values[9:12]
+    np.testing.assert_allclose(line.parameters[6:9], np.abs(coefficients) * 0.4, rtol=0.02)
+    assert "thermometer" in " ".join(budget(c).not_evaluated)
+    sources = [x.source for x in budget(fit(poses, signs=SIGNS, aside=()), Stated(thermometer_k=0.4)).components]
+    assert "thermometer" not in sources
+    assert "temperature" in sources
+
+
+def test_what_temperature_may_have_done_grows_with_how_far_it_moved(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    def share(swing_k: float) -> float:
+        moved = {"temp_c": 25 + swing_k * np.sin(np.arange(26) * 1.7)}
+        poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=moved)
+        found = budget(fit(poses, signs=SIGNS, aside=())).components
+        return next(x.magnitude for x in found if x.source == "temperature")
+
+    steady, moving, wild = share(0.001), share(0.05), share(20.0)
+    assert steady < 0.05 * NOISE
+    assert steady < moving < wild
+    # However far it moves, it cannot cost more than letting the coefficients free.
+    assert wild < 1.5 * NOISE
+
+
+def test_steps_of_registers_are_rectangular(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, aside=())
+    line = next(x for x in budget(c, Stated(rounding={"bias.y": 6e-5})).components if x.source == "register_rounding")
+    assert line.parameters[c.parameters.index("bias.y")] == pytest.approx(6e-5 / np.sqrt(12))
+    assert np.count_nonzero(line.parameters) == 1
+    # |a| feels the bias of one axis by its direction cosine, whose mean square over the sphere is a third.
+    assert line.magnitude == pytest.approx(6e-5 / np.sqrt(12) / np.sqrt(3), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("noise", "reference", "dominant"), [(1e-6, 4e-5, "reference"), (1e-3, 4e-5, "noise"), (1e-6, 1e-9, "noise")]
+)
+def test_the_largest_term_dominates_and_halving_it_is_worth_what_it_says(
+    paper_unit: Sensor, twenty_six: np.ndarray, noise: float, reference: float, dominant: str
+) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, noise, np.random.default_rng(2))
+    c = fit(poses, signs=SIGNS, aside=())
+    b = budget(c, Stated(reference=reference))
+    assert b.dominant.source == dominant
+    assert sum(b.share(x) for x in b.components) == pytest.approx(1)
+    halved = sum((x.magnitude / (2 if x is b.dominant else 1)) ** 2 for x in b.components)
+    assert b.magnitude_if_halved == pytest.approx(np.sqrt(halved))
+
+
+def test_residuals_beyond_noise_are_a_line_of_their_own(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    rng = np.random.default_rng(2)
+    poses = noisy_poses(paper_unit, twenty_six, NOISE, rng)
+    told = [replace(p, covariance=p.covariance / 25) for p in poses]
+    c = fit(told, signs=SIGNS, aside=())
+    b = budget(c)
+    assert b.dominant.source == "lack_of_fit"
+    np.testing.assert_allclose(b.parameters.standard, c.standard_errors, rtol=1e-9)
+    # 17 degrees of freedom behind it, so Student's factor is not the normal one.
+    np.testing.assert_allclose(b.parameters.coverage, stats.t.ppf(0.975, 17), rtol=0.02)
+
+
+def test_what_nobody_stated_is_said_not_to_be_evaluated(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, aside=())
+    assert [line.split(":")[0] for line in budget(c).not_evaluated] == ["reference", "temperature"]
+    assert not [x for x in budget(c, Stated(reference=0.0)).not_evaluated if x.startswith("reference")]
+
+
+@pytest.mark.parametrize("value", [-1e-6, float("nan"), float("inf")])
+def test_uncertainties_that_are_none_are_refused(value: float) -> None:
+    with pytest.raises(InvalidData, match="reference"):
+        Stated(reference=value)
+    with pytest.raises(InvalidData, match="thermometer"):
+        Stated(thermometer_k=value)
+
+
+def test_a_place_gives_the_uncertainty_of_gravity_there_unless_it_was_measured() -> None:
+    assert Stated.at(50.0, 200.0).reference == pytest.approx(43.2e-6, rel=1e-3)
+    assert Stated.at(50.0, 200.0, 2e-8).reference == 2e-8
+    assert Stated.at(None, None).reference is None

@@ -1,0 +1,221 @@
+"""What is kept of the raw samples of a turning unit: sums up to the fourth degree, in one pass and constant memory.
+
+The stream is cut into stretches of equal length; whenever their number reaches `STRETCHES_MOST` neighbours are put
+together. Where stretches begin and end depends on the samples alone, not on the blocks they came in. What differs
+between stretches by more than noise tells later how far the samples may be trusted.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.errors import InvalidData
+
+MONOMIALS = [e for e in itertools.product(range(3), repeat=3) if sum(e) <= 2]
+"""Exponents of the ten monomials of a quadric; products of two of them give all up to the fourth degree."""
+STRETCHES_MOST = 128
+STRETCH_LEAST = 16
+SAMPLED = 16
+"""Samples that are kept of every stretch, to know the directions."""
+DIFFERENCE = 4
+"""Order of the differences from sample to sample: they see the noise, and of a smooth motion next to nothing."""
+_DIFFERENCE_GAIN = 70.0
+"""What it does to the variance of white noise: the sum of the squares of 1, 4, 6, 4, 1."""
+_PIECE = 1 << 13
+_SPAN_LIMIT = 1e60
+"""Outputs whose range, or its inverse, is larger would not survive the fourth power."""
+
+
+@dataclass
+class Moments:
+    """Sums of products of monomials of the samples, by stretch. ``feed`` blocks of any size, then `summary`."""
+
+    count: int = 0
+    _origin: Floats = field(default_factory=lambda: np.zeros(3))
+    _size: int = STRETCH_LEAST
+    _low: Floats = field(default_factory=lambda: np.full((STRETCHES_MOST, 3), np.inf))
+    _high: Floats = field(default_factory=lambda: np.full((STRETCHES_MOST, 3), -np.inf))
+    _sums: Floats = field(default_factory=lambda: np.zeros((STRETCHES_MOST, 10, 10)))
+    _rough: Floats = field(default_factory=lambda: np.zeros((STRETCHES_MOST, 3)))
+    _lags: Floats = field(default_factory=lambda: np.zeros(STRETCHES_MOST))
+    _sampled: Floats = field(default_factory=lambda: np.zeros((STRETCHES_MOST, SAMPLED, 3)))
+    _pieces: int = 0
+    _rest: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def feed(self, u: Floats) -> None:
+        """``u`` (n,3) raw outputs. Raises InvalidData where one is not a finite number."""
+        if not len(u):
+            return
+        if not np.isfinite(u).all():
+            raise InvalidData(f"reading {self.count + int(np.argmin(np.isfinite(u).all(axis=1)))} is not finite")
+        self.count += len(u)
+        waiting = np.concatenate([self._rest, u]) if len(self._rest) else np.asarray(u, dtype=float)
+        if not self._pieces and len(waiting) >= STRETCH_LEAST:
+            self._origin = np.median(waiting[:STRETCH_LEAST], axis=0)  # so that no digits are lost to an offset
+        at = 0
+        while len(waiting) - at >= (piece := min(self._size, _PIECE)):
+            until_full = STRETCHES_MOST * self._size // piece - self._pieces
+            number = min((len(waiting) - at) // piece, _PIECE // piece, until_full)
+            self._take(waiting[at : at + number * piece].reshape(number, piece, 3))
+            at += number * piece
+        self._rest = waiting[at:].copy()
+
+    def _take(self, pieces: Floats) -> None:
+        number, piece, _ = pieces.shape
+        into = (self._pieces + np.arange(number)) * piece // self._size
+        sums, rough = _sums_of(pieces - self._origin)
+        np.minimum.at(self._low, into, pieces.min(axis=1))
+        np.maximum.at(self._high, into, pieces.max(axis=1))
+        np.add.at(self._sums, into, sums)
+        np.add.at(self._rough, into, rough)
+        np.add.at(self._lags, into, piece - DIFFERENCE)
+        # At no constant distance, so that no rate of rotation hides behind it.
+        scattered = (into[:, None] * SAMPLED + np.arange(SAMPLED)) * 0.6180339887 % 1
+        self._sampled[into] = pieces[np.arange(number)[:, None], (scattered * piece).astype(int)]
+        self._pieces += number
+        if self._pieces * piece == STRETCHES_MOST * self._size:
+            self._halve()
+
+    def _halve(self) -> None:
+        half = STRETCHES_MOST // 2
+        for held in (self._sums, self._rough, self._lags):
+            held[:half] = held[::2] + held[1::2]
+            held[half:] = 0
+        self._low[:half], self._low[half:] = np.minimum(self._low[::2], self._low[1::2]), np.inf
+        self._high[:half], self._high[half:] = np.maximum(self._high[::2], self._high[1::2]), -np.inf
+        self._sampled[:half] = np.concatenate([self._sampled[::2, ::2], self._sampled[1::2, ::2]], axis=1)
+        self._size *= 2
+        self._pieces = half * self._size // min(self._size, _PIECE)
+
+    def summary(self) -> Summary:
+        """Of all samples so far. Raises InvalidData where an axis never moved, or beyond what numbers can hold."""
+        piece = min(self._size, _PIECE)
+        closed = -(-self._pieces * piece // self._size)
+        counts = np.full(closed, self._size)
+        if closed:
+            counts[-1] = self._pieces * piece - (closed - 1) * self._size
+        held = _Stretches(
+            self._origin,
+            counts,
+            *(v[:closed] for v in (self._low, self._high, self._sums, self._rough, self._lags, self._sampled)),
+        )
+        return held.summary() if not len(self._rest) else held.and_then(self._rest).summary()
+
+
+@dataclass(frozen=True)
+class _Stretches:
+    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in `Moments`."""
+
+    origin: Floats
+    counts: Ints
+    low: Floats
+    high: Floats
+    sums: Floats
+    rough: Floats
+    lags: Floats
+    sampled: Floats
+
+    def and_then(self, rest: Floats) -> _Stretches:
+        """With samples (n,3) that did not fill a stretch."""
+        sums, rough = _sums_of(rest[None] - self.origin)
+        return replace(
+            self,
+            counts=np.r_[self.counts, len(rest)],
+            low=np.concatenate([self.low, rest.min(axis=0)[None]]),
+            high=np.concatenate([self.high, rest.max(axis=0)[None]]),
+            sums=np.concatenate([self.sums, sums]),
+            rough=np.concatenate([self.rough, rough]),
+            lags=np.r_[self.lags, max(len(rest) - DIFFERENCE, 1)],
+            sampled=np.concatenate([self.sampled, np.broadcast_to(rest[:1], (1, SAMPLED, 3))]),
+        )
+
+    def only(self, kept: Bools) -> _Stretches:
+        names = ("counts", "low", "high", "sums", "rough", "lags", "sampled")
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
+
+    def summary(self) -> Summary:
+        low, high = self.low.min(axis=0), self.high.max(axis=0)
+        flat = [axis for axis, least, most in zip("xyz", low, high, strict=True) if not most > least]
+        if flat:
+            raise InvalidData(f"the output of axis {', '.join(flat)} never changes")
+        half, middle = (high - low) / 2, (high + low) / 2
+        if not (np.all(half < _SPAN_LIMIT) and np.all(half > 1 / _SPAN_LIMIT)):
+            raise InvalidData(f"outputs that range over {half.max():.3g} cannot be summed up")
+        T = _change_of_basis(middle - self.origin, half)
+        return Summary(
+            middle=middle,
+            half=half,
+            counts=self.counts,
+            moments=T @ (self.sums / self.counts[:, None, None]) @ T.T,
+            quick=np.median(self.rough / self.lags[:, None], axis=0) / _DIFFERENCE_GAIN / half**2,
+            sampled=self.sampled.reshape(-1, 3),
+            _fed=self,
+        )
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Samples scaled to ``x = (u − middle)/half``, which lies between −1 and 1 in every axis.
+
+    ``counts`` (m,) samples in each stretch, ``moments`` (m,10,10) mean products of `MONOMIALS` in it; ``quick`` (3,)
+    variance of the noise of one sample, in scaled units, as far as differences from sample to sample show it;
+    ``sampled`` (k,3) some of the outputs, from everywhere.
+    """
+
+    middle: Floats
+    half: Floats
+    counts: Ints
+    moments: Floats
+    quick: Floats
+    sampled: Floats
+    _fed: _Stretches
+
+    @property
+    def count(self) -> int:
+        return int(self.counts.sum())
+
+    @property
+    def reach(self) -> Floats:
+        """(m,3) how far the outputs of each stretch go from the median, at most."""
+        middle = np.median(self.sampled, axis=0)
+        return np.maximum(np.abs(self._fed.low - middle), np.abs(self._fed.high - middle))
+
+    def only(self, stretches: Bools) -> Summary:
+        """Of some of the stretches, scaled anew."""
+        return self._fed.only(stretches).summary()
+
+    def mean(self) -> Floats:
+        """(10,10) over all samples."""
+        return np.asarray(np.einsum("m,mij->ij", self.counts / self.count, self.moments))
+
+
+def _sums_of(x: Floats) -> tuple[Floats, Floats]:
+    """Of pieces (m,n,3): sums of products of the monomials (m,10,10), and of squared differences (m,3)."""
+    columns = np.ascontiguousarray(x.transpose(0, 2, 1))
+    terms = np.empty((len(x), 10, x.shape[1]))
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # judged by the range, in `summary`
+        for row, powers in enumerate(MONOMIALS):
+            axes = [axis for axis in range(3) for _ in range(powers[axis])]
+            if len(axes) == 2:
+                np.multiply(columns[:, axes[0]], columns[:, axes[1]], out=terms[:, row])
+            else:
+                terms[:, row] = columns[:, axes[0]] if axes else 1.0
+        difference = np.diff(columns, n=DIFFERENCE, axis=2)
+        rough = np.einsum("mij,mij->mi", difference, difference)
+        return terms @ terms.transpose(0, 2, 1), rough
+
+
+def _change_of_basis(offset: Floats, half: Floats) -> Floats:
+    """(10,10): the monomials of ``(x − offset)/half`` from those of x."""
+    T = np.zeros((10, 10))
+    for row, powers in enumerate(MONOMIALS):
+        for taken in itertools.product(*(range(p + 1) for p in powers)):
+            factor = 1.0
+            for p, t, o, h in zip(powers, taken, offset, half, strict=True):
+                factor *= (2.0 if (p, t) == (2, 1) else 1.0) * (-o) ** (p - t) / h**p
+            T[row, MONOMIALS.index((taken[0], taken[1], taken[2]))] += factor
+    return T

@@ -1,0 +1,294 @@
+"""The spectrum of a unit's noise, from all its poses together, and what it means for a pose's mean.
+
+A pose shows the noise at the frequencies 1/T, 2/T, … of its own length T; the variance of its mean depends on what
+lies below. All poses share one unit, hence one shape of spectrum, and a model of few parameters carries it down:
+white noise, one process of short memory (first-order, as AR(1), of any time constant; or a moving average of any
+length, as a sensor's filter makes), and 1/f noise, alone or together. The model is fitted by the likelihood of Whittle
+with the exact expectation of the periodogram (Sykulski et al. 2019, Biometrika 106:251), which is free of leakage and
+of what the subtracted mean takes away. How the models share the answer is decided by the Bayesian information
+criterion (Schwarz 1978).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, special, stats
+
+from triaxcal.arrays import Bools, Floats, Ints
+
+BANDS = 1.25
+"""Ordinates of a periodogram are gathered in bands whose edges rise by this factor."""
+TIME_CONSTANTS = 12
+LENGTHS = 12
+SLOWEST = 0.40
+"""exp(3/2 − γ) / 2π: ∫(1 − sinc²(πx)) dx/x from 0 to X tends to ln X + ln 2π + γ − 3/2."""
+DOF_LEVEL = 0.99
+DOF_GRID = np.geomspace(1.0, 1e5, 200)
+STEPS = 12
+MISFIT = 1e-3
+"""Probability below which the model is fitted to lower frequencies only."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """Deviations (n,q) of q quantities from their mean over a pose, at whole places (n,) in units of a window."""
+
+    place: Ints
+    deviation: Floats
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    @property
+    def length(self) -> int:
+        """Of the pose in windows, those left out as well."""
+        return int(self.place[-1] - self.place[0]) + 1
+
+    def pairs(self, weight: Floats | None = None) -> Floats:
+        """(length,) sums over all pairs of windows k apart of the products of their weights, 1 if not given."""
+        there = np.zeros(self.length)
+        there[self.place - self.place[0]] = 1.0 if weight is None else weight
+        size = fft.next_fast_len(2 * self.length, real=True)
+        return np.asarray(fft.irfft(np.abs(fft.rfft(there, size)) ** 2, size)[: self.length])
+
+    def centred(self) -> Floats:
+        """(n,) places from their middle."""
+        return np.asarray(self.place - self.place.mean())
+
+
+@dataclass(frozen=True)
+class Periodogram:
+    """Rows: one band of one pose each. ``power`` (r,q) and the expected power of every component (r,c); ``weight`` (r,)
+    is half the degrees of freedom, ``frequency`` in cycles a window, ``pose`` an index.
+    """
+
+    power: Floats
+    expected: Floats
+    weight: Floats
+    frequency: Floats
+    pose: Ints
+
+    def only(self, rows: Bools) -> Periodogram:
+        return Periodogram(
+            self.power[rows], self.expected[rows], self.weight[rows], self.frequency[rows], self.pose[rows]
+        )
+
+
+@dataclass(frozen=True)
+class Components:
+    """Autocovariances (c, lags) that a spectrum is made of: white, 1/f, first-order of a time constant each, moving
+    averages of a length each, none."""
+
+    autocovariance: Floats
+
+    @classmethod
+    def of(cls, lags: int, typical: float, recording: float) -> Components:
+        """For poses of ``typical`` length in a recording of a length, both in windows.
+
+        1/f noise is a mixture of first-order processes with time constants spread evenly in the logarithm. What is
+        slower than the recording is the same for all poses, and counts as bias: the variance of 1/f noise about its
+        mean over a length L is that of its part above SLOWEST / L.
+        """
+        constants = np.geomspace(0.4, max(typical / 5, 0.8), TIME_CONSTANTS)
+        lengths = np.geomspace(0.5, max(typical / 8, 1.0), LENGTHS)
+        mixture = np.geomspace(0.03, max(recording / (2 * np.pi * SLOWEST), 1.0), 160)
+        many = np.array([_first_order(t, lags) for t in mixture]).mean(axis=0) * np.log(mixture[-1] / mixture[0])
+        rows = [np.eye(1, lags)[0], many, *(_first_order(t, lags) for t in constants)]
+        rows += [*(_moving_average(t, lags) for t in lengths), np.zeros(lags)]
+        return cls(np.array(rows))
+
+    @property
+    def models(self) -> Ints:
+        """(m,3) which components go together; the last one is a row of zeros, for none."""
+        none = len(self.autocovariance) - 1
+        orders = range(2, none)
+        rows = [(0, none, none), (0, 1, none), *((0, none, i) for i in orders), *((0, 1, i) for i in orders)]
+        return np.array(rows, dtype=np.int64)
+
+    def variance_of_mean(self, n: int) -> Floats:
+        """(c,) over n windows."""
+        pairs = np.r_[n, 2.0 * np.arange(n - 1, 0, -1)]
+        return np.asarray(self.autocovariance[:, :n] @ pairs / n**2)
+
+
+def _first_order(constant: float, lags: int) -> Floats:
+    """Autocovariance of averages over windows of a first-order process of unit variance."""
+    k = np.arange(lags, dtype=float)
+    fall = -np.expm1(-1 / constant)
+    out = constant**2 * fall**2 * np.exp(-np.maximum(k - 1, 0) / constant)
+    out[0] = 2 * constant**2 * (1 / constant - fall)
+    return np.asarray(out)
+
+
+def _moving_average(length: float, lags: int) -> Floats:
+    """Autocovariance of averages over windows of white noise averaged over a length: a box twice on a box twice."""
+    steps = [(-1, 1.0), (0, -2.0), (1, 1.0)]
+    k = np.arange(lags, dtype=float)
+    out = np.sum([a * b * np.abs(k + i + j * length) ** 3 for i, a in steps for j, b in steps], axis=0)
+    return np.asarray(np.where(k < 1 + length, out, 0.0) / out[0])
+
+
+def periodogram(tracks: Sequence[Track], components: Components, lowest: int = 1) -> Periodogram:
+    """Of all tracks; without the first ``lowest`` − 1 ordinates of each."""
+    rows: list[tuple[Floats, Floats, Floats, Floats, Ints]] = []
+    for number, track in enumerate(tracks):
+        n = track.length
+        filled = np.zeros((n, track.deviation.shape[1]))
+        filled[track.place - track.place[0]] = track.deviation
+        power = np.abs(fft.rfft(filled, axis=0)) ** 2 / len(track)
+        weighted = components.autocovariance[:, :n] * track.pairs()
+        expected = (2 * fft.rfft(weighted, axis=1).real - weighted[:, :1]).T / len(track)
+        j = np.arange(lowest, n // 2 + 1)
+        if not len(j):
+            continue
+        weight = np.where(2 * j == n, 0.5, 1.0)
+        band = np.where(j < 8, j, 8 + np.floor(np.log(np.maximum(j, 8) / 8) / np.log(BANDS)).astype(int))
+        first = np.flatnonzero(np.diff(band, prepend=-1))
+        total = np.add.reduceat(weight, first)
+        gathered = [np.add.reduceat(v[j] * weight[:, None], first, axis=0) / total[:, None] for v in (power, expected)]
+        centre = np.add.reduceat(j * weight, first) / total / n
+        rows.append((gathered[0], gathered[1], total, centre, np.full(len(first), number)))
+    return Periodogram(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Autocovariance (q, lags) of window means, up to the scale of each pose, and the degrees of freedom (q,) behind
+    the variance of a mean of the usual length, doubt between the models included. ``highest`` is the frequency up to
+    which it was fitted.
+    """
+
+    autocovariance: Floats
+    dof: Floats
+    highest: float
+
+    def variance_of_mean(self, track: Track) -> Floats:
+        """(q,)"""
+        return self._sum(track.pairs()) / len(track) ** 2
+
+    def variance_of_slope(self, track: Track) -> Floats:
+        """(q,) of a straight line fitted by least squares, a window."""
+        x = track.centred()
+        return self._sum(track.pairs(x)) / float(x @ x) ** 2
+
+    def _sum(self, pairs: Floats) -> Floats:
+        held = self.autocovariance[:, : len(pairs)] * pairs
+        # Never below what a thousandth of the same noise would give if it were white: rounding, and lines at Nyquist.
+        return np.asarray(np.maximum(2 * held.sum(axis=1) - held[:, 0], 1e-3 * held[:, 0]))
+
+
+def fitted(p: Periodogram, components: Components, typical: int) -> tuple[Spectrum, Floats]:
+    """The spectrum of every quantity, and the expected power (r,q) of every row of ``p``."""
+    highest = 0.5
+    while True:
+        part = p.only(p.frequency <= highest)
+        amplitude, dof = _averaged(part, components, typical)
+        if highest / 2 * typical < 5 or _fits(part, part.expected @ amplitude.T):
+            break
+        highest /= 2
+    return Spectrum(amplitude @ components.autocovariance, dof, highest), p.expected @ amplitude.T
+
+
+def _fits(p: Periodogram, expected: Floats) -> bool:
+    """Whether the bands of frequencies, over all poses, are off by no more than noise."""
+    band = np.floor(np.log(np.maximum(p.frequency, 1e-9)) / np.log(1.3)).astype(int)
+    _, group = np.unique(band, return_inverse=True)
+    weight = np.bincount(group, p.weight)
+    off = [
+        np.bincount(group, p.weight * (i / np.maximum(e, 1e-300) - 1))
+        for i, e in zip(p.power.T, expected.T, strict=True)
+    ]
+    misfit = float((np.square(off) / weight).sum())
+    return misfit < float(stats.chi2.isf(MISFIT, np.size(off)))
+
+
+def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Floats, Floats]:
+    """Amplitudes (q,c) averaged over the models by their weights, and the degrees of freedom (q,) of the variance of a
+    mean.
+    """
+    models, n = components.models, components.variance_of_mean(typical)
+    fits = [_amplitudes(p.expected[:, models], column, p.weight) for column in p.power.T]
+    # The models of one kind with different time constants share one weight: a mean over a prior, not a sum.
+    none = len(n) - 1
+    flicker, order = models[:, 1] != none, models[:, 2] != none
+    free = len(fits) * (1 + flicker + order)
+    prior = np.where(order, 1 / (TIME_CONSTANTS + LENGTHS), 1.0)
+    loss = np.sum([f[1] for f in fits], axis=0) + free * np.log(max(len(fits) * p.weight.sum(), 2.0)) / 2
+    share = prior * np.exp(loss.min() - loss)
+    share /= share.sum()
+    out, dof = np.zeros((len(fits), len(n))), np.zeros(len(fits))
+    for i, (amplitude, _, information) in enumerate(fits):
+        np.add.at(out[i], models, share[:, None] * amplitude)
+        each = (n[models] * amplitude).sum(axis=1)
+        gradient = np.where(amplitude > 0, n[models], 0.0)
+        spread = np.einsum("mi,mij,mj->m", gradient, np.linalg.pinv(information, hermitian=True), gradient)
+        dof[i] = _mixed_dof(share, each, 2 * each**2 / np.maximum(spread, 1e-12 * each**2 + 1e-300))
+    return out, dof
+
+
+def _mixed_dof(share: Floats, variance: Floats, dof: Floats) -> float:
+    """Degrees of freedom of Student's t that reaches as far as a mixture of such, (m,) each, at `DOF_LEVEL`, when both
+    are told in units of the mixture's own standard deviation.
+
+    By moments a model of small share and large variance would count as much as if every interval had to allow for it.
+    """
+    kept = (share > 1e-6) & (variance > 0)
+    share, variance, dof = share[kept] / max(share[kept].sum(), 1e-300), variance[kept], np.maximum(dof[kept], 1.0)
+    if not len(share):
+        return 1.0
+    mean = float(share @ variance)
+    low, high = 0.0, 100.0 * float(np.sqrt(variance.max() / mean))
+    for _ in range(40):
+        middle = (low + high) / 2
+        beyond = float(share @ (2 * special.stdtr(dof, -middle * np.sqrt(mean / variance))))
+        low, high = (middle, high) if beyond > 1 - DOF_LEVEL else (low, middle)
+    reach = stats.t.isf((1 - DOF_LEVEL) / 2, DOF_GRID)
+    return float(np.interp(-low, -reach, DOF_GRID))
+
+
+SUBSETS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]], dtype=bool)
+
+
+def _amplitudes(basis: Floats, power: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]:
+    """For ``basis`` (r,m,3) of m models: amplitudes (m,3), none below zero, that maximise Whittle's likelihood; its
+    negative (m,), and Fisher's information (m,3,3) of those above zero.
+    """
+    size = float(np.average(power, weights=weight))
+    power = power / (size or 1.0)
+    level = np.maximum(np.average(basis, axis=0, weights=weight), 1e-300)
+    basis = np.ascontiguousarray((basis / level).transpose(1, 0, 2))
+    used = level > 1e-200
+    amplitude = np.where(used, 1.0, 0.0) / used.sum(axis=1, keepdims=True)
+    # A fixed number of steps: where to stop must not hang on the last bits, which differ between processors.
+    for step in range(STEPS):
+        expected = np.maximum((basis @ amplitude[:, :, None])[:, :, 0], 1e-9)
+        scaled = basis * (np.sqrt(weight) / expected)[:, :, None]
+        information = scaled.transpose(0, 2, 1) @ scaled
+        target = (scaled.transpose(0, 2, 1) @ (power * np.sqrt(weight) / expected)[:, :, None])[:, :, 0]
+        new = _nonnegative(information, target, used)
+        amplitude = (amplitude + new) / 2 if step < 3 else new
+    expected = np.maximum((basis @ amplitude[:, :, None])[:, :, 0], 1e-9)
+    loss = (np.log(expected) + power / expected) @ weight
+    held = amplitude > 0
+    information = information * (held[:, :, None] & held[:, None, :]) * level[:, :, None] * level[:, None, :]
+    return amplitude * size / level, np.asarray(loss), information / max(size, 1e-150) ** 2
+
+
+def _nonnegative(information: Floats, target: Floats, used: Bools) -> Floats:
+    """(m,3) least-squares solutions of normal equations without a negative element: of the solutions in every subset of
+    the elements that has none, the best.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.einsum("mii->mi", information), 1e-300))
+    matrix = information * scale[:, :, None] * scale[:, None, :] + 1e-10 * np.eye(3)
+    vector = target * scale
+    allowed = SUBSETS[None] & used[:, None, :]
+    both = allowed[..., :, None] & allowed[..., None, :]
+    solved = np.linalg.solve(
+        np.where(both, matrix[:, None], np.eye(3)), np.where(allowed, vector[:, None], 0.0)[..., None]
+    )[..., 0]
+    gain = np.where((solved >= 0).all(axis=2), np.einsum("msi,mi->ms", solved, vector), -np.inf)
+    best = solved[np.arange(len(solved)), np.argmax(gain, axis=1)]
+    return np.asarray(best * scale)

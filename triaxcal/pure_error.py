@@ -1,0 +1,67 @@
+"""What the noise inside the poses is worth beside the residuals: degrees of freedom, and which of the two to believe.
+
+The scatter inside a pose gives its standard error without any model (pure error). Residuals beyond it come from what
+is not the same in every pose: an effect the model lacks, a stand that does not come back, a drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+from triaxcal.arrays import Floats
+from triaxcal.poses import Pose
+
+DOF_MOST = 1e6
+BEYOND_DOUBT = 0.2
+"""Where residuals like these have less than this probability, the residuals alone say how large the noise is."""
+
+
+def pose_dof(poses: Sequence[Pose]) -> Floats:
+    """(n,) degrees of freedom behind each pose's own noise; zero where it is not known."""
+    return np.array([min(p.dof, DOF_MOST) for p in poses])
+
+
+def pure_error_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
+    """Effective degrees of freedom of a variance of which pose i makes up ``part`` (n,), equal parts where None.
+
+    Welch and Satterthwaite's formula (JCGM 100, G.4.1), where what the estimates of all poses have in common does not
+    average out. Zero where a pose does not know its noise.
+    """
+    dof = pose_dof(poses)
+    if not np.all(dof > 0):
+        return 0.0
+    w = np.full(len(poses), 1 / len(poses)) if part is None else part
+    common = np.array([1 / p.shared_dof for p in poses])
+    own = np.maximum(1 / dof - common, 0.0)
+    return min(float(1 / (np.sum(w**2 * own) + (w @ np.sqrt(common)) ** 2 + 1e-300)), DOF_MOST)
+
+
+def lack_of_fit_p(chi2: float, left: int, pure_dof: float) -> float | None:
+    """Probability of a sum of squares this large in ``left`` degrees of freedom, from the poses' own noise.
+
+    None where nothing is left, or where the noise is not known.
+    """
+    return float(stats.f.sf(chi2 / left, left, pure_dof)) if left > 0 and pure_dof >= 1 else None
+
+
+def raised(chi2: float, left: int, pure_dof: float) -> tuple[float, float]:
+    """By what the standard errors are multiplied, and the degrees of freedom that they then have.
+
+    ``chi2`` is the sum of squares in ``left`` degrees of freedom, ``pure_dof`` those of the noise inside the poses.
+    Residuals larger than that noise raise the errors (Birge 1932, Phys. Rev. 40:207), however little they exceed it,
+    and step by step the degrees of freedom become those of the residuals: a test that decides between the two would
+    leave intervals too short where the excess is too small for it. Residuals that are smaller lower nothing.
+    """
+    if left <= 0:
+        return 1.0, max(pure_dof, 1.0)
+    ratio = chi2 / left
+    if pure_dof < 1:
+        return float(np.sqrt(ratio)), float(left)
+    if ratio <= 1:
+        return 1.0, pure_dof + left
+    p, at_one = float(stats.f.sf(ratio, left, pure_dof)), float(stats.f.sf(1.0, left, pure_dof))
+    doubt = max(0.0, (p - BEYOND_DOUBT) / (at_one - BEYOND_DOUBT))
+    return float(np.sqrt(ratio)), float(1 / (doubt / (pure_dof + left) + (1 - doubt) / left))

@@ -1,0 +1,171 @@
+"""A stream cut into windows of a tenth of a second, of which mean, scatter and times are all that is kept.
+
+Memory grows by about a hundred bytes a window, whatever the sample rate. The windows depend on the samples alone, not
+on how they were fed, so live and replayed streams give the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.errors import InvalidData
+
+WINDOW_S = 0.1
+WINDOW_LEAST = 3
+GAP = 4.0
+"""A silence longer than this many sample periods ends a window, and a span."""
+RATE_SAMPLES = 64
+RATE_S = 1.0
+"""The sample period is learned from at least so many samples over at least so long."""
+RATE_LEAST = 12
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Summaries of consecutive windows of ``size`` samples, (m,) or (m,3) each.
+
+    ``start_ns`` and ``end_ns`` are the times of a window's first and last sample; ``variance`` of a sample by axis,
+    ``cross`` covariance of axes xy, yz, zx; ``joined`` says that no gap lies between it and the one before.
+    """
+
+    size: int
+    start_ns: Ints
+    end_ns: Ints
+    mean: Floats
+    variance: Floats
+    cross: Floats
+    channels: Mapping[str, Floats]
+    joined: Bools
+
+    def __len__(self) -> int:
+        return len(self.start_ns)
+
+    @property
+    def period_ns(self) -> float:
+        """From the start of a window to the start of the next, where no gap lies between."""
+        return float(np.median((self.end_ns - self.start_ns) * self.size / (self.size - 1)))
+
+
+@dataclass
+class WindowCutter:
+    """Cuts blocks of any size into windows."""
+
+    _pending: list[tuple[Ints, Floats, dict[str, Floats]]] = field(default_factory=list)
+    _held: int = 0
+    _size: int = 0
+    _period_ns: float = 0.0
+    _done: list[tuple[Ints, Ints, Floats, Floats, Floats, dict[str, Floats], Bools]] = field(default_factory=list)
+    _last_ns: int | None = None
+    _broken: bool = False
+
+    def feed(self, time_ns: Ints, readings: Floats, channels: Mapping[str, Floats] | None = None) -> None:
+        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3), ``channels`` each (n,).
+
+        Raises InvalidData for a reading that is not a finite number: it would hide every pose.
+        """
+        if not len(time_ns):
+            return
+        if not np.isfinite(readings).all():
+            at = int(np.flatnonzero(~np.isfinite(readings).all(axis=1))[0])
+            raise InvalidData(f"the reading at {int(time_ns[at])} ns is not a finite number")
+        held = {name: np.asarray(v, dtype=float) for name, v in (channels or {}).items()}
+        self._pending.append((np.asarray(time_ns, dtype=np.int64), np.asarray(readings, dtype=float), held))
+        self._held += len(time_ns)
+        if not self._size and self._held >= RATE_SAMPLES and time_ns[-1] - self._pending[0][0][0] >= RATE_S * 1e9:
+            self._learn_rate()
+        if self._size and self._held >= self._size:
+            self._close_windows()
+
+    def finish(self) -> None:
+        """No more samples come: what is pending is cut into windows as far as it goes."""
+        if not self._size and self._held >= RATE_LEAST:
+            self._learn_rate()
+            self._close_windows()
+
+    def _learn_rate(self) -> None:
+        """Over a quarter of the samples at a time, so that neither bursts nor a gap mislead."""
+        time_ns = np.concatenate([p[0] for p in self._pending])
+        enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
+        time_ns = time_ns[:enough]
+        lag = len(time_ns) // 4
+        self._period_ns = float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag
+        if self._period_ns <= 0:
+            raise InvalidData("time does not increase from sample to sample")
+        self._size = max(WINDOW_LEAST, round(WINDOW_S * 1e9 / self._period_ns))
+
+    def _close_windows(self) -> None:
+        time_ns = np.concatenate([p[0] for p in self._pending])
+        readings = np.concatenate([p[1] for p in self._pending])
+        channels = {n: np.concatenate([p[2][n] for p in self._pending]) for n in self._pending[0][2]}
+        before = self._last_ns if self._last_ns is not None else int(time_ns[0]) - int(self._period_ns)
+        gaps = np.flatnonzero(np.diff(time_ns, prepend=before) > GAP * self._period_ns)
+        start = 0
+        for stop in (*gaps[gaps > 0], len(time_ns)):
+            if start in gaps:
+                self._broken = True
+            whole = (stop - start) // self._size
+            if whole:
+                at = slice(start, start + whole * self._size)
+                self._summarise(time_ns[at], readings[at], {n: v[at] for n, v in channels.items()}, whole)
+                self._last_ns = int(time_ns[at.stop - 1])
+            start = stop if stop < len(time_ns) else start + whole * self._size
+        rest = slice(start, len(time_ns))
+        self._pending = [(time_ns[rest], readings[rest], {n: v[rest] for n, v in channels.items()})]
+        self._held = len(time_ns) - start
+
+    def _summarise(self, time_ns: Ints, u: Floats, channels: dict[str, Floats], count: int) -> None:
+        blocks = u.reshape(count, self._size, 3)
+        # Sums over a contiguous last axis, so that a window's figures do not depend on how many come at once.
+        columns = np.ascontiguousarray(blocks.transpose(0, 2, 1))
+        mean = columns.mean(axis=2)
+        rest = columns - mean[:, :, None]
+        variance = (rest * rest).sum(axis=2) / (self._size - 1)
+        cross = (rest * rest[:, [1, 2, 0]]).sum(axis=2) / (self._size - 1)
+        times = time_ns.reshape(count, self._size)
+        joined = np.ones(count, dtype=bool)
+        joined[0] = not self._broken and bool(self._done)
+        self._broken = False
+        means = {n: v.reshape(count, self._size).mean(axis=1) for n, v in channels.items()}
+        self._done.append((times[:, 0].copy(), times[:, -1].copy(), mean, variance, cross, means, joined))
+
+    def windows(self) -> Windows:
+        """Raises InvalidData where there is not one whole window yet."""
+        if not self._done:
+            raise InvalidData(f"too few samples for one window (at least {RATE_SAMPLES})")
+        if len(self._done) > 1:
+            names = self._done[0][5]
+            self._done = [
+                (
+                    *(np.concatenate([d[i] for d in self._done]) for i in range(5)),
+                    {n: np.concatenate([d[5][n] for d in self._done]) for n in names},
+                    np.concatenate([d[6] for d in self._done]),
+                )  # type: ignore[list-item]
+            ]
+        start, end, mean, variance, cross, channels, joined = self._done[0]
+        return Windows(self._size, start, end, mean, variance, cross, channels, joined)
+
+
+def resolution(w: Windows) -> Floats:
+    """(3,) the smallest difference that any two readings show, judged by the sums of windows; never quite zero."""
+    sums = w.mean * w.size
+    least: Floats = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
+    out = least.copy()
+    for i in range(3):
+        gaps = np.diff(np.unique(sums[:, i]))
+        gaps = gaps[gaps > least[i]]
+        out[i] = gaps.min() if len(gaps) else least[i]
+    return out
+
+
+def rounding_variance(step: Floats, scatter: Floats) -> Floats:
+    """(3,) variance of what rounding of the outputs to ``step`` leaves in a mean, however long; ``scatter`` is the
+    variance of a reading. Noise averages it out, if there is enough of it (Widrow and Kollár 2008, Quantization Noise:
+    the harmonics of the rounding error under Gaussian noise).
+    """
+    noise = np.maximum(scatter / step**2 - 1 / 12, 0.0)
+    k = np.arange(1, 50)[:, None]
+    return np.asarray(step**2 * (np.exp(-4 * np.pi**2 * k**2 * noise) / (2 * np.pi**2 * k**2)).sum(axis=0))
