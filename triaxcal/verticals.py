@@ -75,16 +75,6 @@ def verticals_under(
     return Verticals(tuple(poses), direction, V, used, 1e6)
 
 
-def information(sensor: Sensor, u: Floats, held: Mapping[str, Floats], standard_error: Floats) -> Floats:
-    """(p,p) that poses with means ``u`` (n,3) carry on the parameters, in the order of `Calibration.parameters`.
-
-    ``held`` are the deviations of the conditions from their references (n,), ``standard_error`` (n,) of |a|.
-    """
-    a, _, by_parameter = _derivatives(sensor, u, held)
-    J = np.einsum("ni,nip->np", a / np.linalg.norm(a, axis=1, keepdims=True), by_parameter) / standard_error[:, None]
-    return np.asarray(J.T @ J)
-
-
 def _directions(
     sensor: Sensor,
     poses: Sequence[Pose],

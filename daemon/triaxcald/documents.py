@@ -197,11 +197,6 @@ def calibration_document(
 def budget_document(c: Calibration, b: Budget) -> Document:
     """Expanded uncertainties and where they come from. Standard uncertainties in the budget's lines."""
 
-    def by_parameter(values: Floats) -> Document:
-        held = dict(zip(c.parameters, (uncertainty(float(v)) for v in values), strict=True))
-        groups = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
-        effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
-        return groups | ({"effects": effects} if effects else {})
 
     whole = b.magnitude
     return {

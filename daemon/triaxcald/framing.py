@@ -10,12 +10,11 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
-from triaxcal.effects.contract import TIME
 from triaxcal.faces import LABELS, TURNS, axis_of, opposite
 from triaxcal.fixture import Fixture, Quantity
 from triaxcal.frame import Frames, UnitFrame
 from triaxcal.sensor import Sensor
-from triaxcal.verticals import Verticals, information, verticals, verticals_under
+from triaxcal.verticals import Verticals, verticals, verticals_under
 from triaxcald.documents import (
     UNCERTAINTY_DIGITS,
     Document,
@@ -27,6 +26,7 @@ from triaxcald.documents import (
     uncertainty,
 )
 from triaxcald.errors import InputError
+from triaxcald.held_errors import correlation_of, effect_errors_of, linear_errors_of
 from triaxcald.inputs import Measured
 
 ANGLE_DIGITS = 8
@@ -72,58 +72,30 @@ def source_under(
 ) -> Source:
     """A unit with a calibration document. Raises InputError, InvalidData."""
     sensor, channel_reference, reference = sensor_of(document, where=where)
-    covariance, warnings = covariance_of(document, sensor, channel_reference, where=where)
-    with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
-        found = verticals_under(
-            sensor, measured.poses, covariance, channel_reference=channel_reference, reference=reference
-        )
+    covariance, warnings = covariance_of(document, sensor, where=where)
+    absurd = f"{where}: its numbers and the readings of {measured.name} give no finite direction of up"
+    try:
+        with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
+            found = verticals_under(
+                sensor, measured.poses, covariance, channel_reference=channel_reference, reference=reference
+            )
+    except np.linalg.LinAlgError:
+        raise InputError(absurd) from None
     if not (np.isfinite(found.direction).all() and np.isfinite(found.covariance).all()):
-        raise InputError(f"{where}: its numbers and the readings of {measured.name} give no finite direction of up")
+        raise InputError(absurd)
     return Source(name, measured, where, sensor, found, output_unit, reference_unit, None, tuple(warnings))
 
 
-def covariance_of(
-    document: Mapping[str, Any], sensor: Sensor, channel_reference: Mapping[str, float], *, where: str
-) -> tuple[Floats, list[str]]:
-    """(p,p) of the parameters of a calibration document, and warnings. Raises InputError.
-
-    The document holds standard errors; how they go together follows from its poses. Effects of logged channels, whose
-    values in the poses it does not hold, count as independent of the rest.
-    """
+def covariance_of(document: Mapping[str, Any], sensor: Sensor, *, where: str) -> tuple[Floats, list[str]]:
+    """(p,p) of the parameters of a calibration document, and warnings. Raises InputError."""
     part = calibration_part(document, where=where)
-    count = 9 + sum(len(c) for _, c in sensor.effects)
     if "standard_error" not in part:
+        count = 9 + sum(len(c) for _, c in sensor.effects)
         return np.zeros((count, count)), [f"{where} holds no standard errors: the calibration counts as exact"]
-    try:
-        errors = [float(v) for name in ("scale_factor", "misalignment", "bias") for v in part["standard_error"][name]]
-        for effect, _ in sensor.effects:
-            errors += [float(part["effects"][effect.name][c.name]["standard_error"]) for c in effect.coefficients]
-        used = [p for p in part.get("poses", []) if p.get("used", True)]
-        means = np.array([p["mean"] for p in used], dtype=float).reshape(-1, 3)
-        noise = np.array([p["standard_error_g"] for p in used], dtype=float)
-        middle = np.array([(p["start_s"] + p["end_s"]) / 2 for p in used], dtype=float)
-    except KeyError as e:
-        raise InputError(f"{where}: standard_error, poses: {e.args[0]}: missing") from e
-    except (TypeError, ValueError, AttributeError, OverflowError) as e:
-        raise InputError(f"{where}: standard_error, poses: not numbers where numbers belong ({e})") from e
-    sigma = np.array(errors)
-    sound = sigma.shape == (count,) and np.all(sigma >= 0) and np.isfinite(sigma).all() and np.isfinite(means).all()
-    if not sound or not np.all(noise > 0):
-        raise InputError(f"{where}: standard_error, poses: expected finite numbers, no standard error below zero")
-    correlation = np.eye(count)
-    if len(used) < 9:
-        return correlation * sigma**2, [f"{where} holds no poses: its standard errors count as independent"]
-    known = [(e, c) for e, c in sensor.effects if set(e.needs) <= {TIME}]
-    rows = np.concatenate(
-        [np.ones(9, dtype=bool), *(np.full(len(c), set(e.needs) <= {TIME}) for e, c in sensor.effects)]
-    )
-    reduced = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias, tuple(known))
-    held = {TIME: middle - channel_reference.get(TIME, 0.0)}
-    J = information(reduced, means, held, noise)
-    norm = np.sqrt(np.maximum(np.diag(J), 1e-300))
-    P = np.linalg.pinv(J / np.outer(norm, norm), rcond=1e-14) / np.outer(norm, norm)
-    spread = np.sqrt(np.maximum(np.diag(P), 1e-300))
-    correlation[np.ix_(rows, rows)] = P / np.outer(spread, spread)
+    sigma = np.concatenate([linear_errors_of(part, where=where), effect_errors_of(part, sensor, where=where)])
+    correlation = correlation_of(part, sensor, where=where)
+    if correlation is None:
+        return np.diag(sigma**2), [f"{where} holds no correlation: its standard errors count as independent"]
     return correlation * np.outer(sigma, sigma), []
 
 

@@ -5,20 +5,19 @@ All are `triaxcal.calibration/1`, with what the way adds under a key of its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from triaxcal.arrays import Floats
 from triaxcal.attitude import AttitudeFit
-from triaxcal.calibration import Calibration
 from triaxcal.passport import Passport, Refinement
 from triaxcal.rotation import RotationFit
 from triaxcald.documents import (
     LINEAR,
     UNCERTAINTY_DIGITS,
     Document,
+    by_parameter,
     calibration_document,
     calibration_part,
     number,
@@ -28,6 +27,7 @@ from triaxcald.documents import (
     uncertainty,
 )
 from triaxcald.errors import InputError
+from triaxcald.held_errors import correlation_of, effect_errors_of, linear_errors_of
 
 
 def turning_document(found: RotationFit, *, output_unit: str, reference_unit: str) -> Document:
@@ -71,20 +71,13 @@ def passport_document(found: Refinement, *, output_unit: str, reference_unit: st
     document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
     document["passport"] = {
         "conflict_p": probability(found.conflict_p),
-        "value": _by_parameter(c, [number(float(v)) for v in found.passport.values]),
-        "standard_error": _by_parameter(c, [uncertainty(float(v)) for v in found.passport.standard_error]),
-        "shift_standard_errors": _by_parameter(c, [uncertainty(float(v)) for v in found.shift]),
-        "share_of_poses": _by_parameter(c, [uncertainty(float(v)) for v in found.share]),
-        "source": _by_parameter(c, found.sources),
+        "value": by_parameter(c, [number(float(v)) for v in found.passport.values]),
+        "standard_error": by_parameter(c, [uncertainty(float(v)) for v in found.passport.standard_error]),
+        "shift_standard_errors": by_parameter(c, [uncertainty(float(v)) for v in found.shift]),
+        "share_of_poses": by_parameter(c, [uncertainty(float(v)) for v in found.share]),
+        "source": by_parameter(c, found.sources),
     }
     return document
-
-
-def _by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
-    held = dict(zip(c.parameters, values, strict=True))
-    groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
-    effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
-    return groups | ({"effects": effects} if effects else {})
 
 
 def read_passport(
@@ -92,8 +85,8 @@ def read_passport(
 ) -> tuple[Passport, Mapping[str, str]]:
     """The passport values in a calibration, loop or certificate document, and its units.
 
-    ``errors`` stand for the document's: of the scale factors relative to them, of the misalignments in rad, of the
-    biases in the unit of the reference. ``reference`` is the magnitude in the poses, where it is not the document's.
+    ``errors`` stand for the document's, and for its correlation: of the scale factors relative to them, of the
+    misalignments in rad, of the biases in the unit of the reference. ``reference`` is the magnitude in the poses, where it is not the document's.
     Raises InputError.
     """
     sensor, channel_reference, own = sensor_of(document, where=where)
@@ -103,36 +96,17 @@ def read_passport(
     if errors is not None:
         relative, angle, bias = errors
         linear = np.concatenate([np.abs(sensor.scale_factor) * relative, np.full(3, angle), np.full(3, bias)])
+        correlation = None
+    elif "standard_error" not in part:
+        raise InputError(f"{where}: standard_error: missing; expected them, or --passport-error")
     else:
-        linear = np.concatenate([_errors(part, name, where) for name in LINEAR])
-    of_effects = [_effect_errors(part, e.name, [k.name for k in e.coefficients], where) for e, _ in sensor.effects]
-    standard_error = np.concatenate([linear, *of_effects])
+        linear = linear_errors_of(part, where=where)
+        correlation = correlation_of(part, sensor, where=where)
+    standard_error = np.concatenate([linear, effect_errors_of(part, sensor, where=where)])
     if not np.any(standard_error > 0):
-        raise InputError(f"{where}: standard_error: all are 0, so that nothing is left to refine")
+        whose = f"{where}: standard_error" if errors is None else "--passport-error"
+        raise InputError(f"{whose}: all are 0, so that nothing is left to refine")
     units = part.get("units")
     held = {str(k): str(v) for k, v in units.items()} if isinstance(units, Mapping) else {}
-    return Passport(sensor, standard_error, channel_reference, own if reference is None else reference), held
-
-
-def _errors(part: Mapping[str, Any], name: str, where: str) -> Floats:
-    held = part.get("standard_error")
-    values = held.get(name) if isinstance(held, Mapping) else None
-    try:
-        out = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        out = np.zeros(0)
-    if out.shape != (3,) or not (np.isfinite(out).all() and np.all(out >= 0)):
-        raise InputError(
-            f"{where}: standard_error.{name}: expected three numbers of at least 0; without them give --passport-error"
-        )
-    return out
-
-
-def _effect_errors(part: Mapping[str, Any], effect: str, names: Sequence[str], where: str) -> Floats:
-    out = []
-    for name in names:
-        value = part["effects"][effect][name].get("standard_error")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
-            raise InputError(f"{where}: effects.{effect}.{name}.standard_error: expected a number of at least 0")
-        out.append(float(value))
-    return np.array(out)
+    magnitude = own if reference is None else reference
+    return Passport(sensor, standard_error, channel_reference, magnitude, correlation), held

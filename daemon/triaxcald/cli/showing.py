@@ -91,15 +91,19 @@ def show_coefficients(c: Calibration, choice: Choice) -> None:
     table("coefficients", ["", "value", "standard error", "unit"], rows)
 
 
+def _percent(share: float) -> str:
+    return "< 1%" if 0 < share < 0.01 else f"{share:.0%}"
+
+
 def show_budget(b: Budget, choice: Choice) -> None:
     unit = choice.micro_unit
-    rows = [[line.source, line.evaluation, micro(line.magnitude), f"{b.share(line):.0%}"] for line in b.components]
+    rows = [[line.source, line.evaluation, micro(line.magnitude), _percent(b.share(line))] for line in b.components]
     whole = b.magnitude
     rows.append(["combined", "", micro(float(whole.standard)), ""])
     rows.append(
         [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", micro(float(whole.expanded)), ""]
     )
-    table(f"uncertainty of the magnitude, over all orientations, {unit}", ["source", "type", "standard", "share"], rows)
+    table(f"uncertainty of the magnitude, {unit}", ["source", "type", "standard", "share"], rows)
     print(
         f"dominant: {b.dominant.source}; to halve it: {b.dominant.halved_by} "
         f"(combined then {micro(b.magnitude_if_halved)} {unit})"
