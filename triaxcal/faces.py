@@ -72,9 +72,10 @@ class Labelling:
 
 
 def nearest_rotation(up: Floats, axes: Floats) -> Floats:
-    """The rotation C (3,3) that minimises Σ|C upᵢ − axesᵢ|² (Wahba's problem; Markley 1988), for two (n,3)."""
-    u, _, vt = np.linalg.svd(axes.T @ up)
-    return np.asarray(u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt)
+    """The rotation C (…,3,3) that minimises Σ|C upᵢ − axesᵢ|² (Wahba's problem; Markley 1988), for two (…,n,3)."""
+    u, _, vt = np.linalg.svd(np.swapaxes(axes, -1, -2) @ up)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
 
 
 def recognise(up: Floats, used: Bools) -> Labelling:

@@ -24,8 +24,8 @@ class Fixture:
     ``squareness`` by pair of axes (XY, YZ, ZX): how far the mean normals of their faces are from a right angle,
     positive where the angle is smaller. ``parallelism`` by axis: half of what its two faces lack to be parallel, as the
     mean of both inward normals, along the two other axes in cyclic order. Both do not depend on the datum.
-    ``offset`` (3,) rad: standard error, about the body's axes, of the datum against a frame that faces with errors of
-    this size were made to; None where nothing shows that size.
+    ``offset`` (3,) rad: standard error, about the body's axes, of the datum against the frame that faces with
+    independent errors of this size were made to; None where nothing shows that size.
     """
 
     faces: tuple[str, ...]
@@ -42,7 +42,9 @@ class Fixture:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(-1, 3)
 
 
-def fixture_of(faces: tuple[str, ...], up: Floats, covariance: Floats, axes: Floats) -> Fixture:
+def fixture_of(faces: tuple[str, ...], up: Floats, covariance: Floats, axes: Floats, datum: Floats) -> Fixture:
+    """``covariance`` (2f,2f) of the normals in ``axes`` (f,3,2); ``datum`` (3,2f): what of their errors there it makes
+    zero."""
     nominal = np.array([axis_of(label) for label in faces])
     spread = np.zeros((3 * len(faces), 2 * len(faces)))
     for k in range(len(faces)):
@@ -76,14 +78,19 @@ def fixture_of(faces: tuple[str, ...], up: Floats, covariance: Floats, axes: Flo
         if (a, b) in mean and (b, a) in mean
     }
     parallelism = {"XYZ"[a]: (quantity(half[a, (a + 1) % 3]), quantity(half[a, (a + 2) % 3])) for a in both}
-    return Fixture(faces, up, error, V, squareness, parallelism, _offset(faces, error, V))
+    return Fixture(faces, up, error, V, squareness, parallelism, _offset(nominal, axes, error, V, datum))
 
 
-def _offset(faces: tuple[str, ...], error: Floats, V: Floats) -> Floats | None:
-    """(3,): standard error of the least-squares frame if each face had independent errors as large as these."""
-    left = 2 * len(faces) - 3
+def _offset(nominal: Floats, axes: Floats, error: Floats, V: Floats, datum: Floats) -> Floats | None:
+    left = 2 * len(nominal) - 3
     if left < 1:
         return None
-    variance = max(float(np.sum(error**2)) - float(np.trace(V)), 0.0) / left
-    seen = np.sum([np.eye(3) - np.outer(axis_of(x), axis_of(x)) for x in faces], axis=0)
-    return np.sqrt(variance * np.diag(np.linalg.inv(seen)))
+    turns = np.cross(np.eye(3), nominal[:, None]).transpose(0, 2, 1)  # (f,3,3) errors by a rotation of all faces
+    B = turns.reshape(-1, 3)
+    shape = np.eye(len(B)) - B @ np.linalg.pinv(B)  # errors as the least-squares frame has them, whatever the datum
+    rest = shape @ error.ravel()
+    variance = max(float(rest @ rest) - float(np.trace(shape @ V @ shape)), 0.0) / left
+    # The datum turns by what makes its share of the faces' errors zero.
+    across = (axes.transpose(0, 2, 1) @ turns).reshape(-1, 3)
+    turned = np.linalg.solve(datum @ across, datum)
+    return np.asarray(np.sqrt(variance * np.sum(turned**2, axis=1)))

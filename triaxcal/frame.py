@@ -19,10 +19,10 @@ from triaxcal.arrays import Floats
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.faces import LABELS, axis_of, nearest_rotation, opposite
 from triaxcal.fixture import Fixture, fixture_of
+from triaxcal.orientations import LARGE_RAD
 from triaxcal.standing import Standing, basis_of
 
 ROUNDS = 8
-LARGE_RAD = 0.01
 SINGULAR = 0.05
 """Faces that connect units give singular values near 1; ones that do not, those of the faces' own errors."""
 LACK_OF_FIT = 0.01
@@ -132,7 +132,7 @@ def frames(standings: Sequence[Standing], *, datum: Datum | None = None) -> Fram
         UnitFrame(s, joint.rotations[i], covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], dofs[i])
         for i, s in enumerate(standings)
     )
-    fixture = fixture_of(faces, joint.up, covariance[n:, n:], joint.axes)
+    fixture = fixture_of(faces, joint.up, covariance[n:, n:], joint.axes, joint.constraints()[0])
     warnings = list(_warnings(fixture, datum))
     if inflation > 1:
         warnings.append(
@@ -173,7 +173,7 @@ class _Joint:
         """Itself; raises Refused where the faces in common leave units free to turn against each other."""
         n = 3 * len(self.standings)
         self._prepare()
-        G = np.concatenate([np.zeros((3, n)), self._constraints()[0]], axis=1)
+        G = np.concatenate([np.zeros((3, n)), self.constraints()[0]], axis=1)
         rows = np.concatenate([*(self._observed(i, s)[0] for i, s in enumerate(self.standings)), G])
         if np.linalg.matrix_rank(rows, tol=SINGULAR) < rows.shape[1]:
             raise Refused(
@@ -211,7 +211,7 @@ class _Joint:
             right += J.T @ weight @ y
             self.chi2 += float(y @ weight @ y)
             self.gains.append(J.T @ weight)
-        G, miss = self._constraints()
+        G, miss = self.constraints()
         G = np.concatenate([np.zeros((3, n)), G], axis=1)
         scale = float(np.trace(information)) / (n + m)
         bordered = np.block([[information / scale, G.T], [G, np.zeros((3, 3))]])
@@ -236,7 +236,7 @@ class _Joint:
             turn[at, at] = T.T @ self.rotations[i] @ standing.basis[row]
         return J, y, turn @ standing.covariance @ turn.T
 
-    def _constraints(self) -> tuple[Floats, Floats]:
+    def constraints(self) -> tuple[Floats, Floats]:
         """(3,2f) derivatives, and misses (3,), of what the datum wants to be zero."""
         G = np.zeros((3, 2 * len(self.faces)))
         if self.datum.faces is None:

@@ -64,6 +64,7 @@ class Moments:
             at += number * piece
         self._rest = waiting[at:].copy()
 
+    @np.errstate(over="ignore", invalid="ignore", under="ignore")  # judged by the range, in `summary`
     def _take(self, pieces: Floats) -> None:
         number, piece, _ = pieces.shape
         into = (self._pieces + np.arange(number)) * piece // self._size

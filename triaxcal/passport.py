@@ -26,6 +26,7 @@ from triaxcal.sensor import Sensor
 STEPS_MOST = 60
 CONVERGED = 1e-12
 CONFLICT = 0.01
+FAR = "the refinement did not converge: the passport values are far from these poses"
 FROM_POSES, FROM_PASSPORT = 0.9, 0.1
 """Share of the information on a parameter from which on it counts as the poses', or still as the passport's."""
 
@@ -33,12 +34,14 @@ FROM_POSES, FROM_PASSPORT = 0.9, 0.1
 @dataclass(frozen=True)
 class Passport:
     """Values known from before. ``standard_error`` (9+p,) in the order of `Calibration.parameters`: scale factors,
-    misalignments, biases, effects' coefficients; a zero holds a value fast."""
+    misalignments, biases, effects' coefficients; a zero holds a value fast. ``correlation`` (9+p,9+p) of their errors,
+    none where it is None."""
 
     sensor: Sensor
     standard_error: Floats
     channel_reference: Mapping[str, float]
     reference: float
+    correlation: Floats | None = None
 
     def __post_init__(self) -> None:
         n = 9 + sum(len(e.coefficients) for e, _ in self.sensor.effects)
@@ -47,11 +50,26 @@ class Passport:
             raise InvalidData(f"a passport of {n} values needs as many standard errors of at least 0")
         if not np.any(error > 0):
             raise InvalidData("every passport value has a standard error of 0: nothing is left to refine")
+        if self.correlation is not None and self.correlation.shape != (n, n):
+            raise InvalidData(f"the correlation of a passport of {n} values is a matrix of as many rows")
 
     @property
     def values(self) -> Floats:
         s = self.sensor
         return np.concatenate([s.scale_factor, s.misalignment, s.bias, *(c for _, c in s.effects)])
+
+    @property
+    def root(self) -> Floats:
+        """(9+p,q): what independent errors of variance one make of the values that are free; its square is their
+        covariance."""
+        error = self.standard_error
+        free = np.flatnonzero(error > 0)
+        if self.correlation is None:
+            return np.asarray(np.diag(error)[:, free])
+        values, vectors = np.linalg.eigh(self.correlation[np.ix_(free, free)])
+        out = np.zeros((len(error), len(free)))
+        out[free] = error[free, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        return out
 
 
 @dataclass(frozen=True)
@@ -82,15 +100,16 @@ def refine(poses: Sequence[Pose], passport: Passport) -> Refinement:
         raise Refused("no still pose: there is nothing to refine the passport values by")
     problem = _problem(poses, passport)
     free = passport.standard_error > 0
-    p, information = _solved(problem, passport, free)
+    root = passport.root
+    z, information = _solved(problem, passport, root)
+    p = passport.values + root @ z
     prior = passport.standard_error**2
-    covariance = np.zeros((len(p), len(p)))
-    covariance[np.ix_(free, free)] = np.linalg.inv(information)
+    covariance = root @ np.linalg.inv(information) @ root.T
     state = _state(problem, passport, p)
     r, J, s = linearise(problem, state)
     J = J @ _theta_by_parameters(problem, state)
     moved = p - passport.values
-    chi2 = float(np.sum((r / s) ** 2) + np.sum((moved[free] / passport.standard_error[free]) ** 2))
+    chi2 = float(np.sum((r / s) ** 2) + z @ z)
     pure = pure_error_dof(poses)
     conflict_p = lack_of_fit_p(chi2, len(poses), pure if pure >= 1 else 1e6)
     raised = max(1.0, float(np.sqrt(chi2 / len(poses)))) if conflict_p is not None and conflict_p < CONFLICT else 1.0
@@ -145,36 +164,42 @@ def _theta_by_parameters(problem: Problem, state: State) -> Floats:
     return np.linalg.inv(parameters_by_theta(problem, state))
 
 
-def _solved(problem: Problem, passport: Passport, free: np.ndarray) -> tuple[Floats, Floats]:
-    """Parameters (9+p,) and the information (q,q) on the free ones: Gauss–Newton with halved steps."""
-    error = passport.standard_error[free]
-    p = passport.values.copy()
+def _solved(problem: Problem, passport: Passport, root: Floats) -> tuple[Floats, Floats]:
+    """Shifts (q,) of the values along ``root`` (9+p,q) and the information (q,q) on them: Gauss–Newton with halved
+    steps."""
+    z = np.zeros(root.shape[1])
+    free = passport.standard_error > 0
+    size = max(float(np.linalg.norm(passport.values[free] / passport.standard_error[free])), 1.0)
 
-    def cost(p: Floats, s: Floats) -> float:
+    def cost(z: Floats, s: Floats) -> float:
+        p = passport.values + root @ z
         if np.any(p[:3] * passport.values[:3] <= 0):
             return float("inf")
         r, _, _ = linearise(problem, _state(problem, passport, p), jacobian=False)
-        return float(np.sum((r / s) ** 2) + np.sum(((p - passport.values)[free] / error) ** 2))
+        return float(np.sum((r / s) ** 2) + z @ z)
 
     for _ in range(STEPS_MOST):
-        state = _state(problem, passport, p)
+        state = _state(problem, passport, passport.values + root @ z)
         r, J, s = linearise(problem, state)
-        J = (J @ _theta_by_parameters(problem, state))[:, free] / s[:, None] * error  # in prior standard errors
-        information = J.T @ J + np.eye(len(error))
-        step = -np.linalg.solve(information, J.T @ (r / s) + (p - passport.values)[free] / error)
-        now, scale = cost(p, s), 1.0  # the weights follow the gradient from step to step
-        trial = p.copy()
+        if not (np.isfinite(J).all() and np.isfinite(r).all() and np.all(s > 0)):
+            raise Refused(FAR)
+        J = J @ _theta_by_parameters(problem, state) @ root / s[:, None]
+        information = J.T @ J + np.eye(len(z))
+        if not np.isfinite(information).all():
+            raise Refused(FAR)
+        step = -np.linalg.solve(information, J.T @ (r / s) + z)
+        now, scale = cost(z, s), 1.0  # the weights follow the gradient from step to step
         for _ in range(20):
-            trial[free] = p[free] + scale * error * step
+            trial = z + scale * step
             if cost(trial, s) <= now * (1 + 1e-9) + 1e-12:
                 break
             scale /= 2
-        p = trial
-        if np.linalg.norm(step) <= CONVERGED * max(float(np.linalg.norm(p[free] / error)), 1.0):
-            return p, information / np.outer(error, error)
+        z = trial
+        if np.linalg.norm(step) <= CONVERGED * size:
+            return z, information
     if np.linalg.norm(step) > 1e-6:
-        raise Refused("the refinement did not converge: the passport values are far from these poses")
-    return p, information / np.outer(error, error)
+        raise Refused(FAR)
+    return z, information
 
 
 def _residual(r: Floats, s: Floats, leverage: Floats, p: float | None) -> Residual:

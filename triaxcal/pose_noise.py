@@ -50,13 +50,13 @@ def pose_noise(tracks: Sequence[Track], recording: float, creeping: Bools | None
         model = _Model.of(straight, recording, lowest=2)
         for _ in range(2):
             before: Bools | None = creeping
-            creeping = (np.abs(slope) > limit * np.sqrt(model.slope_variance(tracks))).any(axis=1)
+            creeping = np.asarray((np.abs(model.significance(tracks, slope)) > limit).any(axis=1))
             if before is not None and np.array_equal(before, creeping):
                 break
             model = _Model.of(_mixed(tracks, straight, creeping), recording)
     else:
         model = _Model.of(_mixed(tracks, straight, creeping), recording)
-    significance = slope / np.sqrt(np.maximum(model.slope_variance(tracks), 1e-300))
+    significance = model.significance(tracks, slope)
     return PoseNoise(model.mean_variance(tracks), model.dof(), slope, significance, limit, model.common_dof)
 
 
@@ -100,8 +100,21 @@ class _Model:
     def mean_variance(self, tracks: Sequence[Track]) -> Floats:
         return np.asarray(self.scale * np.array([self.spectrum.variance_of_mean(t) for t in tracks]))
 
-    def slope_variance(self, tracks: Sequence[Track]) -> Floats:
-        return np.asarray(self.scale * np.array([self.spectrum.variance_of_slope(t) for t in tracks]))
+    def significance(self, tracks: Sequence[Track], slope: Floats) -> Floats:
+        """(k,q) of slopes, in standard deviations; of what exceeds the slope that a vibration makes."""
+        variance = self.scale * np.array([self.spectrum.variance_of_slope(t) for t in tracks])
+        beyond = np.maximum(np.abs(slope) - self._vibration_slope(tracks), 0.0)
+        return np.asarray(np.sign(slope) * beyond / np.sqrt(np.maximum(variance, 1e-300)))
+
+    def _vibration_slope(self, tracks: Sequence[Track]) -> Floats:
+        """(k,q) the largest slope that a sine of the scatter's size makes by the part of a period at its ends.
+
+        Zero where the spectrum was fitted to the end: there is none then.
+        """
+        if self.spectrum.highest >= 0.5:
+            return np.zeros_like(self.scale)
+        size = np.array([np.sqrt(2 * (t.deviation**2).mean(axis=0)) / t.length**2 for t in tracks])
+        return np.asarray(6 * size / np.sin(np.pi * self.spectrum.highest))
 
     @property
     def common_dof(self) -> float:

@@ -10,6 +10,7 @@ from scipy import optimize, stats
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import Refused
+from triaxcal.faces import nearest_rotation
 from triaxcal.poses import Pose
 from triaxcal.pure_error import lack_of_fit_p
 from triaxcal.start import problem_of, start
@@ -194,16 +195,9 @@ def _off_most(a: Floats, ups: Floats) -> Floats:
     if len(i) > PAIRS_MOST:
         some = np.random.default_rng(0).permutation(len(i))[:PAIRS_MOST]
         i, j = i[some], j[some]
-    C = _rotations_between(np.stack([a[i], a[j]], axis=1), np.stack([ups[i], ups[j]], axis=1))
+    C = nearest_rotation(np.stack([ups[i], ups[j]], axis=1), np.stack([a[i], a[j]], axis=1))
     off: Floats = np.linalg.norm(a - np.einsum("mij,nj->mni", C, ups), axis=2)
     return off[int(np.argmin(np.median(off, axis=1)))] if len(off) else np.full(len(a), np.inf)
-
-
-def _rotations_between(a: Floats, b: Floats) -> Floats:
-    """(m,3,3) proper rotations C with ``a ≈ C b`` in least squares (Kabsch), for vectors (m,k,3)."""
-    U, _, Vt = np.linalg.svd(a.transpose(0, 2, 1) @ b)
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return np.asarray(U @ Vt)
 
 
 def wrong_by_residual(s: TurntableSolution) -> Ints:

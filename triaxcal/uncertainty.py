@@ -8,7 +8,7 @@ conditions. That last figure, its rms over the sphere, is what the sources are w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
@@ -133,8 +133,9 @@ def budget(calibration: Calibration, stated: Stated | None = None, level: float 
     """The budget of a calibration fitted to still poses (`triaxcal.fit.fit`)."""
     stated = stated or Stated()
     ground = _Ground(calibration)
-    found = [*_statistical(calibration, ground), *_reference(ground, stated)]
-    found += [*_temperature(calibration, ground), *_thermometer(calibration, ground, stated)]
+    thermal, beyond = _temperature(calibration, ground)
+    found = [*_statistical(calibration, ground, beyond), *_reference(ground, stated), *thermal]
+    found += _thermometer(calibration, ground, stated)
     found += _rounding(calibration, ground, stated)
     found.sort(key=lambda c: -c.magnitude)
     return Budget(
@@ -152,7 +153,11 @@ class _Ground:
         sensor = calibration.sensor
         poses = [p.pose for p in calibration.poses if p.used]
         signs = tuple(np.sign(sensor.scale_factor))
-        self.problem = problem_of(poses, signs=signs, reference=calibration.reference)
+        problem = problem_of(poses, signs=signs, reference=calibration.reference)
+        # A model without a channel holds at its mean; the reference of one that has it is rounded to read well. To a
+        # millionth, since processors differ in the last digits, and a steady channel should not seem to move.
+        means = {n: round(float(np.mean(problem.channels[n])), 6) for n in problem.channel_reference}
+        self.problem = replace(problem, channel_reference=means | dict(calibration.channel_reference))
         D = self.problem.half / sensor.scale_factor
         w = sensor.bias - self.problem.middle / sensor.scale_factor
         coefficients = [c for _, c in sensor.effects]
@@ -205,8 +210,9 @@ def _pinv(matrix: Floats) -> Floats:
     return np.asarray(np.linalg.pinv(matrix / norms, rcond=1e-13) / norms[:, None])
 
 
-def _statistical(calibration: Calibration, ground: _Ground) -> list[Component]:
-    """What the scatter inside the poses, their creep, and residuals beyond both say."""
+def _statistical(calibration: Calibration, ground: _Ground, beyond: float) -> list[Component]:
+    """What the scatter inside the poses, their creep, and residuals beyond both say, of which thermal effects leave the
+    share ``beyond``."""
     poses = [p.pose for p in calibration.poses if p.used]
     _, by_u = calibration.sensor.magnitude(ground.problem.u, ground.problem.conditions)
     creeping = np.array([p.creep_covariance for p in poses])
@@ -228,7 +234,7 @@ def _statistical(calibration: Calibration, ground: _Ground) -> list[Component]:
         how = f"{np.count_nonzero(creep)} poses creep; rectangular over the change in each"
         by = "wait before each pose until the outputs creep by half as much"
         out.append(ground.component("creep", "B", np.inf, (S * creep) @ S.T, how, by))
-    excess = calibration.covariance - (S * ground.error**2) @ S.T
+    excess = beyond * (calibration.covariance - (S * ground.error**2) @ S.T)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
         how = f"residuals are {calibration.inflation:.2f} times what noise explains"
         by = "find what the model lacks: diagnose; more poses, some of them repeated"
@@ -244,15 +250,16 @@ def _reference(ground: _Ground, stated: Stated) -> list[Component]:
     return [ground.component("reference", "B", np.inf, np.outer(shift, shift), stated.reference_source, by)]
 
 
-def _temperature(calibration: Calibration, ground: _Ground) -> list[Component]:
-    """What thermal effects that the fit has not taken up may have done to its parameters.
+def _temperature(calibration: Calibration, ground: _Ground) -> tuple[list[Component], float]:
+    """What thermal effects that the fit has not taken up may have done to its parameters; and the share of the
+    residuals' variance beyond noise that they do not explain, 0…1, lest it count twice.
 
     A coefficient that did not show is not zero: it is what the data leave of `SENSITIVITY_PER_K`, a mean and a spread
     by Bayes' rule, and the parameters of a fit without it are off by what it does to them.
     """
     missing = _thermal_but(ground.effects)
     if TEMPERATURE not in ground.problem.channel_reference or not missing:
-        return []
+        return [], 1.0
     extra = sum(len(e.coefficients) for e in missing)
     extended = State(np.concatenate([ground.state.theta, np.zeros(extra)]), (*ground.effects, *missing))
     r, J, s = linearise(ground.problem, extended)
@@ -265,11 +272,18 @@ def _temperature(calibration: Calibration, ground: _Ground) -> list[Component]:
     left = np.linalg.inv(np.eye(extra) + rest.T @ rest)
     mean = -left @ rest.T @ (r / s)
     through = ground.G @ (S @ Z)
+    after = r / s + rest @ mean
+    taken = extra - float(np.trace(left))  # degrees of freedom, fewer than coefficients where the data say little
+    before_ratio, after_ratio = (
+        float(v @ v) / max(len(r) - p - dof, 1e-9) for v, dof in ((r / s, 0.0), (after, taken))
+    )
+    beyond = min(max(after_ratio - 1, 0.0) / (before_ratio - 1), 1.0) if before_ratio > 1 else 1.0
     moved = float(np.ptp(ground.problem.channels[TEMPERATURE]))
     names = " and ".join(e.name for e in missing)
     how = f"{names} not in the model; the temperature moved by {moved:.2g} K from pose to pose"
     by = "hold the temperature twice as steady, or let it swing until its effects can be fitted"
-    return [ground.component("temperature", "B", np.inf, through @ (left + np.outer(mean, mean)) @ through.T, how, by)]
+    covariance = through @ (left + np.outer(mean, mean)) @ through.T
+    return [ground.component("temperature", "B", np.inf, covariance, how, by)], beyond
 
 
 def _thermal_but(effects: tuple[Effect, ...]) -> list[Effect]:

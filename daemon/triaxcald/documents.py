@@ -194,15 +194,25 @@ def calibration_document(
     }
 
 
+def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
+    """Values in the order of `Calibration.parameters`, in groups as the coefficients stand in a document."""
+    held = dict(zip(c.parameters, values, strict=True))
+    groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
+    effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
+    return groups | ({"effects": effects} if effects else {})
+
+
 def budget_document(c: Calibration, b: Budget) -> Document:
     """Expanded uncertainties and where they come from. Standard uncertainties in the budget's lines."""
 
+    def by_name(values: Floats) -> Document:
+        return by_parameter(c, [uncertainty(float(v)) for v in values])
 
     whole = b.magnitude
     return {
         "level": b.parameters.level,
-        "expanded": by_parameter(b.parameters.expanded),
-        "coverage_factor": by_parameter(b.parameters.coverage),
+        "expanded": by_name(b.parameters.expanded),
+        "coverage_factor": by_name(b.parameters.coverage),
         "magnitude": {
             "standard_g": uncertainty(float(whole.standard)),
             "coverage_factor": uncertainty(float(whole.coverage)),
@@ -213,7 +223,7 @@ def budget_document(c: Calibration, b: Budget) -> Document:
                 "source": line.source,
                 "evaluation": line.evaluation,
                 "degrees_of_freedom": uncertainty(line.dof),
-                **by_parameter(line.parameters),
+                **by_name(line.parameters),
                 "magnitude_g": uncertainty(line.magnitude),
                 "share": uncertainty(b.share(line)),
                 "how": line.how,

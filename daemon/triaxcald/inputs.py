@@ -92,6 +92,14 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str, moments:
     return Measured(recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference, unit, stated)
 
 
+def require_unit(document: Mapping[str, Any], measured: Measured, *, where: str) -> None:
+    """Raises InputError where a calibration document, ``where``, is of another unit than the recording."""
+    held = document.get("unit")
+    theirs, ours = held.get("serial") if isinstance(held, Mapping) else None, (measured.unit or {}).get("serial")
+    if theirs and ours and theirs != ours:
+        raise InputError(f"{where}: unit.serial is {theirs}; {measured.name} is of {ours}")
+
+
 def signs_of(recording: Recording) -> tuple[int, int, int] | None:
     """Of the scale factors, as the station that made the recording had them."""
     parts = recording.metadata.get("unit", {}).get("signs", "").split(",")

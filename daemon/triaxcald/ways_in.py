@@ -86,8 +86,8 @@ def read_passport(
     """The passport values in a calibration, loop or certificate document, and its units.
 
     ``errors`` stand for the document's, and for its correlation: of the scale factors relative to them, of the
-    misalignments in rad, of the biases in the unit of the reference. ``reference`` is the magnitude in the poses, where it is not the document's.
-    Raises InputError.
+    misalignments in rad, of the biases in the unit of the reference. ``reference`` is the magnitude in the
+    poses, where it is not the document's. Raises InputError.
     """
     sensor, channel_reference, own = sensor_of(document, where=where)
     part = calibration_part(document, where=where)

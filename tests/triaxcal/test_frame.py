@@ -329,12 +329,14 @@ def test_fewer_faces_give_a_frame_of_those(paper_unit: Sensor, faces: list[str])
         assert any("nothing stood" in w for w in result.warnings)
 
 
-def test_what_the_datum_leaves_open_is_said(paper_unit: Sensor) -> None:
-    """How far the least-squares frame lies from the one that a fixture with such faces was made to."""
+@pytest.mark.parametrize("datum", [None, ("-Z", "-X"), ("+Y", "-Z")])
+def test_what_the_datum_leaves_open_is_said(paper_unit: Sensor, datum: tuple[str, str] | None) -> None:
+    """How far the frame lies from the one that a fixture with such faces was made to: farther if two faces define it
+    than if all do."""
     pulls = []
     for seed in range(40):
         bench = Bench.of(paper_unit, seed)
-        result = frames([bench.stood()])
+        result = frames([bench.stood()], datum=Datum(datum))
         assert result.fixture.offset is not None
         wanted = Rotation.from_matrix(bench.mount @ result.units[0].rotation.T).as_rotvec()
         pulls.append(wanted / result.fixture.offset)

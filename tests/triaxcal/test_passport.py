@@ -139,6 +139,42 @@ def test_a_value_without_error_stays_where_it_is() -> None:
     assert np.all(c.standard_errors[3:6] == 0)
 
 
+def test_a_passport_from_earlier_poses_and_new_poses_are_as_good_as_all_poses_at_once() -> None:
+    """Its errors go together: 10 K away from where the coefficients count from, a bias is hardly told from its drift
+    with temperature."""
+    effect = effect_named("temperature_bias")
+    hot = Sensor(UNIT.scale_factor, UNIT.misalignment, UNIT.bias, ((effect, np.array([2e-4, -1e-4, 1e-4])),))
+    rng = np.random.default_rng(3)
+    ups = np.array([v for _, v in cube_directions()])
+    held = noisy_poses(
+        hot, np.concatenate([ups, ups[:14]]), 1e-6, rng,
+        channels={"temp_c": 35 + rng.uniform(-1, 1, 40)}, channel_reference={"temp_c": 25.0},
+    )  # fmt: skip
+    earlier, today = held[:26], held[26:]
+    whole = fit(held, signs=SIGNS, effects=[effect], aside=())
+    before = fit(earlier, signs=SIGNS, effects=[effect], aside=())
+    reference = before.channel_reference["temp_c"]
+    # Moved to 25 °C, as if it had been made to count from there.
+    values, V = _counted_from(before.values, before.covariance / before.inflation**2, 25.0 - reference)
+    error = np.sqrt(np.diag(V))
+    known = Sensor(values[:3], values[3:6], values[6:9], ((effect, values[9:]),))
+    prior = Passport(known, error, {"temp_c": 25.0}, 1.0, V / np.outer(error, error))
+    found = refine(today, prior).calibration
+    values, V = _counted_from(
+        whole.values, whole.covariance / whole.inflation**2, 25.0 - whole.channel_reference["temp_c"]
+    )
+    np.testing.assert_allclose(found.standard_errors, np.sqrt(np.diag(V)), rtol=0.02)
+    assert np.max(np.abs(found.values - values) / np.sqrt(np.diag(V))) < 0.1
+    assert found.inflation == 1
+
+
+def _counted_from(values: np.ndarray, V: np.ndarray, by_k: float) -> tuple[np.ndarray, np.ndarray]:
+    """Values and covariance of the nine and three drifts with temperature, for another reference temperature."""
+    M = np.eye(12)
+    M[6:9, 9:] = by_k * np.eye(3)
+    return M @ values, M @ V @ M.T
+
+
 def test_effects_of_the_passport_are_kept_and_refined_too() -> None:
     effect = effect_named("temperature_bias")
     q = np.array([2e-4, -1e-4, 1e-4])

@@ -135,3 +135,16 @@ def test_what_creep_costs_is_in_the_covariance(paper_unit: Sensor, fourteen: np.
 def test_a_pose_that_cannot_be_is_refused(mean: np.ndarray, covariance: np.ndarray, why: str) -> None:
     with pytest.raises(InvalidData, match=why):
         Pose(0.0, 1.0, 100, mean, covariance, 99.0)
+
+
+@pytest.mark.parametrize("vibration_g", [5e-3, 5e-2, 0.2])
+def test_a_machine_that_shakes_the_stand_does_not_make_poses_creep(
+    vibration_g: float, paper_unit: Sensor, fourteen: np.ndarray, detect: Detect
+) -> None:
+    path = Tumble(fourteen, hold_s=5.0, move_s=1.5)
+    t_s = np.arange(int(100 * path.round_s)) / 100
+    shaken = vibration_g * np.sin(2 * np.pi * 24.7 * t_s)[:, None] * [1.0, 0.3, 0.5]
+    noise = 2e-4 * np.random.default_rng(3).standard_normal((len(t_s), 3))
+    poses = detect(t_s, paper_unit.output(path.specific_force(t_s) + shaken + noise, {}))[2]
+    assert len(poses) == 14
+    assert not any(p.creep.any() for p in poses)

@@ -338,6 +338,11 @@ def test_an_output_that_never_changes_is_no_sensors(unit: Sensor) -> None:
         fitted(u)
 
 
+def test_sums_that_overflow_warn_nobody_before_they_are_refused() -> None:
+    with np.errstate(all="raise"), pytest.raises(InvalidData, match="cannot be summed up"):
+        fitted(1e100 * np.random.default_rng(0).standard_normal((20_000, 3)))
+
+
 def test_outputs_beyond_what_can_be_summed_are_refused() -> None:
     with pytest.raises(InvalidData, match="cannot be summed up"):
         fitted(path(500) * 1e80)

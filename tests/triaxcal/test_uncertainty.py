@@ -138,6 +138,34 @@ def test_what_temperature_may_have_done_grows_with_how_far_it_moved(paper_unit: 
     assert wild < 1.5 * NOISE
 
 
+@pytest.mark.parametrize("steady_c", [22.45, -3.49, 1 / 3])
+def test_a_steady_temperature_costs_nothing_whatever_it_is(
+    paper_unit: Sensor, twenty_six: np.ndarray, steady_c: float
+) -> None:
+    held = {"temp_c": np.full(26, steady_c)}
+    poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=held)
+    line = next(x for x in budget(fit(poses, signs=SIGNS, aside=())).components if x.source == "temperature")
+    assert line.magnitude < 1e-3 * NOISE
+
+
+@pytest.mark.parametrize("moved_k", [0.1, 2.0])
+def test_a_thermal_effect_that_shows_in_the_residuals_counts_once(
+    paper_unit: Sensor, twenty_six: np.ndarray, moved_k: float
+) -> None:
+    """Of sensitivities as the budget expects them, nobody having diagnosed: under temperature, not under lack of fit
+    too."""
+    rng = np.random.default_rng(11)
+    ratios = []
+    for _ in range(60):
+        pairs = tuple((effect_named(n), v * rng.standard_normal(3)) for n, v in SENSITIVITY_PER_K.items())
+        unit = Sensor(paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias, pairs)
+        warm = {"temp_c": 25 + moved_k * rng.permutation(np.linspace(-0.5, 0.5, 26))}
+        poses = noisy_poses(unit, twenty_six, NOISE, rng, channels=warm, channel_reference={"temp_c": 25.0})
+        c = fit(poses, signs=SIGNS, aside=())
+        ratios.append((_sphere_rms(c, paper_unit) / float(budget(c).magnitude.standard)) ** 2)
+    assert abs(np.mean(ratios) - 1) < 4 * np.std(ratios) / np.sqrt(len(ratios))
+
+
 def test_steps_of_registers_are_rectangular(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, aside=())
     line = next(x for x in budget(c, Stated(rounding={"bias.y": 6e-5})).components if x.source == "register_rounding")

@@ -41,18 +41,18 @@ def positive(text: str) -> float:
 
 
 def not_negative(text: str) -> float:
-    return _within(text, 0.0, sys.float_info.max, "a number of at least 0")
+    return within(text, 0.0, sys.float_info.max, "a number of at least 0")
 
 
 def latitude(text: str) -> float:
-    return _within(text, -90.0, 90.0, "degrees between -90 and 90")
+    return within(text, -90.0, 90.0, "degrees between -90 and 90")
 
 
 def height(text: str) -> float:
-    return _within(text, *HEIGHTS_M, f"metres between {HEIGHTS_M[0]:g} and {HEIGHTS_M[1]:g}")
+    return within(text, *HEIGHTS_M, f"metres between {HEIGHTS_M[0]:g} and {HEIGHTS_M[1]:g}")
 
 
-def _within(text: str, low: float, high: float, wanted: str) -> float:
+def within(text: str, low: float, high: float, wanted: str) -> float:
     try:
         value = float(text)
     except ValueError:

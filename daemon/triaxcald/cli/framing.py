@@ -20,13 +20,13 @@ from triaxcal.orientations import Assumed
 from triaxcal.plan import directions
 from triaxcal.standing import Standing, stand
 from triaxcald import documents
-from triaxcald.cli.arguments import add_recording, positive, writable
+from triaxcald.cli.arguments import add_recording, positive, within, writable
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.showing import chosen, warn
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.framing import Source, frame_document, own_source, source_under
-from triaxcald.inputs import measure, read_document
+from triaxcald.inputs import measure, read_document, require_unit
 
 OWN = "own"
 NO_FACE = "*"
@@ -95,13 +95,7 @@ def _datum(text: str) -> Datum:
 
 
 def _angle(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value < 1:
-        raise argparse.ArgumentTypeError(f"expected an angle of 0 to 1 rad, not '{text}'")
-    return value
+    return within(text, 0.0, math.nextafter(1.0, 0.0), "an angle of 0 to 1 rad")
 
 
 def frame_command(a: argparse.Namespace) -> int:
@@ -198,10 +192,7 @@ def _source(a: argparse.Namespace, name: str, calibration: str, taken: Sequence[
         raise InputError(f"{whose}: the scale factors in {calibration} have other signs")
     if a.reference and not math.isclose(a.reference, reference, rel_tol=1e-9):
         raise InputError(f"--reference {a.reference:g}: {calibration} was made for {reference:g}")
-    theirs = document.get("unit")
-    serial = theirs.get("serial") if isinstance(theirs, dict) else None
-    if serial and unit.get("serial") and serial != unit["serial"]:
-        raise InputError(f"{calibration}: unit.serial is {serial}; {name} is of {unit['serial']}")
+    require_unit(document, measured, where=calibration)
     if not measured.poses:
         raise Refused("no still pose", wanted=LABELS)
     return source_under(

@@ -17,10 +17,11 @@ from triaxcal.passport import Refinement, refine
 from triaxcal.rotation import RotationFit, fit_rotation
 from triaxcald import documents, ways_in
 from triaxcald.attitudes import match, read_attitudes
+from triaxcald.cli.arguments import not_negative, within
 from triaxcald.cli.console import micro, table
 from triaxcald.cli.showing import Choice, chosen, show_coefficients
 from triaxcald.errors import InputError
-from triaxcald.inputs import Measured, measure, read_document
+from triaxcald.inputs import Measured, measure, read_document, require_unit
 
 POSES_ENOUGH = 9
 Way = tuple[Measured, documents.Document, Calibration, Callable[[], None]]
@@ -52,6 +53,10 @@ def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | N
         raise InputError("--attitude-error: there are no --attitudes")
     if a.passport_error is not None and not a.passport:
         raise InputError("--passport-error: there is no --passport")
+    way = "--turning" if a.turning else "--attitudes" if a.attitudes else "--passport" if a.passport else None
+    for option in ("reference_uncertainty", "thermometer_uncertainty"):
+        if way and getattr(a, option) is not None:
+            raise InputError(f"--{option.replace('_', '-')}: with {way} there is no budget that it would count in")
     return _turning if a.turning else _attitudes if a.attitudes else _passport if a.passport else None
 
 
@@ -67,26 +72,16 @@ def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator
 
 
 def _angle(text: str) -> float:
-    value = _not_negative(text)
-    if value is None or value > 0.3:
-        raise argparse.ArgumentTypeError(f"expected radians between 0 and 0.3, not '{text}'")
-    return value
+    return within(text, 0.0, 0.3, "radians between 0 and 0.3")
 
 
 def _three_errors(text: str) -> tuple[float, float, float]:
-    values = [_not_negative(part) for part in text.split(",")]
-    if len(values) != 3 or any(v is None for v in values):
-        raise argparse.ArgumentTypeError(f"expected three numbers of at least 0 as in 1e-3,1e-3,2e-3, not '{text}'")
-    relative, angle, bias = (v for v in values if v is not None)
-    return relative, angle, bias
-
-
-def _not_negative(text: str) -> float | None:
     try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if 0 <= value < float("inf") else None
+        relative, angle, bias = (not_negative(part) for part in text.split(","))
+    except (argparse.ArgumentTypeError, ValueError):
+        message = f"expected three numbers of at least 0 as in 1e-3,1e-3,2e-3, not '{text}'"
+        raise argparse.ArgumentTypeError(message) from None
+    return relative, angle, bias
 
 
 def _turning(a: argparse.Namespace) -> Way:
@@ -180,6 +175,7 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
 def _passport(a: argparse.Namespace) -> Way:
     held = read_document(a.passport)
     measured = measure(a.recording)
+    require_unit(held, measured, where=a.passport)
     choice = chosen(a, measured)
     said = a.reference or measured.reference or getattr(a, "latitude", None)
     passport, units = ways_in.read_passport(
@@ -193,7 +189,8 @@ def _passport(a: argparse.Namespace) -> Way:
         output_unit=choice.output_unit or units.get("output", ""),
         reference_unit=a.reference_unit or units.get("reference") or choice.reference_unit,
     )
-    found = refine(measured.poses, passport)
+    with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
+        found = refine(measured.poses, passport)
     document = ways_in.passport_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     return measured, document, found.calibration, lambda: _show_passport(found, choice)
 

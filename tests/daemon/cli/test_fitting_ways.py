@@ -292,7 +292,7 @@ def test_errors_given_stand_for_the_passports_own(files: Path, triaxcal: Run, tm
     bare = tmp_path / "bare.json"
     bare.write_text(json.dumps(document))
     triaxcal("fit", files / "4.csv", "--passport", bare).failed(
-        2, "bare.json: standard_error.scale_factor: expected three numbers", "--passport-error"
+        2, "bare.json: standard_error: missing", "--passport-error"
     )
     done = triaxcal("fit", files / "4.csv", "--passport", bare, "--passport-error", "1e-3,1e-4,1e-3", "--json")
     assert done.code == 0
@@ -327,6 +327,8 @@ def test_a_certificate_is_a_passport_and_its_effects_come_with_it(triaxcal: Run,
         ({"standard_error": {"scale_factor": [0, 0, 0], "misalignment": [0, 0, 0], "bias": [0, 0, 0]}}, "all are 0"),
         ({"standard_error": {"scale_factor": [1, 2]}}, "standard_error.scale_factor: expected three numbers"),
         ({"standard_error": {"scale_factor": [1, 2, -1]}}, "standard_error.scale_factor: expected three numbers"),
+        ({"standard_error": {"scale_factor": [1, 2, 10**400]}}, "standard_error.scale_factor: expected three numbers"),
+        ({"correlation": [[1.0]]}, "correlation: expected a correlation matrix of 9 rows"),
         ({"format": "other"}, "format: expected a triaxcal.calibration/1"),
     ],
 )
@@ -335,6 +337,23 @@ def test_a_faulty_passport_is_one_line(
 ) -> None:
     passport.write_text(json.dumps(json.loads(passport.read_text()) | change))
     triaxcal("fit", files / "4.csv", "--passport", passport).failed(2, "passport.json: ", words)
+
+
+def test_another_units_passport_is_an_error(triaxcal: Run, tmp_path: Path) -> None:
+    certificate = tmp_path / "certificate.json"
+    with Recording.open(RECORDING) as recording:
+        document = json.loads(recording.attachments["certificate.json"])
+    document["unit"]["serial"] = "9999"
+    certificate.write_text(json.dumps(document))
+    for command in (["fit", RECORDING, "--passport"], ["frame", RECORDING, "--calibration"]):
+        triaxcal(*command, certificate).failed(2, "unit.serial is 9999")
+
+
+def test_numbers_that_no_unit_has_are_refused_in_one_line(
+    files: Path, triaxcal: Run, passport: Path, tmp_path: Path
+) -> None:
+    passport.write_text(json.dumps(json.loads(passport.read_text()) | {"scale_factor": [-1e300, 1e-300, 1.0]}))
+    triaxcal("fit", files / "4.csv", "--passport", passport).failed(3, "far from these poses")
 
 
 def test_signs_and_reference_must_be_the_passports(files: Path, triaxcal: Run, passport: Path) -> None:
@@ -355,6 +374,11 @@ def test_signs_and_reference_must_be_the_passports(files: Path, triaxcal: Run, p
         (["--attitudes", "a.csv", "--attitude-error", "-1"], "expected radians between 0 and 0.3"),
         (["--passport", "c.json", "--passport-error", "1,1"], "expected three numbers of at least 0"),
         (["--passport", "c.json", "--passport-error", "1,1,nan"], "expected three numbers of at least 0"),
+        (
+            ["--turning", "--reference-uncertainty", "1e-5"],
+            "--reference-uncertainty: with --turning there is no budget",
+        ),
+        (["--attitudes", "a.csv", "--thermometer-uncertainty", "1"], "with --attitudes there is no budget"),
     ],
 )
 def test_options_that_do_not_go_together_are_one_line(

@@ -287,10 +287,11 @@ def test_what_cannot_be_meant_is_one_line(first: Path, triaxcal: Run, options: l
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"standard_error": {}}, "standard_error, poses: scale_factor: missing"),
-        ({"standard_error": {"scale_factor": [1, 1], "misalignment": [1], "bias": [1]}}, "expected finite numbers"),
-        ({"standard_error": 3}, "not numbers where numbers belong"),
-        ({"poses": [{"used": True}]}, "poses: mean: missing"),
+        ({"standard_error": {}}, "standard_error.scale_factor: expected three numbers"),
+        ({"standard_error": {"scale_factor": [1, 1], "misalignment": [1], "bias": [1]}}, "expected three numbers of"),
+        ({"standard_error": 3}, "standard_error.scale_factor: expected three numbers"),
+        ({"correlation": [[1.0]]}, "correlation: expected a correlation matrix of 9 rows"),
+        ({"scale_factor": [-1e300, -1e-300, -1.0]}, "no finite direction of up"),
         ({"scale_factor": [2.4e5, -2.4e5, -2.4e5]}, "the scale factors in"),
         ({"format": "triaxcal.verify/1"}, "format: expected a triaxcal.calibration/1"),
     ],
