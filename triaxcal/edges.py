@@ -49,7 +49,10 @@ def _onset(w: Windows, run: Ints, noise: NoiseScales) -> int:
     if z[-1] < ONSET_SIGMA:
         return 0
     first = int(np.argmax(z >= ONSET_SIGMA))
-    second = int(np.argmax(z >= min(4 * z[first], z[-1])))
+    # Not beyond the middle of the move, where it no longer sets out; one that is there at once has no onset.
+    second = int(np.argmax(z >= min(4 * z[first], z[-1] / 2)))
+    if second <= first:
+        return 0
     # The sum of displacements up to the end of a window grows as the fourth power of the time since the onset.
     area = np.abs(np.cumsum(away, axis=0))[:, int(np.argmax(np.abs(away[second])))]
     ratio = min(float(area[first] / area[second]), 1.0) ** 0.25

@@ -24,6 +24,12 @@ RATE_S = 1.0
 RATE_LEAST = 12
 
 
+COARSEST = 50
+"""Steps that the range of the outputs has at least."""
+READING_MOST = 1e100
+"""Squares of readings, and sums of them, have to be numbers too."""
+
+
 @dataclass(frozen=True)
 class Windows:
     """Summaries of consecutive windows of ``size`` samples, (m,) or (m,3) each.
@@ -69,8 +75,9 @@ class WindowCutter:
         """
         if not len(time_ns):
             return
-        if not np.isfinite(readings).all():
-            at = int(np.flatnonzero(~np.isfinite(readings).all(axis=1))[0])
+        sound = np.abs(readings) < READING_MOST  # which no NaN is
+        if not sound.all():
+            at = int(np.flatnonzero(~sound.all(axis=1))[0])
             raise InvalidData(f"the reading at {int(time_ns[at])} ns is not a finite number")
         held = {name: np.asarray(v, dtype=float) for name, v in (channels or {}).items()}
         self._pending.append((np.asarray(time_ns, dtype=np.int64), np.asarray(readings, dtype=float), held))
@@ -150,14 +157,18 @@ class WindowCutter:
 
 
 def resolution(w: Windows) -> Floats:
-    """(3,) the smallest difference that any two readings show, judged by the sums of windows; never quite zero."""
+    """(3,) the smallest difference that any two readings show, judged by the sums of windows; never quite zero.
+
+    A step that is a good part of the range is no resolution: outputs without any noise differ by their poses alone.
+    """
     sums = w.mean * w.size
     least: Floats = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
     out = least.copy()
     for i in range(3):
         gaps = np.diff(np.unique(sums[:, i]))
         gaps = gaps[gaps > least[i]]
-        out[i] = gaps.min() if len(gaps) else least[i]
+        fine = len(gaps) > 0 and gaps.min() * COARSEST < np.ptp(w.mean[:, i])
+        out[i] = gaps.min() if fine else least[i]
     return out
 
 

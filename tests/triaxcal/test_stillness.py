@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -388,3 +389,26 @@ def test_memory_grows_by_the_window_not_by_the_sample() -> None:
     kept = sum(getattr(windows, n).nbytes for n in ("start_ns", "end_ns", "mean", "variance", "cross", "joined"))
     assert kept / len(windows) < 120
     assert sum(len(block[0]) for block in detector._pending) < windows.size
+
+
+@pytest.mark.parametrize("noise_g", [0.0, 1e-7, 1e-4, 1e-2])
+def test_poses_with_nothing_between_them_are_found_with_or_without_noise(
+    noise_g: float, twenty_six: np.ndarray, detect: Callable[..., Any]
+) -> None:
+    """Made-up streams step from pose to pose, and may have no noise whose size could be learned."""
+    t_s = np.arange(26 * 300) / 100
+    step = np.arange(len(t_s)) // 300
+    noise = noise_g * np.random.default_rng(1).standard_normal((len(t_s), 3))
+    _, _, poses = detect(t_s, 2.4 * (twenty_six[step] + noise) + 0.01)
+    assert [int(p.t_s // 3) for p in poses] == list(range(26))
+    assert all(3 * i <= p.start_s and p.end_s < 3 * (i + 1) for i, p in enumerate(poses))
+    # Nothing of a pose is given away where no move sets out.
+    assert all(p.end_s - p.start_s > 2.3 for p in poses)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e150])
+def test_readings_that_cannot_be_reckoned_with_are_refused(value: float, detect: Callable[..., Any]) -> None:
+    u = np.zeros((500, 3))
+    u[77, 1] = value
+    with pytest.raises(InvalidData, match="770000000 ns is not a finite number"):
+        detect(np.arange(500) / 100, u)
