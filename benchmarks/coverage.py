@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.fit import fit
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 
 SEEDS, QUICK = 600, 60
 SIGMA = 1.5e-5

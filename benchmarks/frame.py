@@ -12,16 +12,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from triaxcal.arrays import Floats
-from triaxcal.faces import AXES, LABELS, nearest_rotation, recognise
 from triaxcal.fit import fit
-from triaxcal.frame import frames
-from triaxcal.orientations import Assumed
-from triaxcal.plan import directions
+from triaxcal.frame.faces import AXES, LABELS, nearest_rotation, recognise
+from triaxcal.frame.frames import frames
+from triaxcal.frame.orientations import Assumed
+from triaxcal.frame.standing import stand
+from triaxcal.frame.synthetic_fixture import SyntheticFixture
+from triaxcal.frame.verticals import verticals
+from triaxcal.plan.directions import directions
 from triaxcal.sensor import Sensor
-from triaxcal.standing import stand
 from triaxcal.synthetic import noisy_poses
-from triaxcal.synthetic_fixture import SyntheticFixture
-from triaxcal.verticals import verticals
 
 SENSOR = Sensor(
     np.array([-2.410618, -2.403823, -2.371761]),

@@ -17,7 +17,7 @@ from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, bound_and_best, hard, plan
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.fit import fit
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
 SEEDS, QUICK = 200, 20

@@ -16,7 +16,7 @@ from matplotlib.transforms import blended_transform_factory
 from PIL import Image
 
 from triaxcal.arrays import Floats
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.samples import Samples
 
 COLOURS = ("#1f5fa8", "#c1272d", "#2c8a3d")

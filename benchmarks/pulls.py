@@ -16,9 +16,9 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.coloured_noise import first_order, flicker, moving_average, white
-from triaxcal.poses import poses_of
-from triaxcal.stillness import Span
-from triaxcal.windows import WindowCutter
+from triaxcal.poses.pose import poses_of
+from triaxcal.stillness.detector import Span
+from triaxcal.stillness.windows import WindowCutter
 
 RATE_HZ, POSES, MOVE_S, NOISE_G = 100, 26, 1.5, 1e-3
 CASES: list[tuple[str, Callable[..., Floats], tuple[float, ...], int]] = [

@@ -15,8 +15,8 @@ from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.calibration import Calibration
 from triaxcal.fit import fit
-from triaxcal.plan import linear_design
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import linear_design
+from triaxcal.poses.pose import Pose
 
 SEEDS, QUICK = 300, 30
 SIGMA = 1.5e-5

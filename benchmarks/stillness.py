@@ -20,9 +20,9 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.coloured_noise import first_order, flicker, moving_average, white
-from triaxcal.poses import Pose, poses_of
+from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.sensor import Sensor
-from triaxcal.stillness import Span, StillnessDetector, Windows
+from triaxcal.stillness.detector import Span, StillnessDetector, Windows
 
 PAPER_UNIT = Sensor(
     np.array([-2.410618, -2.403823, -2.371761]),

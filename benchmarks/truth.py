@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
 PAPER_UNIT = Sensor(

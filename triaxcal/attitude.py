@@ -19,8 +19,8 @@ from scipy import stats
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration, PoseResult, Residual
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.plan import most_wanted
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import most_wanted
+from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import pure_error_dof
 from triaxcal.sensor import Sensor
 from triaxcal.turntable import (

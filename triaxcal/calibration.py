@@ -11,7 +11,7 @@ from scipy import stats
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME
 from triaxcal.errors import InvalidData
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
 

@@ -12,8 +12,8 @@ from triaxcal.calibration import Calibration, PoseResult, Residual, channels_of,
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.outliers import Spoiled, spoiled
-from triaxcal.plan import dilution, linear_design, most_wanted
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import dilution, linear_design, most_wanted
+from triaxcal.poses.pose import Pose
 from triaxcal.problem import NOT_STILL, Problem, State, linearise, parameters_by_theta, solve
 from triaxcal.pure_error import lack_of_fit_p, pose_dof, pure_error_dof, raised
 from triaxcal.start import DILUTION_LIMIT, problem_of, start

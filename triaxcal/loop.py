@@ -18,7 +18,7 @@ from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import InvalidData
 from triaxcal.fit import fit
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.search import FAMILYWISE, Search
 from triaxcal.sensor import Sensor

@@ -17,8 +17,8 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, PoseResult, Residual, channels_of
 from triaxcal.effects.contract import TIME
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.plan import dilution, linear_design
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import dilution, linear_design
+from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, parameters_by_theta
 from triaxcal.pure_error import lack_of_fit_p, pure_error_dof
 from triaxcal.sensor import Sensor

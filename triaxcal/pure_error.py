@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 
 from triaxcal.arrays import Floats
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 
 DOF_MOST = 1e6
 BEYOND_DOUBT = 0.2

@@ -13,7 +13,7 @@ from triaxcal.calibration import Calibration
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.fit import fit
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, solve
 from triaxcal.pure_error import pure_error_dof
 from triaxcal.visibility import projected

@@ -11,8 +11,8 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import channels_of
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.plan import dilution, distinct, linear_design, most_wanted
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import dilution, distinct, linear_design, most_wanted
+from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise
 
 DILUTION_LIMIT = 100.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
 STANDARD_GRAVITY = 9.80665

@@ -10,8 +10,8 @@ from scipy import optimize, stats
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import Refused
-from triaxcal.faces import nearest_rotation
-from triaxcal.poses import Pose
+from triaxcal.frame.faces import nearest_rotation
+from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import lack_of_fit_p
 from triaxcal.start import problem_of, start
 

@@ -18,7 +18,7 @@ from triaxcal.calibration import Calibration
 from triaxcal.effects import CATALOGUE, Effect
 from triaxcal.errors import InvalidData
 from triaxcal.gravity import local_gravity_g
-from triaxcal.plan import directions
+from triaxcal.plan.directions import directions
 from triaxcal.problem import Problem, State, linearise, parameters_by_theta
 from triaxcal.pure_error import DOF_MOST, pure_error_dof
 from triaxcal.start import problem_of

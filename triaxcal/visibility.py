@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.design import combinations, profile_times, radial
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
-from triaxcal.plan import linear_design
+from triaxcal.plan.design import combinations, profile_times, radial
+from triaxcal.plan.directions import linear_design
 from triaxcal.problem import Problem, State, linearise
 
 VISIBLE = 0.02

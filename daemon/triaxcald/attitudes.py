@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.plan import cube_directions
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import cube_directions
+from triaxcal.poses.pose import Pose
 from triaxcald.errors import InputError
 
 VECTOR, TIMES, LABEL = ("x", "y", "z"), ("start_s", "end_s"), "label"

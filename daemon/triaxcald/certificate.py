@@ -20,7 +20,7 @@ from triaxcal.calibration import Calibration, channels_of
 from triaxcal.effects import TIME, Effect
 from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile

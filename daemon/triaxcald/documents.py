@@ -17,7 +17,7 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Residual
 from triaxcal.effects import Effect, effect_named
 from triaxcal.loop import Loop
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Budget, Stated, budget
 from triaxcald.errors import InputError

@@ -10,11 +10,11 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
-from triaxcal.faces import LABELS, TURNS, axis_of, opposite
-from triaxcal.fixture import Fixture, Quantity
-from triaxcal.frame import Frames, UnitFrame
+from triaxcal.frame.faces import LABELS, TURNS, axis_of, opposite
+from triaxcal.frame.fixture import Fixture, Quantity
+from triaxcal.frame.frames import Frames, UnitFrame
+from triaxcal.frame.verticals import Verticals, verticals, verticals_under
 from triaxcal.sensor import Sensor
-from triaxcal.verticals import Verticals, verticals, verticals_under
 from triaxcald.documents import (
     UNCERTAINTY_DIGITS,
     Document,

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal.errors import InvalidData
-from triaxcal.moments import Moments
-from triaxcal.poses import Pose, poses_of
-from triaxcal.stillness import StillnessDetector, Windows
+from triaxcal.poses.pose import Pose, poses_of
+from triaxcal.stillness.detector import StillnessDetector, Windows
+from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
 from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
 from triaxcald.errors import InputError, RecordingError

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.errors import InvalidData
-from triaxcal.poses import Held, Pose, held_of, poses_of
-from triaxcal.stillness import StillnessDetector, Windows
+from triaxcal.poses.pose import Held, Pose, held_of, poses_of
+from triaxcal.stillness.detector import StillnessDetector, Windows
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import Bundle

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcald.documents import Document, error, number, uncertainty
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from triaxcal.attitude import AttitudeFit
 from triaxcal.passport import Passport, Refinement
-from triaxcal.rotation import RotationFit
+from triaxcal.turning.rotation import RotationFit
 from triaxcald.documents import (
     LINEAR,
     UNCERTAINTY_DIGITS,

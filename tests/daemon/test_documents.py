@@ -12,8 +12,8 @@ import pytest
 from triaxcal.effects import effect_named
 from triaxcal.fit import fit
 from triaxcal.loop import diagnose
-from triaxcal.plan import directions
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import directions
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated

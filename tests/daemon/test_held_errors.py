@@ -9,7 +9,7 @@ import pytest
 
 from triaxcal.effects import effect_named
 from triaxcal.fit import fit
-from triaxcal.plan import cube_directions
+from triaxcal.plan.directions import cube_directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.documents import calibration_document

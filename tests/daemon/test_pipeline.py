@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, load_bundle
 from triaxcald.pipeline import Pipeline

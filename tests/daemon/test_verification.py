@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcald.verification import verification_document, verify
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import effect_named
-from triaxcal.poses import Pose, poses_of
+from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.sensor import Sensor
-from triaxcal.stillness import Span, StillnessDetector, Windows
+from triaxcal.stillness.detector import Span, StillnessDetector, Windows
 
 
 @pytest.fixture(scope="session")

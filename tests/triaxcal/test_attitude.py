@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from triaxcal.attitude import AttitudeFit, fit_attitudes
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.fit import fit
-from triaxcal.plan import cube_directions
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import cube_directions
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

@@ -10,7 +10,7 @@ from benchmarks.coverage import Knowledge, covered, known, own, pooled, unknown
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.errors import InvalidData
 from triaxcal.fit import fit
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import pure_error_dof, raised
 
 SEEDS = 220

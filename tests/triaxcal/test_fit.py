@@ -12,7 +12,7 @@ from scipy import stats
 from triaxcal.effects import CATALOGUE, TIME
 from triaxcal.errors import InvalidData
 from triaxcal.fit import fit
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, solve
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start

@@ -37,7 +37,7 @@ for module in pkgutil.walk_packages(triaxcal.__path__, "triaxcal."):
 
 from triaxcal.fit import fit
 from triaxcal.loop import diagnose
-from triaxcal.plan import directions
+from triaxcal.plan.directions import directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

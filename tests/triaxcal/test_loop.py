@@ -13,7 +13,7 @@ from triaxcal.effects import CATALOGUE, TIME, Coefficient, effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
-from triaxcal.poses import Pose
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

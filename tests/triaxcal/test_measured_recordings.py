@@ -15,8 +15,8 @@ from scipy.optimize import least_squares
 from triaxcal.errors import Refused
 from triaxcal.fit import fit
 from triaxcal.loop import diagnose
-from triaxcal.poses import Pose, poses_of
-from triaxcal.stillness import StillnessDetector
+from triaxcal.poses.pose import Pose, poses_of
+from triaxcal.stillness.detector import StillnessDetector
 
 FOLDER = Path(__file__).parents[3] / "shared" / "datasets"
 pytestmark = [

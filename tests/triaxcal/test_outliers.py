@@ -15,8 +15,8 @@ from triaxcal.calibration import Calibration
 from triaxcal.fit import fit
 from triaxcal.loop import diagnose
 from triaxcal.outliers import spoiled
-from triaxcal.plan import linear_design
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import linear_design
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

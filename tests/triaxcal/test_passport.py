@@ -10,8 +10,8 @@ from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.fit import fit
 from triaxcal.passport import Passport, refine
-from triaxcal.plan import cube_directions
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import cube_directions
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

@@ -10,8 +10,8 @@ from scipy import stats
 
 from triaxcal.errors import Refused
 from triaxcal.fit import fit
-from triaxcal.plan import cube_directions, dilution
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import cube_directions, dilution
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start
 from triaxcal.synthetic import noisy_poses

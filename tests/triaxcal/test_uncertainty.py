@@ -13,8 +13,8 @@ from triaxcal.calibration import Calibration
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData
 from triaxcal.fit import fit
-from triaxcal.plan import directions
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import directions
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import SENSITIVITY_PER_K, Stated, budget

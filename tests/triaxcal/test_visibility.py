@@ -10,7 +10,7 @@ import pytest
 
 from triaxcal.effects import CATALOGUE, effect_named
 from triaxcal.effects.contract import per_axis, per_axis_slope
-from triaxcal.plan import directions
+from triaxcal.plan.directions import directions
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start
 from triaxcal.synthetic import noisy_poses

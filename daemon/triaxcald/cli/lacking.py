@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from triaxcal.addition import ENOUGH, Addition, Had, additions
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, channels_of
-from triaxcal.design import ask, channels_needed, profile_times
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
 from triaxcal.fit import fit
-from triaxcal.plan import FULL, cube_directions, most_wanted
-from triaxcal.poses import Pose
+from triaxcal.plan.addition import ENOUGH, Addition, Had, additions
+from triaxcal.plan.design import ask, channels_needed, profile_times
+from triaxcal.plan.directions import FULL, cube_directions, most_wanted
+from triaxcal.poses.pose import Pose
 from triaxcal.start import rough_directions, wanted_for
 
 

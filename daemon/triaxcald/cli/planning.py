@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.addition import Addition
 from triaxcal.arrays import Floats
-from triaxcal.design import Asked, ask, needs_time
 from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
 from triaxcal.errors import InvalidData
-from triaxcal.optimal import OptimalPlan, optimal
-from triaxcal.plan import FULL, LEAST, PAPER, Direction, closed, dilution, directions
+from triaxcal.plan.addition import Addition
+from triaxcal.plan.design import Asked, ask, needs_time
+from triaxcal.plan.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
+from triaxcal.plan.optimal import OptimalPlan, optimal
 from triaxcal.visibility import Sight, sight, unseen_effects
 from triaxcald.cli.arguments import add_recording, count
 from triaxcald.cli.console import emit, say, table

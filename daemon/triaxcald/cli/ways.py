@@ -12,9 +12,9 @@ import numpy as np
 from triaxcal.attitude import AttitudeFit, fit_attitudes
 from triaxcal.calibration import Calibration
 from triaxcal.errors import Refused
-from triaxcal.moments import Moments
 from triaxcal.passport import Refinement, refine
-from triaxcal.rotation import RotationFit, fit_rotation
+from triaxcal.turning.moments import Moments
+from triaxcal.turning.rotation import RotationFit, fit_rotation
 from triaxcald import documents, ways_in
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.arguments import not_negative, within

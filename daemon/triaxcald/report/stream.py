@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from triaxcal.poses import Pose
-from triaxcal.stillness import Windows
+from triaxcal.poses.pose import Pose
+from triaxcal.stillness.detector import Windows
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData
-from triaxcal.plan import directions
+from triaxcal.plan.directions import directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 from triaxcal.errors import Refused
-from triaxcal.plan import directions
+from triaxcal.plan.directions import directions
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device, RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle

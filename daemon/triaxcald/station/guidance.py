@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.plan import Direction, directions
-from triaxcal.poses import Held
+from triaxcal.plan.directions import Direction, directions
+from triaxcal.poses.pose import Held
 
 COVERED_DEG = 25.0
 """A pose covers the direction of the plan that it is nearest to, up to this far off."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.plan import cube_directions
+from triaxcal.plan.directions import cube_directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Tumble
 from triaxcald.recording.reader import Recording

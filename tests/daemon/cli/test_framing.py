@@ -15,10 +15,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from triaxcal.effects import effect_named
-from triaxcal.faces import LABELS, axis_of
-from triaxcal.plan import directions
+from triaxcal.frame.faces import LABELS, axis_of
+from triaxcal.frame.synthetic_fixture import SyntheticFixture
+from triaxcal.plan.directions import directions
 from triaxcal.sensor import Sensor
-from triaxcal.synthetic_fixture import SyntheticFixture
 from triaxcald.cli.commands import main
 
 Run = Callable[..., Any]

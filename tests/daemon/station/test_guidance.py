@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.plan import directions
-from triaxcal.poses import Pose
+from triaxcal.plan.directions import directions
+from triaxcal.poses.pose import Pose
 from triaxcald.station.guidance import Guide, guide
 
 PLAN = directions(14)

@@ -1,0 +1,1 @@
+"""The frame of the mounting faces: from faces in two orientations each to a rotation, with the fixture's own errors."""

@@ -1,0 +1,188 @@
+"""Still spans as poses: the mean of the outputs, and a covariance that minds autocorrelation, creep and rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from triaxcal.arrays import Bools, Floats
+from triaxcal.errors import InvalidData
+from triaxcal.poses.noise_spectrum import Track
+from triaxcal.poses.pose_noise import PoseNoise, pose_noise
+from triaxcal.stillness.detector import Span
+from triaxcal.stillness.windows import Windows, resolution, rounding_variance
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean, output units. ``dof`` are the
+    degrees of freedom behind the covariance (along the measured vector, where there are six poses or more), and
+    ``shared_dof`` those behind what the covariances of all poses have in common, infinite where that is nothing.
+
+    ``channels`` are means over the span; ``t_s`` is the middle of the span, like ``start_s`` and ``end_s`` in seconds
+    from the first sample. ``creep`` (3,) is the change of the outputs along the span, output units, where it is more
+    than noise, else zero.
+    """
+
+    start_s: float
+    end_s: float
+    samples: int
+    mean: Floats
+    covariance: Floats
+    dof: float
+    channels: Mapping[str, float] = field(default_factory=dict)
+    creep: Floats = field(default_factory=lambda: np.zeros(3))
+    shared_dof: float = float("inf")
+
+    def __post_init__(self) -> None:
+        if self.mean.shape != (3,) or self.covariance.shape != (3, 3):
+            raise InvalidData("a pose has a mean (3,) and a covariance (3, 3)")
+        if not (np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()):
+            raise InvalidData(f"pose at {self.start_s:.3f} s: mean or covariance is not a finite number")
+
+    @property
+    def t_s(self) -> float:
+        return (self.start_s + self.end_s) / 2
+
+    @property
+    def standard_error(self) -> Floats:
+        """(3,) of the mean, output units."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def creep_covariance(self) -> Floats:
+        """(3,3) the part of ``covariance`` that is creep, output units squared: the variance of a value that is
+        anywhere on the way of a steady change, change²/12 (JCGM 100, 4.3.7). Zero where the pose does not creep.
+        """
+        return np.outer(self.creep, self.creep) / 12
+
+
+class Held(Protocol):
+    """Where and when a unit was still: all of a pose but its noise. ``mean`` (3,) output units; times in seconds."""
+
+    @property
+    def start_s(self) -> float: ...
+    @property
+    def end_s(self) -> float: ...
+    @property
+    def mean(self) -> Floats: ...
+
+
+@dataclass(frozen=True)
+class _Held:
+    start_s: float
+    end_s: float
+    mean: Floats
+
+
+def held_of(w: Windows, spans: Sequence[Span]) -> list[Held]:
+    """The still spans, in order of time."""
+    begin = int(w.start_ns[0])
+    return [
+        _Held(
+            (int(w.start_ns[s.first]) - begin) * 1e-9,
+            (int(w.end_ns[s.last]) - begin) * 1e-9,
+            w.mean[s.used].mean(axis=0),
+        )
+        for s in spans
+    ]
+
+
+def poses_of(w: Windows, spans: Sequence[Span]) -> list[Pose]:
+    """The poses of the still spans, in order of time."""
+    if not spans:
+        return []
+    tracks = [_track(w, s) for s in spans]
+    recording = float(w.end_ns[spans[-1].last] - w.start_ns[spans[0].first]) / w.period_ns
+    mean = np.array([w.mean[s.used].mean(axis=0) for s in spans])
+    noise = pose_noise(tracks, recording)
+    creeping = np.asarray(noise.creeping.any(axis=1))
+    length = np.array([t.place[-1] - t.place[0] for t in tracks])[:, None]
+    creep = np.where(creeping[:, None], noise.slope * length, 0.0)
+    covariance = np.array(
+        [_correlation(w, s) * np.outer(e, e) for s, e in zip(spans, np.sqrt(noise.variance), strict=True)]
+    )
+    dof, shared_dof = noise.dof.min(axis=1), noise.common_dof
+    out = outward(mean)
+    if out is not None:
+        along, predicted = _along(w, spans, tracks, out, recording, creeping)
+        covariance = _mended(covariance, out, along.variance[:, 0] * predicted**2)
+        dof, shared_dof = along.dof[:, 0], along.common_dof
+        # A unit that turns creeps across the measured vector; along it only where that shows by itself.
+        radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
+        creep = creep - radial[:, None] * out
+    covariance = covariance + np.diag(_rounding(w, spans))
+    begin = int(w.start_ns[0])
+    return [
+        Pose(
+            start_s=(int(w.start_ns[s.first]) - begin) * 1e-9,
+            end_s=(int(w.end_ns[s.last]) - begin) * 1e-9,
+            samples=len(s.used) * w.size,
+            mean=mean[i],
+            covariance=covariance[i] + np.outer(creep[i], creep[i]) / 12,
+            dof=float(dof[i]),
+            shared_dof=shared_dof,
+            channels={name: float(values[s.used].mean()) for name, values in w.channels.items()},
+            creep=creep[i],
+        )
+        for i, s in enumerate(spans)
+    ]
+
+
+def _track(w: Windows, s: Span) -> Track:
+    """Places by time, so that a silence inside a pose counts as the windows that it lacks."""
+    place = np.round((w.start_ns[s.used] - w.start_ns[s.first]) / w.period_ns).astype(np.int64)
+    place = np.maximum.accumulate(place - np.arange(len(place))) + np.arange(len(place))
+    return Track(place, w.mean[s.used] - w.mean[s.used].mean(axis=0))
+
+
+def _correlation(w: Windows, s: Span) -> Floats:
+    """(3,3) between the axes, from the samples inside the windows."""
+    variance = w.variance[s.used].mean(axis=0)
+    scale = np.maximum(np.sqrt(variance * variance[[1, 2, 0]]), 1e-300)
+    xy, yz, zx = np.clip(w.cross[s.used].mean(axis=0) / scale, -0.99, 0.99)
+    return np.array([[1, xy, zx], [xy, 1, yz], [zx, yz, 1]])
+
+
+def outward(mean: Floats) -> Floats | None:
+    """(k,3) unit gradients of the length of the measured vector at pose means (k,3), in output units; known well enough
+    from the range of the means, for six poses or more.
+    """
+    half = (mean.max(axis=0) - mean.min(axis=0)) / 2
+    if len(mean) < 6 or not np.all(half > 0):
+        return None
+    out = (mean - (mean.max(axis=0) + mean.min(axis=0)) / 2) / half**2
+    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300))
+
+
+def _along(
+    w: Windows, spans: Sequence[Span], tracks: Sequence[Track], out: Floats, recording: float, creeping: Bools
+) -> tuple[PoseNoise, Floats]:
+    """Noise of the poses along the measured vector, in units (k,) of what the scatter inside the windows predicts.
+
+    A unit that is held by hand, or on a stand that settles, turns a little in every pose. That moves the outputs across
+    the measured vector, where |a| does not feel it, and raises the scatter of every axis; along the vector the noise is
+    the sensor's own.
+    """
+    # A scale for each pose, never zero, not even where a coarse output never changed in it.
+    scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans]) + resolution(w) ** 2 / 12
+    inside = np.array([_correlation(w, s) for s in spans]) * [np.outer(e, e) for e in np.sqrt(scatter / w.size)]
+    predicted = np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", out, inside, out), 1e-300))
+    radial = [Track(t.place, (t.deviation @ g / p)[:, None]) for t, g, p in zip(tracks, out, predicted, strict=True)]
+    return pose_noise(radial, recording, creeping), predicted
+
+
+def _mended(covariance: Floats, out: Floats, along: Floats) -> Floats:
+    """Covariances (k,3,3) whose part along ``out`` (k,3) is ``along`` (k,)."""
+    now = np.maximum(np.einsum("ki,kij,kj->k", out, covariance, out), 1e-300)
+    across = np.einsum("kij,kj->ki", covariance, out) / now[:, None]
+    return np.asarray(covariance + (along - now)[:, None, None] * across[:, :, None] * across[:, None, :])
+
+
+def _rounding(w: Windows, spans: Sequence[Span]) -> Floats:
+    """(3,) variance of what rounding of the outputs leaves in a mean."""
+    scatter = np.mean([w.variance[s.used].mean(axis=0) for s in spans], axis=0)
+    return rounding_variance(resolution(w), scatter)

@@ -1,0 +1,1 @@
+"""A unit that turns and never rests: streaming moments, adjusted least squares, the fit."""
