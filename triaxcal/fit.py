@@ -19,6 +19,8 @@ from triaxcal.pure_error import lack_of_fit_p, pose_dof, pure_error_dof, raised
 from triaxcal.start import DILUTION_LIMIT, problem_of, start
 
 DILUTION_WARNING = 10.0
+SPREAD_WARNING = 15.0
+"""Dilution times the root of the number of poses: about 5 where they are all over the sphere, 25 over half of it."""
 SPOILED_ROUNDS = 4
 SIGNIFICANT = 0.05
 STRAIGHT = 1e-4
@@ -183,8 +185,9 @@ def cross_validated(problem: Problem, state: State, leverage: Floats) -> float |
 
 def _warnings(c: Calibration) -> list[str]:
     out = []
-    if c.dilution > DILUTION_WARNING:
-        labels = ", ".join(label for label, _ in most_wanted(np.array([p.direction for p in c.poses])))
+    if c.dilution > DILUTION_WARNING or c.dilution * np.sqrt(len(c.poses)) > SPREAD_WARNING:
+        up, enough = np.array([p.direction for p in c.poses]), min(2.0, c.dilution / 4)
+        labels = ", ".join(label for label, _ in most_wanted(up, enough))
         out.append(
             f"the poses are poorly spread: some combination of parameters is {c.dilution:.3g} times as uncertain as "
             f"one pose; add {labels}"
@@ -199,7 +202,9 @@ def _warnings(c: Calibration) -> list[str]:
         out.append(
             f"residuals are {c.inflation:.1f} times what the noise explains; the standard errors are raised by that"
         )
-    creeping = [p for p in c.poses if np.any(p.pose.creep)]
-    if creeping:
-        out.append(f"{len(creeping)} poses creep; the first at {creeping[0].pose.start_s:.1f} s")
+    if c.residual.lack_of_fit_p is not None and c.residual.lack_of_fit_p > 1 - SIGNIFICANT / 5:
+        out.append(
+            "residuals are smaller than the poses' noise and creep explain: what moves the outputs inside a pose (a "
+            "temperature, a stand that settles) moves the means less, and the standard errors are on the safe side"
+        )
     return out

@@ -227,10 +227,13 @@ def _held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) ->
     """Raises InvalidData where the check poses lack a channel that the effects need."""
     if not check:
         raise InvalidData("the check recording has no still pose")
-    errors = [
-        magnitude_errors(c.sensor, check, channel_reference=c.channel_reference, reference=c.reference)
-        for c in (before, after)
-    ]
+    try:
+        errors = [
+            magnitude_errors(c.sensor, check, channel_reference=c.channel_reference, reference=c.reference)
+            for c in (before, after)
+        ]
+    except InvalidData as e:
+        raise InvalidData(f"the check recording: {e}") from e
     return HeldOut(_rms(errors[0][0]), _rms(errors[1][0]), _rms(errors[1][1]), len(check))
 
 

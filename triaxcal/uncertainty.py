@@ -246,7 +246,7 @@ def _reference(ground: _Ground, stated: Stated) -> list[Component]:
     if not stated.reference:
         return []
     shift = ground.by_residual.sum(axis=1) * stated.reference
-    by = f"know the reference to {stated.reference / 2:.2g}"
+    by = f"know the reference to {stated.reference / 2 * 1e6:.2g} µg"
     return [ground.component("reference", "B", np.inf, np.outer(shift, shift), stated.reference_source, by)]
 
 
@@ -281,7 +281,7 @@ def _temperature(calibration: Calibration, ground: _Ground) -> tuple[list[Compon
     moved = float(np.ptp(ground.problem.channels[TEMPERATURE]))
     names = " and ".join(e.name for e in missing)
     how = f"{names} not in the model; the temperature moved by {moved:.2g} K from pose to pose"
-    by = "hold the temperature twice as steady, or let it swing until its effects can be fitted"
+    by = f"hold the temperature twice as steady, or let it swing until {names} can be fitted"
     covariance = through @ (left + np.outer(mean, mean)) @ through.T
     return [ground.component("temperature", "B", np.inf, covariance, how, by)], beyond
 

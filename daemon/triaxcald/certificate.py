@@ -25,7 +25,7 @@ from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
 from triaxcald.documents import Document, budget_document, error, loop_document, number
-from triaxcald.pipeline import Pipeline
+from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
 from triaxcald.station.config import Limits, StationFile
@@ -90,7 +90,10 @@ def certify(
         "verdict": "outside limits" if outside else "within limits" if _judged(station.limits) else "not judged",
         "outside": outside,
         "result": loop_document(
-            loop, data_quality=pipeline.data_quality(), output_unit=profile.output.unit, stated=station.stated
+            loop,
+            data_quality=pipeline.data_quality() + creeping(poses),
+            output_unit=profile.output.unit,
+            stated=station.stated,
         ),
         "not_written": why_not_written(profile),
         "registers": _registers_document(image, held, loop, poses, station.stated) if image and held else None,

@@ -171,7 +171,7 @@ def calibration_document(
         "standard_error": {name: group(name) for name in LINEAR},
         "parameters": list(c.parameters),
         "correlation": correlation(c.covariance),
-        **({"uncertainty": budget_document(c, budget(c, stated))} if budgeted else {}),
+        **({"uncertainty": budget_document(c, budget(c, stated), reference_unit)} if budgeted else {}),
         "residual": residual_document(c.residual),
         "poses": [
             {
@@ -202,7 +202,7 @@ def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
     return groups | ({"effects": effects} if effects else {})
 
 
-def budget_document(c: Calibration, b: Budget) -> Document:
+def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Document:
     """Expanded uncertainties and where they come from. Standard uncertainties in the budget's lines."""
 
     def by_name(values: Floats) -> Document:
@@ -231,7 +231,7 @@ def budget_document(c: Calibration, b: Budget) -> Document:
             for line in b.components
         ],
         "dominant": b.dominant.source,
-        "halved_by": b.dominant.halved_by,
+        "halved_by": in_words_of(b.dominant.halved_by, reference_unit),
         "magnitude_if_halved_g": uncertainty(b.magnitude_if_halved),
         "not_evaluated": list(b.not_evaluated),
     }
@@ -307,6 +307,13 @@ def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str,
     if not isinstance(inner, Mapping) or inner.get("format") != "triaxcal.calibration/1":
         raise InputError(f"{where}: format: expected a triaxcal.calibration/1, .loop/1 or .certificate/1 document")
     return inner
+
+
+def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: float) -> str:
+    """The unit of the reference that a calibration document says, or what it must be by its magnitude."""
+    units = calibration_part(document, where=where).get("units")
+    said = units.get("reference") if isinstance(units, Mapping) else None
+    return said if isinstance(said, str) and said else reference_unit_of(magnitude)
 
 
 def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[str, float], float]:

@@ -15,7 +15,7 @@ from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
 from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.pipeline import Pipeline
+from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.recording.csv_text import read_csv
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, Phase
@@ -69,7 +69,7 @@ def measure(
         raise InputError(f"{name}: {e}") from e
     poses = poses_of(windows, detector.spans())
     quality = [f"duplicate_samples: {samples.duplicates}"] if samples.duplicates else []
-    return Measured(name, poses, windows, quality + _creeping(poses))
+    return Measured(name, poses, windows, quality + creeping(poses))
 
 
 def _measure_recording(recording: Recording, phase: Phase, stream: str, moments: Moments | None) -> Measured:
@@ -80,7 +80,7 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str, moments:
         if moments is not None:
             moments.feed(block.readings)
     poses = pipeline.finish()
-    quality = pipeline.data_quality() + losses_of(recording) + _creeping(poses)
+    quality = pipeline.data_quality() + losses_of(recording) + creeping(poses)
     signs = signs_of(recording) or bundle.profile.output.signs
     station = None
     if STATION_FILE in recording.attachments:
@@ -118,13 +118,6 @@ def losses_of(recording: Recording) -> list[str]:
     if missing:
         found.append(f"missing_samples: {missing} records were lost when the recording was damaged")
     return found
-
-
-def _creeping(poses: list[Pose]) -> list[str]:
-    creeping = [p for p in poses if p.creep.any()]
-    if not creeping:
-        return []
-    return [f"creeping_pose: {len(creeping)} of {len(poses)}, the first at {creeping[0].start_s:.1f} s"]
 
 
 def bundle_of(recording: Recording) -> Bundle:

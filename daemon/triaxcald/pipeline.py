@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -107,3 +107,11 @@ class Pipeline:
         if self.counts["errors"]:
             found.append(f"bus_errors: {self.counts['errors']} records")
         return found
+
+
+def creeping(poses: Sequence[Pose]) -> list[str]:
+    """What poses are to be blamed for, likewise."""
+    found = [p for p in poses if p.creep.any()]
+    if not found:
+        return []
+    return [f"creeping_pose: {len(found)} of {len(poses)}, the first at {found[0].start_s:.1f} s"]

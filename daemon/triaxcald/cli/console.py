@@ -93,7 +93,9 @@ class Bars:
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         what = "check poses" if phase == "verification" else "poses"
         self._show(unit, completed=guide.found, total=guide.wanted, description=f"{what}: {guide.hint}")
-        self._plain(unit, f"{what}: {guide.found} of {guide.wanted}")
+        # Seconds that go by are for a terminal; a log gets a line for each pose, and where to turn next.
+        hint = f"; {guide.hint}" if guide.hint.startswith("next") else ""
+        self._plain(unit, f"{what}: {guide.found} of {guide.wanted}{hint}")
 
     def _show(self, unit: str, **values: Any) -> None:
         with suppress(OSError):  # the terminal has gone; the work goes on

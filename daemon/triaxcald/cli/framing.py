@@ -253,6 +253,9 @@ def _show(sources: Sequence[Source], result: Frames) -> None:
     table("errors of the faces' outward normals, mrad ± standard error", ["face", "x", "y", "z"], faces)
     for axes, q in fixture.squareness.items():
         print(f"squareness {axes}: {_mrad(q.value)} ± {_mrad(q.standard_error)} mrad")
+    if fixture.offset is not None:
+        known = _mrad(float(np.max(fixture.offset)))
+        print(f"the datum against the frame that the fixture's maker meant: ± {known} mrad about an axis at most")
     if result.left:
         print(f"do the units agree on the faces: p {result.lack_of_fit_p:.2g} in {result.left} degrees of freedom")
 

@@ -87,7 +87,7 @@ def verify_command(a: argparse.Namespace) -> int:
             for p, e, s in zip(measured.poses, errors, noise, strict=True)
         ],
     }
-    unit = a.reference_unit or documents.reference_unit_of(reference)
+    unit = a.reference_unit or documents.reference_unit_in(document, where=a.calibration, magnitude=reference)
     small = documents.micro_unit(unit)
     if a.json:
         emit(result)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from triaxcal.calibration import Calibration
 from triaxcal.gravity import local_gravity_g
 from triaxcal.loop import Loop
-from triaxcal.uncertainty import Budget, Stated, budget
+from triaxcal.uncertainty import Budget, Combined, Stated, budget
 from triaxcald import documents
 from triaxcald.cli.console import micro, say, table
 from triaxcald.errors import InputError
@@ -67,7 +67,8 @@ def _stated(a: argparse.Namespace, measured: Measured) -> Stated:
 
 
 def show_calibration(c: Calibration, choice: Choice) -> None:
-    show_coefficients(c, choice)
+    b = budget(c, choice.stated)
+    show_coefficients(c, choice, b.parameters)
     r, micro_unit = c.residual, choice.micro_unit
     p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
     print(
@@ -75,10 +76,11 @@ def show_calibration(c: Calibration, choice: Choice) -> None:
         f"{micro(r.cross_validated_rms_g)} {micro_unit}, noise floor {micro(r.noise_floor_g)} {micro_unit}, "
         f"lack of fit p {p}"
     )
-    show_budget(budget(c, choice.stated), choice)
+    show_budget(b, choice)
 
 
-def show_coefficients(c: Calibration, choice: Choice) -> None:
+def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = None) -> None:
+    """``whole`` is their uncertainty with all that the budget has, where there is one."""
     rows = []
     unit = choice.reference_unit
     of_scale = f"{choice.output_unit or 'output'}/{documents.grouped(unit)}"
@@ -86,9 +88,15 @@ def show_coefficients(c: Calibration, choice: Choice) -> None:
     of_effects = {
         f"{e.name}.{k.name}": documents.in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients
     }
-    for name, value, error in zip(c.parameters, c.values, c.standard_errors, strict=True):
-        rows.append([name, f"{value:.9g}", f"{error:.2g}", of_effects.get(name, units.get(name.split(".")[0], ""))])
-    table("coefficients", ["", "value", "standard error", "unit"], rows)
+    for i, (name, value, error) in enumerate(zip(c.parameters, c.values, c.standard_errors, strict=True)):
+        expanded = [f"± {whole.expanded[i]:.2g}"] if whole else []
+        of = of_effects.get(name, units.get(name.split(".")[0], ""))
+        rows.append([name, f"{value:.9g}", f"{error:.2g}", *expanded, of])
+    told = [f"expanded ({whole.level:.0%})"] if whole else []
+    table("coefficients", ["", "value", "standard error", *told, "unit"], rows)
+    held = ", ".join(f"{name} = {value:g}" for name, value in c.channel_reference.items())
+    if held:
+        print(f"they hold at {held}")
 
 
 def _percent(share: float) -> str:
@@ -104,10 +112,8 @@ def show_budget(b: Budget, choice: Choice) -> None:
         [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", micro(float(whole.expanded)), ""]
     )
     table(f"uncertainty of the magnitude, {unit}", ["source", "type", "standard", "share"], rows)
-    print(
-        f"dominant: {b.dominant.source}; to halve it: {b.dominant.halved_by} "
-        f"(combined then {micro(b.magnitude_if_halved)} {unit})"
-    )
+    by = documents.in_words_of(b.dominant.halved_by, choice.reference_unit)
+    print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {micro(b.magnitude_if_halved)} {unit})")
     for line in b.not_evaluated:
         print(f"not evaluated: {line}")
 

@@ -40,12 +40,12 @@ def render_report(
     outcome, papers = read_document(document), certificate or {}
     limits = {name: figures.number(value) for name, value in mapping(papers.get("limits")).items()}
     floor_g = outcome.final.noise_floor_g
-    calibration = mapping(document.get("calibration")) or document
+    uncertainty = read_uncertainty(mapping(document.get("calibration")) or document)
     page = _ENVIRONMENT.get_template("report.html").render(
         title=title,
         outcome=outcome,
-        verdict=judge(outcome, limits),
-        uncertainty=read_uncertainty(calibration),
+        verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None),
+        uncertainty=uncertainty,
         bars=bars_picture(outcome.stages, outcome.held_out),
         sphere=sphere_picture(outcome.poses, outcome.stages, floor_g),
         over_time=time_picture(outcome.poses, outcome.stages, floor_g),

@@ -37,7 +37,7 @@ class Verdict:
     checks: tuple[LimitCheck, ...]
 
 
-def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None]) -> Verdict:
+def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expanded_g: float | None = None) -> Verdict:
     """The verdict on an outcome.
 
     Limits are named like the fields of a residual, or `held_out_rms_g`, and hold inclusively. A limit that
@@ -46,7 +46,7 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None]) -> V
     checks = tuple(_checks(outcome, {**outcome.limits, **certificate_limits}))
     if outcome.refused is not None:
         return Verdict("refused", "Refused", outcome.refused, (), checks)
-    reservations = tuple(_reservations(outcome, checks))
+    reservations = (*_reservations(outcome, checks), *_beyond_limits(checks, expanded_g))
     errors = _errors(outcome)
     open_checks = [check for check in checks if check.passed is None]
     exceeded = [check.name for check in checks if check.passed is False]
@@ -60,7 +60,8 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None]) -> V
     if open_checks or not (checks or _tested(outcome)):
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
-    headline = _WORDS["within"] if checks else "Nothing left unexplained"
+    unsearched = "Nothing left unexplained" if outcome.searched else "No lack of fit shows"
+    headline = _WORDS["within"] if checks else unsearched
     return Verdict("within", headline, errors, reservations, checks)
 
 
@@ -101,6 +102,17 @@ def _errors(outcome: Outcome) -> str:
     if len(pairs) > 1 and pairs[0] is not None:
         text += f", {micro_g(pairs[0])} before"
     return f"{text}; noise floor {micro_g(floor_g)}."
+
+
+def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None) -> list[str]:
+    """What no residual can show: an error of the reference is the same in every pose, and fitted away."""
+    least = min((c.limit_g for c in checks if c.limit_g is not None), default=None)
+    if least is None or expanded_g is None or expanded_g <= least:
+        return []
+    return [
+        f"The expanded uncertainty of the magnitude, {micro_g(expanded_g)}, is above the limit of {micro_g(least)}; "
+        "residuals alone were judged by it."
+    ]
 
 
 def _reservations(outcome: Outcome, checks: tuple[LimitCheck, ...]) -> list[str]:

@@ -347,3 +347,16 @@ def test_another_reference_has_its_own_unit_everywhere(changed: dict[str, Any]) 
     page = render(changed)
     assert "µg" not in page.html
     assert "1e-6 <uT> rms" in page.text
+
+
+def test_a_limit_below_the_expanded_uncertainty_is_reserved_against(budgeted: dict[str, Any]) -> None:
+    said = "The expanded uncertainty of the magnitude, 86.0 µg, is above the limit of 50.0 µg"
+    assert said in render(budgeted, certificate={"limits": {"rms_g": 5e-5}}).text
+    assert "is above the limit" not in render(budgeted, certificate={"limits": {"rms_g": 9e-5}}).text
+
+
+def test_a_fit_that_searched_for_nothing_claims_no_more_than_no_lack_of_fit(loop: dict[str, Any]) -> None:
+    fitted = {**loop["calibration"], "residual": loop["after"]}
+    page = render(fitted)
+    assert "No lack of fit shows" in page.text
+    assert "Nothing left unexplained" not in page.text

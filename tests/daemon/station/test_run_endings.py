@@ -60,7 +60,7 @@ async def _outcome(workshop: Any, served: Any, **settings: Any) -> Outcome:
 def test_a_standard_error_that_is_closed_in_the_check_poses_stops_nothing(workshop: Any, terminal: bool) -> None:
     """As by `2>&1 | head`; rich takes a pipe for a terminal where the environment says so."""
     environment = {**os.environ, "COLUMNS": "200", **({"FORCE_COLOR": "1"} if terminal else {})}
-    with workshop.serve(workshop.device(speed=40.0, fixture={**FIXTURE, "hold_s": 1.5})) as served:
+    with workshop.serve(workshop.device(speed=40.0, fixture={**FIXTURE, "hold_s": 2.2})) as served:
         station = workshop.station({"bus": served.bus}, plan={**PLAN, "check_poses": 9})
         reading, writing = os.pipe()
         with subprocess.Popen(
@@ -251,7 +251,7 @@ def test_corrected_frames_that_stop_are_found_out_and_the_old_calibration_is_put
     monkeypatch.setattr(RecordingWriter, "event", then_stop)
     monkeypatch.setattr(CanUnit, "_send", send_readings)
     bus = {"interface": "virtual", "channel": f"half-silent-{os.getpid()}", "node_id": 5}
-    device = workshop.device(profile="triax-ref-can", bus=bus, speed=30.0, fixture={**FIXTURE, "hold_s": 1.5})
+    device = workshop.device(profile="triax-ref-can", bus=bus, speed=30.0, fixture={**FIXTURE, "hold_s": 2.2})
     profile = workshop.impatient_profile("triax-ref-can")
     with workshop.serve(device) as served:
         done = triaxcal("run", workshop.station({"bus": bus, "profile": profile}, plan=PLAN))
