@@ -49,8 +49,8 @@ def _onset(w: Windows, run: Ints, noise: NoiseScales) -> int:
     if z[-1] < ONSET_SIGMA:
         return 0
     first = int(np.argmax(z >= ONSET_SIGMA))
-    # Not beyond the middle of the move, where it no longer sets out; one that is there at once has no onset.
-    second = int(np.argmax(z >= min(4 * z[first], z[-1] / 2)))
+    # A move that is there at once has no onset; what noise adds to its end is none of it.
+    second = int(np.argmax(z >= min(4 * z[first], 0.9 * z[-1])))
     if second <= first:
         return 0
     # The sum of displacements up to the end of a window grows as the fourth power of the time since the onset.
