@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.table import Table, chosen
+from benchmarks.table import Table, run
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
@@ -94,9 +94,7 @@ def table(seeds: int) -> Table:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    quick = chosen(__doc__, arguments)
-    print(table(QUICK if quick else SEEDS))
-    return 0
+    return run(__doc__, arguments, table, quick=QUICK, full=SEEDS)
 
 
 if __name__ == "__main__":

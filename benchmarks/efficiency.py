@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.table import Table, chosen
+from benchmarks.table import Table, run
 from benchmarks.truth import PARAMETERS, Condition, bound_and_best, conditions
 from triaxcal.fit import fit
 
@@ -71,9 +71,7 @@ def table(seeds: int) -> Table:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    quick = chosen(__doc__, arguments)
-    print(table(QUICK if quick else SEEDS))
-    return 0
+    return run(__doc__, arguments, table, quick=QUICK, full=SEEDS)
 
 
 if __name__ == "__main__":

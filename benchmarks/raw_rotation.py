@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.table import Table, chosen
+from benchmarks.table import Table, run
 from benchmarks.truth import information
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.sensor import Sensor
@@ -88,9 +88,7 @@ def table(seeds: int) -> Table:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    quick = chosen(__doc__, arguments)
-    print(table(QUICK if quick else SEEDS))
-    return 0
+    return run(__doc__, arguments, table, quick=QUICK, full=SEEDS)
 
 
 if __name__ == "__main__":

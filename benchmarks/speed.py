@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -35,14 +36,14 @@ def fits(quick: bool) -> Table:
     for count in (14, 26, 100, 1000) if quick else (14, 26, 100, 1000, 10_000):
         c = Condition("", PAPER_UNIT, plan(count), np.array(1.5e-5))
         poses, _ = c.draw(0)
-        ours = seconds(lambda poses=poses, c=c: fit(poses, signs=c.signs), budget)  # type: ignore[misc]
-        bare = seconds(lambda poses=poses, c=c: fit(poses, signs=c.signs, aside=()), budget)  # type: ignore[misc]
-        plain = seconds(lambda poses=poses, c=c: scipy_magnitude(c, poses), budget)  # type: ignore[misc]
+        ours = seconds(partial(fit, poses, signs=c.signs), budget)
+        bare = seconds(partial(fit, poses, signs=c.signs, aside=()), budget)
+        plain = seconds(partial(scipy_magnitude, c, poses), budget)
         rows.append([f"{count} poses", _duration(ours), f"{bare / ours:.2g}", f"{plain / ours:.2g}"])
     for count in (10_000, 100_000) if quick else (10_000, 100_000, 1_000_000):
         u, _ = turning(count, 0.02, 0)
-        ours = seconds(lambda u=u: adjusted(u), budget)  # type: ignore[misc]
-        plain = seconds(lambda u=u: paper(u), budget)  # type: ignore[misc]
+        ours = seconds(partial(adjusted, u), budget)
+        plain = seconds(partial(paper, u), budget)
         rows.append([f"{count} points of a turning unit", _duration(ours), "", f"{plain / ours:.2g}"])
     head = ["what", "triaxcal", "without the search for spoiled poses", "poses: scipy on |a| − 1; points: closed form"]
     return Table("Speed of a fit; other columns are times over ours", head, rows)

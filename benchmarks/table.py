@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 
@@ -27,3 +27,11 @@ def chosen(about: str | None, arguments: Sequence[str] | None) -> bool:
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--quick", action="store_true", help="fewer runs: the same tables within half a minute")
     return bool(parser.parse_args(arguments).quick)
+
+
+def run(
+    about: str | None, arguments: Sequence[str] | None, table: Callable[[int], Table], *, quick: int, full: int
+) -> int:
+    """Prints a benchmark's one table, which takes the number of its seeds."""
+    print(table(quick if chosen(about, arguments) else full))
+    return 0

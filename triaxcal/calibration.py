@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -123,3 +123,15 @@ def channels_of(poses: list[Pose] | tuple[Pose, ...]) -> dict[str, Floats]:
     out = {name: np.array([p.channels[name] for p in poses]) for name in sorted(shared)}
     out[TIME] = np.array([p.t_s for p in poses])
     return out
+
+
+def conditions_elsewhere(poses: Sequence[Pose], reference: Mapping[str, float]) -> dict[str, Floats]:
+    """`conditions` of poses of another recording than that which ``reference`` is of, whose clock is its own: effects
+    of time count as at their reference. Raises InvalidData where a channel is missing.
+    """
+    channels = channels_of(list(poses))
+    missing = [n for n in reference if n not in channels]
+    if missing:
+        raise InvalidData(f"the poses have no channel {', '.join(missing)}, which the calibration needs")
+    channels[TIME] = np.full(len(poses), reference.get(TIME, 0.0))
+    return conditions(channels, reference)

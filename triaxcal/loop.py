@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration, channels_of, conditions
+from triaxcal.calibration import Calibration, channels_of, conditions_elsewhere
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import InvalidData
@@ -245,13 +245,8 @@ def magnitude_errors(
     The poses are of another recording than the model's, whose clock is its own: effects of time count as at their
     reference. Raises InvalidData where a channel that the effects need is missing.
     """
-    channels = channels_of(list(poses))
-    missing = [n for n in channel_reference if n not in channels]
-    if missing:
-        raise InvalidData(f"the poses have no channel {', '.join(missing)}, which the calibration needs")
-    channels[TIME] = np.full(len(poses), channel_reference.get(TIME, 0.0))
     u = np.array([p.mean for p in poses])
-    held = conditions(channels, channel_reference)
+    held = conditions_elsewhere(poses, channel_reference)
     length, by_u = sensor.magnitude(u, held)
     covariance = np.array([p.covariance for p in poses])
     return length - reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))

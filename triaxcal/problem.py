@@ -10,7 +10,7 @@ and the effects' coefficients; all derivatives are exact.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +64,19 @@ class State:
 
     theta: Floats
     effects: tuple[Effect, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, sensor: Sensor) -> State:
+        """The point at which a sensor stands: the inverse of `sensor`."""
+        k = sensor.scale_factor
+        coefficients = [c for _, c in sensor.effects]
+        theta = np.concatenate([problem.half / k, sensor.bias - problem.middle / k, sensor.misalignment, *coefficients])
+        return cls(theta, tuple(e for e, _ in sensor.effects))
+
+    def extended(self, effects: Sequence[Effect]) -> State:
+        """With further effects, whose coefficients are zero."""
+        zeros = np.zeros(sum(len(e.coefficients) for e in effects))
+        return State(np.concatenate([self.theta, zeros]), (*self.effects, *effects))
 
     def sensor(self, problem: Problem) -> Sensor:
         D, w, angles = self.theta[:3], self.theta[3:6], self.theta[6:9]

@@ -158,11 +158,8 @@ class _Ground:
         # millionth, since processors differ in the last digits, and a steady channel should not seem to move.
         means = {n: round(float(np.mean(problem.channels[n])), 6) for n in problem.channel_reference}
         self.problem = replace(problem, channel_reference=means | dict(calibration.channel_reference))
-        D = self.problem.half / sensor.scale_factor
-        w = sensor.bias - self.problem.middle / sensor.scale_factor
-        coefficients = [c for _, c in sensor.effects]
-        self.effects = tuple(e for e, _ in sensor.effects)
-        self.state = State(np.concatenate([D, w, sensor.misalignment, *coefficients]), self.effects)
+        self.state = State.of(self.problem, sensor)
+        self.effects = self.state.effects
         _, J, self.error = linearise(self.problem, self.state)
         self.weighted = J / self.error[:, None]
         self.G = parameters_by_theta(self.problem, self.state)
@@ -261,8 +258,7 @@ def _temperature(calibration: Calibration, ground: _Ground) -> tuple[list[Compon
     if TEMPERATURE not in ground.problem.channel_reference or not missing:
         return [], 1.0
     extra = sum(len(e.coefficients) for e in missing)
-    extended = State(np.concatenate([ground.state.theta, np.zeros(extra)]), (*ground.effects, *missing))
-    r, J, s = linearise(ground.problem, extended)
+    r, J, s = linearise(ground.problem, ground.state.extended(missing))
     spread = np.concatenate([[_sensitivity(e, calibration.reference)] * len(e.coefficients) for e in missing])
     p = len(ground.state.theta)
     Z = J[:, p:] * spread / s[:, None]

@@ -25,14 +25,9 @@ def is_visible(problem: Problem, state: State, effect: Effect, given: Sequence[E
 
 def _columns(problem: Problem, state: State, effects: Sequence[Effect]) -> tuple[Floats, Floats, Floats]:
     """Weighted residuals, weighted linear columns, and those of the effects, all at ``state``."""
-    extended = State(np.concatenate([state.theta, np.zeros(_count(effects))]), (*state.effects, *effects))
-    r, J, s = linearise(problem, extended)
+    r, J, s = linearise(problem, state.extended(effects))
     at = len(state.theta)
     return r / s, J[:, :at] / s[:, None], J[:, at:] / s[:, None]
-
-
-def _count(effects: Sequence[Effect]) -> int:
-    return sum(len(e.coefficients) for e in effects)
 
 
 def projected(problem: Problem, state: State, effect: Effect, given: Sequence[Effect] = ()) -> Floats:

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
-from triaxcal.calibration import Calibration, channels_of, conditions
-from triaxcal.effects.contract import TIME
+from triaxcal.calibration import Calibration, channels_of, conditions, conditions_elsewhere
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
@@ -64,13 +63,8 @@ def verticals_under(
     Effects of time count as at their reference there, since its clock is its own. Raises InvalidData where a channel
     that the calibration needs is missing.
     """
-    channels = channels_of(list(poses))
-    channels[TIME] = np.full(len(poses), channel_reference.get(TIME, 0.0))
-    missing = [n for n in channel_reference if n not in channels]
-    if missing:
-        raise InvalidData(f"the poses have no channel {', '.join(missing)}, which the calibration needs")
     used = np.ones(len(poses), dtype=bool)
-    held = conditions(channels, channel_reference)
+    held = conditions_elsewhere(poses, channel_reference)
     direction, V = _directions(sensor, poses, held, reference, covariance, used)
     return Verticals(tuple(poses), direction, V, used, 1e6)
 

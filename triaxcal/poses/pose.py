@@ -97,7 +97,8 @@ def poses_of(w: Windows, spans: Sequence[Span]) -> list[Pose]:
         return []
     tracks = [_track(w, s) for s in spans]
     recording = float(w.end_ns[spans[-1].last] - w.start_ns[spans[0].first]) / w.period_ns
-    mean = np.array([w.mean[s.used].mean(axis=0) for s in spans])
+    held = held_of(w, spans)
+    mean = np.array([h.mean for h in held])
     noise = pose_noise(tracks, recording)
     creeping = np.asarray(noise.creeping.any(axis=1))
     length = np.array([t.place[-1] - t.place[0] for t in tracks])[:, None]
@@ -115,13 +116,12 @@ def poses_of(w: Windows, spans: Sequence[Span]) -> list[Pose]:
         radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
         creep = creep - radial[:, None] * out
     covariance = covariance + np.diag(_rounding(w, spans))
-    begin = int(w.start_ns[0])
     return [
         Pose(
-            start_s=(int(w.start_ns[s.first]) - begin) * 1e-9,
-            end_s=(int(w.end_ns[s.last]) - begin) * 1e-9,
+            start_s=held[i].start_s,
+            end_s=held[i].end_s,
             samples=len(s.used) * w.size,
-            mean=mean[i],
+            mean=held[i].mean,
             covariance=covariance[i] + np.outer(creep[i], creep[i]) / 12,
             dof=float(dof[i]),
             shared_dof=shared_dof,
