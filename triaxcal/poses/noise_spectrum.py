@@ -28,6 +28,8 @@ SLOWEST = 0.40
 DOF_LEVEL = 0.99
 DOF_GRID = np.geomspace(1.0, 1e5, 200)
 STEPS = 12
+FLICKER = 0.3
+"""Odds, before the data, of 1/f noise strong enough to matter (decision 0022)."""
 MISFIT = 1e-3
 """Probability below which the model is fitted to lower frequencies only."""
 
@@ -95,9 +97,9 @@ class Components:
         constants = np.geomspace(0.4, max(typical / 5, 0.8), TIME_CONSTANTS)
         lengths = np.geomspace(0.5, max(typical / 8, 1.0), LENGTHS)
         mixture = np.geomspace(0.03, max(recording / (2 * np.pi * SLOWEST), 1.0), 160)
-        many = np.array([_first_order(t, lags) for t in mixture]).mean(axis=0) * np.log(mixture[-1] / mixture[0])
-        rows = [np.eye(1, lags)[0], many, *(_first_order(t, lags) for t in constants)]
-        rows += [*(_moving_average(t, lags) for t in lengths), np.zeros(lags)]
+        many = np.array([first_order_windows(t, lags) for t in mixture]).mean(axis=0) * np.log(mixture[-1] / mixture[0])
+        rows = [np.eye(1, lags)[0], many, *(first_order_windows(t, lags) for t in constants)]
+        rows += [*(moving_average_windows(t, lags) for t in lengths), np.zeros(lags)]
         return cls(np.array(rows))
 
     @property
@@ -114,7 +116,7 @@ class Components:
         return np.asarray(self.autocovariance[:, :n] @ pairs / n**2)
 
 
-def _first_order(constant: float, lags: int) -> Floats:
+def first_order_windows(constant: float, lags: int) -> Floats:
     """Autocovariance of averages over windows of a first-order process of unit variance."""
     k = np.arange(lags, dtype=float)
     fall = -np.expm1(-1 / constant)
@@ -123,7 +125,7 @@ def _first_order(constant: float, lags: int) -> Floats:
     return np.asarray(out)
 
 
-def _moving_average(length: float, lags: int) -> Floats:
+def moving_average_windows(length: float, lags: int) -> Floats:
     """Autocovariance of averages over windows of white noise averaged over a length: a box twice on a box twice."""
     steps = [(-1, 1.0), (0, -2.0), (1, 1.0)]
     k = np.arange(lags, dtype=float)
@@ -215,7 +217,7 @@ def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Flo
     none = len(n) - 1
     flicker, order = models[:, 1] != none, models[:, 2] != none
     free = len(fits) * (1 + flicker + order)
-    prior = np.where(order, 1 / (TIME_CONSTANTS + LENGTHS), 1.0)
+    prior = np.where(order, 1 / (TIME_CONSTANTS + LENGTHS), 1.0) * np.where(flicker, FLICKER, 1.0)
     loss = np.sum([f[1] for f in fits], axis=0) + free * np.log(max(len(fits) * p.weight.sum(), 2.0)) / 2
     share = prior * np.exp(loss.min() - loss)
     share /= share.sum()
