@@ -15,10 +15,12 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from scipy.signal import butter, sosfilt
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, Ints
 from triaxcal.coloured_noise import first_order, flicker, moving_average, white
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.sensor import Sensor
@@ -49,7 +51,11 @@ class Condition:
     vibration_g: float = 0.0
     vibration_hz: float = 29.7
     machine: str = "steady"
-    """steady, switching (between and within poses), or impulses."""
+    """steady, switching (between and within poses), some poses (half of them, more or less loud), or impulses."""
+    noise_like: bool = False
+    """The machine hisses in an octave from its frequency on, instead of humming."""
+    jitter_g: float = 0.0
+    """Of the hand that moves the unit, white."""
     bump_g: float = 0.0
     bump_s: float = 0.1
     ringing_g: float = 0.0
@@ -92,12 +98,15 @@ def made(c: Condition, seed: int) -> Stream:
     start = np.r_[0, np.cumsum(holds[:-1] + moves)]
     end = start + holds
     t = np.arange(int(end[-1] * c.rate_hz)) / c.rate_hz
-    pose = np.searchsorted(start, t, side="right") - 1
+    pose = pose_at(t, start)
     a = directions[pose]
     moving = t >= end[pose]
     for i in range(c.poses - 1):
         at = np.flatnonzero(moving & (pose == i))
         a[at] = path(directions[i], directions[i + 1], (t[at] - end[i]) / moves[i], moves[i], c.by_hand, rng)
+    if c.jitter_g:
+        into = np.clip((t - end[pose]) / np.r_[moves, 1.0][pose], 0, 1)
+        a += (c.jitter_g * np.sin(np.pi * into) ** 0.5)[:, None] * rng.standard_normal(a.shape)
     a += after_moves(c, t, start, pose, rng) + bumps(c, t, start, holds, rng)
     creep = np.zeros_like(a)
     for i in range(1, c.poses, 3):
@@ -113,6 +122,11 @@ def made(c: Condition, seed: int) -> Stream:
         u = np.round(u / step) * step
     truth = PAPER_UNIT.output(directions, {}) + c.offset
     return Stream(t, u, clean + c.offset, list(zip(start, end, strict=True)), truth)
+
+
+def pose_at(t: Floats, start: Floats) -> Ints:
+    """The pose at each time, or the one before the move."""
+    return np.asarray(np.searchsorted(start, t, side="right") - 1)
 
 
 def path(here: Floats, there: Floats, x: Floats, seconds: float, by_hand: bool, rng: np.random.Generator) -> Floats:
@@ -170,7 +184,14 @@ def vibration(c: Condition, t: Floats, start: Floats, holds: Floats, rng: np.ran
         np.sin(2 * np.pi * f * t[:, None] + rng.uniform(0, 6, 3)) * rng.uniform(0.3, 1, 3)
         for f in (c.vibration_hz, 2.07 * c.vibration_hz)
     )
+    if c.noise_like:
+        band = [c.vibration_hz, min(2 * c.vibration_hz, 0.48 * c.rate_hz)]
+        sections = butter(2, band, "band", fs=c.rate_hz, output="sos")
+        lines = sosfilt(sections, rng.standard_normal((len(t), 3)), axis=0)
+        lines /= lines.std()
     out = c.vibration_g * wander * lines
+    if c.machine == "some poses":
+        out *= (rng.uniform(0.2, 1.0, len(start)) * (rng.random(len(start)) < 0.5))[pose_at(t, start)][:, None]
     if c.machine == "switching":
         edges = np.cumsum(rng.uniform(8, 30, 200))
         out *= (np.searchsorted(edges, t) % 2)[:, None]
@@ -256,6 +277,8 @@ def _average(n: int, length: float, rng: np.random.Generator) -> Floats:
     return moving_average(n, int(length), rng)
 
 
+SOME_POSES: dict[str, Any] = {"vibration_g": 1e-2, "machine": "some poses", "hold_s": (3.0, 8.0)}
+SLOW_TURNS: dict[str, Any] = {"jitter_g": 0.01, "apart_deg": 10.0, "move_s": (6.0, 9.0)}
 CONDITIONS = [
     Condition("white, 100 Hz"),
     *(Condition(f"white, {r:g} Hz", r, poses=26 if r < 2000 else 14) for r in (20.0, 50.0, 1000.0)),
@@ -296,6 +319,16 @@ CONDITIONS = [
     Condition("vibration 2 mg at 4 Hz", vibration_g=2e-3, vibration_hz=4.3),
     Condition("vibration 5 mg on and off", vibration_g=5e-3, machine="switching"),
     Condition("vibration 5 mg on and off, 1 kHz", 1000.0, vibration_g=5e-3, machine="switching"),
+    Condition("vibration 10 mg, some poses", vibration_g=1e-2, machine="some poses", hold_s=(3.0, 8.0)),
+    Condition("the same, moves that jitter", **SOME_POSES, jitter_g=0.03, by_hand=True),
+    Condition("the same at 7 Hz", **SOME_POSES, jitter_g=0.03, vibration_hz=7.3),
+    Condition("the same at 90 Hz, 1 kHz", 1000.0, **SOME_POSES, jitter_g=0.03, vibration_hz=90.0),
+    Condition("noise-like vibration, some poses", **SOME_POSES, noise_like=True, vibration_hz=15.0),
+    Condition("the same from 5 Hz, by hand", **SOME_POSES, noise_like=True, vibration_hz=5.0, by_hand=True),
+    Condition("the same, AR(1), 0.3 s", **SOME_POSES, noise_like=True, jitter_g=0.03, noise=coloured(first_order, 30)),
+    Condition("vibration, slow turns that jitter", **(SOME_POSES | SLOW_TURNS)),
+    Condition("AR(1), 0.3 s, moves that jitter", noise=coloured(first_order, 30), jitter_g=0.03),
+    Condition("AR(1), 0.3 s, slow turns that jitter", noise=coloured(first_order, 30), **SLOW_TURNS),
     Condition("impulses 25 mg every 3.4 s", vibration_g=5e-3, machine="impulses"),
     Condition("coarse steps of 1 mg", step_g=1e-3),
     Condition("coarse steps of 10 mg", step_g=1e-2, pulls=False),

@@ -325,7 +325,8 @@ def keys_of(value: object, named: frozenset[str]) -> set[str]:
         return set()
     found = set(value)
     for key, inner in value.items():
-        found |= keys_of(inner, named) if key not in named else {k for v in inner.values() for k in keys_of(v, named)}
+        by_name = key in named and isinstance(inner, dict)
+        found |= {k for v in inner.values() for k in keys_of(v, named)} if by_name else keys_of(inner, named)
     return found
 
 

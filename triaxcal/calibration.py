@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
+from scipy import linalg, stats
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import TIME
+from triaxcal.conditions import channels_of, conditions, of_readings, with_scale
+from triaxcal.effects.part import Part, mix_of
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
@@ -51,7 +52,8 @@ class Calibration:
     ``reference`` is the magnitude of the reference vector; ``channel_reference`` the values from which the effects'
     conditions are counted; ``inflation`` is the factor on the standard errors by which residuals exceed the noise:
     at least 1, unless no pose knows its noise (then the residuals alone set it). ``dof`` are the effective degrees of
-    freedom behind the standard errors.
+    freedom behind the standard errors. ``shape_errors`` are standard errors of the effects' shapes, by "effect.name";
+    ``shared`` are coefficients, named so, that only a combination of them is known of.
     """
 
     sensor: Sensor
@@ -64,6 +66,8 @@ class Calibration:
     dilution: float
     inflation: float
     dof: float
+    shape_errors: Mapping[str, float] = field(default_factory=dict)
+    shared: frozenset[str] = frozenset()
     blind_to: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -87,6 +91,38 @@ class Calibration:
         """Of `parameters`."""
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def whole(self) -> Calibration:
+        """The same calibration with every effect in full; what a part leaves out is zero, without error."""
+        blocks = [np.eye(9), *(mix_of(e) for e, _ in self.sensor.effects)]
+        mix = linalg.block_diag(*blocks)
+        shared = {
+            f"{e.name}.{c.name}"
+            for e, _ in self.sensor.effects
+            if isinstance(e, Part) and not e.selects
+            for c in e.whole.coefficients
+        }
+        return replace(
+            self, sensor=self.sensor.whole, covariance=mix @ self.covariance @ mix.T, shared=frozenset(shared)
+        )
+
+    def coefficients_of(self, name: str) -> dict[str, tuple[float, float | None, str]]:
+        """name → (value, standard error, unit) of the coefficients of the effect of that name, and of its shape.
+
+        The standard error is None where |a| does not tell it: of a step between two poses, the moment; of coefficients
+        that show by a combination of them alone, each.
+        Raises KeyError for an effect that is not in the model.
+        """
+        errors = dict(zip(self.parameters, self.standard_errors, strict=True))
+        effect, q = {e.name: (e, q) for e, q in self.sensor.effects}[name]
+        out: dict[str, tuple[float, float | None, str]] = {
+            c.name: (float(v), None if (n := f"{name}.{c.name}") in self.shared else float(errors[n]), c.unit)
+            for c, v in zip(effect.coefficients, q, strict=True)
+        }
+        for name, (value, unit) in effect.shape.items():
+            out[name] = (value, self.shape_errors.get(f"{effect.name}.{name}"), unit)
+        return out
+
     def coverage_factor(self, level: float = 0.95) -> float:
         """By what a standard error is multiplied for an interval that holds the truth with probability ``level``.
 
@@ -106,32 +142,13 @@ class Calibration:
 
         Raises KeyError for a channel that is not there; time stands under ``t_s``.
         """
-        return self.sensor.specific_force(readings, conditions(channels, self.channel_reference))
+        held = of_readings(channels, self.channel_reference, len(readings))
+        return self.sensor.specific_force(readings, held)
+
+    def conditions_of(self, poses: Sequence[Pose]) -> dict[str, Floats]:
+        """Of poses of the recording that it was fitted to."""
+        channels = with_scale(channels_of(poses), poses, self.sensor.scale_factor, self.sensor.bias)
+        return conditions(channels, self.channel_reference)
 
     def with_blind_to(self, effects: tuple[str, ...]) -> Calibration:
         return replace(self, blind_to=effects)
-
-
-def conditions(channels: Mapping[str, Floats], reference: Mapping[str, float]) -> dict[str, Floats]:
-    """Deviations of the channels from their references; a channel with no reference is left out."""
-    return {name: np.asarray(channels[name]) - value for name, value in reference.items() if name in channels}
-
-
-def channels_of(poses: list[Pose] | tuple[Pose, ...]) -> dict[str, Floats]:
-    """The channels' means by pose, (n,) each, with the time of each pose."""
-    shared = set.intersection(*(set(p.channels) for p in poses)) if poses else set()
-    out = {name: np.array([p.channels[name] for p in poses]) for name in sorted(shared)}
-    out[TIME] = np.array([p.t_s for p in poses])
-    return out
-
-
-def conditions_elsewhere(poses: Sequence[Pose], reference: Mapping[str, float]) -> dict[str, Floats]:
-    """`conditions` of poses of another recording than that which ``reference`` is of, whose clock is its own: effects
-    of time count as at their reference. Raises InvalidData where a channel is missing.
-    """
-    channels = channels_of(list(poses))
-    missing = [n for n in reference if n not in channels]
-    if missing:
-        raise InvalidData(f"the poses have no channel {', '.join(missing)}, which the calibration needs")
-    channels[TIME] = np.full(len(poses), reference.get(TIME, 0.0))
-    return conditions(channels, reference)

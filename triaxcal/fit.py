@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.calibration import Calibration, PoseResult, Residual, channels_of, conditions
+from triaxcal.calibration import Calibration, PoseResult, Residual
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.outliers import Spoiled, spoiled
 from triaxcal.plan.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
-from triaxcal.problem import NOT_STILL, Problem, State, linearise, parameters_by_theta, solve
+from triaxcal.problem import NOT_STILL, Problem, State, by_shape, linearise, parameters_by_theta, solve
 from triaxcal.pure_error import lack_of_fit_p, pose_dof, pure_error_dof, raised
-from triaxcal.start import DILUTION_LIMIT, problem_of, start
+from triaxcal.start import DILUTION_LIMIT, problem_of, start, with_history
 
 DILUTION_WARNING = 10.0
 SPREAD_WARNING = 15.0
@@ -42,10 +42,11 @@ def fit(
     cannot carry the parameters, InvalidData where a channel that an effect needs is not there.
     """
     everything = problem_of(poses, signs=signs, reference=reference)
+    begin = start(everything, poses, signs)
+    everything = with_history(everything, poses, begin.sensor(everything))
     missing = {n for e in effects for n in e.needs if n not in everything.channel_reference}
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
-    begin = start(everything, poses, signs)
     verdict = Spoiled(tuple(sorted(aside))) if aside is not None else Spoiled()
     state = solve(everything, begin, tuple(effects)) if not verdict.rows else begin
     if aside is None:
@@ -55,12 +56,14 @@ def fit(
     if found:
         kept = [p for i, p in enumerate(poses) if i not in found]
         problem = problem_of(kept, signs=signs, reference=reference)
-        state = solve(problem, start(problem, kept, signs), tuple(effects))
+        begin = start(problem, kept, signs)
+        problem = with_history(problem, kept, begin.sensor(problem))
+        state = solve(problem, begin, tuple(effects))
     calibration = _conclude(problem, kept, state, verdict)
     if found:
         calibration = _with_aside(calibration, poses, verdict)
     if verdict.rivals:
-        sets = " or ".join(" and ".join(f"{poses[i].start_s:.1f} s" for i in rows) for rows in verdict.rivals)
+        sets = " or ".join(" and ".join(poses[i].at for i in rows) for rows in verdict.rivals)
         warning = f"some poses were spoiled, and these cannot be told from each other, so none is left out: {sets}"
         calibration = replace(calibration, warnings=(warning, *calibration.warnings))
     return calibration
@@ -86,9 +89,8 @@ def _spoiled(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
 
 def _with_aside(calibration: Calibration, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
     """The calibration with the poses left out among its results, in order of time, and a warning that names them."""
-    held = channels_of(list(poses))
     u = np.array([p.mean for p in poses])
-    conditioned = conditions(held, calibration.channel_reference)
+    conditioned = calibration.conditions_of(poses)
     length, by_u = calibration.sensor.magnitude(u, conditioned)
     a = calibration.sensor.specific_force(u, conditioned)
     results = list(calibration.poses)
@@ -97,7 +99,7 @@ def _with_aside(calibration: Calibration, poses: Sequence[Pose], verdict: Spoile
         error = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
         miss = float(length[i] - calibration.reference)
         results.insert(i, PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, error, miss / error, 0.0, used=False))
-        names.append(f"at {poses[i].start_s:.1f} s ({miss / error:+.0f} standard errors)")
+        names.append(f"at {poses[i].at} ({miss / error:+.0f} standard errors)")
     warning = f"left out as spoiled: the pose {', the pose '.join(names)}"
     if verdict.doubtful:
         warning += (
@@ -115,7 +117,8 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State, verdict: Sp
     free = np.sqrt(np.maximum(1 - leverage, 0.0))
     studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
     chi2 = float(np.sum((r / s) ** 2))
-    left = n - p
+    # What the shape of an effect was chosen by is spent, though no column of the Jacobian stands for it.
+    left = n - p - sum(len(e.shape) for e in state.effects)
     doubtful = len(verdict.rows) if verdict.doubtful else 0
     inflation, dof = raised(chi2 + verdict.doubtful, left + doubtful, pure_error_dof(poses, leverage / p))
     crossed = cross_validated(problem, state, leverage)
@@ -128,6 +131,8 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State, verdict: Sp
         # No scale factor and a bias of one reference fit anything: |a| is right everywhere and means nothing.
         raise Refused(f"the fit ran away, to a dilution of {spread:.3g}; {NOT_STILL}")
     norms = np.linalg.norm(J / s[:, None], axis=0)
+    shapes = by_shape(problem, state)
+    covariance = _covariance(problem, state, np.concatenate([J, shapes], axis=1) / s[:, None]) * inflation**2
     residual = Residual(
         rms_g=float(np.sqrt(np.mean(r**2))),
         max_abs_g=float(np.max(np.abs(r))),
@@ -137,7 +142,7 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State, verdict: Sp
     )
     calibration = Calibration(
         sensor=sensor,
-        covariance=_covariance(problem, state, J / s[:, None]) * inflation**2,
+        covariance=covariance[:p, :p],
         reference=problem.reference,
         channel_reference={c: problem.channel_reference[c] for e in state.effects for c in e.needs},
         residual=residual,
@@ -149,17 +154,32 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State, verdict: Sp
         dilution=spread,
         inflation=inflation,
         dof=dof,
+        shape_errors=_shape_errors(state, shapes, np.sqrt(np.diag(covariance)[p:])),
     )
     return replace(calibration, warnings=tuple(_warnings(calibration)))
 
 
 def _covariance(problem: Problem, state: State, weighted: Floats) -> Floats:
-    """Of scale factor, misalignment, bias and the effects' coefficients, from the weighted Jacobian."""
-    norms = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
+    """Of scale factor, misalignment, bias and the effects' coefficients, from the weighted Jacobian; further columns
+    are of what was estimated beside them."""
+    norms = np.linalg.norm(weighted, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
     inverse = np.linalg.pinv((weighted / norms).T @ (weighted / norms), rcond=1e-14)
     theta = inverse / np.outer(norms, norms)
-    G = parameters_by_theta(problem, state)
+    G = np.eye(len(theta))
+    G[: len(state.theta), : len(state.theta)] = parameters_by_theta(problem, state)
     return np.asarray(G @ theta @ G.T)
+
+
+def _shape_errors(state: State, columns: Floats, thousandths: Floats) -> dict[str, float]:
+    """By "effect.name", of the shapes that move the residuals; their errors come in thousandths of their values."""
+    named = [(f"{e.name}.{n}", value) for e in state.effects for n, (value, _) in e.shape.items()]
+    moves = np.abs(columns).max(axis=0, initial=0.0) > 0
+    return {
+        name: 1e-3 * abs(value) * float(error)
+        for (name, value), error, tells in zip(named, thousandths, moves, strict=True)
+        if tells
+    }
 
 
 def cross_validated(problem: Problem, state: State, leverage: Floats) -> float | None:
@@ -197,7 +217,7 @@ def _warnings(c: Calibration) -> list[str]:
         out.append(f"{len(c.poses)} poses for {len(c.parameters)} parameters: the residual proves little")
     worst = max(c.poses, key=lambda p: p.leverage)
     if worst.leverage > 0.95:
-        out.append(f"the pose at {worst.pose.start_s:.1f} s alone carries a parameter (leverage {worst.leverage:.2f})")
+        out.append(f"the pose at {worst.pose.at} alone carries a parameter (leverage {worst.leverage:.2f})")
     if c.residual.lack_of_fit_p is not None and c.residual.lack_of_fit_p < SIGNIFICANT:
         out.append(
             f"residuals are {c.inflation:.1f} times what the noise explains; the standard errors are raised by that"

@@ -8,23 +8,33 @@ tested against the noise inside the poses (pure error).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import special
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration, channels_of, conditions_elsewhere
-from triaxcal.effects import CATALOGUE
-from triaxcal.effects.contract import TIME, Effect
-from triaxcal.errors import InvalidData
+from triaxcal.calibration import Calibration
+from triaxcal.conditions import channels_of, conditions_elsewhere
+from triaxcal.creep import with_creep_left, without_creep
+from triaxcal.effects import catalogue_for
+from triaxcal.effects.contract import Effect
+from triaxcal.effects.empirical import Empirical
+from triaxcal.effects.part import Part
+from triaxcal.errors import InvalidData, Refused
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
-from triaxcal.search import FAMILYWISE, Search
+from triaxcal.runs import by_run, expected_of
+from triaxcal.search import Search, alternatives, telling_apart
+from triaxcal.search.candidates import still_conditions
 from triaxcal.sensor import Sensor
-from triaxcal.start import problem_of, start
-from triaxcal.visibility import is_visible
+from triaxcal.start import problem_of, start, with_history
+from triaxcal.unexplained import Unexplained, unexplained_of
 
+DESCRIBES = 1.4
+"""A smooth term has to lower the cross-validated error by this factor: less is chance among so many coefficients."""
 ROUNDS_MOST = 3
 """Effects and spoiled poses are sought in turn so often."""
 
@@ -39,20 +49,14 @@ class Finding:
     effect: str
     verdict: str
     p_value: float
-    coefficients: Mapping[str, tuple[float, float, str]]
+    coefficients: Mapping[str, tuple[float, float | None, str]]
     alternatives: tuple[str, ...]
     reason: str
     remedy: str
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """What is left. ``rms_g`` is its size beyond noise; ``lead`` the best hint at what it may be."""
-
-    significant: bool
-    p_value: float | None
-    rms_g: float
-    lead: str
+    step: Calibration
+    """The model with this effect and those before it."""
+    apart: tuple[str, ...] = ()
+    """What to record so as to tell it from its alternatives."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,8 @@ class Loop:
     unexplained: Unexplained
     held_out: HeldOut | None
     advice: tuple[str, ...]
+    search: Search | None = field(default=None, repr=False, compare=False)
+    """That which found it, for further questions."""
 
 
 def diagnose(
@@ -83,35 +89,54 @@ def diagnose(
     signs: Sequence[float] = (1, 1, 1),
     reference: float = 1.0,
     check: Sequence[Pose] | None = None,
-    catalogue: Sequence[Effect] = CATALOGUE,
+    catalogue: Sequence[Effect] | None = None,
+    empirical: bool = False,
 ) -> Loop:
     """Find and add the effects that still poses show beyond the linear model.
 
-    Raises as `triaxcal.fit.fit` does. ``check`` are poses of another recording, for the held-out error.
+    ``catalogue`` are the effects to look for: all that are known for these poses' channels where it is None. ``check``
+    are poses of another recording, for the held-out error. ``empirical``: what no effect explains is described by a
+    smooth term, where that helps poses that it was not fitted to. Raises as `triaxcal.fit.fit` does.
     """
-    aside = _aside(fit(poses, signs=signs, reference=reference))
-    if aside:
-        # What looks like spoiled poses may be an effect that the linear model lacks.
-        whole = _searched(poses, (), signs, reference, catalogue)
-        without = _searched(poses, aside, signs, reference, catalogue)
-        aside = aside if _criterion(without, len(poses)) < _criterion(whole, len(poses)) else ()
+    linear = fit(poses, signs=signs, reference=reference)
+    moving = set(channels_of(poses)) - still_conditions(poses)
+    effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, poses)
+    # What moves the bias also makes poses creep: to the search that is no error of their means.
+    quiet = without_creep(poses)
+    asked = [(), _aside(linear), _aside(fit(quiet, signs=signs, reference=reference))]
+    # What looks like spoiled poses may be an effect that the linear model lacks.
+    trials = [_searched(quiet, rows, signs, reference, effects) for rows in dict.fromkeys(asked)]
+    first = trials[0].search
+    if not trials[0].adopted and first.left_over(first.linear) and (row := first.spoiled_beside()) is not None:
+        trials.append(_searched(quiet, (row,), signs, reference, effects))
+    found = min(trials, key=lambda trial: _criterion(trial, len(poses)))
     for _ in range(ROUNDS_MOST):
-        found = _searched(poses, aside, signs, reference, catalogue)
         # Beside an effect a spoiled pose may not have shown; with the effect in the model it does.
-        sought = fit(poses, signs=signs, reference=reference, effects=found.adopted)
-        again = _aside(sought)
-        if again == aside or not found.adopted:
+        again = _aside(fit(quiet, signs=signs, reference=reference, effects=found.adopted))
+        if again == found.aside or not found.adopted:
             break
-        aside = again
-    search, before = found.search, found.search.before
-    after = search.best = (
-        sought
-        if _aside(sought) == aside
-        else fit(poses, signs=signs, reference=reference, effects=found.adopted, aside=aside)
-    )
-    blind = tuple(e.name for e in catalogue if e not in search.seen)
-    findings = tuple(_finding(search, e, found.adopted) for e in found.adopted)
-    unexplained = _unexplained(after, search)
+        found = _searched(quiet, again, signs, reference, effects)
+    search, before, steps = found.search, linear, [linear]
+    # Poses in which |a| itself creeps are something that is left, not an excuse for it.
+    model = fit(quiet, signs=signs, reference=reference)
+    if found.adopted:
+        before = fit(poses, signs=signs, reference=reference, aside=found.aside)
+        model = fit(quiet, signs=signs, reference=reference, effects=found.adopted, aside=found.aside)
+        left = with_creep_left(poses, model)
+        steps = [
+            fit(left, signs=signs, reference=reference, effects=found.adopted[:count], aside=found.aside)
+            for count in range(1, len(found.adopted) + 1)
+        ]
+    after = steps[-1]
+    unexplained = unexplained_of(model, search.passed_over)
+    smooth = _described(after, signs) if empirical and unexplained.significant else None
+    if smooth is not None:
+        after = smooth
+    blind = tuple(e.name for e in effects if e.name not in search.full)
+    findings = tuple(_finding(search, e, after, step) for e, step in zip(found.adopted, steps, strict=False))
+    if smooth is not None:
+        findings = (*findings, _description(smooth, steps[-1]))
+        unexplained = unexplained_of(smooth, search.passed_over)
     return Loop(
         before=before.with_blind_to(blind),
         after=after.with_blind_to(blind),
@@ -119,6 +144,7 @@ def diagnose(
         unexplained=unexplained,
         held_out=_held_out(before, after, check) if check is not None else None,
         advice=tuple(_advice(findings, unexplained, blind)),
+        search=search,
     )
 
 
@@ -146,44 +172,87 @@ def _searched(
     kept = [p for i, p in enumerate(poses) if i not in aside]
     problem = problem_of(kept, signs=signs, reference=reference)
     linear = solve(problem, start(problem, kept, signs), ())
-    seen = [e for e in catalogue if is_visible(problem, linear, e)]
-    search = Search(problem, kept, signs, reference, seen, before)
-    return _Found(search, search.run(linear), aside)
+    problem = with_history(problem, kept, linear.sensor(problem))
+    search = Search(problem, kept, signs, reference, catalogue, before, linear)
+    other = copy(search)
+    other.passed_over = {}
+    adopted = search.run()
+    expected = [e for e in expected_of(kept) if e.name in search.full]
+    # What is nearly always there: beside it others show that neither alone nor in pairs would have.
+    if expected and len(other.run(expected)) > 1 and other.score(other.found) < search.score(search.found):
+        search, adopted = other, list(other.found.effects)
+    return _Found(search, adopted, aside)
 
 
 def _criterion(found: _Found, n: int) -> float:
-    """Schwarz's: a pose left out costs a parameter, and the choice of it as much again."""
-    search = found.search
-    chi2 = search.chi2(search.with_effects(search.linear, found.adopted))
-    effects = sum(len(e.coefficients) for e in found.adopted)
-    return chi2 + (effects + 2 * len(found.aside)) * float(np.log(n))
+    """The score of a model, where a pose left out costs a parameter, and the choice of those left out as effects do."""
+    aside = len(found.aside)
+    choice = float(special.gammaln(n + 1) - special.gammaln(aside + 1) - special.gammaln(n - aside + 1))
+    return found.search.score(found.search.found) + aside * float(np.log(n)) + 2 * choice
 
 
-def _finding(search: Search, effect: Effect, adopted: list[Effect]) -> Finding:
-    alternatives = search.alternatives(effect, adopted)
-    errors = dict(zip(search.best.parameters, search.best.standard_errors, strict=True))
-    values = dict(zip(search.best.parameters, search.best.values, strict=True))
-    rest = search.fitted([e for e in adopted if e is not effect])
+def _finding(search: Search, effect: Effect, after: Calibration, step: Calibration) -> Finding:
+    found = alternatives(search, effect, search.found)
+    others = [e for e in search.found.effects if e is not effect]
+    rest = search.fitted(others) if others else None
     without = rest.residual if rest else search.before.residual
-    p = search.earned(effect, [e for e in adopted if e is not effect])
+    p = search.earned(effect, others)
     reason = (
         f"with it the cross-validated error falls from {_micro(without.cross_validated_rms_g)} to "
-        f"{_micro(search.best.residual.cross_validated_rms_g)} (noise floor "
-        f"{_micro(search.best.residual.noise_floor_g)}); familywise p {_probability(p)}"
+        f"{_micro(after.residual.cross_validated_rms_g)} (noise floor "
+        f"{_micro(after.residual.noise_floor_g)}); familywise p {_probability(p)}"
     )
-    if alternatives:
-        reason += f"; {', '.join(alternatives)} would do as well on these poses"
+    if isinstance(effect, Part) and not effect.selects:
+        reason += f"; of its coefficients these poses show only {effect.formula}, which they share in that proportion"
+    if found:
+        reason += f"; {', '.join(found)} would do as well on these poses"
     return Finding(
         effect=effect.name,
-        verdict="confounded" if alternatives else "adopted",
+        verdict="confounded" if found else "adopted",
         p_value=p,
-        coefficients={
-            c.name: (values[f"{effect.name}.{c.name}"], errors[f"{effect.name}.{c.name}"], c.unit)
-            for c in effect.coefficients
-        },
-        alternatives=alternatives,
+        coefficients=after.coefficients_of(effect.name),
+        alternatives=tuple(found),
         reason=reason,
         remedy=effect.remedy,
+        step=step,
+        apart=tuple(telling_apart(search, effect, found)),
+    )
+
+
+def _described(after: Calibration, signs: Sequence[float]) -> Calibration | None:
+    """The model with the smooth term that lowers the cross-validated error most; None where none does."""
+    poses = [p.pose for p in after.poses]
+    effects = [e for e, _ in after.sensor.effects]
+    trials = []
+    for form in Empirical().forms:
+        try:
+            trial = fit(poses, signs=signs, reference=after.reference, effects=[*effects, form], aside=_aside(after))
+        except Refused:
+            continue
+        if trial.residual.cross_validated_rms_g is not None:
+            trials.append(trial)
+    best = min(trials, key=lambda t: t.residual.cross_validated_rms_g or np.inf, default=None)
+    old = after.residual.cross_validated_rms_g
+    if best is None or old is None or (best.residual.cross_validated_rms_g or np.inf) > old / DESCRIBES:
+        return None
+    return best
+
+
+def _description(smooth: Calibration, without: Calibration) -> Finding:
+    effect = smooth.sensor.effects[-1][0]
+    return Finding(
+        effect=effect.name,
+        verdict="adopted",
+        p_value=without.residual.lack_of_fit_p or 0.0,
+        coefficients=smooth.coefficients_of(effect.name),
+        alternatives=(),
+        reason=(
+            "asked for: a smooth term that describes what is left and explains nothing; with it the cross-validated "
+            f"error falls from {_micro(without.residual.cross_validated_rms_g)} to "
+            f"{_micro(smooth.residual.cross_validated_rms_g)}"
+        ),
+        remedy=effect.remedy,
+        step=smooth,
     )
 
 
@@ -193,34 +262,6 @@ def _micro(value: float | None) -> str:
 
 def _probability(p: float) -> str:
     return "below 1e-12" if p < 1e-12 else f"{p:.1e}"
-
-
-def _unexplained(after: Calibration, search: Search) -> Unexplained:
-    residual = after.residual
-    p = residual.lack_of_fit_p
-    significant = p is not None and p < FAMILYWISE
-    beyond = float(np.sqrt(max(residual.rms_g**2 - residual.noise_floor_g**2, 0.0)))
-    return Unexplained(significant, p, beyond, _lead(after, search) if significant else "")
-
-
-def _lead(after: Calibration, search: Search) -> str:
-    used = [p for p in after.poses if p.used]
-    worst = max(used, key=lambda p: abs(p.studentized))
-    squares = np.array([p.studentized**2 for p in used])
-    parts = []
-    if worst.studentized**2 > 0.5 * squares.sum():
-        parts.append(
-            f"most of it is one pose, at {worst.pose.start_s:.1f} s ({worst.residual_g * 1e6:+.3g} µg): was it still?"
-        )
-    for name, why in search.passed_over.items():
-        parts.append(f"the nearest effect is {name}, not adopted: {why}")
-    miss = np.array([p.residual_g for p in used])
-    for name, values in channels_of([p.pose for p in used]).items():
-        if np.ptp(values) > 0:
-            r = float(np.corrcoef(values, miss)[0, 1])
-            if abs(r) > 0.6:
-                parts.append(f"it goes with {'time' if name == TIME else name} (correlation {r:+.2f})")
-    return "; ".join(parts) or "no candidate comes near, and no pose or channel stands out"
 
 
 def _held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HeldOut:
@@ -246,7 +287,7 @@ def magnitude_errors(
     reference. Raises InvalidData where a channel that the effects need is missing.
     """
     u = np.array([p.mean for p in poses])
-    held = conditions_elsewhere(poses, channel_reference)
+    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias)
     length, by_u = sensor.magnitude(u, held)
     covariance = np.array([p.covariance for p in poses])
     return length - reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))
@@ -256,22 +297,16 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _advice(
-    findings: Sequence[Finding],
-    unexplained: Unexplained,
-    blind: Sequence[str],
-) -> list[str]:
+def _advice(findings: Sequence[Finding], unexplained: Unexplained, blind: Sequence[str]) -> list[str]:
     out = [f"{f.effect}: {f.remedy}" for f in findings if f.verdict == "adopted"]
     for f in findings:
         if f.verdict == "confounded":
-            out.append(
-                f"{f.effect} cannot be told from {', '.join(f.alternatives)} here: record again with the poses in "
-                "another order, some of them repeated at the end, and with more directions"
-            )
+            out.append(f"{f.effect} cannot be told from {', '.join(f.alternatives)} here: {'; '.join(f.apart)}")
     if unexplained.significant:
         out.append("something is left that no candidate explains: look at the lead, and record more poses")
     if blind:
+        names = ", ".join(blind)
         out.append(
-            f"these poses cannot show {', '.join(blind)}: too few directions, or no such channel, or it stood still"
+            f"these poses cannot show in full {names}: too few directions, or no such channel, or it stood still"
         )
     return out

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration, PoseResult, Residual, channels_of
-from triaxcal.effects.contract import TIME
+from triaxcal.calibration import Calibration, PoseResult, Residual
+from triaxcal.conditions import conditions_elsewhere
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.plan.directions import dilution, linear_design
 from triaxcal.poses.pose import Pose
@@ -136,16 +136,11 @@ def refine(poses: Sequence[Pose], passport: Passport) -> Refinement:
 def _problem(poses: Sequence[Pose], passport: Passport) -> Problem:
     """Scaled by what the passport expects, since few poses have no range of their own."""
     sensor = passport.sensor
-    channels = channels_of(list(poses))
-    missing = [n for n in passport.channel_reference if n not in channels]
-    if missing:
-        raise InvalidData(f"the poses have no channel {', '.join(missing)}, which the passport's effects need")
-    # Another recording's clock: effects of time count as at their reference.
-    channels[TIME] = np.full(len(poses), passport.channel_reference.get(TIME, 0.0))
+    held = conditions_elsewhere(poses, passport.channel_reference, sensor.scale_factor, sensor.bias)
     return Problem(
         u=np.array([p.mean for p in poses]),
         covariance=np.array([p.covariance for p in poses]),
-        channels=channels,
+        channels={name: held[name] + value for name, value in passport.channel_reference.items()},
         channel_reference=passport.channel_reference,
         middle=sensor.centre,
         half=np.abs(sensor.scale_factor) * passport.reference,

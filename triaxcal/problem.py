@@ -11,18 +11,20 @@ and the effects' coefficients; all derivatives are exact.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.calibration import conditions
+from triaxcal.conditions import conditions, references
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.sensor import Sensor
 
 NOT_STILL = "the poses do not look like those of one still triad"
 STEPS_MOST = 60
+NEARBY = 1e-6
+"""Share of a shape by which it is moved to find the derivative."""
 CONVERGED = 1e-12
 """Relative step at which the search ends; the noise of any real pose is a million times larger."""
 
@@ -44,18 +46,14 @@ class Problem:
     def conditions(self) -> dict[str, Floats]:
         return conditions(self.channels, self.channel_reference)
 
+    def with_channels(self, channels: Mapping[str, Floats]) -> Problem:
+        """The same problem with more conditions."""
+        return replace(self, channels=channels, channel_reference=references(channels) | dict(self.channel_reference))
+
     def only(self, rows: Ints | slice) -> Problem:
         """The same problem with some of its poses."""
-        return Problem(
-            self.u[rows],
-            self.covariance[rows],
-            {n: v[rows] for n, v in self.channels.items()},
-            self.channel_reference,
-            self.middle,
-            self.half,
-            self.signs,
-            self.reference,
-        )
+        channels = {n: v[rows] for n, v in self.channels.items()}
+        return replace(self, u=self.u[rows], covariance=self.covariance[rows], channels=channels)
 
 
 @dataclass(frozen=True)
@@ -95,6 +93,11 @@ def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: in
     """
     extra = sum(len(e.coefficients) for e in effects) - (len(state.theta) - 9)
     theta = np.concatenate([state.theta, np.zeros(max(extra, 0))])
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a step too far is taken back
+        return _solved(problem, theta, effects, steps)
+
+
+def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps: int) -> State:
     for _ in range(steps):
         r, J, s = linearise(problem, State(theta, effects))
         if not (np.isfinite(J).all() and np.isfinite(r).all()):
@@ -134,6 +137,24 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> tuple[Fl
     variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
     # Poses without any scatter (made up, or below the resolution) would otherwise weigh infinitely.
     return length - problem.reference, J, np.sqrt(np.maximum(variance, (1e-12 * problem.reference) ** 2))
+
+
+def by_shape(problem: Problem, state: State) -> Floats:
+    """(n,m) derivatives of the residuals by the shapes of the effects (`Effect.shape`), in thousandths of each."""
+    sensor = state.sensor(problem)
+    columns = []
+    for i, (effect, q) in enumerate(sensor.effects):
+        for name, (value, _) in effect.shape.items():
+            sides = []
+            for sign in (1, -1):
+                other = effect.shaped(
+                    {k: v for k, (v, _) in effect.shape.items()} | {name: value * (1 + sign * NEARBY)}
+                )
+                pairs = [(other, q) if j == i else pair for j, pair in enumerate(sensor.effects)]
+                moved = replace(sensor, effects=tuple(pairs))
+                sides.append(np.linalg.norm(moved.specific_force(problem.u, problem.conditions), axis=1))
+            columns.append((sides[0] - sides[1]) / (2000 * NEARBY))
+    return np.array(columns).T if columns else np.empty((len(problem.u), 0))
 
 
 def parameters_by_theta(problem: Problem, state: State) -> Floats:

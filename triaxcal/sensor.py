@@ -7,13 +7,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Effect
+from triaxcal.effects.part import mix_of, whole
 
 SOLVE_TOLERANCE = 1e-13
 """Relative step, of the reference vector, at which the inverse of a nonlinear model counts as found."""
@@ -60,6 +61,11 @@ class Sensor:
     def centre(self) -> Floats:
         """c = K b (3,), output units."""
         return self.scale_factor * self.bias
+
+    @property
+    def whole(self) -> Sensor:
+        """The same sensor with every effect in full; coefficients that its parts leave out are zero."""
+        return replace(self, effects=tuple((whole(e), mix_of(e) @ q) for e, q in self.effects))
 
     def output(self, a: Floats, conditions: Mapping[str, Floats]) -> Floats:
         """u (n,3) for specific force (n,3); ``conditions`` are deviations from their references, each (n,)."""

@@ -8,12 +8,13 @@ import numpy as np
 from scipy import stats
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import channels_of
+from triaxcal.conditions import channels_of, references, with_scale
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.plan.directions import dilution, distinct, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise
+from triaxcal.sensor import Sensor
 
 DILUTION_LIMIT = 100.0
 """Above this a set of poses is refused: some combination of parameters is a hundred times worse than one pose."""
@@ -41,22 +42,17 @@ def problem_of(poses: Sequence[Pose], *, signs: Sequence[float] = (1, 1, 1), ref
         raise InvalidData(f"signs must be +1 or −1, not {signs}")
     if not (np.isfinite(reference) and reference > 0):
         raise InvalidData(f"the reference must be a positive number, not {reference}")
-    channels = channels_of(list(poses))
+    channels = channels_of(poses)
     return Problem(
         u=u,
         covariance=np.array([p.covariance for p in poses]),
         channels=channels,
-        channel_reference={n: _round(float(np.mean(v))) for n, v in channels.items() if np.isfinite(v).all()},
+        channel_reference=references(channels),
         middle=(low + high) / 2,
         half=(high - low) / 2,
         signs=np.asarray(signs, dtype=float),
         reference=reference,
     )
-
-
-def _round(value: float) -> float:
-    """To a tenth, so that a reference temperature reads well and fits a float32 register."""
-    return round(value, 1)
 
 
 def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> State:
@@ -89,6 +85,11 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
             wanted=wanted_for(poses, signs),
         )
     return state
+
+
+def with_history(problem: Problem, poses: Sequence[Pose], sensor: Sensor) -> Problem:
+    """The problem with the conditions that need the scale of the outputs: the pose before, the scatter."""
+    return problem.with_channels(with_scale(problem.channels, poses, sensor.scale_factor, sensor.bias))
 
 
 def _count(a: Floats) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import TIME
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SINCE_START, TIME
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
@@ -123,7 +123,13 @@ def noisy_poses(
     t_s = (np.arange(n) + 0.5) * hold_s
     held = {name: np.asarray(v, dtype=float) for name, v in (channels or {}).items()}
     reference = channel_reference or {}
-    conditions = {name: v - reference.get(name, 0.0) for name, v in {**held, TIME: t_s}.items()}
+    s = directions @ sensor.axes.T
+    before = np.concatenate([s[:1], s[:-1]])
+    own = {TIME: t_s, SINCE_START: t_s, HELD: np.full(n, hold_s)}
+    own |= {name: before[:, i] for i, name in enumerate(BEFORE)} | {
+        name: (s - before)[:, i] for i, name in enumerate(CHANGE)
+    }
+    conditions = {name: v - reference.get(name, 0.0) for name, v in {**held, **own}.items()}
     u = sensor.output(directions, conditions) + rng.standard_normal((n, 3)) * error
     return [
         Pose(
@@ -134,6 +140,7 @@ def noisy_poses(
             covariance=np.diag(error[i] ** 2),
             dof=1e6,
             channels={name: float(v[i]) for name, v in held.items()},
+            before=u[i - 1] if i else None,
         )
         for i in range(n)
     ]

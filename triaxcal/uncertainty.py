@@ -15,13 +15,14 @@ from scipy import stats
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
+from triaxcal.conditions import at_reference
 from triaxcal.effects import CATALOGUE, Effect
 from triaxcal.errors import InvalidData
 from triaxcal.gravity import local_gravity_g
 from triaxcal.plan.directions import directions
 from triaxcal.problem import Problem, State, linearise, parameters_by_theta
 from triaxcal.pure_error import DOF_MOST, pure_error_dof
-from triaxcal.start import problem_of
+from triaxcal.start import problem_of, with_history
 
 LEVEL = 0.95
 TEMPERATURE = "temp_c"
@@ -153,7 +154,7 @@ class _Ground:
         sensor = calibration.sensor
         poses = [p.pose for p in calibration.poses if p.used]
         signs = tuple(np.sign(sensor.scale_factor))
-        problem = problem_of(poses, signs=signs, reference=calibration.reference)
+        problem = with_history(problem_of(poses, signs=signs, reference=calibration.reference), poses, sensor)
         # A model without a channel holds at its mean; the reference of one that has it is rounded to read well. To a
         # millionth, since processors differ in the last digits, and a steady channel should not seem to move.
         means = {n: round(float(np.mean(problem.channels[n])), 6) for n in problem.channel_reference}
@@ -174,9 +175,9 @@ class _Ground:
         """Outputs of the unit all over the sphere, at the reference conditions but for ``shift``."""
         up = np.array([v for _, v in directions(SPHERE)]) * calibration.reference
         reference = self.problem.channel_reference
-        held = {n: np.zeros(len(up)) for n in reference}
+        held = at_reference(reference, len(up))
         u = calibration.sensor.output(up, held)
-        channels = {n: np.full(len(up), v + shift.get(n, 0.0)) for n, v in reference.items()}
+        channels = {n: held[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
         none = np.zeros((len(u), 3, 3))
         problem = self.problem
         return Problem(u, none, channels, reference, problem.middle, problem.half, problem.signs, problem.reference)

@@ -10,6 +10,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
+from triaxcal.plan.clock import in_plan
 from triaxcal.plan.design import combinations, profile_times, radial
 from triaxcal.plan.directions import linear_design
 from triaxcal.problem import Problem, State, linearise
@@ -67,7 +68,7 @@ def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None 
 
     Every channel is taken to move freely, but for those ``held`` (n,).
     """
-    n = len(directions)
+    n, effect = len(directions), in_plan(effect)
     rng = np.random.default_rng(0)
     conditions = {TIME: profile_times(n)} | {c: rng.standard_normal(n) for c in effect.needs if c != TIME}
     conditions |= {c: v for c, v in (held or {}).items() if c in conditions}

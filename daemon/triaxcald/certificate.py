@@ -16,8 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.calibration import Calibration, channels_of
-from triaxcal.effects import TIME, Effect
+from triaxcal.calibration import Calibration
+from triaxcal.conditions import channels_of, with_scale
+from triaxcal.effects import Effect
+from triaxcal.effects.contract import DERIVED, rate_of
+from triaxcal.effects.part import whole
 from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
 from triaxcal.poses.pose import Pose
@@ -138,7 +141,7 @@ def why_not_written(profile: Profile) -> str | None:
 
 def is_passing(effect: Effect) -> bool:
     """Whether an effect is the recording's rather than the unit's, so that no register could hold it."""
-    return TIME in effect.needs
+    return bool(effect.needs) and all(n in DERIVED or n.endswith(rate_of("")) for n in effect.needs)
 
 
 def _held_by_device(
@@ -154,7 +157,7 @@ def _held_by_device(
     kept = [
         effect
         for effect, _ in full.sensor.effects
-        if is_passing(effect) or all(profile.by_role(f"{effect.name}.{c.name}") for c in effect.coefficients)
+        if is_passing(effect) or all(profile.by_role(f"{effect.name}.{c.name}") for c in whole(effect).coefficients)
     ]
     if len(kept) == len(full.sensor.effects):
         return full
@@ -162,7 +165,7 @@ def _held_by_device(
 
 
 def _image(profile: Profile, held: Calibration, date_days: int) -> RegisterImage:
-    wanted = {r: v for r, v in roles(held.sensor, held.channel_reference).items() if profile.by_role(r)}
+    wanted = {r: v for r, v in roles(held.sensor.whole, held.channel_reference).items() if profile.by_role(r)}
     return build_image(profile, wanted, date_days=date_days)
 
 
@@ -198,7 +201,7 @@ def _steps(image: RegisterImage) -> dict[str, float]:
 def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) -> float:
     """rms change of |a| in the poses, in g, that rounding the coefficients to their registers makes."""
     rounded = {w.role: w.held for w in image.words}
-    sensor = held.sensor
+    sensor = held.sensor.whole
 
     def triple(name: str, values: Any) -> Any:
         return np.array([rounded.get(f"{name}.{axis}", float(values[i])) for i, axis in enumerate("xyz")])
@@ -214,7 +217,7 @@ def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) ->
         tuple((effect, of_effect(effect, values)) for effect, values in sensor.effects),
     )
     u = np.array([p.mean for p in poses])
-    channels = channels_of(poses)
+    channels = with_scale(channels_of(poses), poses, sensor.scale_factor, sensor.bias)
     reference = dict(held.channel_reference)
     conditions = {n: channels[n] - v for n, v in reference.items()}
     if TEMPERATURE in reference and REFERENCE_TEMPERATURE in rounded:

@@ -15,7 +15,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Residual
-from triaxcal.effects import Effect, effect_named
+from triaxcal.effects import Effect, effect_of
 from triaxcal.loop import Loop
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
@@ -58,7 +58,8 @@ def numbers(values: Any, digits: int = DIGITS) -> list[Any]:
 
 def correlation(covariance: Floats) -> list[Any]:
     """(p,p) from a covariance, to a millionth: near zero the digits beyond differ from processor to processor."""
-    deviation = np.maximum(np.sqrt(np.diag(covariance)), 1e-300)
+    deviation = np.sqrt(np.diag(covariance))
+    deviation = np.where(deviation > 0, deviation, 1.0)
     return list((np.round(covariance / np.outer(deviation, deviation), 6) + 0.0).tolist())
 
 
@@ -119,6 +120,18 @@ def residual_document(residual: Residual) -> Document:
     }
 
 
+def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, str]], reference_unit: str) -> Document:
+    """Of one effect; null for a standard error that the poses do not tell."""
+    return {
+        name: {
+            "value": number(value),
+            "standard_error": None if deviation is None else uncertainty(deviation),
+            "unit": in_units_of(unit, reference_unit),
+        }
+        for name, (value, deviation, unit) in coefficients.items()
+    }
+
+
 def reference_unit_of(reference: float) -> str:
     """g where the magnitude can be gravity in units of g, else what the caller did not name."""
     return "g" if 0.9 <= reference <= 1.1 else "reference unit"
@@ -134,7 +147,8 @@ def calibration_document(
 ) -> Document:
     """``reference_unit`` names the unit of the reference vector; keys keep their ``_g`` whatever it is. ``stated`` are
     uncertainties that no recording can tell. ``budgeted``: with the budget, which is that of a fit to still poses."""
-    errors = dict(zip(c.parameters, c.standard_errors, strict=True))
+    whole = c.whole
+    errors = dict(zip(whole.parameters, whole.standard_errors, strict=True))
     unit = output_unit or "output"
 
     def group(name: str) -> list[Any]:
@@ -158,19 +172,12 @@ def calibration_document(
         "matrix": numbers(c.sensor.matrix),
         "centre": numbers(c.sensor.centre),
         "effects": {
-            effect.name: {
-                k.name: {
-                    "value": number(float(value)),
-                    "standard_error": uncertainty(float(errors[f"{effect.name}.{k.name}"])),
-                    "unit": in_units_of(k.unit, reference_unit),
-                }
-                for k, value in zip(effect.coefficients, values, strict=True)
-            }
-            for effect, values in c.sensor.effects
+            effect.name: coefficients_document(whole.coefficients_of(effect.name), reference_unit)
+            for effect, _ in c.sensor.effects
         },
         "standard_error": {name: group(name) for name in LINEAR},
-        "parameters": list(c.parameters),
-        "correlation": correlation(c.covariance),
+        "parameters": list(whole.parameters),
+        "correlation": correlation(whole.covariance),
         **({"uncertainty": budget_document(c, budget(c, stated), reference_unit)} if budgeted else {}),
         "residual": residual_document(c.residual),
         "poses": [
@@ -184,6 +191,7 @@ def calibration_document(
                 "studentized": uncertainty(p.studentized),
                 "leverage": uncertainty(p.leverage),
                 "used": p.used,
+                "channels": {name: number(v) for name, v in p.pose.channels.items()},
             }
             for p in c.poses
         ],
@@ -272,17 +280,13 @@ def loop_document(
                 "effect": f.effect,
                 "verdict": f.verdict,
                 "p_value": probability(f.p_value),
-                "coefficients": {
-                    name: {
-                        "value": number(value),
-                        "standard_error": uncertainty(deviation),
-                        "unit": in_units_of(unit, reference_unit),
-                    }
-                    for name, (value, deviation, unit) in f.coefficients.items()
-                },
+                "coefficients": coefficients_document(f.coefficients, reference_unit),
                 "alternatives": list(f.alternatives),
                 "reason": in_words_of(f.reason, reference_unit),
                 "remedy": f.remedy,
+                "apart": [in_words_of(line, reference_unit) for line in f.apart],
+                "residual": residual_document(f.step.residual),
+                "pose_residual_g": [error(p.residual_g) for p in f.step.poses],
             }
             for f in loop.findings
         ],
@@ -293,7 +297,7 @@ def loop_document(
             "lead": in_words_of(loop.unexplained.lead, reference_unit),
         },
         "data_quality": list(data_quality),
-        "advice": list(loop.advice),
+        "advice": [in_words_of(line, reference_unit) for line in loop.advice],
         "calibration": calibration,
     }
 
@@ -323,8 +327,11 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
         k, m, b = (np.array(part[name], dtype=float) for name in ("scale_factor", "misalignment", "bias"))
         effects = []
         for name, held in part.get("effects", {}).items():
-            effect = effect_named(name)
-            effects.append((effect, np.array([held[c.name]["value"] for c in effect.coefficients], dtype=float)))
+            effect, q = effect_of(name, {n: float(v["value"]) for n, v in held.items()})
+            lacking = [n for n in (*(c.name for c in effect.coefficients), *effect.shape) if n not in held]
+            if lacking:
+                raise KeyError(f"effects.{name}.{lacking[0]}")
+            effects.append((effect, q))
         reference = {str(n): float(v) for n, v in part.get("channel_reference", {}).items()}
         magnitude = float(part.get("reference", 1.0))
     except KeyError as e:

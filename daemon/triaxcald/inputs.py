@@ -10,12 +10,13 @@ from typing import Any
 
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose, poses_of
+from triaxcal.quality import QualityDetector
 from triaxcal.stillness.detector import StillnessDetector, Windows
 from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
 from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.pipeline import Pipeline, creeping
+from triaxcald.pipeline import Pipeline, creeping, together
 from triaxcald.recording.csv_text import read_csv
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, Phase
@@ -58,17 +59,21 @@ def measure(
         with Recording.open(Path(name)) as recording:
             return _measure_recording(recording, phase, stream, moments)
     samples = read_csv(name)
-    detector = StillnessDetector()
+    detector, judge = StillnessDetector(), QualityDetector()
     try:
         detector.feed(samples.time_ns, samples.readings, samples.channels)
         detector.finish()
         windows = detector.windows()
+        judge.feed(samples.time_ns, samples.readings)
+        judge.finish()
         if moments is not None:
             moments.feed(samples.readings)
     except InvalidData as e:
         raise InputError(f"{name}: {e}") from e
-    poses = poses_of(windows, detector.spans())
-    quality = [f"duplicate_samples: {samples.duplicates}"] if samples.duplicates else []
+    spans = detector.spans()
+    poses = poses_of(windows, spans)
+    counted = [f"duplicate_samples: {samples.duplicates}"] if samples.duplicates else []
+    quality = together(counted, judge.findings(windows, spans))
     return Measured(name, poses, windows, quality + creeping(poses))
 
 

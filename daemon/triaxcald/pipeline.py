@@ -10,17 +10,18 @@ import numpy as np
 
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Held, Pose, held_of, poses_of
-from triaxcal.stillness.detector import StillnessDetector, Windows
+from triaxcal.quality import Finding, QualityDetector
+from triaxcal.stillness.detector import Span, StillnessDetector, Windows
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
-from triaxcal_drivers.profile import Bundle
+from triaxcal_drivers.profile import READINGS, Bundle
 
 COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order", "receiver_overflows")
 
 
 @dataclass
 class Pipeline:
-    """Decoder and stillness detector of one stream of one unit; counts whatever does not come through."""
+    """Decoder, stillness and quality detector of one stream of one unit; counts whatever does not come through."""
 
     bundle: Bundle
     stream: str
@@ -29,6 +30,8 @@ class Pipeline:
     def __post_init__(self) -> None:
         self._decoder = driver_named(self.bundle.profile.driver).decoder(self.bundle, self.stream)
         self._detector = StillnessDetector()
+        self._quality = QualityDetector()
+        self._spans: tuple[int, list[Span]] = (0, [])
         self._last_ns: int | None = None
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
@@ -54,9 +57,9 @@ class Pipeline:
             self.counts["out_of_order"] += int((~fresh).sum())
             self.counts["samples"] += int(fresh.sum())
             self._last_ns = max(int(block.time_ns.max()), self._last_ns or -(2**62))
-            self._detector.feed(
-                block.time_ns[fresh], block.readings[fresh], {n: v[fresh] for n, v in block.channels.items()}
-            )
+            time_ns, readings = block.time_ns[fresh], block.readings[fresh]
+            self._detector.feed(time_ns, readings, {n: v[fresh] for n, v in block.channels.items()})
+            self._quality.feed(time_ns, readings)
         return block
 
     def feed_all(self, batches: Iterable[RawBatch]) -> Pipeline:
@@ -80,16 +83,23 @@ class Pipeline:
     def poses(self) -> list[Pose]:
         """The still poses so far."""
         windows = self.windows
-        return [] if windows is None else poses_of(windows, self._detector.spans())
+        return [] if windows is None else poses_of(windows, self._still(windows))
 
     def held(self) -> list[Held]:
         """The same without their noise, which takes longer than all the rest: enough to guide an operator by."""
         windows = self.windows
-        return [] if windows is None else held_of(windows, self._detector.spans())
+        return [] if windows is None else held_of(windows, self._still(windows))
+
+    def _still(self, windows: Windows) -> list[Span]:
+        """The still spans so far, found once for the same windows."""
+        if self._spans[0] != len(windows):
+            self._spans = (len(windows), self._detector.spans())
+        return self._spans[1]
 
     def finish(self) -> list[Pose]:
         """The still poses of the whole stream."""
         self._detector.finish()
+        self._quality.finish()
         return self.poses()
 
     def data_quality(self) -> list[str]:
@@ -106,7 +116,24 @@ class Pipeline:
             found.append(f"out_of_order_samples: {self.counts['out_of_order']}, left out")
         if self.counts["errors"]:
             found.append(f"bus_errors: {self.counts['errors']} records")
-        return found
+        windows = self.windows
+        unit = self.bundle.profile.output.unit if self.stream == READINGS else "g"
+        seen = self._quality.findings(windows, self._still(windows) if windows else [], unit=unit)
+        return together(found, seen)
+
+
+def together(counted: Sequence[str], seen: Iterable[Finding]) -> list[str]:
+    """What was counted on the way here, and what is ``seen`` in the samples: one line for each kind of fault. What was
+    counted as missing leaves the gaps that are seen, which are not said again.
+    """
+    lines = list(counted)
+    for finding in seen:
+        same = [i for i, line in enumerate(lines) if line.startswith(f"{finding.name}:")]
+        if not same:
+            lines.append(finding.line)
+        elif finding.name != "missing_samples":
+            lines[same[0]] += f"; {finding.text}"
+    return lines
 
 
 def creeping(poses: Sequence[Pose]) -> list[str]:

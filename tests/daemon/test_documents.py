@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from triaxcal.effects import effect_named
+from triaxcal.effects import Effect, effect_named
+from triaxcal.effects.bias_step import BiasStep
+from triaxcal.effects.part import Part
+from triaxcal.effects.warm_up import WarmUp
 from triaxcal.fit import fit
 from triaxcal.loop import diagnose
 from triaxcal.plan.directions import directions
@@ -124,6 +128,42 @@ def test_a_loop_says_what_each_pose_was_before(poses: list[Pose]) -> None:
     assert np.sqrt(np.mean(after**2)) == pytest.approx(document["after"]["rms_g"], abs=2e-11)
 
 
+def test_an_effect_stands_in_the_document_in_full_whatever_part_of_it_was_fitted(poses: list[Pose]) -> None:
+    fitted = fit(poses, signs=SIGNS, effects=[Part.of(SECOND, "y")])
+    document = calibration_document(fitted)
+    held = document["effects"]["second_order_nonlinearity"]
+    assert list(held) == ["x", "y", "z"]
+    assert (held["x"]["value"], held["x"]["standard_error"]) == (0.0, 0.0)
+    assert held["y"]["value"] == pytest.approx(fitted.values[9], rel=1e-9)
+    assert document["parameters"][9:] == [f"second_order_nonlinearity.{axis}" for axis in "xyz"]
+    assert np.array(document["correlation"]).shape == (12, 12)
+    assert np.isfinite(document["correlation"]).all()
+
+
+SHAPED = [(WarmUp(75.0), "time_constant", 75.0), (BiasStep(127.0), "at", 127.0), (BiasStep(130.0), "at", 130.0)]
+
+
+@pytest.mark.parametrize(("effect", "shape", "value"), SHAPED, ids=["warm-up", "within a pose", "between two"])
+def test_the_shape_of_an_effect_stands_beside_its_coefficients_and_comes_back(
+    effect: Effect, shape: str, value: float, poses: list[Pose]
+) -> None:
+    # Poses of 10 s without a gap: half a second off at both ends.
+    apart = [replace(p, start_s=p.start_s + 0.5, end_s=p.end_s - 0.5) for p in poses]
+    fitted = fit(apart, signs=SIGNS, effects=[SECOND, effect])
+    document = json.loads(to_text(calibration_document(fitted)))
+    held = document["effects"][effect.name]
+    assert list(held) == ["x", "y", "z", shape]
+    assert (held[shape]["value"], held[shape]["unit"]) == (value, "s")
+    # |a| does not tell when between two poses a step was.
+    assert (held[shape]["standard_error"] is None) == (value == 130.0)
+    sensor, reference, _ = sensor_of(document, where="cal.json")
+    assert [e for e, _ in sensor.effects] == [SECOND, effect]
+    u = np.array([p.mean for p in apart])
+    own = fitted.conditions_of(apart)
+    assert set(reference) == set(own)
+    assert sensor.specific_force(u, own) == pytest.approx(fitted.sensor.specific_force(u, own), abs=1e-8)
+
+
 def test_the_calibration_is_found_in_a_loop_and_in_a_certificate(poses: list[Pose]) -> None:
     loop = loop_document(diagnose(poses, signs=SIGNS))
     inner = loop["calibration"]
@@ -160,7 +200,7 @@ def _effect(value: Any) -> Callable[[dict[str, Any]], None]:
         (_with("scale_factor", [1, 0, 1]), "none zero in the first"),
         (_with("misalignment", {"x": 1}), "numbers"),
         (_with("effects", {"flat_earth": {}}), "flat_earth"),
-        (_with("effects", {"second_order_nonlinearity": {"x": {"value": 1}}}), "y: missing"),
+        (_with("effects", {"second_order_nonlinearity": {"w": {"value": 1}}}), "second_order_nonlinearity.w"),
         (_with("effects", [1]), "numbers"),
         (_effect("much"), "numbers"),
         (_effect(float("nan")), "effects.second_order_nonlinearity: expected finite numbers"),

@@ -53,6 +53,32 @@ def test_text_has_no_signs_and_says_what_came_twice(tmp_path: Path) -> None:
     assert [round(p.channels["temp_c"]) for p in measured.poses] == [20, 21, 22, 20, 21, 22]
 
 
+def test_the_samples_of_a_text_are_judged_like_those_of_a_recording(tmp_path: Path) -> None:
+    lines = _csv().splitlines(keepends=True)
+    frozen = lines[451].split(",")[2]
+    for i in range(451, 551):
+        t, x, _, *rest = lines[i].split(",")
+        lines[i] = ",".join([t, x, frozen, *rest])
+    del lines[701:704]
+    path = tmp_path / "a.csv"
+    path.write_text("".join(lines))
+    found = {q.split(":")[0]: q for q in measure(str(path)).data_quality}
+    assert found["stuck_output"].startswith(f"stuck_output: y repeats {float(frozen):.7g} for 100 samples")
+    assert "in the pose that begins at 4." in found["stuck_output"]
+    assert found["missing_samples"] == "missing_samples: 3 of 1200 by the times, at 7.0 s"
+
+
+def test_rows_that_came_twice_and_readings_that_did_are_one_line(tmp_path: Path) -> None:
+    lines = _csv().splitlines(keepends=True)
+    for i in range(20, 1200, 50):
+        lines[i] = ",".join([lines[i].split(",")[0], *lines[i - 1].split(",")[1:]])
+    path = tmp_path / "a.csv"
+    path.write_text("".join([*lines[:300], lines[299], *lines[300:]]))
+    assert [q for q in measure(str(path)).data_quality if not q.startswith("creeping")] == [
+        "duplicate_samples: 1; 24 of 1199 samples repeat the one before on all axes"
+    ]
+
+
 def test_a_pose_that_creeps_is_said(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     lines = _csv(6000, hold=1000).splitlines()

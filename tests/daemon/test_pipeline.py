@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from triaxcal.poses.pose import Pose
+from triaxcal.quality import Finding
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, load_bundle
-from triaxcald.pipeline import Pipeline
+from triaxcald.pipeline import Pipeline, together
 from triaxcald.recording.schema import cut
 from triaxcald.simulation.bench import DeviceFile, physics_of
 from triaxcald.simulation.can_unit import tpdos
@@ -96,6 +97,35 @@ def test_a_sample_that_comes_twice_is_used_once_and_its_messages_are_counted(
     assert pipeline.counts["samples"] == 2001
     assert pipeline.counts["duplicates"] == 2
     assert pipeline.data_quality() == ["duplicate_samples: 2"]
+
+
+@pytest.mark.parametrize("size", [5, 1024])
+def test_a_frozen_axis_is_said_however_the_records_are_cut(
+    records: list[tuple[int, int, int, bytes]], size: int
+) -> None:
+    def frozen(i: int) -> bytes:  # x, the first three bytes of a sample's first frame, from sample 1000 to 1099
+        own = records[i][3]
+        return records[4000][3][:3] + own[3:] if 4000 <= i < 4400 and i % 4 == 0 else own
+
+    held = [(t, source, flags, frozen(i)) for i, (t, source, flags, _) in enumerate(records)]
+    whole = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(held)])
+    whole.finish()
+    pieces = Pipeline(BUNDLE, READINGS).feed_all(cut(RawBatch.of(held), size))
+    pieces.finish()
+    found = [q for q in whole.data_quality() if q.startswith("stuck_output")]
+    assert len(found) == 1
+    assert found[0].startswith("stuck_output: x repeats ")
+    assert " for 100 samples, first at 10.0 s" in found[0]
+    assert pieces.data_quality() == whole.data_quality()
+
+
+def test_what_was_counted_as_missing_is_not_said_again_by_the_times() -> None:
+    seen = [Finding("missing_samples", "10 of 2001 by the times"), Finding("stuck_output", "x never changes")]
+    assert together(["missing_samples: 10 of 2001"], seen) == [
+        "missing_samples: 10 of 2001",
+        "stuck_output: x never changes",
+    ]
+    assert together([], seen[:1]) == ["missing_samples: 10 of 2001 by the times"]
 
 
 def test_nothing_fed_is_no_pose_and_no_window() -> None:

@@ -9,70 +9,93 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from triaxcal.effects import CATALOGUE, TIME
+from triaxcal.effects import CATALOGUE, TIME, effect_named
+from triaxcal.effects.contract import SCATTER, rate_of
 from triaxcal.errors import InvalidData
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, solve
 from triaxcal.sensor import Sensor
-from triaxcal.start import problem_of, start
+from triaxcal.start import problem_of, start, with_history
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)
 COEFFICIENTS: dict[str, list[float]] = {
     "second_order_nonlinearity": [3e-3, -2e-3, 1e-3],
     "third_order_nonlinearity": [-1e-3, 4e-3, 2e-3],
+    "scale_factor_asymmetry": [1e-3, -2e-3, 1e-3],
+    "cross_coupling": [1e-3, -1e-3, 2e-3, 1e-3, -2e-3, 1e-3, 1e-3],
     "temperature_bias": [1e-4, -2e-4, 3e-4],
     "temperature_bias_quadratic": [1e-4, 1e-4, -2e-4, 1e-5, -2e-5, 3e-5],
     "temperature_scale_factor": [2e-4, -1e-4, 3e-4],
+    "thermal_gradient": [1e-2, -2e-2, 1e-2],
     "bias_drift": [1e-5, -2e-5, 1e-5],
+    "warm_up": [1e-3, 2e-3, -1e-3],
+    "bias_step": [1e-3, -1e-3, 2e-3],
+    "hysteresis": [1e-3, 1e-3, -2e-3],
+    "vibration_rectification": [10.0, -20.0, 30.0],
 }
+SHAPES = {"warm_up": {"time_constant": 80.0}, "bias_step": {"at": 75.0}}
+# On these poses a drift that bends and a step in the middle of one have columns of their own.
+ALL_ON = tuple(e.shaped(SHAPES[e.name]) if e.shape else e for e in CATALOGUE)
 
 
 def wandering(n: int) -> dict[str, np.ndarray]:
     return {"temp_c": 25 + 3 * np.sin(1.7 * np.arange(n)) + np.cos(0.9 * np.arange(n))}
 
 
-def everything_on(
-    with_effects: Callable[..., Sensor], directions: np.ndarray, seed: int = 0
-) -> tuple[Problem, State, list[Pose]]:
-    sensor = with_effects(**COEFFICIENTS)
+def everything_on(paper_unit: Sensor, directions: np.ndarray, seed: int = 0) -> tuple[Problem, State, list[Pose]]:
+    sensor = replace(paper_unit, effects=tuple((e, np.array(COEFFICIENTS[e.name])) for e in ALL_ON))
     rng = np.random.default_rng(seed)
-    reference = {"temp_c": 25.0, TIME: 5.0 * len(directions)}
-    poses = noisy_poses(sensor, directions, 1e-4, rng, channels=wandering(len(directions)), channel_reference=reference)
+    n = len(directions)
+    rate, scatter = rng.uniform(-0.02, 0.02, n), rng.uniform(1e-6, 1e-4, (n, 3))
+    logged = wandering(n)
+    there = logged | {rate_of("temp_c"): rate} | {name: scatter[:, i] for i, name in enumerate(SCATTER)}
+    reference = {"temp_c": 25.0, TIME: 5.0 * n}
+    poses = [
+        replace(
+            p,
+            channels={"temp_c": float(logged["temp_c"][i])},
+            rates={"temp_c": float(rate[i])},
+            scatter=scatter[i] * sensor.scale_factor**2,
+        )
+        for i, p in enumerate(noisy_poses(sensor, directions, 1e-4, rng, channels=there, channel_reference=reference))
+    ]
     problem = problem_of(poses, signs=MINUS)
     linear = start(problem, poses, MINUS)
-    theta = np.concatenate([linear.theta, *(np.array(COEFFICIENTS[e.name]) for e in CATALOGUE)])
-    return problem, State(theta, CATALOGUE), poses
+    problem = with_history(problem, poses, linear.sensor(problem))
+    theta = np.concatenate([linear.theta, *(np.array(COEFFICIENTS[e.name]) for e in ALL_ON)])
+    return problem, State(theta, ALL_ON), poses
 
 
 def test_the_jacobian_is_that_of_central_differences_with_every_effect_on(
-    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+    paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
     assert [e.name for e in CATALOGUE] == list(COEFFICIENTS)
-    problem, state, _ = everything_on(with_effects, twenty_six)
+    problem, state, _ = everything_on(paper_unit, twenty_six)
     _, J, _ = linearise(problem, state)
+    assert np.all(np.abs(J).max(axis=0) > 0)
     for column in range(J.shape[1]):
         h = np.zeros(J.shape[1])
-        # Far below any curvature, far above rounding; an effect's column is as large as its condition squared.
-        h[column] = 1e-5 / max(float(np.abs(J[:, column]).max()), 1.0)
-        up, down = (linearise(problem, State(state.theta + s * h, CATALOGUE))[0] for s in (1, -1))
+        # Far below any curvature, far above rounding; an effect's column is as large as its condition.
+        h[column] = 1e-5 / float(np.abs(J[:, column]).max())
+        up, down = (linearise(problem, State(state.theta + s * h, ALL_ON))[0] for s in (1, -1))
         slope = (up - down) / (2 * h[column])
         assert J[:, column] == pytest.approx(slope, rel=1e-6, abs=1e-8 * np.abs(J[:, column]).max())
 
 
 def test_the_standard_error_of_a_residual_is_the_noise_along_its_gradient(
-    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+    paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
-    problem, state, poses = everything_on(with_effects, twenty_six)
+    problem, state, poses = everything_on(paper_unit, twenty_six)
     r, _, s = linearise(problem, state)
     rng = np.random.default_rng(1)
     tiny = 1e-3
     draws = []
-    for _ in range(2000):
+    for _ in range(400):
         noise = np.array([rng.multivariate_normal(np.zeros(3), p.covariance) for p in poses]) * tiny
         draws.append((linearise(replace(problem, u=problem.u + noise), state, jacobian=False)[0] - r) / tiny)
-    assert np.std(draws, axis=0) / s == pytest.approx(np.ones(len(s)), abs=4.5 / np.sqrt(2 * 2000))
+    assert np.std(draws, axis=0) / s == pytest.approx(np.ones(len(s)), abs=4.5 / np.sqrt(2 * 400))
 
 
 def test_the_covariance_of_effects_too_is_the_spread_over_seeds(
@@ -208,8 +231,8 @@ def test_the_answer_does_not_depend_on_the_order_of_the_poses(paper_unit: Sensor
     assert fit(shuffled, signs=MINUS).values == pytest.approx(fit(poses, signs=MINUS).values, abs=1e-12)
 
 
-def test_the_solution_is_a_minimum_of_chi_square(with_effects: Callable[..., Sensor], twenty_six: np.ndarray) -> None:
-    problem, state, _ = everything_on(with_effects, twenty_six)
+def test_the_solution_is_a_minimum_of_chi_square(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    problem, state, _ = everything_on(paper_unit, twenty_six)
     second = (CATALOGUE[0],)
     found = solve(problem, State(state.theta[:9], ()), second)
     r, J, s = linearise(problem, found)
@@ -224,7 +247,7 @@ def test_the_solution_is_a_minimum_of_chi_square(with_effects: Callable[..., Sen
         ({"signs": (1, 0, 1)}, "signs"),
         ({"reference": 0.0}, "reference"),
         ({"reference": float("nan")}, "reference"),
-        ({"effects": (CATALOGUE[2],)}, "temp_c"),
+        ({"effects": (effect_named("temperature_bias"),)}, "temp_c"),
     ],
 )
 def test_arguments_that_make_no_sense_are_named(

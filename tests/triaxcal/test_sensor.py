@@ -10,20 +10,33 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from triaxcal.effects import CATALOGUE, TIME
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SCATTER, SINCE_START, rate_of
 from triaxcal.sensor import Sensor
 
 EVERYTHING: dict[str, list[float]] = {
     "second_order_nonlinearity": [8e-3, -9e-3, 5e-3],
     "third_order_nonlinearity": [-7e-3, 4e-3, 2e-3],
+    "scale_factor_asymmetry": [1e-3, -2e-3, 1e-3],
+    "cross_coupling": [4e-3, -1e-3, 2e-3, 1e-3, -2e-3, 1e-3, 3e-3],
     "temperature_bias": [1e-3, -2e-3, 3e-3],
     "temperature_bias_quadratic": [1e-4, 1e-4, -2e-4, 1e-5, -2e-5, 3e-5],
     "temperature_scale_factor": [2e-3, -1e-3, 3e-3],
+    "thermal_gradient": [1e-2, -2e-2, 1e-2],
     "bias_drift": [1e-5, -2e-5, 1e-5],
+    "warm_up": [1e-3, 2e-3, -1e-3],
+    "bias_step": [1e-3, -1e-3, 2e-3],
+    "hysteresis": [1e-3, 1e-3, -2e-3],
+    "vibration_rectification": [10.0, -20.0, 30.0],
 }
 
 
 def conditions(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    return {"temp_c": rng.uniform(-15, 15, n), TIME: rng.uniform(-300, 300, n)}
+    within = {name: rng.uniform(-1, 1, n) for name in (*BEFORE, *CHANGE)}
+    within |= {name: rng.uniform(0, 1e-4, n) for name in SCATTER}
+    there = {"temp_c": rng.uniform(-15, 15, n), rate_of("temp_c"): rng.uniform(-0.1, 0.1, n)}
+    # The step of the catalogue is at 0 s: poses on either side of it.
+    times = {TIME: rng.uniform(-300, 300, n), SINCE_START: rng.uniform(-10, 300, n), HELD: np.full(n, 10.0)}
+    return within | there | times
 
 
 def test_the_output_is_the_paper_s_equation_written_out() -> None:

@@ -1,28 +1,84 @@
-"""The catalogue of effects. A new effect is one file and one line here."""
+"""The catalogue of effects. A new effect is one file and one line here, or an entry point of another package."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from triaxcal.arrays import Floats
 from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.contract import TIME, Coefficient, Effect
+from triaxcal.effects.bias_step import BiasStep
+from triaxcal.effects.channel import BIAS, SCALE_FACTOR, ChannelBias, ChannelScaleFactor
+from triaxcal.effects.contract import DERIVED, TIME, Coefficient, Effect
+from triaxcal.effects.cross_coupling import CrossCoupling
+from triaxcal.effects.empirical import Empirical
+from triaxcal.effects.hysteresis import Hysteresis
+from triaxcal.effects.in_run import InRuns, runs_named
+from triaxcal.effects.plugins import plugins
+from triaxcal.effects.run_bias import BETWEEN_RUNS
+from triaxcal.effects.scale_factor_asymmetry import ScaleFactorAsymmetry
 from triaxcal.effects.second_order_nonlinearity import SecondOrderNonlinearity
 from triaxcal.effects.temperature_bias import TemperatureBias
 from triaxcal.effects.temperature_bias_quadratic import TemperatureBiasQuadratic
 from triaxcal.effects.temperature_scale_factor import TemperatureScaleFactor
+from triaxcal.effects.thermal_gradient import RATE, ThermalGradient
 from triaxcal.effects.third_order_nonlinearity import ThirdOrderNonlinearity
+from triaxcal.effects.vibration_rectification import VibrationRectification
+from triaxcal.effects.warm_up import WarmUp
 
 CATALOGUE: tuple[Effect, ...] = (
     SecondOrderNonlinearity(),
     ThirdOrderNonlinearity(),
+    ScaleFactorAsymmetry(),
+    CrossCoupling(),
     TemperatureBias(),
     TemperatureBiasQuadratic(),
     TemperatureScaleFactor(),
+    ThermalGradient(),
     BiasDrift(),
+    WarmUp(),
+    BiasStep(),
+    Hysteresis(),
+    VibrationRectification(),
 )
+"""Those of our own that need no channel but the temperature."""
+OWN_CHANNELS = (*DERIVED, "temp_c", RATE)
+
+
+def catalogue_for(conditions: Collection[str]) -> tuple[Effect, ...]:
+    """All effects that a recording with these conditions might show: the catalogue, the plugins, and bias and scale
+    factor by every other channel.
+    """
+    effects = (*CATALOGUE, *plugins()[0])
+    # A channel that an effect of somebody else needs is that effect's business, and may be any other's too.
+    others = sorted(c for c in conditions if c not in OWN_CHANNELS and not c.endswith(".rate"))
+    return (*effects, *(made(c) for c in others for made in (ChannelBias, ChannelScaleFactor)))
 
 
 def effect_named(name: str) -> Effect:
     """Raises KeyError."""
-    return {effect.name: effect for effect in CATALOGUE}[name]
+    for prefix, made in ((BIAS, ChannelBias), (SCALE_FACTOR, ChannelScaleFactor)):
+        if name.startswith(prefix) and len(name) > len(prefix):
+            return made(name[len(prefix) :])
+    return {effect.name: effect for effect in (*plugins()[0], *CATALOGUE, Empirical())}[name]
 
 
-__all__ = ["CATALOGUE", "TIME", "Coefficient", "Effect", "effect_named"]
+def effect_of(name: str, values: Mapping[str, float]) -> tuple[Effect, Floats]:
+    """An effect by its name and its coefficients and shape by theirs; coefficients not given are zero.
+
+    Raises KeyError for a name that is not known.
+    """
+    between = next((e.named(values) for e in BETWEEN_RUNS if e.name == name), None)
+    whole = between or effect_named(name)
+    runs = runs_named(values)
+    for form in (*whole.forms, *(InRuns(form, runs) for form in whole.forms if runs)):
+        own = [c.name for c in form.coefficients]
+        if set(values) <= {*own, *form.shape}:
+            shaped = form.shaped({n: values.get(n, v) for n, (v, _) in form.shape.items()}) if form.shape else form
+            return shaped, np.array([values.get(n, 0.0) for n in own])
+    known = {n for form in whole.forms for n in (*(c.name for c in form.coefficients), *form.shape)}
+    raise KeyError(f"{name}.{next((n for n in values if n not in known), ', '.join(values))}")
+
+
+__all__ = ["CATALOGUE", "TIME", "Coefficient", "Effect", "catalogue_for", "effect_named", "effect_of"]

@@ -1,4 +1,4 @@
-"""Bias that moves steadily with time."""
+"""Bias that moves with time, along a polynomial."""
 
 from __future__ import annotations
 
@@ -8,20 +8,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import TIME, Coefficient, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import TIME, Coefficient, Effect, no_slope, on_each_axis, xyz
+
+DEGREES = (1, 2, 3)
 
 
 @dataclass(frozen=True)
-class BiasDrift:
-    """``e_i = q_i (t − t_ref)``."""
+class BiasDrift(Effect):
+    """``e_i = q_i (t − t_ref) + q2_i (t − t_ref)² + …`` up to ``degree``."""
 
+    degree: int = 1
     name: str = "bias_drift"
-    coefficients: tuple[Coefficient, ...] = xyz("g/s")
     needs: tuple[str, ...] = (TIME,)
     remedy: str = "Let the unit settle before the first pose, and repeat the first pose at the end."
 
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        higher = (c for d in range(2, self.degree + 1) for c in xyz(f"g/s{'²³'[d - 2]}", f"{{}}{d}"))
+        return (*xyz("g/s"), *higher)
+
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis(np.repeat(conditions[TIME][:, None], 3, axis=1))
+        powers = [on_each_axis(conditions[TIME] ** d) for d in range(1, self.degree + 1)]
+        return np.concatenate(powers, axis=2)
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis_slope(np.zeros_like(s))
+        return no_slope(s, 3 * self.degree)
+
+    @property
+    def forms(self) -> tuple[Effect, ...]:
+        return tuple(BiasDrift(degree) for degree in DEGREES)

@@ -1,14 +1,15 @@
 """What every effect states about itself.
 
 An effect adds ``e`` to the reading: ``u = K (s + b + e(s, conditions))`` with ``s = R a`` the specific force
-along each sensitive axis, in g. ``e`` is linear in the effect's coefficients: ``e = basis @ coefficients``.
+along each sensitive axis, in g. ``e`` is linear in the effect's coefficients: ``e = basis @ coefficients``. What is not
+linear (a time constant, the moment of a step) is the effect's shape: the search tries `Effect.variants` of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -16,14 +17,37 @@ from triaxcal.arrays import Floats
 
 TIME = "t_s"
 """The name under which time stands among the conditions, in seconds."""
+SINCE_START = "since_start_s"
+"""Seconds since the first sample of the recording; infinite for a unit in use, which started long ago."""
+HELD = "held_s"
+"""How long the unit was held still, in seconds; zero where a single reading is asked for."""
+BEFORE = ("before_x", "before_y", "before_z")
+"""The specific force along each sensitive axis in the pose before, in g; in the first pose, that of the pose itself."""
+CHANGE = ("change_x", "change_y", "change_z")
+"""The change along each sensitive axis since the pose before, in g; zero in the first pose."""
+SCATTER = ("scatter_x", "scatter_y", "scatter_z")
+"""The variance of the readings inside the pose along each axis, in g²."""
+RUN = "run_index"
+"""Which of several recordings of the unit, from 0; infinite for a unit in use, which is in none of them."""
+CLOCKS = (TIME, SINCE_START, HELD)
+"""Conditions that follow from when and for how long the unit was held."""
+DERIVED = (*CLOCKS, *BEFORE, *CHANGE, *SCATTER, RUN)
+"""Conditions that no channel has to be logged for."""
+
+
+def rate_of(channel: str) -> str:
+    """The name of the condition that is a channel's rate of change, per second."""
+    return f"{channel}.rate"
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """``unit`` uses g for the unit of the reference vector, whatever that is."""
+    """``unit`` uses g for the unit of the reference vector, whatever that is. Coefficients of one ``part`` belong
+    together: an effect may act in one part alone, on one axis say."""
 
     name: str
     unit: str
+    part: str = ""
 
 
 class Effect(Protocol):
@@ -43,9 +67,34 @@ class Effect(Protocol):
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         """(n,3,p): what a unit of each coefficient adds to each axis, in g."""
+        ...
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         """(n,3,3,p): derivative of `basis` by s, as [n, axis, by axis, coefficient]."""
+        ...
+
+    @property
+    def shape(self) -> Mapping[str, tuple[float, str]]:
+        """What the effect has beside its coefficients: name → (value, unit). None, unless said otherwise."""
+        return {}
+
+    @property
+    def lasting(self) -> bool:
+        """Whether what it changes stays so when the unit is switched off and on: no, unless said otherwise."""
+        return False
+
+    @property
+    def forms(self) -> tuple[Effect, ...]:
+        """The forms that it comes in, which differ in their coefficients: one, unless said otherwise."""
+        return (self,)
+
+    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+        """What the search should try under these conditions: its forms, unless said otherwise."""
+        return self.forms
+
+    def shaped(self, values: Mapping[str, float]) -> Self:
+        """The same effect with another `shape`."""
+        return self
 
 
 def per_axis(values: Floats) -> Floats:
@@ -62,5 +111,15 @@ def per_axis_slope(values: Floats) -> Floats:
     return out
 
 
-def xyz(unit: str) -> tuple[Coefficient, ...]:
-    return tuple(Coefficient(axis, unit) for axis in "xyz")
+def on_each_axis(condition: Floats) -> Floats:
+    """(n,) → (n,3,3): a condition that acts on every axis by a coefficient of its own, whatever the specific force."""
+    return per_axis(np.repeat(condition[:, None], 3, axis=1))
+
+
+def no_slope(s: Floats, coefficients: int = 3) -> Floats:
+    """(n,3,3,p) of an effect that does not depend on the specific force."""
+    return np.zeros((len(s), 3, 3, coefficients))
+
+
+def xyz(unit: str, name: str = "{}") -> tuple[Coefficient, ...]:
+    return tuple(Coefficient(name.format(axis), unit, axis) for axis in "xyz")

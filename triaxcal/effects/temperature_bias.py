@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, xyz
 
 
 @dataclass(frozen=True)
-class TemperatureBias:
+class TemperatureBias(Effect):
     """``e_i = q_i (T − T_ref)``."""
 
     name: str = "temperature_bias"
@@ -21,7 +19,7 @@ class TemperatureBias:
     remedy: str = "Correct the bias by the logged temperature, or hold the temperature steadier."
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis(np.repeat(conditions["temp_c"][:, None], 3, axis=1))
+        return on_each_axis(conditions["temp_c"])
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis_slope(np.zeros_like(s))
+        return no_slope(s)

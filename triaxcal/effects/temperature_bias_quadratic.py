@@ -8,28 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient
+from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, xyz
 
 
 @dataclass(frozen=True)
-class TemperatureBiasQuadratic:
+class TemperatureBiasQuadratic(Effect):
     """``e_i = p_i (T − T_ref) + q_i (T − T_ref)²``; the linear part belongs to it, as a parabola has one."""
 
     name: str = "temperature_bias_quadratic"
     coefficients: tuple[Coefficient, ...] = (
-        *(Coefficient(f"linear_{axis}", "g/K") for axis in "xyz"),
-        *(Coefficient(f"quadratic_{axis}", "g/K²") for axis in "xyz"),
+        *xyz("g/K", "linear_{}"),
+        *xyz("g/K²", "quadratic_{}"),
     )
     needs: tuple[str, ...] = ("temp_c",)
     remedy: str = "Correct the bias by a parabola in the logged temperature, or hold the temperature steadier."
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         deviation = conditions["temp_c"]
-        out = np.zeros((len(s), 3, 6))
-        for axis in range(3):
-            out[:, axis, axis] = deviation
-            out[:, axis, 3 + axis] = deviation**2
-        return out
+        return np.concatenate([on_each_axis(deviation), on_each_axis(deviation**2)], axis=2)
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return np.zeros((len(s), 3, 3, 6))
+        return no_slope(s, 6)

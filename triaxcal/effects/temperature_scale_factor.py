@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import Coefficient, Effect, per_axis, per_axis_slope, xyz
 
 
 @dataclass(frozen=True)
-class TemperatureScaleFactor:
+class TemperatureScaleFactor(Effect):
     """``e_i = q_i (T − T_ref) s_i``."""
 
     name: str = "temperature_scale_factor"

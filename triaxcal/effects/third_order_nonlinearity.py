@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import Coefficient, Effect, per_axis, per_axis_slope, xyz
 
 
 @dataclass(frozen=True)
-class ThirdOrderNonlinearity:
+class ThirdOrderNonlinearity(Effect):
     """``e_i = q_i s_i³``."""
 
     name: str = "third_order_nonlinearity"

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
-from triaxcal.calibration import Calibration, channels_of, conditions, conditions_elsewhere
+from triaxcal.calibration import Calibration
+from triaxcal.conditions import conditions_elsewhere
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
@@ -42,7 +43,7 @@ def verticals(calibration: Calibration) -> Verticals:
     direction, covariance = _directions(
         calibration.sensor,
         poses,
-        conditions(channels_of(poses), calibration.channel_reference),
+        calibration.conditions_of(poses),
         calibration.reference,
         calibration.covariance / calibration.inflation**2,
         used,
@@ -64,7 +65,7 @@ def verticals_under(
     that the calibration needs is missing.
     """
     used = np.ones(len(poses), dtype=bool)
-    held = conditions_elsewhere(poses, channel_reference)
+    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias)
     direction, V = _directions(sensor, poses, held, reference, covariance, used)
     return Verticals(tuple(poses), direction, V, used, 1e6)
 

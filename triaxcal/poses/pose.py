@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,6 +17,17 @@ from triaxcal.stillness.windows import Windows, resolution, rounding_variance
 
 
 @dataclass(frozen=True)
+class Run:
+    """Which of several recordings of a unit a pose is of: the ``index`` (0-based) of how many, and the middle of its
+    poses, from which time counts there. Alone, time counts as it was recorded.
+    """
+
+    index: int = 0
+    of: int = 1
+    middle_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class Pose:
     """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean, output units. ``dof`` are the
     degrees of freedom behind the covariance (along the measured vector, where there are six poses or more), and
@@ -24,7 +35,10 @@ class Pose:
 
     ``channels`` are means over the span; ``t_s`` is the middle of the span, like ``start_s`` and ``end_s`` in seconds
     from the first sample. ``creep`` (3,) is the change of the outputs along the span, output units, where it is more
-    than noise, else zero.
+    than noise, else zero. ``rates`` are the channels' slopes, per second, over the span and half its length on either
+    side; ``channel_errors`` and ``rate_errors`` the standard errors of both from the scatter about those slopes.
+    ``before`` (3,) is the mean of the pose before, None in the first; ``scatter`` (3,) the variance of a sample inside
+    the span, output units squared.
     """
 
     start_s: float
@@ -35,7 +49,13 @@ class Pose:
     dof: float
     channels: Mapping[str, float] = field(default_factory=dict)
     creep: Floats = field(default_factory=lambda: np.zeros(3))
+    channel_errors: Mapping[str, float] = field(default_factory=dict)
+    rates: Mapping[str, float] = field(default_factory=dict)
+    rate_errors: Mapping[str, float] = field(default_factory=dict)
+    before: Floats | None = None
+    scatter: Floats = field(default_factory=lambda: np.zeros(3))
     shared_dof: float = float("inf")
+    run: Run = field(default_factory=Run)
 
     def __post_init__(self) -> None:
         if self.mean.shape != (3,) or self.covariance.shape != (3, 3):
@@ -46,6 +66,11 @@ class Pose:
     @property
     def t_s(self) -> float:
         return (self.start_s + self.end_s) / 2
+
+    @property
+    def at(self) -> str:
+        """When it began, in words."""
+        return f"{self.start_s:.1f} s" + (f" of recording {self.run.index + 1}" if self.run.of > 1 else "")
 
     @property
     def standard_error(self) -> Floats:
@@ -116,6 +141,7 @@ def poses_of(w: Windows, spans: Sequence[Span]) -> list[Pose]:
         radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
         creep = creep - radial[:, None] * out
     covariance = covariance + np.diag(_rounding(w, spans))
+    logged = [_logged(w, s) for s in spans]
     return [
         Pose(
             start_s=held[i].start_s,
@@ -127,9 +153,41 @@ def poses_of(w: Windows, spans: Sequence[Span]) -> list[Pose]:
             shared_dof=shared_dof,
             channels={name: float(values[s.used].mean()) for name, values in w.channels.items()},
             creep=creep[i],
+            channel_errors={name: channel.error for name, channel in logged[i].items()},
+            rates={name: channel.rate for name, channel in logged[i].items()},
+            rate_errors={name: channel.rate_error for name, channel in logged[i].items()},
+            before=held[i - 1].mean if i else None,
+            scatter=w.variance[s.used].mean(axis=0) * (w.size - 1) / w.size + w.mean[s.used].var(axis=0),
         )
         for i, s in enumerate(spans)
     ]
+
+
+class _Logged(NamedTuple):
+    """A channel about a pose: standard error of its mean, its rate per second and the standard error of that."""
+
+    error: float
+    rate: float
+    rate_error: float
+
+
+def _logged(w: Windows, s: Span) -> dict[str, _Logged]:
+    """By least squares over the span and half its length on either side: a thermometer's steps and noise are spread
+    over what is around the pose as well.
+    """
+    begin, end = int(w.start_ns[s.first]), int(w.end_ns[s.last])
+    half = (end - begin) // 2
+    first, last = np.searchsorted(w.start_ns, [begin - half, end + half])
+    t_s = (w.start_ns[first:last] - begin) * 1e-9
+    t_s = t_s - t_s.mean()
+    size = float(t_s @ t_s) or 1.0
+    out = {}
+    for name, channel in w.channels.items():
+        values = channel[first:last] - channel[first:last].mean()
+        rate = float(t_s @ values) / size
+        scatter = float(np.sqrt(np.sum((values - rate * t_s) ** 2) / max(len(t_s) - 2, 1)))
+        out[name] = _Logged(scatter / np.sqrt(len(s.used)), rate, scatter / np.sqrt(size))
+    return out
 
 
 def _track(w: Windows, s: Span) -> Track:

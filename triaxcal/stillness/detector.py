@@ -4,7 +4,7 @@ It works on the windows of `triaxcal.stillness.windows`, in three steps. What sc
 windows do is calm. Among calm windows a move shows in the difference of neighbouring averages over one window and more,
 judged by how such differences scatter in this very stream, whatever the colour of its noise. What is left are runs,
 trimmed where a move sets out or settles, and put together where only a bump parts them. Where a machine shakes the
-stand, the same is done once more with the noise that the shaking makes.
+stand, `triaxcal.stillness.shaken` looks for the poses that are left.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from scipy import stats
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.stillness.edges import SPAN_LEAST_WINDOWS, trimmed
 from triaxcal.stillness.noise_scales import SCALES, NoiseScales, contrasts
+from triaxcal.stillness.shaken import ALONE_S, runs, shaken_noise, shaken_runs
 from triaxcal.stillness.windows import WindowCutter, Windows, resolution, rounding_variance
 
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
 
 SPAN_LEAST_S = 0.4
-LOUD_LEAST_S = 1.0
 REJOIN_S = 1.5
 """A disturbance shorter than this, with the same mean before and after, is a bump inside one pose."""
 FALSE_ALARM = 1e-6
@@ -34,9 +34,8 @@ BESIDE = 6
 """Windows beside a run in which a move shows."""
 MOTION = 2.0
 """Of a random walk, the strongest colour that noise has, a quarter of the squared steps is below 0.4 of the scatter."""
-LOUD_SPREAD = 5.0
-LOUD_SHARE = 0.01
-"""Shaking makes the outputs scatter by no more than this share of the range of the poses."""
+SLIGHT = 0.01
+"""Slow vibration moves the outputs from window to window by no more than this share of their range."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +78,27 @@ def find_spans(w: Windows) -> list[Span]:
             break
         calm = np.asarray((w.variance <= _limit_within(w.variance[inside], w.size - 1)).all(axis=1))
         found, noise = _still_runs(w, calm, residue)
-    pieces = [trimmed(w, run, noise) for run in found if not _under_way(w, run, noise)]
-    pieces = [p for p in pieces if len(p) >= SPAN_LEAST_WINDOWS]
-    pieces += _loud_pieces(w, calm, pieces, noise)
+    taken, pieces = _quiet_pieces(w, found, noise)
+    shaken = shaken_runs(w, taken, noise)
     disturbed = ~_steady(w, calm, noise)
-    pieces.sort(key=lambda p: int(p[0]))
-    return [s for s in _rejoin(w, pieces, noise, disturbed) if _long_enough(w, s.used)]
+    spans = _rejoin(w, sorted([*pieces, *shaken], key=lambda p: int(p[0])), noise, disturbed)
+    quiet = np.zeros(len(w), dtype=bool)
+    quiet[np.concatenate([*pieces, np.zeros(0, dtype=np.int64)])] = True
+    return [s for s in spans if _long_enough(w, s.used, SPAN_LEAST_S if quiet[s.used].any() else ALONE_S)]
+
+
+def _quiet_pieces(w: Windows, found: list[Ints], noise: NoiseScales) -> tuple[list[Ints], list[Ints]]:
+    """Runs that are settled, one way or the other, and the still pieces of them."""
+    taken, pieces = [], []
+    for run in found:
+        if _under_way(w, run, noise):
+            taken.append(run)
+            continue
+        piece = trimmed(w, run, noise)
+        if len(piece) >= SPAN_LEAST_WINDOWS:
+            taken.append(run)
+            pieces.append(piece)
+    return taken, pieces
 
 
 def _still_runs(w: Windows, calm: Bools, residue: Floats) -> tuple[list[Ints], NoiseScales]:
@@ -179,16 +193,7 @@ def _only_moves(w: Windows, calm: Bools) -> bool:
     _, far = contrasts(w.mean, calm, w.joined, SCALES[-1], SCALES[-1])
     pace = np.median(np.abs(step), axis=0)
     leads = len(far) > 0 and (np.median(np.abs(far), axis=0) > 3 * pace).any()
-    return bool(leads or pace.max() > LOUD_SHARE * np.ptp(w.mean, axis=0).max())
-
-
-def runs(still: Bools, joined: Bools) -> list[Ints]:
-    """Indices of unbroken runs of still windows."""
-    index = np.flatnonzero(still)
-    if not len(index):
-        return []
-    breaks = np.flatnonzero((np.diff(index) > 1) | ~joined[index[1:]]) + 1
-    return [np.asarray(run, dtype=np.int64) for run in np.split(index, breaks)]
+    return bool(leads or pace.max() > SLIGHT * np.ptp(w.mean, axis=0).max())
 
 
 def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
@@ -234,43 +239,6 @@ def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
     return np.asarray(np.unique(hit[:, None] + np.arange(scale)), dtype=np.int64)
 
 
-def _loud_pieces(w: Windows, calm: Bools, pieces: list[Ints], noise: NoiseScales) -> list[Ints]:
-    """Spans in which the mean stands still while something shakes the unit, among the windows that are not calm.
-
-    Shaking raises the scatter inside windows and, in proportion at most, that of their means; a move shifts the means
-    by more than it scatters inside a window. Only what is small beside the differences of poses can be told from a hand
-    that shakes the unit.
-    """
-    if len(pieces) < 2:
-        return []
-    levels = np.array([w.mean[p].mean(axis=0) for p in pieces])
-    most = LOUD_SHARE * float(np.linalg.norm(np.ptp(levels, axis=0)))
-    rest = np.ones(len(w), dtype=bool)
-    for piece in pieces:
-        rest[max(piece[0] - 1, 0) : piece[-1] + 2] = False
-    for scale in SCALES:
-        at, difference = contrasts(w.mean, rest, w.joined, scale, scale)
-        _, ahead = contrasts(w.variance, rest, w.joined, 0, scale, at)
-        _, behind = contrasts(w.variance, rest, w.joined, scale, 0, at)
-        share = np.maximum((noise.step[scale] / noise.scatter) ** 2, 2 / (w.size * scale))
-        moved = at[(difference**2 > MOVE_SIGMA**2 * share * (ahead - behind) / 2).any(axis=1)]
-        for shift in range(-max(scale // 2, 1), max(scale // 2, 1)):
-            rest[moved + shift] = False
-    found = []
-    for run in runs(rest, w.joined):
-        level = np.median(w.variance[run], axis=0)
-        even = np.asarray(
-            ((w.variance[run] < LOUD_SPREAD * level) & (w.variance[run] > level / LOUD_SPREAD)).all(axis=1)
-        )
-        if np.sqrt(level.max()) > most or calm[run].mean() > 0.5:
-            continue
-        for part in runs(even, np.ones(len(run), dtype=bool)):
-            piece = trimmed(w, run[part], noise.louder(level))
-            if _long_enough(w, piece, LOUD_LEAST_S):
-                found.append(piece)
-    return found
-
-
 def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools) -> list[Span]:
     """Pieces of one pose on either side of a bump, put together."""
     period_s = w.period_ns * 1e-9
@@ -292,11 +260,11 @@ def _same_pose(w: Windows, before: Ints, after: Ints, noise: NoiseScales) -> boo
     scale = max(s for s in SCALES if s <= min(len(before), len(after)))
     here, there = before[-scale:], after[:scale]
     apart = np.abs(w.mean[here].mean(axis=0) - w.mean[there].mean(axis=0))
-    level = np.median(w.variance[np.concatenate([here, there])], axis=0)
-    return bool((apart <= MOVE_SIGMA * noise.louder(level).step[scale]).all())
+    level = w.variance[np.concatenate([here, there])].mean(axis=0)
+    return bool((apart <= MOVE_SIGMA * shaken_noise(noise, level, w.size).step[scale]).all())
 
 
-def _long_enough(w: Windows, used: Ints, least_s: float = SPAN_LEAST_S) -> bool:
+def _long_enough(w: Windows, used: Ints, least_s: float) -> bool:
     if len(used) < SPAN_LEAST_WINDOWS:
         return False
     return bool((w.end_ns[used[-1]] - w.start_ns[used[0]]) * 1e-9 >= least_s)

@@ -11,6 +11,8 @@ from triaxcal.stillness.windows import Windows
 SPAN_LEAST_WINDOWS = 3
 EDGE_SIGMA = 3.5
 """At the ends of a run, where a false alarm costs a few windows and nothing else."""
+EVENLY = 0.1
+"""The scatter of a steady tone repeats itself to less than that: a little more of it at an end is no sign of a move."""
 ONSET_SIGMA = 6.0
 ONSET_WINDOWS = 30
 """Where the onset of a move is judged by what follows: well above the noise, and within this reach."""
@@ -68,19 +70,23 @@ def _unsettled(w: Windows, run: Ints, noise: NoiseScales) -> int:
     if len(inner) >= 8:
         x = inner - inner.mean()
         climb = x @ w.mean[inner] / (x @ x) * np.sign(run[1] - run[0])
-        climb[np.abs(climb) < EDGE_SIGMA * noise.step[1] / np.sqrt(2 * x @ x)] = 0.0
-    share = w.variance[run] / np.median(w.variance[inner], axis=0)
-    middle = share[n // 4 : n - n // 4].mean(axis=1)
-    spread = 1.4826 * float(np.median(np.abs(middle - np.median(middle))))
+    # Of the logarithm, which is nearly normal also where coloured noise leaves few degrees of freedom to a window.
+    share = np.log((w.variance[run] / np.median(w.variance[inner], axis=0)).mean(axis=1))
+    middle = share[n // 4 : n - n // 4]
+    spread = max(1.4826 * float(np.median(np.abs(middle - np.median(middle)))), EVENLY)
+    # A part during which a machine was off makes the rest no louder.
+    usual = np.maximum(share[: n // 2], np.median(middle) - 5 * spread).mean()
     for scale in SCALES:
         before = min(4 * scale, n - scale)
         if before < 2 * scale or n < 5 * scale:
             break
         change = w.mean[run[-scale:]].mean(axis=0) - w.mean[run[-scale - before : -scale]].mean(axis=0)
-        change -= climb * (scale + before) / 2
+        # What the middle climbs explains any part of it: whether that is a creep, or the noise, one need not know.
+        crept = climb * (scale + before) / 2
+        change -= np.clip(change, np.minimum(crept, 0), np.maximum(crept, 0))
         if (np.abs(change) > EDGE_SIGMA * noise.of_edge(scale, before)).any():
             return scale
-        louder = float(share[-scale:].mean() - share[: n // 2].mean())
+        louder = float(share[-scale:].mean() - usual)
         if n >= 12 and louder > EDGE_SIGMA * spread * np.sqrt(1 / scale + 2 / n):
             return scale
     return 0

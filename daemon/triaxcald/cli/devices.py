@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from triaxcal.effects import CATALOGUE
+from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
 from triaxcal_drivers.catalogue import listed
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
@@ -44,7 +46,7 @@ def register(commands: Any) -> None:
     p.add_argument("--unit", help="where the station has more than one")
     add_json(p)
     p.set_defaults(run=registers_command)
-    p = commands.add_parser("devices", help="drivers and profiles found, broken ones with their reason")
+    p = commands.add_parser("devices", help="drivers, profiles and effects found, broken ones with their reason")
     add_json(p)
     p.set_defaults(run=devices_command)
 
@@ -178,13 +180,15 @@ async def _registers(place: Place) -> tuple[str | None, list[Any]]:
 def devices_command(a: argparse.Namespace) -> int:
     drivers = [dataclasses.asdict(d) for d in listed()]
     profiles = [_profile(path) for path in sorted(BUILT_IN.glob("*.toml"))]
+    effects = _effects()
     if a.json:
-        emit({"format": "triaxcal.devices/1", "drivers": drivers, "profiles": profiles})
+        emit({"format": "triaxcal.devices/1", "drivers": drivers, "profiles": profiles, "effects": effects})
         return 0
     rows = [[d["name"], d["distribution"], d["target"], d["fault"] or "usable"] for d in drivers]
     table("drivers", ["name", "package", "class", "state"], rows)
     table("profiles", ["name", "title", "state"], [[p["name"], p["title"], p["fault"] or "usable"] for p in profiles])
-    for broken in (x for x in (*drivers, *profiles) if x["fault"]):
+    table("effects", ["name", "from", "state"], [[e["name"], e["origin"], e["fault"] or "usable"] for e in effects])
+    for broken in (x for x in (*drivers, *profiles, *effects) if x["fault"]):
         say(f"warning: {broken['name']}: {broken['fault']}")
     return 0
 
@@ -195,3 +199,10 @@ def _profile(path: Path) -> dict[str, Any]:
     except (ProfileError, DriverMissing, DriverError) as e:
         return {"name": path.stem, "title": "", "driver": "", "fault": str(e)}
     return {"name": profile.name, "title": profile.title, "driver": profile.driver, "fault": None}
+
+
+def _effects() -> list[dict[str, Any]]:
+    found, broken = plugins()
+    own = [{"name": e.name, "origin": "triaxcal", "fault": None} for e in CATALOGUE]
+    others = [{"name": e.name, "origin": "another package", "fault": None} for e in found]
+    return [*own, *others, *({"name": name, "origin": "another package", "fault": why} for name, why in broken)]

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from triaxcal.agreement import agreement
+from triaxcal.errors import Refused
 from triaxcal.fit import fit
-from triaxcal.loop import diagnose
+from triaxcal.loop import Loop, diagnose
+from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, add_uncertainty, positive, writable
 from triaxcald.cli.console import emit
-from triaxcald.cli.showing import chosen, judge, show_calibration, show_loop, warn
+from triaxcald.cli.several import as_one_unit, measured_each, show_agreement, show_by_recording
+from triaxcald.cli.showing import Choice, chosen, judge, show_calibration, show_loop, warn
 from triaxcald.cli.ways import Way, add_ways, chosen_way, telling_default_signs
+from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, measure
 from triaxcald.report.page import render_report
 from triaxcald.report.stream import overview_of
+from triaxcald.several import agreement_document, with_recordings
 
 
 def register(commands: Any) -> None:
@@ -27,8 +33,12 @@ def register(commands: Any) -> None:
     _add_results(p)
     p.set_defaults(run=fit_command)
     p = commands.add_parser("diagnose", help="find, add and judge effects that the linear model lacks")
-    add_recording(p)
+    add_recording(p, several=True)
     _add_results(p)
+    p.add_argument(
+        "--units", action="store_true", help="each recording is of another unit: judge each, then whether they agree"
+    )
+    p.add_argument("--empirical", action="store_true", help="describe what no effect explains by a smooth term")
     p.add_argument("--check", metavar="REC2", help="another recording, whose poses no fit sees")
     p.set_defaults(run=diagnose_command)
 
@@ -78,26 +88,75 @@ def _fit_by(way: Callable[[argparse.Namespace], Way], a: argparse.Namespace) -> 
 def diagnose_command(a: argparse.Namespace) -> int:
     writable(a.output)
     writable(a.report)
-    measured = measure(a.recording)
+    recordings = measured_each(a)
+    if a.units:
+        return _diagnose_units(a, recordings)
+    names = [m.name for m in recordings]
+    measured = as_one_unit(recordings, a)
     check = measure(a.check).poses if a.check else None
     choice = chosen(a, measured)
+    loop = _loop(a, measured, choice, check)
+    document = _loop_document(loop, measured, choice)
+    if len(names) > 1:
+        document = with_recordings(document, loop, names)
+    _write(a, measured, document)
+    if a.json:
+        emit(document)
+    else:
+        if len(names) > 1:
+            show_by_recording(loop, names, choice)
+        show_loop(loop, choice)
+        show_calibration(loop.after, choice)
+        warn([*loop.after.warnings, *measured.data_quality])
+    return judge(a.limit, loop.after.residual.rms_g)
+
+
+def _loop(a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequence[Pose] | None = None) -> Loop:
     with telling_default_signs(a, measured):
-        loop = diagnose(measured.poses, signs=choice.signs, reference=choice.reference, check=check)
-    document = documents.loop_document(
+        return diagnose(
+            measured.poses, signs=choice.signs, reference=choice.reference, check=check, empirical=a.empirical
+        )
+
+
+def _loop_document(loop: Loop, measured: Measured, choice: Choice) -> documents.Document:
+    return documents.loop_document(
         loop,
         data_quality=measured.data_quality,
         output_unit=choice.output_unit,
         reference_unit=choice.reference_unit,
         stated=choice.stated,
     )
-    _write(a, measured, document)
+
+
+def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> int:
+    if len(recordings) < 2:
+        raise InputError("--units: whether units agree takes two recordings or more")
+    for option, given in (("--check", a.check), ("--report", a.report)):
+        if given:
+            raise InputError(f"{option}: not with --units; diagnose the recording of one unit with it")
+    names, choices = [m.name for m in recordings], [chosen(a, m) for m in recordings]
+    loops = []
+    for measured, choice in zip(recordings, choices, strict=True):
+        try:
+            loops.append(_loop(a, measured, choice))
+        except Refused as e:
+            raise Refused(f"{measured.name}: {e}", wanted=e.wanted) from e
+    found = agreement(loops)
+    results = []
+    for loop, measured, choice in zip(loops, recordings, choices, strict=True):
+        results.append(
+            _loop_document(loop, measured, choice) | ({"unit": dict(measured.unit)} if measured.unit else {})
+        )
+    document = agreement_document(found, names, results, choices[0].reference_unit)
+    if a.output:
+        write_text(a.output, documents.to_text(document))
     if a.json:
         emit(document)
     else:
-        show_loop(loop, choice)
-        show_calibration(loop.after, choice)
-        warn([*loop.after.warnings, *measured.data_quality])
-    return judge(a.limit, loop.after.residual.rms_g)
+        show_agreement(found, names, loops, choices)
+        for measured, loop in zip(recordings, loops, strict=True):
+            warn([f"{measured.name}: {line}" for line in (*loop.after.warnings, *measured.data_quality)])
+    return max(judge(a.limit, loop.after.residual.rms_g) for loop in loops)
 
 
 def _write(a: argparse.Namespace, measured: Measured, document: documents.Document) -> None:
@@ -107,6 +166,7 @@ def _write(a: argparse.Namespace, measured: Measured, document: documents.Docume
         write_text(a.output, documents.to_text(document))
     if a.report:
         limits = {"limits": {"rms_g": a.limit}} if a.limit else None
-        overview = overview_of(measured.windows, measured.poses, chosen(a, measured).output_unit)
+        unit = chosen(a, measured).output_unit
+        overview = overview_of(measured.windows, measured.poses, unit) if measured.windows is not None else None
         page = render_report(document, title=measured.name, stream=overview, certificate=limits)
         write_text(a.report, page)

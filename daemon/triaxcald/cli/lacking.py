@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration, channels_of
+from triaxcal.calibration import Calibration
+from triaxcal.conditions import channels_of
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
 from triaxcal.fit import fit

@@ -11,8 +11,10 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
+from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER
 from triaxcal.errors import InvalidData
 from triaxcal.plan.addition import Addition
+from triaxcal.plan.clock import in_plan
 from triaxcal.plan.design import Asked, ask, needs_time
 from triaxcal.plan.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
 from triaxcal.plan.optimal import OptimalPlan, optimal
@@ -44,7 +46,13 @@ def plan_command(a: argparse.Namespace) -> int:
     for name in a.effects:
         if not _known(name):
             raise InputError(f"--for {name}: no effect of that name; known: {', '.join(e.name for e in CATALOGUE)}")
-    effects = [effect_named(name) for name in dict.fromkeys(a.effects)]
+    effects = [in_plan(effect_named(name)) for name in dict.fromkeys(a.effects)]
+    for effect in effects:
+        if set(effect.needs) & {*BEFORE, *CHANGE, *SCATTER}:
+            raise InputError(
+                f"--for {effect.name}: expected an effect of direction, time or a channel; this one goes with the pose "
+                "before or with shaking, for which any plan does, taken twice in different orders"
+            )
     if a.poses and a.poses > POSES_MOST:
         raise InputError(f"--poses {a.poses}: at most {POSES_MOST}")
     if a.poses and effects and a.poses > POSES_MOST_FOR:

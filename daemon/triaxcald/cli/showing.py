@@ -136,7 +136,7 @@ def show_loop(loop: Loop, choice: Choice) -> None:
         lead = documents.in_words_of(loop.unexplained.lead, choice.reference_unit)
         print(f"unexplained: {micro(loop.unexplained.rms_g)} {choice.micro_unit} rms; {lead}")
     for line in loop.advice:
-        print(f"advice: {line}")
+        print(f"advice: {documents.in_words_of(line, choice.reference_unit)}")
 
 
 def judge(limit: float | None, rms: float) -> int:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from triaxcald.report.document import mapping, texts, vector
 from triaxcald.report.figures import effect_title, number
+from triaxcald.report.untrusted import mapping, texts, vector
 
 
 @dataclass(frozen=True)

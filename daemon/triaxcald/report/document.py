@@ -6,36 +6,18 @@ where a value is missing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from triaxcald.report.figures import clean, effect_title, number
+from triaxcald.report.figures import effect_title, number
+from triaxcald.report.stages import HeldOut, Residual, Stage, held_out_of, stages_of
+from triaxcald.report.untrusted import Vector, mapping, numbers, texts, vector, words
 
-Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Residual:
-    """Errors of the magnitude in g, and the probability that pure noise leaves as much."""
-
-    rms_g: float | None = None
-    max_abs_g: float | None = None
-    cross_validated_rms_g: float | None = None
-    noise_floor_g: float | None = None
-    lack_of_fit_p: float | None = None
-
-
-@dataclass(frozen=True)
-class Stage:
-    """The model at one step of the loop: its errors and, where known, the residual of every pose in g."""
-
-    label: str
-    residual: Residual
-    held_out_rms_g: float | None = None
-    pose_residual_g: NDArray[np.float64] | None = None
+_OF_A_POSE = (
+    "start_s", "end_s", "before_residual_g", "residual_g", "studentized", "leverage", "standard_error_g",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -60,6 +42,8 @@ class Pose:
     studentized: float | None
     leverage: float | None
     used: bool
+    standard_error_g: float | None = None
+    channels: Mapping[str, float | None] = field(default_factory=dict)
 
     @property
     def middle_s(self) -> float | None:
@@ -76,6 +60,12 @@ class Finding:
     alternatives: tuple[str, ...]
     reason: str | None
     remedy: str | None
+    apart: tuple[str, ...] = ()
+    """What to record so as to tell it from its alternatives."""
+
+    def shape(self, name: str) -> float | None:
+        """The value of a coefficient, such as the moment of a step."""
+        return next((c.value for c in self.coefficients if c.name == name), None)
 
 
 @dataclass(frozen=True)
@@ -83,15 +73,7 @@ class Unexplained:
     significant: bool
     p_value: float | None
     rms_g: float | None
-    lead: str | None
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    before_rms_g: float | None
-    after_rms_g: float | None
-    noise_floor_g: float | None
-    poses: int | None
+    leads: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -119,6 +101,7 @@ class Outcome:
     data_quality: tuple[str, ...]
     advice: tuple[str, ...]
     limits: Mapping[str, float | None]
+    channel_reference: Mapping[str, float | None]
 
     @property
     def final(self) -> Residual:
@@ -135,14 +118,15 @@ def read_document(document: Mapping[str, object]) -> Outcome:
     calibration = mapping(document.get("calibration")) if looped else document
     matrix, centre = _matrix(calibration.get("matrix")), vector(calibration.get("centre"))
     poses = tuple(_poses(calibration, matrix, centre))
-    held_out = _held_out(document)
+    held_out = held_out_of(document)
+    before_g, after_g = [pose.before_residual_g for pose in poses], [pose.residual_g for pose in poses]
     effects = mapping(calibration.get("effects"))
     terms = {*texts(calibration.get("terms")), *effects}
     units = calibration.get("units")
     return Outcome(
         refused=_refusal(document, calibration),
         searched=looped,
-        stages=_stages(document, calibration, poses, held_out),
+        stages=stages_of(document, calibration, before_g, after_g, held_out),
         held_out=held_out,
         findings=tuple(_findings(document.get("findings"), terms)),
         unexplained=_unexplained(document.get("unexplained")),
@@ -158,32 +142,9 @@ def read_document(document: Mapping[str, object]) -> Outcome:
         warnings=texts(calibration.get("warnings")),
         data_quality=texts(document.get("data_quality")),
         advice=texts(document.get("advice")),
-        limits={name: number(value) for name, value in mapping(document.get("limits")).items()},
+        limits=numbers(document.get("limits")),
+        channel_reference=numbers(calibration.get("channel_reference")),
     )
-
-
-def mapping(value: object) -> Mapping[str, object]:
-    return value if isinstance(value, Mapping) else {}
-
-
-def texts(value: object) -> tuple[str, ...]:
-    """A list of sentences or names; an entry with keys becomes `key: value; key: value`."""
-    entries = value if isinstance(value, (list, tuple)) else [] if value is None else [value]
-    return tuple(_words(entry) for entry in entries if entry is not None)
-
-
-def vector(value: object) -> Vector | None:
-    """Three finite numbers, or None."""
-    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 3:
-        return None
-    x, y, z = (number(component) for component in value)
-    return None if x is None or y is None or z is None else (x, y, z)
-
-
-def _words(entry: object) -> str:
-    if isinstance(entry, Mapping):
-        return "; ".join(f"{key}: {value}" for key, value in entry.items())
-    return str(entry)
 
 
 def _matrix(value: object) -> tuple[Vector, ...] | None:
@@ -201,15 +162,10 @@ def _output_unit(units: object) -> str:
 
 def _refusal(document: Mapping[str, object], calibration: Mapping[str, object]) -> str | None:
     if document.get("refused"):
-        return _words(document["refused"])
+        return words(document["refused"])
     if vector(calibration.get("scale_factor")) is None:
         return "The document holds no calibration."
     return None
-
-
-def _residual(value: object) -> Residual | None:
-    known = mapping(value)
-    return Residual(*(number(known.get(field.name)) for field in fields(Residual))) if known else None
 
 
 def _unexplained(value: object) -> Unexplained | None:
@@ -221,20 +177,7 @@ def _unexplained(value: object) -> Unexplained | None:
         bool(known.get("significant")),
         number(known.get("p_value")),
         number(known.get("rms_g")),
-        None if lead is None else _words(lead),
-    )
-
-
-def _held_out(document: Mapping[str, object]) -> HeldOut | None:
-    known = mapping(document.get("held_out"))
-    if not known:
-        return None
-    poses = number(known.get("poses"))
-    return HeldOut(
-        number(known.get("before_rms_g")),
-        number(known.get("after_rms_g")),
-        number(known.get("noise_floor_g")),
-        None if poses is None else int(poses),
+        tuple(part for part in words(lead or "").split("; ") if part),
     )
 
 
@@ -250,8 +193,9 @@ def _findings(value: object, terms: set[str]) -> Iterator[Finding]:
             p_value=number(known.get("p_value")),
             coefficients=_coefficients(known.get("coefficients")),
             alternatives=texts(known.get("alternatives")),
-            reason=None if reason is None else _words(reason),
-            remedy=None if remedy is None else _words(remedy),
+            reason=None if reason is None else words(reason),
+            remedy=None if remedy is None else words(remedy),
+            apart=texts(known.get("apart")),
         )
 
 
@@ -290,10 +234,8 @@ def _poses(
             mean=mean,
             direction=vector(known.get("direction")) or _direction(mean, matrix, centre),
             used=known.get("used") is None or bool(known["used"]),
-            **{
-                name: number(known.get(name))
-                for name in ("start_s", "end_s", "before_residual_g", "residual_g", "studentized", "leverage")
-            },
+            channels=numbers(known.get("channels")),
+            **{name: number(known.get(name)) for name in _OF_A_POSE},
         )
 
 
@@ -303,53 +245,3 @@ def _direction(mean: Vector | None, matrix: tuple[Vector, ...] | None, centre: V
     up = np.asarray(matrix) @ (np.asarray(mean) - np.asarray(centre))
     length = float(np.linalg.norm(up))
     return None if length == 0.0 else vector((up / length).tolist())
-
-
-def _stages(
-    document: Mapping[str, object],
-    calibration: Mapping[str, object],
-    poses: tuple[Pose, ...],
-    held_out: HeldOut | None,
-) -> tuple[Stage, ...]:
-    """Before, after each adopted effect whose finding carries a `residual`, and after the last one."""
-    after = _residual(document.get("after")) or _residual(calibration.get("residual"))
-    before = _residual(document.get("before"))
-    last = Stage(
-        "After" if before else "This model",
-        after or Residual(),
-        held_out.after_rms_g if held_out else None,
-        _series([pose.residual_g for pose in poses]),
-    )
-    if before is None:
-        return (last,) if after else ()
-    first = Stage(
-        "Before",
-        before,
-        held_out.before_rms_g if held_out else None,
-        _series([pose.before_residual_g for pose in poses]),
-    )
-    if after is None:
-        return (first,)
-    if before == after:
-        return (Stage("This model", after, last.held_out_rms_g, last.pose_residual_g),)
-    return (first, *_steps(document.get("findings"), len(poses)), last)
-
-
-def _steps(findings: object, pose_count: int) -> Iterator[Stage]:
-    adopted = [
-        known
-        for known in map(mapping, findings if isinstance(findings, (list, tuple)) else [])
-        if known.get("verdict") == "adopted"
-    ]
-    for known in adopted[:-1]:
-        residual, per_pose = _residual(known.get("residual")), known.get("pose_residual_g")
-        series = _series([number(value) for value in per_pose]) if isinstance(per_pose, list) else None
-        if residual:
-            label = clean("+ " + effect_title(str(known.get("effect", ""))).lower())
-            yield Stage(label, residual, None, series if series is None or series.size == pose_count else None)
-
-
-def _series(values: Sequence[float | None]) -> NDArray[np.float64] | None:
-    """Residuals as an array with NaN for a missing one; None when all are missing."""
-    array = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-    return None if array.size == 0 or bool(np.isnan(array).all()) else array

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from triaxcald.report.document import Pose, Stage
+from triaxcald.report.document import Pose
 from triaxcald.report.figures import micro
 from triaxcald.report.ink import GRID, INK, MUTED, draw
+from triaxcald.report.stages import Stage
 
 # Readable on white and on near-black alike: saturated ends, a middle grey for "no more than noise".
 _COLOURS = LinearSegmentedColormap.from_list(
@@ -23,7 +24,7 @@ _COLOURS = LinearSegmentedColormap.from_list(
 )
 _MOST_DOUBLINGS = 7
 _EQUATOR = 0.02
-_MOST_NUMBERED = 60
+_MOST_NUMBERED = 40
 
 
 def sphere_picture(poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g: float | None) -> Markup | None:
@@ -34,18 +35,23 @@ def sphere_picture(poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g
     norm = _doubling_classes(shown, noise_floor_g)
     alt = f"Residual over the sphere for {len(poses)} poses, {' and '.join(s.label.lower() for s in shown)}"
 
-    def paint(figure: Figure) -> None:
-        grid = figure.subplots(len(shown), 2, squeeze=False)
-        for row, stage in zip(grid, shown, strict=True):
-            for axes, side in zip(row, (1, -1), strict=True):
-                _hemisphere(axes, side, poses, stage, norm)
-                if stage is shown[0]:
-                    axes.set_title("Upper half, +Z in the middle" if side > 0 else "Lower half, −Z in the middle",
-                                   pad=16)  # fmt: skip
-            row[0].text(-1.85, 0, stage.label, ha="center", va="center", weight="bold", rotation=90)
-        _colour_bar(figure, grid, norm)
+    rows = -(-len(shown) // 2)
+    height_in = (2.25 if len(shown) > 1 else 3.2) * rows + 0.75
 
-    return draw("sphere", alt, (8.0, 2.7 * len(shown) + 0.75), paint)
+    def paint(figure: Figure) -> None:
+        # Two stages a row, so that before and after stand beside each other.
+        grid = figure.subplots(rows, 4 if len(shown) > 1 else 2, squeeze=False)
+        pairs = [grid[i // 2, 2 * (i % 2) : 2 * (i % 2) + 2] for i in range(len(shown))]
+        for pair, stage in zip(pairs, shown, strict=True):
+            for axes, side in zip(pair, (1, -1), strict=True):
+                _hemisphere(axes, side, poses, stage, norm)
+                axes.text(0, -1.52, "+Z half" if side > 0 else "−Z half", ha="center", color=MUTED, fontsize=8)
+            pair[0].set_title(stage.label, loc="left", weight="bold", pad=8)
+        for axes in grid.flat[2 * len(shown) :]:
+            axes.axis("off")
+        _colour_bar(figure, grid, norm, 0.2 / height_in)
+
+    return draw("sphere", alt, (8.0, height_in), paint)
 
 
 def equal_area(direction: NDArray[np.float64], side: int) -> NDArray[np.float64]:
@@ -68,14 +74,14 @@ def _doubling_classes(stages: Sequence[Stage], noise_floor_g: float | None) -> B
 
 
 def _hemisphere(axes: Axes, side: int, poses: Sequence[Pose], stage: Stage, norm: BoundaryNorm) -> None:
-    axes.set(xlim=(-1.28, 1.28), ylim=(-1.24, 1.24), aspect="equal")
+    axes.set(xlim=(-1.42, 1.42), ylim=(-1.56, 1.36), aspect="equal")
     axes.axis("off")
     axes.add_patch(Circle((0, 0), 1, fill=False, ec=MUTED, lw=0.9))
     for tilt_deg in (30, 60):
         axes.add_patch(Circle((0, 0), float(np.sqrt(1 - np.cos(np.radians(tilt_deg)))), fill=False, ec=GRID, lw=0.6))
     axes.plot([-1, 1], [0, 0], color=GRID, lw=0.6, zorder=0)
     axes.plot([0, 0], [-1, 1], color=GRID, lw=0.6, zorder=0)
-    for label, x, y in (("+X", 1.17, 0), ("−X", -1.17, 0), ("+Y", 0, 1.17), ("−Y", 0, -1.17)):
+    for label, x, y in (("+X", 1.27, -0.02), ("−X", -1.22, -0.02), ("+Y", 0, 1.24), ("−Y", 0, -1.18)):
         axes.text(x, y, label, ha="center", va="center", color=MUTED, fontsize=8)
     assert stage.pose_residual_g is not None
     here = [
@@ -94,18 +100,19 @@ def _markers(axes: Axes, side: int, here: Sequence[tuple[Pose, float]], norm: Bo
     for mask, marker, edge in ((used, "o", INK), (~used, "X", INK)):
         axes.scatter(
             places[mask, 0], places[mask, 1], c=residuals[mask], cmap=_COLOURS, norm=norm, marker=marker,
-            s=70 if numbered else 22, edgecolors=edge, linewidths=0.6, clip_on=False, zorder=3,
+            s=52 if numbered else 18, edgecolors=edge, linewidths=0.6, clip_on=False, zorder=3,
         )  # fmt: skip
     if numbered:
         for (pose, _), (x, y) in zip(here, places, strict=True):
-            axes.annotate(str(pose.number), (x, y), (5.5, 5.5), textcoords="offset points", fontsize=6.5)
+            axes.annotate(str(pose.number), (x, y), (4.5, 4.5), textcoords="offset points", fontsize=6.5)
 
 
-def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm) -> None:
+def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, share: float) -> None:
     bar = figure.colorbar(
-        ScalarMappable(norm, _COLOURS), ax=grid, orientation="horizontal", fraction=0.04, pad=0.02, aspect=45,
+        ScalarMappable(norm, _COLOURS), ax=grid, orientation="horizontal", fraction=share, pad=0.02, aspect=37,
         spacing="uniform",
     )  # fmt: skip
     bar.set_ticks(list(norm.boundaries), labels=[micro(edge) for edge in norm.boundaries])
+    bar.ax.tick_params(labelsize=7)
     bar.set_label("residual of the magnitude, µg (grey: within one noise floor; every colour doubles)")
     bar.outline.set_edgecolor(MUTED)

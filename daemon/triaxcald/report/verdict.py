@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from triaxcald.report.document import Outcome
-from triaxcald.report.figures import effect_title, micro_g
+from triaxcald.report.document import Finding, Outcome
+from triaxcald.report.faults import faults_of
+from triaxcald.report.figures import micro_g
+from triaxcald.report.meanings import told
 
 _SIGNIFICANT_P = 0.01
-_WORDS = {"within": "Within limits", "outside": "Outside a limit", "unexplained": "Unexplained error left"}
+_WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
+_MOST_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -47,22 +50,56 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
     if outcome.refused is not None:
         return Verdict("refused", "Refused", outcome.refused, (), checks)
     reservations = (*_reservations(outcome, checks), *_beyond_limits(checks, expanded_g))
-    errors = _errors(outcome)
+    errors = f"{_found(outcome)}{_errors(outcome)}"
     open_checks = [check for check in checks if check.passed is None]
     exceeded = [check.name for check in checks if check.passed is False]
     if exceeded:
-        return Verdict("outside", _WORDS["outside"], f"{', '.join(exceeded)}: over the limit. {errors}",
-                       reservations, checks)  # fmt: skip
+        return Verdict("outside", _OUTSIDE, f"{', '.join(exceeded)}: over the limit. {errors}", reservations, checks)
     if _unexplained(outcome):
         kept = "Every declared limit is kept, but more" if checks and not open_checks else "More"
         sentence = f"{kept} is left than the noise of the poses accounts for. {errors}"
-        return Verdict("unexplained", _WORDS["unexplained"], sentence, reservations, checks)
+        return Verdict("unexplained", _UNEXPLAINED, sentence, reservations, checks)
     if open_checks or not (checks or _tested(outcome)):
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
-    unsearched = "Nothing left unexplained" if outcome.searched else "No lack of fit shows"
-    headline = _WORDS["within"] if checks else unsearched
-    return Verdict("within", headline, errors, reservations, checks)
+    if checks:
+        return Verdict("within", _WITHIN, errors, reservations, checks)
+    return Verdict("unexplained" if _uncertain(outcome) else "within", _without_limits(outcome), errors,
+                   reservations, checks)  # fmt: skip
+
+
+def _without_limits(outcome: Outcome) -> str:
+    if not outcome.searched:
+        return "No lack of fit shows"
+    if not outcome.findings:
+        return "Nothing found beyond noise"
+    what = "Effect" if len(outcome.findings) == 1 else f"{len(outcome.findings)} effects"
+    return f"{what} found, cause uncertain" if _uncertain(outcome) else f"{what} found and corrected"
+
+
+def _uncertain(outcome: Outcome) -> bool:
+    return any(finding.verdict == "confounded" or finding.alternatives for finding in outcome.findings)
+
+
+def _found(outcome: Outcome) -> str:
+    """The effects in words, each with its name."""
+    if not outcome.searched or not (outcome.findings or _tested(outcome)):
+        return ""
+    if not outcome.findings:
+        return "No effect beyond the linear model was found. "
+    return f"Found: {'; '.join(_named(finding, outcome) for finding in outcome.findings)}. "
+
+
+def _named(finding: Finding, outcome: Outcome) -> str:
+    names = (finding.effect, *finding.alternatives)
+    clauses = []
+    for name in names[:_MOST_NAMED]:
+        known = told(name, outcome.channel_reference)
+        title = known.title.lower()
+        clauses.append(known.clause if known.clause == title else f"{known.clause} ({title})")
+    clauses += ["others"] if len(names) > _MOST_NAMED else []
+    doubt = "" if len(names) == 1 else " – these poses cannot tell which"
+    return " or ".join(clauses) + doubt
 
 
 def _checks(outcome: Outcome, limits: Mapping[str, float | None]) -> list[LimitCheck]:
@@ -116,18 +153,17 @@ def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None) -> 
 
 
 def _reservations(outcome: Outcome, checks: tuple[LimitCheck, ...]) -> list[str]:
+    spoiled = sum(fault.spoils for fault in faults_of(outcome.data_quality))
+    rejected = len(outcome.poses) - outcome.poses_used
     found = []
+    if spoiled:
+        found.append("Faults in the recording spoil poses, which have to be taken again: see below.")
+    if rejected:
+        found.append(f"{rejected} of {len(outcome.poses)} poses not used.")
     if not checks:
         found.append("No limit was declared; the verdict compares with the noise floor alone.")
     if not _tested(outcome):
         found.append("Whether anything is left beyond noise was not tested.")
-    for finding in outcome.findings:
-        if finding.verdict == "confounded" or finding.alternatives:
-            others = ", ".join(effect_title(name).lower() for name in finding.alternatives)
-            found.append(f"These poses cannot tell {effect_title(finding.effect).lower()} from {others or 'others'}.")
-    rejected = len(outcome.poses) - outcome.poses_used
-    if rejected:
-        found.append(f"{rejected} of {len(outcome.poses)} poses not used.")
     for count, what in ((len(outcome.warnings), "warning"), (len(outcome.data_quality), "remark")):
         if count:
             where = "on the fit" if what == "warning" else "on the quality of the data"

@@ -248,7 +248,7 @@ def test_one_of_two_units_has_to_be_named(workshop: Any, triaxcal: Run) -> None:
 def test_devices_lists_drivers_and_profiles(triaxcal: Run) -> None:
     done = triaxcal("devices", "--json")
     assert (done.code, done.err) == (0, "")
-    assert set(done.json) == {"format", "drivers", "profiles"}
+    assert set(done.json) == {"format", "drivers", "profiles", "effects"}
     drivers = {d["name"]: d for d in done.json["drivers"]}
     assert {"can", "modbus"} <= set(drivers)
     assert drivers["can"] == {

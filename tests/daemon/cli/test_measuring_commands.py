@@ -27,7 +27,10 @@ CALIBRATION = {
     "standard_error", "residual", "poses", "condition", "blind_to", "warnings",
 }  # fmt: skip
 LOOP = {"format", "before", "after", "findings", "unexplained", "data_quality", "advice", "calibration"}
-FINDING = {"effect", "verdict", "p_value", "coefficients", "alternatives", "reason", "remedy"}
+FINDING = {
+    "effect", "verdict", "p_value", "coefficients", "alternatives", "apart", "reason", "remedy", "residual",
+    "pose_residual_g",
+}  # fmt: skip
 SIGNS = "--sign=-,-,-"
 
 
@@ -168,7 +171,9 @@ def test_diagnose_finds_what_is_hidden_and_judges_it_on_another_recording(
     assert [f["effect"] for f in document["findings"]] == ["second_order_nonlinearity"]
     for finding in document["findings"]:
         assert set(finding) == FINDING
-        assert finding["verdict"] == "adopted"
+        # On exact directions the first differs by 7.5 % of its size: by that the poses tell them, or not.
+        assert set(finding["alternatives"]) <= {"scale_factor_asymmetry", "cross_coupling"}
+        assert finding["verdict"] == ("confounded" if finding["alternatives"] else "adopted")
         assert 0 <= finding["p_value"] < 0.01
         values = {axis: held["value"] for axis, held in finding["coefficients"].items()}
         errors = {axis: held["standard_error"] for axis, held in finding["coefficients"].items()}
@@ -218,9 +223,7 @@ def test_the_same_for_people_is_a_table_and_no_json(finished_run: Any, tmp_path:
     cal = tmp_path / "cal.json"
     assert "bias.x" in triaxcal("fit", finished_run.can, "-o", cal).out
     assert "still poses in " in triaxcal("poses", finished_run.can).out
-    assert (
-        "adopted: second_order_nonlinearity" in triaxcal("diagnose", finished_run.can, "--check", finished_run.can).out
-    )
+    assert "second_order_nonlinearity" in triaxcal("diagnose", finished_run.can, "--check", finished_run.can).out
     assert "noise floor" in triaxcal("verify", cal, finished_run.can).out
     assert "cannot show: " in triaxcal("plan").out
     assert "none is wanted" in triaxcal("plan", finished_run.can).out

@@ -72,8 +72,7 @@ def loop_document(count: int = 26, seed: int = 7) -> dict[str, Any]:
     _, _, before, before_leverage = _fit(outputs, 9)
     found, error, after, leverage = _fit(outputs, 12)
     named = {
-        f"k2{axis}": {"value": found[9 + i], "standard_error": error[9 + i], "unit": "g/g^2"}
-        for i, axis in enumerate("xyz")
+        axis: {"value": found[9 + i], "standard_error": error[9 + i], "unit": "g/g^2"} for i, axis in enumerate("xyz")
     }
     calibration = _calibration(found, error, named)
     calibration["residual"] = _residual(after, leverage, 0.43)
@@ -87,6 +86,8 @@ def loop_document(count: int = 26, seed: int = 7) -> dict[str, Any]:
             "studentized": float(after[i] / (NOISE_G * np.sqrt(1 - leverage[i]))),
             "leverage": float(leverage[i]),
             "used": True,
+            "standard_error_g": NOISE_G,
+            "channels": {"temp_c": 22.0 + 0.1 * i, "supply_v": 5.0},
             "direction": (recovered[i] / np.linalg.norm(recovered[i])).tolist(),
             "before_residual_g": float(before[i]),
         }
@@ -104,6 +105,8 @@ def loop_document(count: int = 26, seed: int = 7) -> dict[str, Any]:
                 "p_value": 3.2e-38,
                 "coefficients": named,
                 "alternatives": [],
+                "residual": {"rms_g": 2.5e-5, "cross_validated_rms_g": 3.6e-5},
+                "pose_residual_g": [2.5e-5 * (-1) ** i for i in range(count)],
                 "reason": "The residual follows the square of the acceleration along each axis.",
                 "remedy": "Store the second-order coefficients in the device; nothing has to be repaired.",
             },
@@ -111,10 +114,11 @@ def loop_document(count: int = 26, seed: int = 7) -> dict[str, Any]:
                 "effect": "temperature_bias",
                 "verdict": "confounded",
                 "p_value": 0.004,
-                "coefficients": {"bx_t": {"value": 2.1e-6, "standard_error": 7.0e-7, "unit": "g/K"}},
+                "coefficients": {"x": {"value": 2.1e-6, "standard_error": 7.0e-7, "unit": "g/K"}},
                 "alternatives": ["bias_drift", "warm_up"],
                 "reason": "Temperature rose steadily with time, so the two cannot be told apart.",
                 "remedy": "Repeat four poses at another temperature.",
+                "apart": ["record again while temp_c moves by itself"],
             },
         ],
         "unexplained": {"significant": False, "p_value": 0.43, "rms_g": 4.0e-6, "lead": None},

@@ -1,0 +1,159 @@
+"""The residuals along the time of the recording, step by step, above the channels that moved meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from triaxcald.report.document import Pose
+from triaxcald.report.figures import clean
+from triaxcald.report.ink import AFTER, BAND, BEFORE, FLOOR, INK, MUTED, STEP, draw, hang_grid
+from triaxcald.report.stages import Stage
+
+_CONSPICUOUS = 3.0
+_MOST_MARKED = 8
+_MOST_CHANNELS = 4
+_MOST_BARS = 120
+_FIGURE_IN, _PANEL_IN = (8.0, 0.9), 1.35
+
+
+def time_picture(
+    poses: Sequence[Pose],
+    stages: Sequence[Stage],
+    noise_floor_g: float | None,
+    *,
+    moments: Mapping[str, float] | None = None,
+) -> Markup | None:
+    """A panel a stage, each on its own scale, and one for each logged channel that moved; ``moments`` are marked."""
+    shown = [stage for stage in stages if stage.pose_residual_g is not None]
+    if not shown:
+        return None
+    place, label = _places(poses)
+    logged = _moving_channels(poses)
+    alt = f"Residual of {len(poses)} poses in order of time, {' and '.join(s.label.lower() for s in shown)}"
+    if logged:
+        alt += f", above {', '.join(clean(name) for name in logged)}"
+    rows = len(shown) + len(logged)
+
+    def paint(figure: Figure) -> None:
+        panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+        colours = stage_colours(stages)
+        for axes, stage in zip(panels, shown, strict=False):
+            _noise_band(axes, noise_floor_g)
+            _residuals(axes, place, poses, stage, colours[stage.label])
+            axes.set_title(stage.label, loc="left", weight="bold")
+            axes.set_ylabel("residual, µg")
+        _mark_conspicuous(panels[len(shown) - 1], place, poses, shown[-1])
+        for axes, (name, values) in zip(panels[len(shown) :], logged.items(), strict=True):
+            axes.plot(place, values, "s-", color=MUTED, ms=3, lw=0.8)
+            axes.set_title(f"Channel {clean(name)[:40]}, mean of each pose", loc="left")
+        for axes in panels:
+            _mark_moments(axes, moments if "time" in label else None, named=axes is panels[0])
+            axes.yaxis.set_major_locator(MaxNLocator(4))
+            axes.ticklabel_format(axis="y", useOffset=False)
+            hang_grid(axes)
+        panels[-1].set_xlabel(label)
+        handles = panels[0].get_legend_handles_labels()
+        if handles[0]:
+            figure.legend(*handles, loc="outside upper right", ncols=3)
+
+    return draw("time", alt, (_FIGURE_IN[0], _FIGURE_IN[1] + _PANEL_IN * rows), paint)
+
+
+def stage_colours(stages: Sequence[Stage]) -> dict[str, str]:
+    colours = {stage.label: STEP for stage in stages}
+    if len(stages) > 1:
+        colours[stages[0].label] = BEFORE
+    if stages:
+        colours[stages[-1].label] = AFTER
+    return colours
+
+
+def _places(poses: Sequence[Pose]) -> tuple[NDArray[np.float64], str]:
+    """Where each pose stands on the axis of time, or its number where a time is missing."""
+    middles = [pose.middle_s for pose in poses]
+    times_s = np.array([middle for middle in middles if middle is not None])
+    if times_s.size < len(poses):
+        return np.array([pose.number for pose in poses], dtype=np.float64), "pose"
+    return times_s, "time, s"
+
+
+def _moving_channels(poses: Sequence[Pose]) -> dict[str, NDArray[np.float64]]:
+    """The channels that every pose has and that did not stand still, by name."""
+    names = set.intersection(*(set(pose.channels) for pose in poses)) if poses else set()
+    columns = {name: [pose.channels[name] for pose in poses] for name in sorted(names)}
+    whole = {
+        name: np.array(column, dtype=np.float64)
+        for name, column in columns.items()
+        if all(value is not None for value in column)
+    }
+    moving = {name: v for name, v in whole.items() if float(np.ptp(v)) > 1e-9 * float(np.abs(v).max())}
+    return dict(list(moving.items())[:_MOST_CHANNELS])
+
+
+def _noise_band(axes: Axes, noise_floor_g: float | None) -> None:
+    axes.axhline(0, color=MUTED, lw=0.7)
+    if noise_floor_g is not None:
+        for factor in (2, 1):
+            reach = factor * noise_floor_g * 1e6
+            axes.axhspan(-reach, reach, color=BAND, lw=0, label="±1, ±2 noise floors" if factor == 2 else None)
+
+
+def _residuals(axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, colour: str) -> None:
+    """With one standard error of the pose either way, as far as it is known."""
+    assert stage.pose_residual_g is not None
+    used, residual_ug = np.array([pose.used for pose in poses]), stage.pose_residual_g * 1e6
+    size = 4.0 if len(poses) <= 100 else 2.2
+    if len(poses) <= _MOST_BARS:
+        half_ug = np.array([(pose.standard_error_g or 0.0) * 1e6 for pose in poses])
+        axes.vlines(place, residual_ug - half_ug, residual_ug + half_ug, color=colour, lw=0.9)
+    axes.plot(place[used], residual_ug[used], "o-", color=colour, ms=size, lw=0.6)
+    axes.plot(place[~used], residual_ug[~used], "x", color=colour, ms=size + 2.0, mew=1.6)
+    if (~used).any() and used.any():
+        _keep_used_in_sight(axes, residual_ug, used)
+
+
+def _keep_used_in_sight(axes: Axes, residual_ug: NDArray[np.float64], used: NDArray[np.bool_]) -> None:
+    """Poses left out may be off by a hundred times what the others are: those are drawn at the edge, as arrows."""
+    reach = 3.0 * float(np.nanmax(np.abs(residual_ug[used])))
+    if not float(np.nanmax(np.abs(residual_ug))) > 2 * reach > 0:
+        return
+    axes.set_ylim(-reach, reach)
+    at = axes.lines[-1].get_xdata()
+    for x, y in zip(np.asarray(at), residual_ug[~used], strict=True):
+        if abs(y) > reach:
+            axes.plot([x], [np.sign(y) * 0.93 * reach], "^" if y > 0 else "v", color=FLOOR, ms=6)
+
+
+def _mark_moments(axes: Axes, moments: Mapping[str, float] | None, *, named: bool) -> None:
+    for name, at_s in (moments or {}).items():
+        axes.axvline(at_s, color=FLOOR, lw=1.2, ls=(0, (4, 2)))
+        if named:
+            axes.annotate(
+                name, (at_s, 1.0), (3, 3), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8
+            )
+
+
+def _mark_conspicuous(axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage) -> None:
+    """Numbers beside the poses a metrologist looks up first: not used, or far out for their noise."""
+    assert stage.pose_residual_g is not None
+    conspicuous = [
+        (abs(pose.studentized or 0.0), pose, at, residual_g)
+        for at, residual_g, pose in zip(place, stage.pose_residual_g, poses, strict=True)
+        if np.isfinite(residual_g) and (abs(pose.studentized or 0.0) > _CONSPICUOUS or not pose.used)
+    ]
+    low, high = axes.get_ylim()
+    for _, pose, at, residual_g in sorted(conspicuous, key=lambda entry: -entry[0])[:_MOST_MARKED]:
+        note = f"pose {pose.number}" + ("" if pose.used else ", not used")
+        y = float(np.clip(residual_g * 1e6, low + 0.07 * (high - low), high - 0.12 * (high - low)))
+        left = at > place.min() + 0.8 * np.ptp(place)
+        axes.annotate(
+            note, (at, y), (-7 if left else 7, 3), textcoords="offset points", fontsize=7, color=INK,
+            ha="right" if left else "left",
+        )  # fmt: skip

@@ -1,0 +1,265 @@
+"""What each kind of outcome looks like on the page: the document's values appear, and what matters stands first."""
+
+from __future__ import annotations
+
+import copy
+import re
+from html import unescape
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from triaxcald.report import render_report
+from triaxcald.report.document import read_document
+from triaxcald.report.over_time import time_picture
+from triaxcald.report.registers import read_device
+from triaxcald.report.sphere import sphere_picture
+
+_spec = spec_from_file_location("sample_documents", Path(__file__).with_name("sample_documents.py"))
+assert _spec is not None
+assert _spec.loader is not None
+samples = module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+_SAMPLE = samples.loop_document(14)
+HOSTILE = "<script>x</script>"
+
+
+def text_of(html: str) -> str:
+    """What a reader sees; rows of tables with a bar between cells."""
+    body = re.sub(r"<style.*?</style>|<svg.*?</svg>", " ", html, flags=re.DOTALL)
+    body = re.sub(r"</t[hd]>\s*<t[hd][^>]*>", " | ", body)
+    body = unescape(re.sub(r"<[^>]+>", " ", body))
+    return " ".join(body.split())
+
+
+def page(document: dict[str, Any], certificate: dict[str, Any] | None = None) -> tuple[str, str]:
+    html = render_report(document, title="unit", certificate=certificate)
+    assert "<script" not in html
+    return html, text_of(html)
+
+
+def labels(html: str) -> list[str]:
+    return re.findall(r'aria-label="([^"]*)"', html)
+
+
+@pytest.fixture
+def loop() -> dict[str, Any]:
+    """Nothing found."""
+    document = copy.deepcopy(_SAMPLE)
+    document["findings"], document["data_quality"], document["advice"], document["held_out"] = [], [], [], None
+    document["before"] = document["after"]
+    document["calibration"] |= {"terms": ["linear"], "effects": {}, "warnings": [], "blind_to": []}
+    return document
+
+
+@pytest.fixture
+def words(loop: dict[str, Any]) -> dict[str, Any]:
+    """The same without poses, which need pictures."""
+    loop["calibration"]["poses"] = []
+    return loop
+
+
+def add(document: dict[str, Any], effect: str, coefficients: dict[str, Any], **more: Any) -> None:
+    """A finding in the model, with the residual of its step."""
+    first = not document["findings"]
+    if first:
+        document["before"] = {**document["after"], "rms_g": 9e-4, "cross_validated_rms_g": 1.1e-3}
+    known = {
+        name: dict(zip(("value", "standard_error", "unit"), held, strict=True)) for name, held in coefficients.items()
+    }
+    document["calibration"]["terms"].append(effect)
+    document["calibration"]["effects"][effect] = known
+    document["findings"].append(
+        {
+            "effect": effect,
+            "verdict": "confounded" if more.get("alternatives") else "adopted",
+            "p_value": 1e-9,
+            "coefficients": known,
+            "alternatives": [],
+            "reason": "with it the error falls",
+            "remedy": "Wait.",
+            "residual": {"rms_g": 2.22e-5, "cross_validated_rms_g": 3.33e-5},
+            "pose_residual_g": [1e-5] * 14,
+        }
+        | more
+    )
+
+
+def test_nothing_found_says_so_in_the_first_sentence(loop: dict[str, Any]) -> None:
+    html, text = page(loop)
+    assert text.index("Nothing found beyond noise") < text.index("No effect beyond the linear model was found.") < 300
+    assert 'class="verdict within"' in html
+    assert "Poses to take again" not in text
+    assert "Step by step" not in text
+
+
+def test_an_adopted_effect_has_words_formula_shape_and_what_to_change(words: dict[str, Any]) -> None:
+    words["calibration"]["channel_reference"] = {"since_start_s": 0.0}
+    add(words, "warm_up", {"x": (8.27e-4, 1.5e-5, "g"), "time_constant": (88.1, 2.2, "s")})
+    html, text = page(words)
+    assert text.index("Effect found and corrected") < text.index("the bias settles after the start") < 300
+    assert "e = q exp(−t / τ)" in text
+    assert "x | x | exp(−t / τ) | (0.827 ± 0.015) × 10⁻³ g" in text
+    assert "time_constant | | τ | 88.1 ± 2.2 s" in text
+    assert "What to change Wait." in text
+    assert 'class="verdict within"' in html
+
+
+def test_a_step_is_marked_on_the_time_axis_and_said_to_lie_between_its_poses(loop: dict[str, Any]) -> None:
+    poses = loop["calibration"]["poses"]
+    at_s = 0.5 * (poses[3]["end_s"] + poses[4]["start_s"])
+    add(loop, "bias_step", {"x": (7e-4, 2e-5, "g"), "at": (at_s, None, "s")})
+    html, text = page(loop)
+    assert (
+        f"between pose 4 and pose 5, that is between {poses[3]['end_s']:.1f} s and {poses[4]['start_s']:.1f} s" in text
+    )
+    assert ">Bias step</text>" in html
+    loop["findings"][0]["coefficients"]["at"]["value"] = poses[6]["start_s"] + 1.0
+    assert "The moment lies in pose 7." in page(loop)[1]
+
+
+def test_confounded_effects_are_all_told_in_words_with_what_would_tell_them_apart(words: dict[str, Any]) -> None:
+    others = ["bias_drift", "warm_up", "channel_bias:fan_rpm"]
+    add(words, "temperature_bias", {"y": (-2e-5, 1e-6, "g/K")}, alternatives=others,
+        apart=["record again while temp_c moves by itself"])  # fmt: skip
+    html, text = page(words)
+    assert 'class="verdict unexplained"' in html
+    assert text.index("Effect found, cause uncertain") < text.index("or others – these poses cannot tell which") < 450
+    for said in (
+        "Bias drift: the bias drifts with time",
+        "Warm up: the bias settles",
+        "Channel bias: fan_rpm: the bias goes with fan_rpm",
+    ):
+        assert said in text
+    assert "Would tell them apart Record again while temp_c moves by itself" in text
+    assert "elsewhere it holds only if the name is right" in text
+
+
+def test_a_confounded_effect_within_its_limits_is_within_limits(words: dict[str, Any]) -> None:
+    add(words, "temperature_bias", {"y": (-2e-5, 1e-6, "g/K")}, alternatives=["bias_drift"])
+    html, _ = page(words, {"limits": {"rms_g": 1e-3}})
+    assert 'class="verdict within"' in html
+
+
+def test_two_effects_are_a_ladder_of_three_models_above_the_channels_that_moved(loop: dict[str, Any]) -> None:
+    add(loop, "channel_bias:supply_v", {"x": (1e-4, 1e-5, "g/[supply_v]")})
+    add(loop, "hysteresis", {"x": (1e-4, 1e-5, "g/g")}, alternatives=["bias_drift"])
+    html, text = page(loop)
+    assert "2 effects found, cause uncertain" in text
+    assert "Linear model | 900 µg | 1100 µg" in text
+    assert "+ channel bias: supply_v | 22.2 µg | 33.3 µg" in text
+    last_ug = loop["after"]["rms_g"] * 1e6
+    assert f"+ hysteresis | {last_ug:.1f} µg" in text or f"+ hysteresis | {last_ug:.2f} µg" in text
+    bars, sphere, time = (next(line for line in labels(html) if what in line) for what in ("Bars", "sphere", "time"))
+    for picture in (bars, sphere, time):
+        assert "+ channel bias: supply_v" in picture
+    assert re.search(r"before and \+ channel bias: supply_v and after, above temp_c$", time)
+
+
+def test_the_leads_of_what_is_unexplained_are_a_list(words: dict[str, Any]) -> None:
+    lead = f"93% goes with an odd pattern; the nearest effect is cross_coupling, not adopted: p = 0.9; {HOSTILE}"
+    words["unexplained"] = {"significant": True, "p_value": 1e-9, "rms_g": 2e-4, "lead": lead}
+    html, text = page(words)
+    assert 'class="verdict unexplained"' in html
+    assert "<li>93% goes with an odd pattern</li>" in html
+    assert "<li>The nearest effect is cross coupling, not adopted: p = 0.9</li>" in html
+    assert text.count(HOSTILE) == 1
+
+
+def test_poses_left_out_are_named_above_all_figures(loop: dict[str, Any]) -> None:
+    loop["calibration"]["poses"][4] |= {"used": False, "residual_g": 3.062e-3}
+    html, text = page(loop)
+    assert "Pose 5, at 166.0 s: off by 3062 µg" in text
+    assert text.index("Poses to take again") < text.index("Residual, rms")
+    assert "pose 5, not used" in html
+
+
+def test_faults_that_spoil_poses_come_first_and_the_rest_stay_remarks(words: dict[str, Any]) -> None:
+    words["data_quality"] = [
+        "mains_pickup: 50.0 Hz, amplitude y 0.0014",
+        "saturation: x at 2.1 in 687 samples, in the pose that begins at 171.6 s: take again",
+        f"odd_fault: {HOSTILE}",
+    ]
+    _, text = page(words)
+    top, rest = text.split("Residual, rms", 1)
+    assert "Faults in the recording spoil poses" in top
+    assert "Readings at the end of the range : x at 2.1 in 687 samples" in top
+    assert "50.0 Hz" not in top
+    assert rest.index("✗ take again") < rest.index("Mains hum | 50.0 Hz, amplitude y 0.0014 | no pose to take again")
+    assert f"odd_fault: {HOSTILE}" in rest
+
+
+def test_another_reference_writes_its_errors_in_its_own_unit(loop: dict[str, Any]) -> None:
+    loop["calibration"]["units"] |= {"reference": "µT", "bias": "µT"}
+    add(loop, "bias_drift", {"x": (3e-5, 1e-6, "µT/s")}, reason="falls from 1.53e+04 1e-6 µT to 12 1e-6 µT")
+    html, text = page(loop)
+    assert "µg" not in html
+    assert "Falls from 15300 × 10⁻⁶ µT to 12 × 10⁻⁶ µT." in text
+    assert "residual, 10⁻⁶ µT" in html
+
+
+@pytest.fixture
+def registers() -> dict[str, Any]:
+    return {
+        "registers": {
+            "terms": ["linear", "temperature_bias"],
+            "left_to_host": ["hysteresis", "third_order_nonlinearity"],
+            "rms_g": 4.4e-5,
+            "rounding_rms_g": 2.2e-8,
+            "words": [
+                {"register": "bias_x", "role": "bias.x", "raw": "85471ac0", "wanted": 0.0056, "held": 0.00561},
+            ],
+        },
+        "verification": {
+            "before_rms_g": 1.3e-3, "after_rms_g": 6.5e-6, "after_max_abs_g": 1.4e-5, "noise_floor_g": 7e-6,
+            "limit_rms_g": None, "verdict": "within limits",
+        },
+        "device": "the device holds the new calibration, verified",
+        "result": {"before": {"rms_g": 0.123456}},
+    }  # fmt: skip
+
+
+def test_a_certificate_tells_what_the_device_holds_and_what_each_choice_leaves(
+    words: dict[str, Any], registers: dict[str, Any]
+) -> None:
+    add(words, "third_order_nonlinearity", {"x": (1e-4, 1e-5, "g/g³")})
+    _, text = page(words, registers)
+    assert "The device holds the new calibration, verified." in text
+    assert "After a power cycle, with the new ones, rms | 6.50 µg" in text
+    assert "The linear model alone | 900 µg" in text
+    assert "The registers: linear, temperature bias | 44.0 µg" in text
+    assert "no registers for third-order nonlinearity: the host has to correct it" in text
+    assert "no register could hold: hysteresis" in text
+    assert "bias_x | bias.x | 0.00560000000 | 0.00561000000 | — | 85471ac0" in text
+    assert "0.123456" not in text
+
+
+def test_a_device_without_registers_says_why(words: dict[str, Any]) -> None:
+    _, text = page(words, {"registers": None, "not_written": f"no register for {HOSTILE}"})
+    assert f"Nothing was written: no register for {HOSTILE}." in text
+    assert "Wanted" not in text
+
+
+@pytest.mark.parametrize("damage", [3, "x", [], {"words": 7, "terms": None}, {"words": [None, 4]}])
+def test_damaged_registers_tell_nothing_and_break_nothing(loop: dict[str, Any], damage: object) -> None:
+    device = read_device({"registers": damage, "verification": damage}, read_document(loop))
+    assert device is None or not any(word.raw for word in device.words)
+
+
+@pytest.mark.parametrize("damage", [3, "x", {"temp_c": None}, {"temp_c": "warm"}])
+def test_a_channel_that_a_pose_lacks_is_not_drawn(loop: dict[str, Any], damage: object) -> None:
+    loop["calibration"]["poses"][2]["channels"] = damage
+    outcome = read_document(loop)
+    drawing = time_picture(outcome.poses, outcome.stages, None)
+    assert drawing is not None
+    assert "temp_c" not in drawing
+
+
+def test_a_small_set_of_poses_carries_its_numbers_and_a_large_one_does_not() -> None:
+    for count, numbered in ((14, True), (60, False)):
+        outcome = read_document(samples.loop_document(count))
+        drawing = sphere_picture(outcome.poses, outcome.stages, 1.5e-5)
+        assert drawing is not None
+        assert (">13</text>" in drawing) is numbered

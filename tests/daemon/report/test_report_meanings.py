@@ -1,0 +1,108 @@
+"""The words and formulas of the effects, against the effects themselves."""
+
+from __future__ import annotations
+
+import itertools
+import re
+
+import numpy as np
+import pytest
+
+from triaxcal.effects import CATALOGUE, effect_named
+from triaxcal.effects.bias_drift import BiasDrift
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SCATTER, SINCE_START, Effect
+from triaxcal.effects.empirical import Empirical
+from triaxcal.effects.hysteresis import Hysteresis
+from triaxcald.report.meanings import factor, in_plain, told
+
+FORMS = [form for effect in (*CATALOGUE, effect_named("channel_bias:fan rpm")) for form in effect.forms]
+FORMS += [effect_named("channel_scale_factor:supply_v"), *(BiasDrift(d) for d in (1, 2, 3))]
+FORMS += [Hysteresis("memory"), Hysteresis("reversal")]
+RNG = np.random.default_rng(11)
+S = RNG.uniform(-1, 1, (5, 3))
+CONDITIONS = {
+    name: RNG.uniform(0.5, 2.0, 5)
+    for name in {*(n for e in FORMS for n in e.needs), *BEFORE, *CHANGE, *SCATTER, SINCE_START, HELD}
+}
+CONDITIONS[HELD] = np.zeros(5)
+CONDITIONS[SINCE_START] = np.arange(5.0)
+
+
+def by_hand(text: str, effect: Effect, axis: int) -> np.ndarray:
+    """What a factor on the page says, reckoned without the effect's own code."""
+    s, c = S[:, axis], CONDITIONS
+    need = c[effect.needs[0]] if effect.needs else np.zeros(5)
+    if product := re.fullmatch(r"s_([xyz]) s_([xyz])", text):
+        return np.asarray(S[:, "xyz".index(product[1])] * S[:, "xyz".index(product[2])])
+    tau, at = (effect.shape.get(n, (1.0, ""))[0] for n in ("time_constant", "at"))
+    known = {
+        "s²": s**2,
+        "s³": s**3,
+        "|s|": np.abs(s),
+        "T − T₀": need,
+        "(T − T₀)²": need**2,
+        "(T − T₀) s": need * s,
+        "dT/dt": need,
+        "c − c₀": need,
+        "(c − c₀) s": need * s,
+        "t − t₀": need,
+        "(t − t₀)²": need**2,
+        "(t − t₀)³": need**3,
+        "exp(−t / τ)": np.exp(-c[SINCE_START] / tau),
+        "−1 before t₁, 0 after": -(c[SINCE_START] < at).astype(float),
+        "s′": c[BEFORE[axis]],
+        "sign(s − s′)": np.sign(c[CHANGE[axis]]),
+        "v": c[SCATTER[axis]],
+        "product of the two other components, on each axis": S[:, axis - 1] * S[:, axis - 2],
+    }
+    return np.asarray(known[text])
+
+
+@pytest.mark.parametrize("effect", FORMS, ids=lambda e: f"{e.name}-{len(e.coefficients)}-{e.coefficients[0].name}")
+def test_what_the_page_says_a_coefficient_is_multiplied_by_is_what_the_effect_does(effect: Effect) -> None:
+    shaped = effect.shaped(dict.fromkeys(effect.shape, 2.5)) if effect.shape else effect
+    basis = shaped.basis(S, CONDITIONS)
+    for i, coefficient in enumerate(shaped.coefficients):
+        axis, text = factor(effect.name, coefficient.name)
+        for k, name in enumerate("xyz"):
+            expected = by_hand(text, shaped, k) if axis in ("", name) else np.zeros(5)
+            np.testing.assert_allclose(basis[:, k, i], expected, atol=1e-12)
+    assert all(factor(effect.name, name)[1] for name in effect.shape)
+    assert told(effect.name, {}).formula
+
+
+@pytest.mark.parametrize("effect", [Empirical(), *CATALOGUE], ids=lambda e: e.name)
+def test_every_effect_of_the_catalogue_is_told_in_words(effect: Effect) -> None:
+    known = told(effect.name, {})
+    assert known.because
+    assert known.clause != known.title.lower()
+    for c in itertools.chain.from_iterable(form.coefficients for form in effect.forms):
+        assert factor(effect.name, c.name)[1], c.name
+
+
+def test_references_and_channels_are_put_into_the_formula() -> None:
+    assert told("temperature_bias", {"temp_c": 23.4}).symbols == "T: temp_c; T₀ = 23.4"
+    channel = told("channel_bias:fan rpm", {"fan rpm": 1200.0})
+    assert channel.clause == "the bias goes with fan rpm"
+    assert channel.symbols == "c: fan rpm, as logged; c₀ = 1200"
+
+
+def test_an_effect_of_somebody_else_is_shown_by_its_name() -> None:
+    known = told("magnetic_pull", {})
+    assert (known.title, known.clause, known.formula) == ("Magnetic pull", "magnetic pull", "")
+    assert factor("magnetic_pull", "x") == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ("channel_bias:supply_v: hold it", "Channel bias: supply_v: hold it"),
+        ("warm_up cannot be told from bias_drift here", "Warm up cannot be told from bias drift here"),
+        ("record while temp_c moves", "Record while temp_c moves"),
+        ("from 1.53e+04 µg, p below 1e-12", "From 15300 µg, p below 1 × 10⁻¹²"),
+        ("15300 1e-6 µT", "15300 1e-6 µT"),
+        ("temperature_bias_quadratic with warm_upper", "Temperature bias quadratic with warm_upper"),
+    ],
+)  # fmt: skip
+def test_sentences_lose_the_names_of_programs(text: str, plain: str) -> None:
+    assert in_plain(text) == plain

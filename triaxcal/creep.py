@@ -1,0 +1,57 @@
+"""Poses that creep: an error of their means as long as nobody knows why, none once an effect explains it.
+
+The mean of the outputs over a pose goes with the mean of the time and of the channels over it, so an effect that
+follows them is not disturbed by their moving inside the pose; a model that lacks the effect is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration
+from triaxcal.effects.contract import SINCE_START, TIME
+from triaxcal.poses.pose import Pose
+
+
+def without_creep(poses: Sequence[Pose]) -> list[Pose]:
+    """The same poses with the scatter about their creep alone in their covariance."""
+    return [_with(p, np.zeros(3)) if p.creep.any() else p for p in poses]
+
+
+def with_creep_left(poses: Sequence[Pose], model: Calibration) -> list[Pose]:
+    """The same poses with so much of their creep as the model's effects do not explain."""
+    if not any(p.creep.any() for p in poses) or not model.sensor.effects:
+        return list(poses)
+    change = _change(poses, model)
+    left = [p.creep - c for p, c in zip(poses, change, strict=True)]
+    return [
+        _with(p, rest) if p.creep.any() and rest @ rest < p.creep @ p.creep else p
+        for p, rest in zip(poses, left, strict=True)
+    ]
+
+
+def _change(poses: Sequence[Pose], model: Calibration) -> Floats:
+    """(n,3) by how much the model's effects change the outputs from the beginning of each pose to its end."""
+    held = model.conditions_of(poses)
+    length = np.array([p.end_s - p.start_s for p in poses])
+    ends = []
+    for half in (-length / 2, length / 2):
+        at = dict(held)
+        for name in held:
+            if name in (TIME, SINCE_START):
+                at[name] = held[name] + half
+            elif all(name in p.rates for p in poses):
+                at[name] = held[name] + half * np.array([p.rates[name] for p in poses])
+        ends.append(at)
+    s = model.sensor.along_axes(np.array([p.mean for p in poses]), held)
+    first, last = (model.sensor.departure(s, at) for at in ends)
+    return np.asarray(model.sensor.scale_factor * (last - first))
+
+
+def _with(pose: Pose, creep: Floats) -> Pose:
+    change = (np.outer(creep, creep) - np.outer(pose.creep, pose.creep)) / 12
+    return replace(pose, covariance=pose.covariance + change, creep=creep)

@@ -1,0 +1,50 @@
+"""Bias that jumps once, at a moment that nobody knows: a knock, a supply that switched, a loose part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import HELD, SINCE_START, Coefficient, Effect, no_slope, on_each_axis, xyz
+
+
+@dataclass(frozen=True)
+class BiasStep(Effect):
+    """``e_i = −q_i`` before the step, zero after it: what the unit is after the step is the reference.
+
+    ``at_s`` counts from the start of the recording. In a pose that the step falls into the part before it counts.
+    """
+
+    at_s: float = 0.0
+    name: str = "bias_step"
+    coefficients: tuple[Coefficient, ...] = xyz("g")
+    needs: tuple[str, ...] = (SINCE_START, HELD)
+    lasting: bool = True
+    remedy: str = "Look for what happened then (a knock, a supply, a loose part) and record again."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        held = np.maximum(conditions[HELD], 1e-9)
+        begin = conditions[SINCE_START] - held / 2
+        return on_each_axis(-np.clip((self.at_s - begin) / held, 0.0, 1.0))
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return no_slope(s)
+
+    @property
+    def shape(self) -> Mapping[str, tuple[float, str]]:
+        return {"at": (self.at_s, "s")}
+
+    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+        """Between any two poses, and in the middle of any but the first and the last."""
+        t, held = conditions[SINCE_START], conditions[HELD]
+        order = np.argsort(t)
+        begin, end = (t - held / 2)[order], (t + held / 2)[order]
+        moments = [*(end[:-1] + begin[1:]) / 2, *t[order][1:-1]]
+        return tuple(self.shaped({"at": float(m)}) for m in sorted(moments))
+
+    def shaped(self, values: Mapping[str, float]) -> Self:
+        return replace(self, at_s=values["at"])

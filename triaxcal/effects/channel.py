@@ -1,0 +1,71 @@
+"""Bias and scale factor that change with any other logged channel: a supply voltage, a magnetic field, humidity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, per_axis, per_axis_slope, xyz
+
+BIAS, SCALE_FACTOR = "channel_bias:", "channel_scale_factor:"
+
+
+@dataclass(frozen=True)
+class ChannelBias(Effect):
+    """``e_i = q_i (c − c_ref)`` of a channel c."""
+
+    channel: str
+
+    @property
+    def name(self) -> str:
+        return BIAS + self.channel
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return xyz(f"g/[{self.channel}]")
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.channel,)
+
+    @property
+    def remedy(self) -> str:
+        return f"Hold {self.channel} steadier, or correct the bias by it, in the host."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return on_each_axis(conditions[self.channel])
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return no_slope(s)
+
+
+@dataclass(frozen=True)
+class ChannelScaleFactor(Effect):
+    """``e_i = q_i (c − c_ref) s_i`` of a channel c."""
+
+    channel: str
+
+    @property
+    def name(self) -> str:
+        return SCALE_FACTOR + self.channel
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return xyz(f"1/[{self.channel}]")
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return (self.channel,)
+
+    @property
+    def remedy(self) -> str:
+        return f"Hold {self.channel} steadier, or correct the scale factor by it, in the host."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return per_axis(s * conditions[self.channel][:, None])
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return per_axis_slope(np.repeat(conditions[self.channel][:, None], 3, axis=1))

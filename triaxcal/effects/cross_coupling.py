@@ -1,0 +1,50 @@
+"""Output that changes with the product of two components of the input (IEEE Std 1293: Kip, Kio, Kpo)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import Coefficient, Effect
+
+PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+"""(axis, other): the axis reads its own component times the other."""
+
+
+@dataclass(frozen=True)
+class CrossCoupling(Effect):
+    """``e_i = q_ij s_i s_j + q_xyz s_j s_k``.
+
+    The three products of the two other components change |a| in one way, by their sum, so no still pose tells them
+    apart; they share one coefficient.
+    """
+
+    name: str = "cross_coupling"
+    coefficients: tuple[Coefficient, ...] = (
+        *(Coefficient(f"{'xyz'[i]}_{'xyz'[i]}{'xyz'[j]}", "g/g²", f"{i}{j}") for i, j in PAIRS),
+        Coefficient("xyz", "g/g²", "xyz"),
+    )
+    needs: tuple[str, ...] = ()
+    remedy: str = "Correct it with the cross-coupling coefficients, in the host."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        out = np.zeros((len(s), 3, 7))
+        for k, (i, j) in enumerate(PAIRS):
+            out[:, i, k] = s[:, i] * s[:, j]
+        for i in range(3):
+            out[:, i, 6] = s[:, (i + 1) % 3] * s[:, (i + 2) % 3]
+        return out
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        out = np.zeros((len(s), 3, 3, 7))
+        for k, (i, j) in enumerate(PAIRS):
+            out[:, i, i, k] = s[:, j]
+            out[:, i, j, k] = s[:, i]
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            out[:, i, j, 6] = s[:, k]
+            out[:, i, k, 6] = s[:, j]
+        return out

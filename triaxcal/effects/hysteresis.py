@@ -1,0 +1,45 @@
+"""Output that remembers the pose before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import BEFORE, CHANGE, Coefficient, Effect, no_slope, per_axis, xyz
+
+KINDS = {"memory": "", "reversal": "sign_"}
+REVERSAL_G = 1e-3
+"""The change along an axis at which its sign is certain; below it the effect goes through zero in a straight line."""
+
+
+@dataclass(frozen=True)
+class Hysteresis(Effect):
+    """``e_i = q_i p_i``, of the specific force p_i in the pose before ("memory"), or ``q_i sign(Δ_i)``, of the change
+    Δ_i since then, the way on which the pose was reached ("reversal").
+    """
+
+    kind: str = "memory"
+    name: str = "hysteresis"
+    remedy: str = "Approach every pose from the same side, or wait longer in it before it counts."
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return BEFORE if self.kind == "memory" else CHANGE
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return xyz("g/g" if self.kind == "memory" else "g", KINDS[self.kind] + "{}")
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        values = np.stack([conditions[n] for n in self.needs], axis=1)
+        return per_axis(values if self.kind == "memory" else np.clip(values / REVERSAL_G, -1.0, 1.0))
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return no_slope(s)
+
+    @property
+    def forms(self) -> tuple[Effect, ...]:
+        return tuple(Hysteresis(kind) for kind in KINDS)

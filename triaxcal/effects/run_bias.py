@@ -1,0 +1,90 @@
+"""Bias and scale factor that differ from recording to recording of a unit: their repeatability from start to start."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import RUN, Coefficient, Effect, no_slope, xyz
+
+ALONE = re.compile(r"[xyz]_run([1-9]\d*)_alone")
+
+
+@dataclass(frozen=True)
+class RunBias(Effect):
+    """``e_i = q_ik`` in run k of ``runs``, but for the first, where it is minus the sum of the others: the unit's bias
+    is the mean over the recordings. ``x_run2`` is that of x in the second.
+
+    With ``alone`` (0-based), e_i = q_i in that run and zero in all others, whose bias is the unit's: ``x_run2_alone``.
+    """
+
+    runs: int = 2
+    alone: int | None = None
+    name: str = "run_bias"
+    needs: tuple[str, ...] = (RUN,)
+    unit: str = "g"
+    remedy: str = (
+        "The bias comes back anew at every start: allow for its spread, or correct it after each start by a few poses."
+    )
+
+    def named(self, coefficients: Iterable[str]) -> Self:
+        """That which coefficients of these names are of."""
+        names = list(coefficients)
+        alone = [int(match[1]) - 1 for name in names if (match := ALONE.fullmatch(name))]
+        if alone:
+            return replace(self, alone=alone[0])
+        numbers = [int(name.rpartition("_run")[2]) for name in names if name.rpartition("_run")[2].isdecimal()]
+        return replace(self, runs=max([2, *numbers]))
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        if self.alone is not None:
+            return xyz(self.unit, f"{{}}_run{self.alone + 1}_alone")
+        return tuple(c for k in range(2, self.runs + 1) for c in xyz(self.unit, f"{{}}_run{k}"))
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return np.concatenate([c[:, None, None] * np.eye(3) for c in self._contrasts(conditions)], axis=2)
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return no_slope(s, len(self.coefficients))
+
+    def _contrasts(self, conditions: Mapping[str, Floats]) -> list[Floats]:
+        """(n,) each: the share that a pose has in the coefficients of each run."""
+        index = conditions[RUN]
+        if self.alone is not None:
+            return [(index == self.alone).astype(float)]
+        return [(index == k).astype(float) - (index == 0) for k in range(1, self.runs)]
+
+    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+        """In every run another, and in one run alone where there are more than two."""
+        single = range(self.runs) if self.runs > 2 else ()
+        return (self, *(replace(self, alone=run) for run in single))
+
+
+@dataclass(frozen=True)
+class RunScaleFactor(RunBias):
+    """``e_i = q_ik s_i`` likewise: the unit's scale factor is the mean over the recordings."""
+
+    name: str = "run_scale_factor"
+    unit: str = "g/g"
+    remedy: str = (
+        "The scale factor comes back anew at every start, or goes with what nobody logged: log the temperature, and "
+        "allow for its spread."
+    )
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        shares = self._contrasts(conditions)
+        return np.concatenate([(c[:, None] * s)[:, :, None] * np.eye(3) for c in shares], axis=2)
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        diagonal = np.zeros((3, 3, 3))
+        diagonal[range(3), range(3), range(3)] = 1.0
+        return np.concatenate([c[:, None, None, None] * diagonal for c in self._contrasts(conditions)], axis=3)
+
+
+BETWEEN_RUNS: tuple[RunBias, ...] = (RunBias(), RunScaleFactor())

@@ -1,0 +1,27 @@
+"""Bias that changes with the rate of temperature: gradients inside the unit while it warms or cools."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, rate_of, xyz
+
+RATE = rate_of("temp_c")
+
+
+@dataclass(frozen=True)
+class ThermalGradient(Effect):
+    """``e_i = q_i dT/dt``."""
+
+    name: str = "thermal_gradient"
+    coefficients: tuple[Coefficient, ...] = xyz("g/(K/s)")
+    needs: tuple[str, ...] = (RATE,)
+    remedy: str = "Let the temperature settle before each pose, or correct the bias by its rate, in the host."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return on_each_axis(conditions[RATE])
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return no_slope(s)

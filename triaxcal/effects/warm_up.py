@@ -1,0 +1,48 @@
+"""Bias that settles exponentially after the start, as a unit that warms up does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import SINCE_START, Coefficient, Effect, no_slope, on_each_axis, xyz
+
+CONSTANTS = 8
+SLOWEST = 4.0
+
+
+@dataclass(frozen=True)
+class WarmUp(Effect):
+    """``e_i = q_i exp(−t/τ)`` at t after the start of the recording; the settled unit is the reference."""
+
+    time_constant_s: float = 300.0
+    name: str = "warm_up"
+    coefficients: tuple[Coefficient, ...] = xyz("g")
+    needs: tuple[str, ...] = (SINCE_START,)
+    remedy: str = "Switch the unit on and wait before the first pose, until the bias has settled."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return on_each_axis(np.exp(-conditions[SINCE_START] / self.time_constant_s))
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return no_slope(s)
+
+    @property
+    def shape(self) -> Mapping[str, tuple[float, str]]:
+        return {"time_constant": (self.time_constant_s, "s")}
+
+    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+        """From what three poses show to what is straight over the recording but for a few per cent."""
+        t = conditions[SINCE_START]
+        whole = float(np.ptp(t))
+        shortest = 1.5 * whole / max(len(t) - 1, 1)
+        return tuple(
+            self.shaped({"time_constant": float(c)}) for c in np.geomspace(shortest, SLOWEST * whole, CONSTANTS)
+        )
+
+    def shaped(self, values: Mapping[str, float]) -> Self:
+        return replace(self, time_constant_s=values["time_constant"])

@@ -1,0 +1,53 @@
+"""Effects of the recording's clock as a plan sees them, whose time runs from −1, the first pose, to 1, the last."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import CLOCKS, HELD, SINCE_START, TIME, Coefficient, Effect
+
+POSES = 27
+HELD_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class OnPlansClock(Effect):
+    """``whole`` with a shape that suits a recording two units long, by `TIME` alone."""
+
+    whole: Effect
+    needs: tuple[str, ...] = (TIME,)
+
+    @property
+    def name(self) -> str:
+        return self.whole.name
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return self.whole.coefficients
+
+    @property
+    def remedy(self) -> str:
+        return self.whole.remedy
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return self.whole.basis(s, _clocks(conditions[TIME]))
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return self.whole.slope(s, _clocks(conditions[TIME]))
+
+
+def in_plan(effect: Effect) -> Effect:
+    """The effect as a plan can show it: of a time constant or a moment, the middle one that would be tried."""
+    needs = set(effect.needs)
+    if not needs or needs <= {TIME} or not needs <= set(CLOCKS):
+        return effect
+    variants = effect.variants(_clocks(np.linspace(-1, 1, POSES)))
+    return OnPlansClock(variants[len(variants) // 2])
+
+
+def _clocks(time: Floats) -> dict[str, Floats]:
+    return {TIME: time, SINCE_START: time + 1, HELD: np.full(len(time), HELD_SHARE)}

@@ -1,0 +1,64 @@
+"""What would do as well as a finding: effects that explain as much when they stand in its place."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from triaxcal.effects.contract import Effect
+from triaxcal.search.candidates import Candidate, Ground
+from triaxcal.search.search import Model, Search
+
+NEAR = 10.0
+"""An alternative is out where it is worse by so much in deviance and price. Of two effects that differ by δ standard
+errors the wrong one is better by Δ with a probability of Φ(−(Δ + δ²)/2δ), at most Φ(−√Δ), 0.08 %, however alike."""
+CONTAINED = 1e-6
+VARIANTS = 2
+
+
+def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]:
+    """What would do as well in the place of ``effect``, by name, nearest first, each with its model."""
+    rest = [e for e in now.effects if e is not effect]
+    without = search.model(rest)
+    if without is None:
+        return {}
+    found: list[tuple[str, Model]] = []
+    for candidate in _near(search, without, [e.name for e in now.effects], search.score(now)):
+        other = search.model([*rest, candidate.effect])
+        if other is None or search.score(other) > search.score(now) + NEAR:
+            continue
+        ground = Ground.at(search.problem, other.state)
+        contained = not ground.shown(ground.columns(effect), CONTAINED)[0].shape[1]
+        if contained and search.left(other.effects) < search.left(now.effects):
+            continue  # it contains the finding, and has more to it: the simpler of the two is the name
+        found.append((candidate.name, other))
+    out: dict[str, Model] = {}
+    for name, other in sorted([*found, *_jointly(search, effect, now)], key=lambda f: search.score(f[1])):
+        out.setdefault(name, other)
+    return out
+
+
+def _near(search: Search, without: Model, taken: Sequence[str], best: float) -> list[Candidate]:
+    """The best variants of every other effect, as far as linear reckoning puts them near."""
+    beside = search.beside(without)
+    scores = beside.scores + without.price
+    # What linear reckoning is off by grows with the effect.
+    reach = best + NEAR + 5 + 0.02 * without.chi2
+    out, seen = [], Counter[str]()
+    for i in np.argsort(scores, kind="stable"):
+        c = beside.candidates[int(i)]
+        if scores[i] < reach and c.name not in taken and seen[c.name] < VARIANTS:
+            seen[c.name] += 1
+            out.append(c)
+    return out
+
+
+def _jointly(search: Search, effect: Effect, now: Model) -> list[tuple[str, Model]]:
+    """Where two effects were found: the names in pairs of two others that explain as much, for the first of the two."""
+    if len(now.effects) != 2 or effect is not now.effects[0]:
+        return []
+    taken = {e.name for e in now.effects}
+    near = [m for m in search.pairs_from(search.linear) if search.score(m) < search.score(now) + NEAR]
+    return [(e.name, m) for m in near if not taken & {e.name for e in m.effects} for e in m.effects]

@@ -1,0 +1,131 @@
+"""What no effect of the catalogue explains: how much it is, and the best hint at what it may be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration, PoseResult
+from triaxcal.conditions import channels_of, with_scale
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME
+from triaxcal.plan.directions import linear_design
+
+SIGNIFICANT = 0.01
+LEAD = 0.01
+"""Probability of a pattern as clear as this by chance, the choice among all patterns allowed for, up to which it is a
+lead."""
+LEADS_MOST = 3
+PERIODS = 24
+NAMES = {TIME: "the time", RUN: "the recording", HELD: "how long the pose was held"}
+NAMES |= {b: f"the pose before, along {b[-1]}" for b in BEFORE}
+NAMES |= {c: f"the change since the pose before, along {c[-1]}" for c in CHANGE}
+NAMES |= {s: f"the scatter of axis {s[-1]}" for s in SCATTER}
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What is left. ``rms_g`` is its size beyond noise; ``lead`` the best hint at what it may be."""
+
+    significant: bool
+    p_value: float | None
+    rms_g: float
+    lead: str
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """A pattern of the residuals: its columns (n,q) in g, and how to say it. Of one family the clearest is told."""
+
+    columns: Floats
+    text: str
+    family: str
+
+
+def unexplained_of(after: Calibration, passed_over: Mapping[str, str]) -> Unexplained:
+    """``passed_over`` are the effects that came near, each with the reason why it was not adopted."""
+    residual = after.residual
+    p = residual.lack_of_fit_p
+    significant = p is not None and p < SIGNIFICANT
+    beyond = float(np.sqrt(max(residual.rms_g**2 - residual.noise_floor_g**2, 0.0)))
+    return Unexplained(significant, p, beyond, lead(after, passed_over) if significant else "")
+
+
+def lead(after: Calibration, passed_over: Mapping[str, str]) -> str:
+    """The patterns that the residuals show beyond chance: on the sphere, in time, in one pose, in a channel."""
+    used = [p for p in after.poses if p.used]
+    worst = max(used, key=lambda p: abs(p.studentized))
+    parts = []
+    if worst.studentized**2 > 0.5 * sum(p.studentized**2 for p in used):
+        parts.append(f"most of it is one pose, at {worst.pose.at} ({worst.residual_g * 1e6:+.3g} µg): was it still?")
+    parts += _clear_patterns(used, _patterns(after, used))
+    parts += [f"the nearest effect is {name}, not adopted: {why}" for name, why in list(passed_over.items())[:2]]
+    return "; ".join(parts) or "no candidate comes near, and no pose, pattern or channel stands out"
+
+
+def _clear_patterns(used: Sequence[PoseResult], patterns: Sequence[_Pattern]) -> list[str]:
+    error = np.array([p.standard_error_g for p in used])
+    y = np.array([p.residual_g for p in used]) / error
+    direction = np.array([p.direction for p in used])
+    model, _ = np.linalg.qr(linear_design(direction, direction) / error[:, None])
+    y = y - model @ (model.T @ y)
+    total = float(y @ y)
+    found: dict[str, tuple[float, str]] = {}
+    for pattern in patterns:
+        columns = pattern.columns / error[:, None]
+        size = np.linalg.norm(columns, axis=0)
+        columns = columns[:, size > 0] / size[size > 0]
+        left, singular, _ = np.linalg.svd(columns - model @ (model.T @ columns), full_matrices=False)
+        basis = left[:, singular > 0.05]
+        q, rest = basis.shape[1], len(y) - 9 - basis.shape[1]
+        if not q or rest < 2:
+            continue
+        share = float(np.sum((basis.T @ y) ** 2)) / total
+        p = float(stats.f.sf(share / q / max((1 - share) / rest, 1e-12), q, rest)) * len(patterns)
+        if p < min(LEAD, found.get(pattern.family, (LEAD, ""))[0]):
+            found[pattern.family] = (p, f"{share:.0%} of it goes with {pattern.text}")
+    return [text for _, text in sorted(found.values())[:LEADS_MOST]]
+
+
+def _patterns(after: Calibration, used: Sequence[PoseResult]) -> list[_Pattern]:
+    direction = np.array([p.direction for p in used])
+    poses = [p.pose for p in used]
+    out = [
+        _Pattern(_monomials(direction, 3), "an odd pattern on the sphere (degree 3, as of second order)", "odd"),
+        _Pattern(_monomials(direction, 4), "an even pattern on the sphere (degree 4, as of third order)", "even"),
+    ]
+    sensor = after.sensor
+    held = with_scale(channels_of(poses), poses, sensor.scale_factor, sensor.bias)
+    for name, values in held.items():
+        if name != SINCE_START and np.ptp(values) > 1e-9 * np.max(np.abs(values)):
+            scaled = (values - values.mean()) / np.ptp(values)
+            said = NAMES.get(name, name)
+            out.append(_Pattern(scaled[:, None], said, name))
+            out.append(_Pattern(scaled[:, None] * direction, f"{said}, as a bias", name))
+    out += _waves(held[TIME], np.ones((len(poses), 1)), "a swing in time with a period of {:.3g} s", 2.0)
+    for i, axis in enumerate("xyz"):
+        s = direction[:, i]
+        out += _waves(s, direction[:, i : i + 1], f"a wave along the output of axis {axis}, {{:.2g}} g long", 5.0)
+    return out
+
+
+def _waves(x: Floats, size: Floats, text: str, most: float) -> list[_Pattern]:
+    """Sines of many periods, from a few poses apart to the whole range; each counts as chosen among them."""
+    whole = float(np.ptp(x)) or 1.0
+    finest = max(len(x) / 2.5, 2.0) if most < 3 else 2 * most
+    out = []
+    for cycles in np.geomspace(0.8, finest, PERIODS):
+        angle = 2 * np.pi * cycles * x / whole
+        columns = np.concatenate([np.sin(angle)[:, None] * size, np.cos(angle)[:, None] * size], axis=1)
+        out.append(_Pattern(columns, text.format(whole / cycles), text))
+    return out
+
+
+def _monomials(a: Floats, degree: int) -> Floats:
+    """(n,m) all products of ``degree`` components of directions (n,3): what is left of them beside the nine parameters
+    are the harmonics of that degree."""
+    powers = [(i, j, degree - i - j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    return np.array([a[:, 0] ** i * a[:, 1] ** j * a[:, 2] ** k for i, j, k in powers]).T
