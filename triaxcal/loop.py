@@ -107,7 +107,9 @@ def diagnose(
     # What looks like spoiled poses may be an effect that the linear model lacks.
     trials = [_searched(quiet, rows, signs, reference, effects) for rows in dict.fromkeys(asked)]
     first = trials[0].search
-    if not trials[0].adopted and first.left_over(first.linear) and (row := first.spoiled_beside()) is not None:
+    # Nothing, or much, may be made of an effect and a spoiled pose that hide each other.
+    unsure = len(trials[0].adopted) != 1 and first.left_over(first.linear)
+    if unsure and (row := first.spoiled_beside()) is not None:
         trials.append(_searched(quiet, (row,), signs, reference, effects))
     found = min(trials, key=lambda trial: _criterion(trial, len(poses)))
     for _ in range(ROUNDS_MOST):
