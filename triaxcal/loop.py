@@ -103,21 +103,7 @@ def diagnose(
     effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, poses)
     # What moves the bias also makes poses creep: to the search that is no error of their means.
     quiet = without_creep(poses)
-    asked = [(), _aside(linear), _aside(fit(quiet, signs=signs, reference=reference))]
-    # What looks like spoiled poses may be an effect that the linear model lacks.
-    trials = [_searched(quiet, rows, signs, reference, effects) for rows in dict.fromkeys(asked)]
-    first = trials[0].search
-    # Nothing, or much, may be made of an effect and a spoiled pose that hide each other.
-    unsure = len(trials[0].adopted) != 1 and first.left_over(first.linear)
-    if unsure and (row := first.spoiled_beside()) is not None:
-        trials.append(_searched(quiet, (row,), signs, reference, effects))
-    found = min(trials, key=lambda trial: _criterion(trial, len(poses)))
-    for _ in range(ROUNDS_MOST):
-        # Beside an effect a spoiled pose may not have shown; with the effect in the model it does.
-        again = _aside(fit(quiet, signs=signs, reference=reference, effects=found.adopted))
-        if again == found.aside or not found.adopted:
-            break
-        found = _searched(quiet, again, signs, reference, effects)
+    found = _explained(quiet, _aside(linear), signs, reference, effects)
     search, before, steps = found.search, linear, [linear]
     # Poses in which |a| itself creeps are something that is left, not an excuse for it.
     model = fit(quiet, signs=signs, reference=reference)
@@ -161,6 +147,32 @@ class _Found:
 
 def _aside(c: Calibration) -> tuple[int, ...]:
     return tuple(i for i, p in enumerate(c.poses) if not p.used)
+
+
+def _explained(
+    poses: Sequence[Pose],
+    aside: tuple[int, ...],
+    signs: Sequence[float],
+    reference: float,
+    effects: Sequence[Effect],
+) -> _Found:
+    """The best explanation by effects, spoiled poses, or both; ``aside`` are those that the linear fit leaves out."""
+    asked = [(), aside, _aside(fit(poses, signs=signs, reference=reference))]
+    # What looks like spoiled poses may be an effect that the linear model lacks.
+    trials = [_searched(poses, rows, signs, reference, effects) for rows in dict.fromkeys(asked)]
+    first = trials[0].search
+    # Nothing, or much, may be made of an effect and a spoiled pose that hide each other.
+    unsure = len(trials[0].adopted) != 1 and first.left_over(first.linear)
+    if unsure and (row := first.spoiled_beside()) is not None:
+        trials.append(_searched(poses, (row,), signs, reference, effects))
+    found = min(trials, key=lambda trial: _criterion(trial, len(poses)))
+    for _ in range(ROUNDS_MOST):
+        # Beside an effect a spoiled pose may not have shown; with the effect in the model it does.
+        again = _aside(fit(poses, signs=signs, reference=reference, effects=found.adopted))
+        if again == found.aside or not found.adopted:
+            break
+        found = _searched(poses, again, signs, reference, effects)
+    return found
 
 
 def _searched(

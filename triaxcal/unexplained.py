@@ -51,6 +51,9 @@ def unexplained_of(after: Calibration, passed_over: Mapping[str, str]) -> Unexpl
     p = residual.lack_of_fit_p
     significant = p is not None and p < SIGNIFICANT
     beyond = float(np.sqrt(max(residual.rms_g**2 - residual.noise_floor_g**2, 0.0)))
+    if significant:
+        # One loud pose may hide in the plain rms what the others show, each by its own noise.
+        beyond = max(beyond, residual.noise_floor_g * float(np.sqrt(max(after.inflation**2 - 1, 0.0))))
     return Unexplained(significant, p, beyond, lead(after, passed_over) if significant else "")
 
 
