@@ -35,6 +35,8 @@ from triaxcal.unexplained import Unexplained, unexplained_of
 
 DESCRIBES = 1.4
 """A smooth term has to lower the cross-validated error by this factor: less is chance among so many coefficients."""
+ANYTHING = 4
+"""An effect beside others, with so many alternatives, is none."""
 ROUNDS_MOST = 3
 """Effects and spoiled poses are sought in turn so often."""
 
@@ -195,7 +197,21 @@ def _searched(
     # What is nearly always there: beside it others show that neither alone nor in pairs would have.
     if expected and len(other.run(expected)) > 1 and other.score(other.found) < search.score(search.found):
         search, adopted = other, list(other.found.effects)
-    return _Found(search, adopted, aside)
+    return _Found(search, adopted if expected else _without_fillers(search), aside)
+
+
+def _without_fillers(search: Search) -> list[Effect]:
+    """The effects found, but where one of several could be almost anything: then it only fills what no effect explains,
+    and what stands beside it has to earn its place without it."""
+    now = search.found
+    while len(now.effects) > 1:
+        filler = next((e for e in reversed(now.effects) if len(alternatives(search, e, now)) >= ANYTHING), None)
+        if filler is None:
+            break
+        search.passed_over[filler.name] = "beside the others almost any effect would do as well"
+        rest = search.model([e for e in now.effects if e is not filler])
+        now = rest if rest is not None and search.earned_all(rest) else search.linear
+    return list(now.effects) if now is search.found else search.settle_on(now)
 
 
 def _criterion(found: _Found, n: int) -> float:

@@ -27,9 +27,9 @@ EFFECTS_MOST = 4
 P_LEAST = 1e-300
 SECOND_LOOK = 12
 """So many of the best candidates are fitted in earnest; linear reckoning is good to a thousandth of chi-square."""
-KEPT = 3.0
+KEPT = 2.6
 """A model keeps at least one of so many degrees of freedom, or it would fit anything."""
-LIKE_NOISE, MUCH_BETTER = 2.0, 3.0
+LIKE_NOISE, MUCH_BETTER = 2.0, 10.0
 """The cross-validated error of a model is at most so many times what noise makes it, or so many times less than before;
 or else the model only bends to the poses."""
 MOST = 9.0
@@ -139,6 +139,16 @@ class Search:
             now = self._settled(now)
         self.found = now
         return list(now.effects)
+
+    def earned_all(self, m: Model) -> bool:
+        """Whether the effects of a model earn their places, from nothing."""
+        return self._earned(m, self.linear)
+
+    def settle_on(self, m: Model) -> list[Effect]:
+        """Takes a model for the one found."""
+        self.found = m
+        self.best = (self.fitted(m.effects) if m.effects else None) or self.before
+        return list(m.effects)
 
     def _step(self, now: Model) -> Model | None:
         """The best model with one or two effects more, where each of them earns its place."""
