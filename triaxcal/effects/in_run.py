@@ -10,15 +10,14 @@ from typing import Self
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
-from triaxcal.effects.contract import HELD, RUN, SINCE_START, TIME, Coefficient, Effect
+from triaxcal.effects.contract import CLOCKS, RUN, SINCE_START, TIME, Coefficient, Effect
 
-CLOCKS = frozenset({TIME, SINCE_START, HELD})
 NAMED = re.compile(r"(.+)_run([1-9]\d*)")
 
 
 def of_clocks(effect: Effect) -> bool:
     """Whether an effect depends on nothing but the clocks, which start anew in every recording."""
-    return bool(effect.needs) and set(effect.needs) <= CLOCKS
+    return bool(effect.needs) and set(effect.needs) <= set(CLOCKS)
 
 
 @dataclass(frozen=True)

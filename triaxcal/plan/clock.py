@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import CLOCKS, HELD, SINCE_START, TIME, Coefficient, Effect
+from triaxcal.effects.contract import HELD, SINCE_START, TIME, Coefficient, Effect
+from triaxcal.effects.in_run import of_clocks
 
 POSES = 27
 HELD_SHARE = 0.01
@@ -42,8 +43,7 @@ class OnPlansClock(Effect):
 
 def in_plan(effect: Effect) -> Effect:
     """The effect as a plan can show it: of a time constant or a moment, the middle one that would be tried."""
-    needs = set(effect.needs)
-    if not needs or needs <= {TIME} or not needs <= set(CLOCKS):
+    if not of_clocks(effect) or effect.needs == (TIME,):
         return effect
     variants = effect.variants(_clocks(np.linspace(-1, 1, POSES)))
     return OnPlansClock(variants[len(variants) // 2])

@@ -267,13 +267,13 @@ class Search:
             rest = [e for e in now.effects if e is not effect]
             if not rest:
                 continue
-            if self.earned(effect, rest, now) >= FAMILYWISE:
-                trial = self.model(rest)
-            else:
-                without = self.model(rest)
-                trials = [] if without is None else self.singles_from(without)
-                trial = min([now, *trials], key=self.score)
-            if trial is not None and trial is not now and (fitted := self.fitted(trial.effects)) is not None:
+            without = self.model(rest)
+            if without is None:
+                continue
+            trial = without
+            if self.earned(effect, rest, now) < FAMILYWISE:
+                trial = min([now, *self.singles_from(without)], key=self.score)
+            if trial is not now and (fitted := self.fitted(trial.effects)) is not None:
                 now, self.best = trial, fitted
         better = refined(now.effects, self.problem, lambda effects: self._cost(effects))
         if better != now.effects and (model := self.model(better)) and (fitted := self.fitted(model.effects)):
