@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
+# The matrices are small: threads of linear algebra would only wait for each other.
+ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 .PHONY: demo test check format bench docs clean
 
@@ -17,10 +19,10 @@ demo: $(READY)  ## the whole line on two simulated units
 	$(BIN)/triaxcal demo --out demo-out
 
 test: $(READY)  ## the whole test suite
-	$(BIN)/python -m pytest -q -n 2
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2
 
 bench: $(READY)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)
+	$(ONE_THREAD) $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)
 
 check: $(READY)  ## lint, format, types, import contracts
 	$(BIN)/ruff check .

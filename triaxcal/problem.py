@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -42,7 +43,7 @@ class Problem:
     signs: Floats
     reference: float
 
-    @property
+    @cached_property
     def conditions(self) -> dict[str, Floats]:
         return conditions(self.channels, self.channel_reference)
 

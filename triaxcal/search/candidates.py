@@ -6,6 +6,7 @@ A candidate stands in the search by the part of its columns that the model canno
 from __future__ import annotations
 
 import itertools
+import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -85,7 +86,8 @@ class Ground:
         left, singular, right = np.linalg.svd(rest, full_matrices=False)
         kept = singular > least
         mix = np.zeros((len(size), int(kept.sum())))
-        mix[there] = right[kept].T / size[there][:, None] * np.median(size[there]) if there.any() else 0.0
+        if there.any():
+            mix[there] = right[kept].T / size[there][:, None] * statistics.median(size[there].tolist())
         return left[:, kept], mix
 
 

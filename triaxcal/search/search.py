@@ -77,9 +77,13 @@ class Search:
         self.before = self.best = before
         self.catalogue, self.still = catalogue, still_conditions(poses)
         self.pure = max(pure_error_dof(poses), 1.0)
+        # Kept with what they are of, so that no other object can come to have the same id.
+        self._known: dict[tuple[int, ...], tuple[tuple[Effect, ...], Model | None]] = {}
+        self._reckonings: dict[tuple[int, ...], tuple[Model, Beside]] = {}
         self.linear = self._model((), State(linear.theta[:9], ()), 0.0)
         ground = Ground.at(problem, self.linear.state)
         self.candidates, self.full = candidates_of(ground, catalogue, self.still)
+        self.tries = {c.name: c.tries for c in self.candidates}
         self.kept = max(int((len(poses) - 9) / KEPT), 1)
         self.names = list(dict.fromkeys(c.name for c in self.candidates))
         self.tests = independent_tests(Gains.of(self.candidates, ground.y), self.pure)
@@ -94,18 +98,23 @@ class Search:
 
     def model(self, effects: Sequence[Effect]) -> Model | None:
         """Fitted; None where the poses cannot carry it."""
+        key = tuple(map(id, effects))
+        if key not in self._known:
+            self._known[key] = tuple(effects), self._solved(tuple(effects))
+        return self._known[key][1]
+
+    def _solved(self, effects: tuple[Effect, ...]) -> Model | None:
         if self.left(effects) < self.kept:
             return None
         try:
-            state = solve(self.problem, State(self.linear.state.theta, ()), tuple(effects))
+            state = solve(self.problem, State(self.linear.state.theta, ()), effects)
         except Refused:
             return None
-        return self._model(tuple(effects), state, sum(self.price(e) for e in effects))
+        return self._model(effects, state, sum(self.price(e) for e in effects))
 
     def price(self, effect: Effect) -> float:
         """What a model pays for an effect: Schwarz's for its coefficients, and the choice among all that was tried."""
-        tries = max((c.tries for c in self.candidates if c.name == effect.name), default=1)
-        return self.price_of(len(effect.coefficients), tries)
+        return self.price_of(len(effect.coefficients), self.tries.get(effect.name, 1))
 
     def price_of(self, rank: int, tries: int) -> float:
         return rank * float(np.log(len(self.poses))) + 2 * float(np.log(tries * max(len(self.names), 1)))
@@ -167,8 +176,15 @@ class Search:
 
     def beside(self, now: Model) -> Beside:
         """What may come beside a model, in linear reckoning; the best of every effect with its shape refined."""
-        ground = Ground.at(self.problem, now.state)
-        found, _ = candidates_of(ground, [e for e in self.catalogue if e.name in self.names], self.still)
+        key = tuple(map(id, now.effects))
+        if key not in self._reckonings:
+            self._reckonings[key] = now, self._reckoned(now)
+        return self._reckonings[key][1]
+
+    def _reckoned(self, now: Model) -> Beside:
+        ground, found = Ground.at(self.problem, now.state), self.candidates
+        if now.effects:
+            found, _ = candidates_of(ground, [e for e in self.catalogue if e.name in self.names], self.still)
         candidates = [c for c in found if c.name not in {e.name for e in now.effects}]
         rough = self._scored(now, ground, candidates)
         shaped: dict[str, Candidate] = {}
