@@ -118,7 +118,7 @@ def diagnose(
             for count in range(1, len(found.adopted) + 1)
         ]
     after = steps[-1]
-    unexplained = unexplained_of(model, search.passed_over)
+    unexplained = unexplained_of(model, search.passed_over, search.nearest())
     smooth = _described(after, signs) if empirical and unexplained.significant else None
     if smooth is not None:
         after = smooth
@@ -173,7 +173,10 @@ def _explained(
         again = _aside(fit(poses, signs=signs, reference=reference, effects=found.adopted))
         if again == found.aside or not found.adopted:
             break
-        found = _searched(poses, again, signs, reference, effects)
+        other = _searched(poses, again, signs, reference, effects)
+        if _criterion(other, len(poses)) >= _criterion(found, len(poses)):
+            break
+        found = other
     return found
 
 

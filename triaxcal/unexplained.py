@@ -13,6 +13,7 @@ from triaxcal.calibration import Calibration, PoseResult
 from triaxcal.conditions import channels_of, with_scale
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME
 from triaxcal.plan.directions import linear_design
+from triaxcal.search import Nearest
 
 SIGNIFICANT = 0.01
 LEAD = 0.01
@@ -28,7 +29,9 @@ NAMES |= {s: f"the scatter of axis {s[-1]}" for s in SCATTER}
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What is left. ``rms_g`` is its size beyond noise; ``lead`` the best hint at what it may be."""
+    """What is left. ``p_value`` is the probability of as much by chance; ``rms_g`` its size beyond noise; ``lead`` the
+    best hint at what it may be.
+    """
 
     significant: bool
     p_value: float | None
@@ -45,19 +48,25 @@ class _Pattern:
     family: str
 
 
-def unexplained_of(after: Calibration, passed_over: Mapping[str, str]) -> Unexplained:
-    """``passed_over`` are the effects that came near, each with the reason why it was not adopted."""
+def unexplained_of(after: Calibration, passed_over: Mapping[str, str], nearest: Nearest | None = None) -> Unexplained:
+    """``passed_over`` are the effects that came near, each with the reason why it was not adopted.
+
+    Two tests, of which either tells: that of everything that is left, and that of the ``nearest`` single effect, which
+    sees what is too little to be named.
+    """
     residual = after.residual
     p = residual.lack_of_fit_p
+    if p is not None and nearest is not None:
+        p = min(2 * min(p, nearest.p_value), 1.0)
     significant = p is not None and p < SIGNIFICANT
     beyond = float(np.sqrt(max(residual.rms_g**2 - residual.noise_floor_g**2, 0.0)))
     if significant:
         # One loud pose may hide in the plain rms what the others show, each by its own noise.
         beyond = max(beyond, residual.noise_floor_g * float(np.sqrt(max(after.inflation**2 - 1, 0.0))))
-    return Unexplained(significant, p, beyond, lead(after, passed_over) if significant else "")
+    return Unexplained(significant, p, beyond, lead(after, passed_over, nearest) if significant else "")
 
 
-def lead(after: Calibration, passed_over: Mapping[str, str]) -> str:
+def lead(after: Calibration, passed_over: Mapping[str, str], nearest: Nearest | None = None) -> str:
     """The patterns that the residuals show beyond chance: on the sphere, in time, in one pose, in a channel."""
     used = [p for p in after.poses if p.used]
     worst = max(used, key=lambda p: abs(p.studentized))
@@ -65,7 +74,10 @@ def lead(after: Calibration, passed_over: Mapping[str, str]) -> str:
     if worst.studentized**2 > 0.5 * sum(p.studentized**2 for p in used):
         parts.append(f"most of it is one pose, at {worst.pose.at} ({worst.residual_g * 1e6:+.3g} µg): was it still?")
     parts += _clear_patterns(used, _patterns(after, used))
-    parts += [f"the nearest effect is {name}, not adopted: {why}" for name, why in list(passed_over.items())[:2]]
+    near = dict(passed_over)
+    if nearest is not None and nearest.p_value < SIGNIFICANT:
+        near.setdefault(nearest.effect, f"p = {nearest.p_value:.2g}, but it explains too little for what it adds")
+    parts += [f"the nearest effect is {name}, not adopted: {why}" for name, why in list(near.items())[:2]]
     return "; ".join(parts) or "no candidate comes near, and no pose, pattern or channel stands out"
 
 

@@ -15,6 +15,9 @@ from triaxcal.poses.pose_noise import PoseNoise, pose_noise
 from triaxcal.stillness.detector import Span
 from triaxcal.stillness.windows import Windows, resolution, rounding_variance
 
+SHAKEN, QUIET = 2.0, 0.1
+"""Poses are shaken in which the outputs scatter with so many times the variance that a tenth of all poses keep below."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -227,6 +230,8 @@ def _along(
     """
     # A scale for each pose, never zero, not even where a coarse output never changed in it.
     scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans]) + resolution(w) ** 2 / 12
+    # Where a machine shakes the stand the scatter is the machine's, most of which a window averages out.
+    scatter = np.minimum(scatter, SHAKEN * np.quantile(scatter, QUIET, axis=0))
     inside = np.array([_correlation(w, s) for s in spans]) * [np.outer(e, e) for e in np.sqrt(scatter / w.size)]
     predicted = np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", out, inside, out), 1e-300))
     radial = [Track(t.place, (t.deviation @ g / p)[:, None]) for t, g, p in zip(tracks, out, predicted, strict=True)]

@@ -15,6 +15,7 @@ from scipy import special, stats
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.poses.noise_spectrum import Components, Spectrum, Track, fitted, periodogram
+from triaxcal.poses.tones import without_tones
 
 FALSE_CREEP = 0.01
 """Probability that a recording of still poses shows a creeping one."""
@@ -42,6 +43,8 @@ class PoseNoise:
 
 def pose_noise(tracks: Sequence[Track], recording: float, creeping: Bools | None = None) -> PoseNoise:
     """``recording`` is its length in windows. ``creeping`` (k,) are poses known to creep; without it they are found."""
+    cleaned = [without_tones(t) for t in tracks]
+    tracks = [c.track for c in cleaned]
     slope = np.array([t.centred() @ t.deviation / (t.centred() @ t.centred()) for t in tracks])
     straight = [Track(t.place, t.deviation - t.centred()[:, None] * s) for t, s in zip(tracks, slope, strict=True)]
     limit = float(stats.norm.isf(FALSE_CREEP / (2 * slope.size)))
@@ -57,7 +60,8 @@ def pose_noise(tracks: Sequence[Track], recording: float, creeping: Bools | None
     else:
         model = _Model.of(_mixed(tracks, straight, creeping), recording)
     significance = model.significance(tracks, slope)
-    return PoseNoise(model.mean_variance(tracks), model.dof(), slope, significance, limit, model.common_dof)
+    variance = model.mean_variance(tracks) + np.array([c.variance for c in cleaned])
+    return PoseNoise(variance, model.dof(), slope, significance, limit, model.common_dof)
 
 
 def _mixed(tracks: Sequence[Track], straight: Sequence[Track], creeping: Bools) -> list[Track]:

@@ -2,6 +2,6 @@
 
 from triaxcal.search.alternatives import alternatives
 from triaxcal.search.apart import telling_apart
-from triaxcal.search.search import FAMILYWISE, Model, Search
+from triaxcal.search.search import FAMILYWISE, Model, Nearest, Search
 
-__all__ = ["FAMILYWISE", "Model", "Search", "alternatives", "telling_apart"]
+__all__ = ["FAMILYWISE", "Model", "Nearest", "Search", "alternatives", "telling_apart"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from triaxcal.effects.contract import Effect
 from triaxcal.search.candidates import Candidate, Ground
-from triaxcal.search.search import Model, Search
+from triaxcal.search.search import FAMILYWISE, Model, Search
 
 NEAR = 10.0
 """An alternative is out where it is worse by so much in deviance and price. Of two effects that differ by δ standard
@@ -37,6 +37,12 @@ def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]
     out: dict[str, Model] = {}
     for name, other in sorted([*found, *_jointly(search, effect, now)], key=lambda f: search.score(f[1])):
         out.setdefault(name, other)
+    if search.coincidence(now) >= FAMILYWISE:
+        # So few poses would have shown one effect or another whatever it was: also one that they cannot test.
+        for other in search.untestable():
+            name = other.effects[0].name
+            if name not in {e.name for e in now.effects}:
+                out.setdefault(name, other)
     return out
 
 

@@ -60,6 +60,14 @@ class Beside:
     scores: Floats
 
 
+@dataclass(frozen=True)
+class Nearest:
+    """An effect that was not adopted, and its familywise p."""
+
+    effect: str
+    p_value: float
+
+
 class Search:
     """Forward, by one effect or by two that only show together; every step refits the whole model and settles it."""
 
@@ -112,6 +120,27 @@ class Search:
             return None
         return self._model(effects, state, sum(self.price(e) for e in effects))
 
+    def untestable(self) -> list[Model]:
+        """Models of one effect with more coefficients than the poses can test, as far as they explain what there is."""
+        ground, found = Ground.at(self.problem, self.linear.state), []
+        for c in self.candidates:
+            left = self.left((c.effect,))
+            chi2 = float(ground.y @ ground.y - np.sum((c.basis.T @ ground.y) ** 2))
+            if 0 <= left < self.kept and (left == 0 or stats.f.sf(chi2 / left, left, self.pure) > FAMILYWISE):
+                try:
+                    state = solve(self.problem, self.linear.state, (c.effect,))
+                except Refused:
+                    continue
+                found.append(self._model((c.effect,), state, self.price(c.effect)))
+        return found
+
+    def coincidence(self, m: Model) -> float:
+        """Probability that the best of all candidates would explain as much of residuals as large as these are, did they
+        lie in any direction: small where a model has been put to the test."""
+        left, dof = self.left(m.effects), self.left(())
+        rest = min(max(m.chi2, left) / max(self.linear.chi2, 1e-300), 1.0)
+        return familywise(float(stats.beta.cdf(rest, left / 2, (dof - left) / 2)), self.tests) if m.effects else 1.0
+
     def price(self, effect: Effect) -> float:
         """What a model pays for an effect: Schwarz's for its coefficients, and the choice among all that was tried."""
         return self.price_of(len(effect.coefficients), self.tries.get(effect.name, 1))
@@ -152,6 +181,14 @@ class Search:
     def earned_all(self, m: Model) -> bool:
         """Whether the effects of a model earn their places, from nothing."""
         return self._earned(m, self.linear)
+
+    def nearest(self) -> Nearest | None:
+        """Of single effects beside those found the one that is least likely to be chance; None where none is left."""
+        found = [
+            Nearest(m.effects[-1].name, self.earned(m.effects[-1], self.found.effects, m))
+            for m in self.singles_from(self.found)
+        ]
+        return min(found, key=lambda n: n.p_value, default=None)
 
     def settle_on(self, m: Model) -> list[Effect]:
         """Takes a model for the one found."""

@@ -1,0 +1,81 @@
+"""Tones in a pose: a machine shakes the stand at frequencies of its own, or at those to which the windows fold them.
+
+A tone averages out as one over the length of the pose, and noise as its root. Taken for noise, it makes the standard
+error of a mean several times too large.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+from scipy.ndimage import median_filter
+
+from triaxcal.arrays import Floats
+from triaxcal.poses.noise_spectrum import Track
+
+CYCLES_LEAST = 4.0
+"""What is slower, in cycles a pose, is the noise that the mean has."""
+WINDOWS_LEAST = 24
+TONES_MOST = 6
+LOUD = 30.0
+"""A tone is so many times the median power about its frequency; noise makes one in one pose of two hundred."""
+ABOUT = 8
+"""The median is taken over so many cycles a pose to either side."""
+PADDED = 2
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """A track without its tones, and the ``variance`` (q,) that they give its mean."""
+
+    track: Track
+    variance: Floats
+
+
+def without_tones(track: Track) -> Cleaned:
+    """A sine of amplitude A and j cycles adds about A/πj to a mean at most, half the square of that over the phases, and
+    half of this over the parts of a cycle that are left.
+    """
+    q = track.deviation.shape[1]
+    variance, left, tones = np.zeros(q), track.deviation, 0
+    if len(track) < WINDOWS_LEAST:
+        return Cleaned(track, variance)
+    x = track.centred()
+    while tones < TONES_MOST and (frequency := _loudest(track, left)) is not None:
+        angle = 2 * np.pi * frequency * x
+        columns = np.stack([np.ones_like(x), x, np.cos(angle), np.sin(angle)], axis=1)
+        coefficients = np.linalg.lstsq(columns, left, rcond=None)[0]
+        left = left - columns[:, 2:] @ coefficients[2:]
+        most = 1 / (track.length * np.sin(np.pi * frequency))
+        variance = variance + (coefficients[2:] ** 2).sum(axis=0) / 4 * most**2
+        tones += 1
+    if tones:
+        # Frequency, amplitude and phase took some of the noise with them.
+        left = (left - left.mean(axis=0)) * np.sqrt(len(track) / (len(track) - 3.0 * tones))
+        track = Track(track.place, left)
+    return Cleaned(track, variance)
+
+
+def _loudest(track: Track, deviation: Floats) -> float | None:
+    """Frequency, in cycles a window, of what stands out most in the spectrum; None where nothing does."""
+    n = track.length
+    taper = np.sin(np.pi * (track.place - track.place[0] + 0.5) / n) ** 2
+    filled = np.zeros((n, deviation.shape[1]))
+    filled[track.place - track.place[0]] = deviation * taper[:, None]
+    power = np.abs(fft.rfft(filled, PADDED * n, axis=0)) ** 2
+    usual = median_filter(power, size=(2 * PADDED * ABOUT + 1, 1), mode="reflect")
+    ratio = (power / np.maximum(usual, 1e-300)).max(axis=1)
+    first = int(np.ceil(PADDED * CYCLES_LEAST))
+    last = len(power) - PADDED  # at half the rate of the windows sine and cosine are one
+    if last <= first:
+        return None
+    peak = first + int(np.argmax(ratio[first:last]))
+    if ratio[peak] < LOUD:
+        return None
+    column = int(np.argmax(power[peak] / np.maximum(usual[peak], 1e-300)))
+    below, at, above = np.log(np.maximum(power[peak - 1 : peak + 2, column], 1e-300))
+    bend = below - 2 * at + above
+    beside = 0.5 * (below - above) / bend if bend < 0 else 0.0
+    return float(peak + np.clip(beside, -0.5, 0.5)) / (PADDED * n)
