@@ -352,7 +352,7 @@ def test_every_key_of_a_recordings_documents_is_explained(attachment: str) -> No
     [
         "poses recordings/paper-unit.csv.gz",
         "fit recordings/paper-unit.csv.gz",
-        "diagnose recordings/can-second-order.mcap --check recordings/can-second-order.mcap",
+        "diagnose recordings/can-second-order.mcap --check recordings/paper-unit.csv.gz --sign=-,-,- --output-unit V",
         "plan --poses 14",
         "plan --poses 14 --for temperature_bias bias_drift",
         "plan recordings/paper-unit.csv.gz",

@@ -12,7 +12,19 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import BEFORE, CHANGE, DERIVED, HELD, RUN, SCATTER, SINCE_START, TIME, rate_of
+from triaxcal.effects.contract import (
+    BEFORE,
+    CHANGE,
+    HELD,
+    RUN,
+    SCATTER,
+    SINCE_START,
+    TIME,
+    channel_of,
+    condition_of,
+    is_derived,
+    rate_of,
+)
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose
 
@@ -25,10 +37,11 @@ def conditions(channels: Mapping[str, Floats], reference: Mapping[str, float]) -
 def channels_of(poses: Sequence[Pose]) -> dict[str, Floats]:
     """The channels' means by pose, (n,) each, their rates, and the time of each pose and for how long it was held."""
     out: dict[str, Floats] = {}
-    for name in sorted(set.intersection(*(set(p.channels) for p in poses)) if poses else set()):
-        out[name] = np.array([p.channels[name] for p in poses])
-        if all(name in p.rates for p in poses):
-            out[rate_of(name)] = np.array([p.rates[name] for p in poses])
+    for channel in sorted(set.intersection(*(set(p.channels) for p in poses)) if poses else set()):
+        name = condition_of(channel)
+        out[name] = np.array([p.channels[channel] for p in poses])
+        if all(channel in p.rates for p in poses):
+            out[rate_of(name)] = np.array([p.rates[channel] for p in poses])
     out[SINCE_START] = np.array([p.t_s for p in poses])
     out[TIME] = out[SINCE_START] - np.array([p.run.middle_s for p in poses])
     out[HELD] = np.array([p.end_s - p.start_s for p in poses])
@@ -56,7 +69,7 @@ def references(channels: Mapping[str, Floats]) -> dict[str, float]:
     Rounded, so that a reference temperature reads well and fits a float32 register: to a tenth, or to a tenth of the
     range where that is finer.
     """
-    zero = {name for name in channels if (name in DERIVED and name != TIME) or name.endswith(rate_of(""))}
+    zero = {name for name in channels if is_derived(name)} - {TIME}
     return {
         name: 0.0 if name in zero else round(float(np.mean(values)), _decimals(float(np.ptp(values))))
         for name, values in channels.items()
@@ -78,7 +91,8 @@ def conditions_elsewhere(
     channels[RUN] = np.full(len(poses), np.inf)
     missing = [n for n in reference if n not in channels]
     if missing:
-        raise InvalidData(f"the poses have no channel {', '.join(missing)}, which the calibration needs")
+        named = ", ".join(map(channel_of, missing))
+        raise InvalidData(f"the poses have no channel {named}, which the calibration needs")
     channels[TIME] = np.full(len(poses), reference.get(TIME, 0.0))
     channels[SINCE_START] = np.full(len(poses), np.inf)
     return conditions(channels, reference)
@@ -93,6 +107,7 @@ def of_readings(channels: Mapping[str, Floats], reference: Mapping[str, float], 
     """`conditions` of n single readings, for whoever applies a calibration: what was not given and nobody logs (rates,
     scatter, the pose before) counts as at its reference. Raises KeyError for a channel that is not there.
     """
-    derived = {name for name in reference if name in DERIVED or name.endswith(rate_of(""))} - {TIME}
-    given = at_reference(derived, n) | dict(channels)
+    given = at_reference({name for name in reference if is_derived(name)} - {TIME}, n)
+    # A derived condition may be given too, unless the reference knows a logged channel of that name.
+    given |= {name if condition_of(name) not in reference else condition_of(name): v for name, v in channels.items()}
     return {name: np.asarray(given[name]) - value for name, value in reference.items()}

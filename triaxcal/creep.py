@@ -13,6 +13,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
+from triaxcal.conditions import conditions_elsewhere
 from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.poses.pose import Pose
 
@@ -22,11 +23,13 @@ def without_creep(poses: Sequence[Pose]) -> list[Pose]:
     return [_with(p, np.zeros(3)) if p.creep.any() else p for p in poses]
 
 
-def with_creep_left(poses: Sequence[Pose], model: Calibration) -> list[Pose]:
-    """The same poses with so much of their creep as the model's effects do not explain."""
+def with_creep_left(poses: Sequence[Pose], model: Calibration, *, elsewhere: bool = False) -> list[Pose]:
+    """The same poses with so much of their creep as the model's effects do not explain. ``elsewhere``: they are of
+    another recording than the model, of whose clocks it knows nothing.
+    """
     if not any(p.creep.any() for p in poses) or not model.sensor.effects:
         return list(poses)
-    change = _change(poses, model)
+    change = _change(poses, model, elsewhere)
     left = [p.creep - c for p, c in zip(poses, change, strict=True)]
     return [
         _with(p, rest) if p.creep.any() and rest @ rest < p.creep @ p.creep else p
@@ -34,22 +37,26 @@ def with_creep_left(poses: Sequence[Pose], model: Calibration) -> list[Pose]:
     ]
 
 
-def _change(poses: Sequence[Pose], model: Calibration) -> Floats:
+def _change(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> Floats:
     """(n,3) by how much the model's effects change the outputs from the beginning of each pose to its end."""
-    held = model.conditions_of(poses)
+    sensor = model.sensor
+    if elsewhere:
+        held = conditions_elsewhere(poses, model.channel_reference, sensor.scale_factor, sensor.bias)
+    else:
+        held = model.conditions_of(poses)
     length = np.array([p.end_s - p.start_s for p in poses])
     ends = []
     for half in (-length / 2, length / 2):
         at = dict(held)
         for name in held:
             if name in (TIME, SINCE_START):
-                at[name] = held[name] + half
+                at[name] = held[name] if elsewhere else held[name] + half
             elif all(name in p.rates for p in poses):
                 at[name] = held[name] + half * np.array([p.rates[name] for p in poses])
         ends.append(at)
-    s = model.sensor.along_axes(np.array([p.mean for p in poses]), held)
-    first, last = (model.sensor.departure(s, at) for at in ends)
-    return np.asarray(model.sensor.scale_factor * (last - first))
+    s = sensor.along_axes(np.array([p.mean for p in poses]), held)
+    first, last = (sensor.departure(s, at) for at in ends)
+    return np.asarray(sensor.scale_factor * (last - first))
 
 
 def _with(pose: Pose, creep: Floats) -> Pose:

@@ -38,9 +38,15 @@ def fit(
     """Fit the linear model, and the effects given, to still poses.
 
     ``signs`` (3,) of the scale factors, which |a| does not show. ``aside`` are indices of poses to leave out; where it
-    is None, poses that something spoiled are found and left out (`triaxcal.outliers`). Raises Refused where the poses
-    cannot carry the parameters, InvalidData where a channel that an effect needs is not there.
+    is None, poses that something spoiled are found and left out (`triaxcal.outliers`). Poses with a fault are left out
+    in any case. Raises Refused where the poses cannot carry the parameters, InvalidData where a channel that an effect
+    needs is not there.
     """
+    sound = [i for i, p in enumerate(poses) if not p.fault]
+    if len(sound) < len(poses):
+        among = None if aside is None else [k for k, i in enumerate(sound) if i in aside]
+        kept = [poses[i] for i in sound]
+        return with_faulty(fit(kept, signs=signs, reference=reference, effects=effects, aside=among), poses)
     everything = problem_of(poses, signs=signs, reference=reference)
     begin = start(everything, poses, signs)
     everything = with_history(everything, poses, begin.sensor(everything))
@@ -87,26 +93,45 @@ def _spoiled(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
     return found
 
 
-def _with_aside(calibration: Calibration, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
-    """The calibration with the poses left out among its results, in order of time, and a warning that names them."""
+def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
+    """A calibration from the sound ones of ``poses`` with the faulty ones among its results, and a warning."""
+    faulty = tuple(i for i, p in enumerate(poses) if p.fault)
+    if not faulty:
+        return calibration
+    faults = ", ".join(f"the pose at {poses[i].at} ({poses[i].fault})" for i in faulty)
+    warning = f"left out, as the outputs did not follow the acceleration: {faults}"
+    results, _ = _among(calibration, poses, faulty)
+    return replace(calibration, poses=results, warnings=(warning, *calibration.warnings))
+
+
+def _among(
+    calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int]
+) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
+    """The results of a calibration with those of further ``rows`` of all poses among them, in order; and these."""
     u = np.array([p.mean for p in poses])
     conditioned = calibration.conditions_of(poses)
     length, by_u = calibration.sensor.magnitude(u, conditioned)
     a = calibration.sensor.specific_force(u, conditioned)
-    results = list(calibration.poses)
-    names = []
-    for i in verdict.rows:
+    results, added = list(calibration.poses), []
+    for i in rows:
         error = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
         miss = float(length[i] - calibration.reference)
-        results.insert(i, PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, error, miss / error, 0.0, used=False))
-        names.append(f"at {poses[i].at} ({miss / error:+.0f} standard errors)")
+        added.append(PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, error, miss / error, 0.0, used=False))
+        results.insert(i, added[-1])
+    return tuple(results), added
+
+
+def _with_aside(calibration: Calibration, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
+    """The calibration with the poses left out among its results, in order of time, and a warning that names them."""
+    results, added = _among(calibration, poses, verdict.rows)
+    names = [f"at {p.pose.at} ({p.studentized:+.0f} standard errors)" for p in added]
     warning = f"left out as spoiled: the pose {', the pose '.join(names)}"
     if verdict.doubtful:
         warning += (
             "; the noise inside the poses says so, while the other residuals leave it open whether all poses come "
             "back less well than that: the standard errors allow for both"
         )
-    return replace(calibration, poses=tuple(results), warnings=(warning, *calibration.warnings))
+    return replace(calibration, poses=results, warnings=(warning, *calibration.warnings))
 
 
 def _conclude(problem: Problem, poses: Sequence[Pose], state: State, verdict: Spoiled) -> Calibration:

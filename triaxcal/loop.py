@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import special
@@ -23,11 +23,11 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.part import Part
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.fit import fit
+from triaxcal.fit import fit, with_faulty
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.runs import by_run, expected_of
-from triaxcal.search import Search, alternatives, telling_apart
+from triaxcal.search import NEAR, Search, alternatives, telling_apart
 from triaxcal.search.candidates import still_conditions
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start, with_history
@@ -68,6 +68,7 @@ class HeldOut:
     before_rms_g: float
     after_rms_g: float
     noise_floor_g: float
+    """What the noise of these poses leaves, with so much of their creep as the extended model does not explain."""
     poses: int
 
 
@@ -100,6 +101,17 @@ def diagnose(
     are poses of another recording, for the held-out error. ``empirical``: what no effect explains is described by a
     smooth term, where that helps poses that it was not fitted to. Raises as `triaxcal.fit.fit` does.
     """
+    sound = [p for p in poses if not p.fault]
+    if check is not None:
+        check = [p for p in check if not p.fault]
+    if len(sound) < len(poses):
+        loop = diagnose(sound, signs=signs, reference=reference, check=check, catalogue=catalogue, empirical=empirical)
+        return replace(
+            loop,
+            before=with_faulty(loop.before, poses),
+            after=with_faulty(loop.after, poses),
+            findings=tuple(replace(f, step=with_faulty(f.step, poses)) for f in loop.findings),
+        )
     linear = fit(poses, signs=signs, reference=reference)
     moving = set(channels_of(poses)) - still_conditions(poses)
     effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, poses)
@@ -123,7 +135,10 @@ def diagnose(
     if smooth is not None:
         after = smooth
     blind = tuple(e.name for e in effects if e.name not in search.full)
-    findings = tuple(_finding(search, e, after, step) for e, step in zip(found.adopted, steps, strict=False))
+    findings = tuple(
+        _finding(search, e, after, step, found.rivals if e is found.adopted[0] else ())
+        for e, step in zip(found.adopted, steps, strict=False)
+    )
     if smooth is not None:
         findings = (*findings, _description(smooth, steps[-1]))
         unexplained = unexplained_of(smooth, search.passed_over)
@@ -145,6 +160,8 @@ class _Found:
     search: Search
     adopted: list[Effect]
     aside: tuple[int, ...]
+    rivals: tuple[tuple[Effect, ...], ...] = ()
+    """Effects that explain as much with other poses left out."""
 
 
 def _aside(c: Calibration) -> tuple[int, ...]:
@@ -161,23 +178,46 @@ def _explained(
     """The best explanation by effects, spoiled poses, or both; ``aside`` are those that the linear fit leaves out."""
     asked = [(), aside, _aside(fit(poses, signs=signs, reference=reference))]
     # What looks like spoiled poses may be an effect that the linear model lacks.
-    trials = [_searched(poses, rows, signs, reference, effects) for rows in dict.fromkeys(asked)]
+    tried = [_tried(poses, rows, signs, reference, effects) for rows in dict.fromkeys(asked)]
+    trials = [t for t in tried if t is not None]
     first = trials[0].search
     # Nothing, or much, may be made of an effect and a spoiled pose that hide each other.
     unsure = len(trials[0].adopted) != 1 and first.left_over(first.linear)
-    if unsure and (row := first.spoiled_beside()) is not None:
-        trials.append(_searched(poses, (row,), signs, reference, effects))
+    if unsure and not trials[0].aside and (row := first.spoiled_beside()) is not None:
+        trials += [t for t in [_tried(poses, (row,), signs, reference, effects)] if t is not None]
     found = min(trials, key=lambda trial: _criterion(trial, len(poses)))
     for _ in range(ROUNDS_MOST):
         # Beside an effect a spoiled pose may not have shown; with the effect in the model it does.
         again = _aside(fit(poses, signs=signs, reference=reference, effects=found.adopted))
         if again == found.aside or not found.adopted:
             break
-        other = _searched(poses, again, signs, reference, effects)
-        if _criterion(other, len(poses)) >= _criterion(found, len(poses)):
+        other = _tried(poses, again, signs, reference, effects)
+        if other is None or _criterion(other, len(poses)) >= _criterion(found, len(poses)):
             break
+        trials.append(other)
         found = other
-    return found
+    near = _criterion(found, len(poses)) + NEAR
+    rivals: list[tuple[Effect, ...]] = []
+    for t in trials:
+        if t.aside != found.aside:
+            models = [t.search.found, *t.search.singles_from(t.search.linear)]
+            price = _criterion(t, len(poses)) - t.search.score(t.search.found)
+            rivals += [m.effects for m in models if m.effects and t.search.score(m) + price < near]
+    return replace(found, rivals=tuple(rivals))
+
+
+def _tried(
+    poses: Sequence[Pose],
+    aside: tuple[int, ...],
+    signs: Sequence[float],
+    reference: float,
+    effects: Sequence[Effect],
+) -> _Found | None:
+    """None where the poses that are left cannot carry the linear model."""
+    try:
+        return _searched(poses, aside, signs, reference, effects)
+    except Refused:
+        return None
 
 
 def _searched(
@@ -224,17 +264,30 @@ def _criterion(found: _Found, n: int) -> float:
     return found.search.score(found.search.found) + aside * float(np.log(n)) + 2 * choice
 
 
-def _finding(search: Search, effect: Effect, after: Calibration, step: Calibration) -> Finding:
+def _finding(
+    search: Search,
+    effect: Effect,
+    after: Calibration,
+    step: Calibration,
+    rivals: Sequence[Sequence[Effect]],
+) -> Finding:
+    """``rivals`` explain as much with other poses left out as spoiled."""
     found = alternatives(search, effect, search.found)
+    taken = {e.name for e in search.found.effects}
+    for rival in rivals:
+        model = search.model(rival)
+        found |= {e.name: model for e in rival if model and e.name not in taken | found.keys()}
     others = [e for e in search.found.effects if e is not effect]
     rest = search.fitted(others) if others else None
     without = rest.residual if rest else search.before.residual
     p = search.earned(effect, others)
-    reason = (
-        f"with it the cross-validated error falls from {_micro(without.cross_validated_rms_g)} to "
-        f"{_micro(after.residual.cross_validated_rms_g)} (noise floor "
-        f"{_micro(after.residual.noise_floor_g)}); familywise p {_probability(p)}"
-    )
+    old, new = without.cross_validated_rms_g, after.residual.cross_validated_rms_g
+    reason = f"familywise p {_probability(p)}"
+    if old is not None and new is not None:
+        reason = (
+            f"with it the cross-validated error {'falls' if new < old else 'goes'} from {_micro(old)} to "
+            f"{_micro(new)} (noise floor {_micro(after.residual.noise_floor_g)}); {reason}"
+        )
     if isinstance(effect, Part) and not effect.selects:
         reason += f"; of its coefficients these poses show only {effect.formula}, which they share in that proportion"
     if found:
@@ -303,8 +356,8 @@ def _held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) ->
         raise InvalidData("the check recording has no still pose")
     try:
         errors = [
-            magnitude_errors(c.sensor, check, channel_reference=c.channel_reference, reference=c.reference)
-            for c in (before, after)
+            magnitude_errors(c.sensor, held, channel_reference=c.channel_reference, reference=c.reference)
+            for c, held in ((before, check), (after, with_creep_left(check, after, elsewhere=True)))
         ]
     except InvalidData as e:
         raise InvalidData(f"the check recording: {e}") from e

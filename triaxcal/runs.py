@@ -13,9 +13,10 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
-from triaxcal.effects.contract import RUN, Coefficient, Effect
+from triaxcal.effects.contract import RUN, Effect
 from triaxcal.effects.in_run import InRuns, longest, of_clocks
 from triaxcal.effects.run_bias import BETWEEN_RUNS, RunBias
+from triaxcal.effects.wrapped import Wrapped
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose, Run
 
@@ -56,50 +57,31 @@ def expected_of(poses: Sequence[Pose]) -> tuple[Effect, ...]:
 
 
 @dataclass(frozen=True)
-class ByRun(Effect):
+class ByRun(Wrapped):
     """An effect of the clocks, of which the search tries: alike in all ``runs``; in one alone; in each, and in all but
     one, by coefficients of their own. One that lasts begins in one run.
     """
 
-    effect: Effect
     runs: int
 
     @property
-    def name(self) -> str:
-        return self.effect.name
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return self.effect.coefficients
-
-    @property
     def needs(self) -> tuple[str, ...]:
-        return (*self.effect.needs, RUN)
-
-    @property
-    def remedy(self) -> str:
-        return self.effect.remedy
-
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return self.effect.basis(s, conditions)
-
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return self.effect.slope(s, conditions)
+        return (*self.whole.needs, RUN)
 
     def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
         out: list[Effect] = []
-        if not self.effect.lasting:
-            out += self.effect.variants(longest(conditions, range(self.runs)))
+        if not self.whole.lasting:
+            out += self.whole.variants(longest(conditions, range(self.runs)))
         for runs in self._sets():
             fewest = min(int(np.sum(conditions[RUN] == run)) for run in runs)
             most = len(runs) * fewest / POSES_A_COEFFICIENT
-            out += [e for e in InRuns(self.effect, runs).variants(conditions) if len(e.coefficients) <= most]
+            out += [e for e in InRuns(self.whole, runs).variants(conditions) if len(e.coefficients) <= most]
         return tuple(out)
 
     def _sets(self) -> list[tuple[int, ...]]:
         every = tuple(range(self.runs))
         sets: list[tuple[int, ...]] = [(run,) for run in every]
-        if self.effect.lasting:
+        if self.whole.lasting:
             return sets
         if self.runs > 2:
             sets += [tuple(other for other in every if other != run) for run in every]

@@ -13,42 +13,9 @@ from triaxcal.effects.contract import TIME, Effect
 from triaxcal.plan.clock import in_plan
 from triaxcal.plan.design import combinations, profile_times, radial
 from triaxcal.plan.directions import linear_design
-from triaxcal.problem import Problem, State, linearise
 
 VISIBLE = 0.02
 """An effect is visible when the part of it that the model cannot absorb is at least this share of it."""
-
-
-def is_visible(problem: Problem, state: State, effect: Effect, given: Sequence[Effect] = ()) -> bool:
-    """Whether every coefficient of an effect shows beside the model and the effects given."""
-    return len(projected(problem, state, effect, given)) == len(effect.coefficients)
-
-
-def _columns(problem: Problem, state: State, effects: Sequence[Effect]) -> tuple[Floats, Floats, Floats]:
-    """Weighted residuals, weighted linear columns, and those of the effects, all at ``state``."""
-    r, J, s = linearise(problem, state.extended(effects))
-    at = len(state.theta)
-    return r / s, J[:, :at] / s[:, None], J[:, at:] / s[:, None]
-
-
-def projected(problem: Problem, state: State, effect: Effect, given: Sequence[Effect] = ()) -> Floats:
-    """Orthonormal rows (q,n): the part of an effect that the model, with the effects given, cannot absorb."""
-    if any(n not in problem.channel_reference for n in effect.needs):
-        return np.empty((0, len(problem.u)))
-    _, J, Z = _columns(problem, state, (*given, effect))
-    own = len(effect.coefficients)
-    J, Z = np.concatenate([J, Z[:, :-own]], axis=1), Z[:, -own:]
-    size = np.linalg.norm(Z, axis=0)
-    Z = Z[:, size > 1e-9]  # a coefficient whose column is zero does not show; others of its effect may
-    if not Z.size:
-        return np.empty((0, len(problem.u)))
-    size = size[size > 1e-9]
-    norms = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    rest = Z / size - J / norms @ np.linalg.lstsq(J / norms, Z / size, rcond=1e-12)[0]
-    _, singular, rows = np.linalg.svd(rest.T @ rest)
-    kept = np.sqrt(singular) > VISIBLE
-    basis = rest @ rows[kept].T
-    return np.asarray((basis / np.sqrt(singular[kept])).T)
 
 
 @dataclass(frozen=True)

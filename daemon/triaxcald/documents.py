@@ -15,18 +15,17 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Residual
-from triaxcal.effects import Effect, effect_of
 from triaxcal.loop import Loop
 from triaxcal.poses.pose import Pose
-from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Budget, Stated, budget
-from triaxcald.errors import InputError
+from triaxcald.units import SMALLEST, ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]
 DIGITS, UNCERTAINTY_DIGITS, PROBABILITY_DIGITS = 10, 6, 4
 LINEAR = ("scale_factor", "misalignment", "bias")
 GRID_G = 1e-11
-"""Errors of the magnitude are differences of numbers near 1 g: beyond this they differ from processor to processor."""
+"""Errors of the magnitude are differences of numbers near 1 g: beyond this they differ from processor to processor. Of
+numbers near another reference, as much finer or coarser as that is smaller or larger, in powers of ten."""
 
 
 def number(value: float | None, digits: int = DIGITS) -> float | None:
@@ -36,9 +35,12 @@ def number(value: float | None, digits: int = DIGITS) -> float | None:
     return float(f"{value:.{digits}g}") + 0.0
 
 
-def error(value: float | None) -> float | None:
-    """An error of the magnitude, in g."""
-    return None if value is None else number(round(value / GRID_G) * GRID_G if math.isfinite(value) else value)
+def error(value: float | None, reference: float = 1.0) -> float | None:
+    """An error of the magnitude, in the unit of the ``reference``."""
+    if value is None or not math.isfinite(value):
+        return None
+    grid = GRID_G * 10.0 ** round(math.log10(max(reference, SMALLEST)))
+    return number(round(value / grid) * grid)
 
 
 def uncertainty(value: float | None) -> float | None:
@@ -90,32 +92,12 @@ def poses_document(poses: Sequence[Pose]) -> Document:
     }
 
 
-def in_units_of(unit: str, reference_unit: str) -> str:
-    """A coefficient's unit, which the metrology writes with g for the unit of the reference vector."""
-    return unit if reference_unit == "g" else unit.replace("g", grouped(reference_unit))
-
-
-def grouped(unit: str) -> str:
-    """A unit as it stands below a fraction bar."""
-    return f"({unit})" if set(unit) & set(" /") else unit
-
-
-def micro_unit(reference_unit: str) -> str:
-    """The unit in which errors of the magnitude are told."""
-    return "µg" if reference_unit == "g" else f"1e-6 {reference_unit}"
-
-
-def in_words_of(text: str, reference_unit: str) -> str:
-    """What the metrology says in words, where it writes g likewise."""
-    return text.replace("µg", micro_unit(reference_unit))
-
-
-def residual_document(residual: Residual) -> Document:
+def residual_document(residual: Residual, reference: float = 1.0) -> Document:
     return {
-        "rms_g": error(residual.rms_g),
-        "max_abs_g": error(residual.max_abs_g),
-        "cross_validated_rms_g": error(residual.cross_validated_rms_g),
-        "noise_floor_g": error(residual.noise_floor_g),
+        "rms_g": error(residual.rms_g, reference),
+        "max_abs_g": error(residual.max_abs_g, reference),
+        "cross_validated_rms_g": error(residual.cross_validated_rms_g, reference),
+        "noise_floor_g": error(residual.noise_floor_g, reference),
         "lack_of_fit_p": probability(residual.lack_of_fit_p),
     }
 
@@ -130,11 +112,6 @@ def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, 
         }
         for name, (value, deviation, unit) in coefficients.items()
     }
-
-
-def reference_unit_of(reference: float) -> str:
-    """g where the magnitude can be gravity in units of g, else what the caller did not name."""
-    return "g" if 0.9 <= reference <= 1.1 else "reference unit"
 
 
 def calibration_document(
@@ -179,14 +156,14 @@ def calibration_document(
         "parameters": list(whole.parameters),
         "correlation": correlation(whole.covariance),
         **({"uncertainty": budget_document(c, budget(c, stated), reference_unit)} if budgeted else {}),
-        "residual": residual_document(c.residual),
+        "residual": residual_document(c.residual, c.reference),
         "poses": [
             {
                 "start_s": number(p.pose.start_s),
                 "end_s": number(p.pose.end_s),
                 "mean": numbers(p.pose.mean),
                 "direction": direction(p.direction),
-                "residual_g": error(p.residual_g),
+                "residual_g": error(p.residual_g, c.reference),
                 "standard_error_g": uncertainty(p.standard_error_g),
                 "studentized": uncertainty(p.studentized),
                 "leverage": uncertainty(p.leverage),
@@ -239,7 +216,7 @@ def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Doc
             for line in b.components
         ],
         "dominant": b.dominant.source,
-        "halved_by": in_words_of(b.dominant.halved_by, reference_unit),
+        "halved_by": ErrorUnit.of(reference_unit, c.reference).in_words(b.dominant.halved_by),
         "magnitude_if_halved_g": uncertainty(b.magnitude_if_halved),
         "not_evaluated": list(b.not_evaluated),
     }
@@ -256,19 +233,20 @@ def loop_document(
     calibration = calibration_document(
         loop.after, output_unit=output_unit, reference_unit=reference_unit, stated=stated
     )
+    reference, held = loop.after.reference, loop.held_out
+    small = ErrorUnit.of(reference_unit, reference)
     for pose, before in zip(calibration["poses"], loop.before.poses, strict=True):
-        pose["before_residual_g"] = error(before.residual_g)
-    held = loop.held_out
+        pose["before_residual_g"] = error(before.residual_g, reference)
     return {
         "format": "triaxcal.loop/1",
-        "before": residual_document(loop.before.residual),
-        "after": residual_document(loop.after.residual),
+        "before": residual_document(loop.before.residual, reference),
+        "after": residual_document(loop.after.residual, reference),
         **(
             {
                 "held_out": {
-                    "before_rms_g": error(held.before_rms_g),
-                    "after_rms_g": error(held.after_rms_g),
-                    "noise_floor_g": error(held.noise_floor_g),
+                    "before_rms_g": error(held.before_rms_g, reference),
+                    "after_rms_g": error(held.after_rms_g, reference),
+                    "noise_floor_g": error(held.noise_floor_g, reference),
                     "poses": held.poses,
                 }
             }
@@ -282,82 +260,21 @@ def loop_document(
                 "p_value": probability(f.p_value),
                 "coefficients": coefficients_document(f.coefficients, reference_unit),
                 "alternatives": list(f.alternatives),
-                "reason": in_words_of(f.reason, reference_unit),
+                "reason": small.in_words(f.reason),
                 "remedy": f.remedy,
-                "apart": [in_words_of(line, reference_unit) for line in f.apart],
-                "residual": residual_document(f.step.residual),
-                "pose_residual_g": [error(p.residual_g) for p in f.step.poses],
+                "apart": [small.in_words(line) for line in f.apart],
+                "residual": residual_document(f.step.residual, reference),
+                "pose_residual_g": [error(p.residual_g, reference) for p in f.step.poses],
             }
             for f in loop.findings
         ],
         "unexplained": {
             "significant": loop.unexplained.significant,
             "p_value": probability(loop.unexplained.p_value),
-            "rms_g": error(loop.unexplained.rms_g),
-            "lead": in_words_of(loop.unexplained.lead, reference_unit),
+            "rms_g": error(loop.unexplained.rms_g, reference),
+            "lead": small.in_words(loop.unexplained.lead),
         },
         "data_quality": list(data_quality),
-        "advice": [in_words_of(line, reference_unit) for line in loop.advice],
+        "advice": [small.in_words(line) for line in loop.advice],
         "calibration": calibration,
     }
-
-
-def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str, Any]:
-    """The `triaxcal.calibration/1` in a calibration, loop or certificate document. Raises InputError."""
-    inner: Any = document
-    for key in ("result", "calibration"):
-        if isinstance(inner, Mapping) and isinstance(inner.get(key), Mapping):
-            inner = inner[key]
-    if not isinstance(inner, Mapping) or inner.get("format") != "triaxcal.calibration/1":
-        raise InputError(f"{where}: format: expected a triaxcal.calibration/1, .loop/1 or .certificate/1 document")
-    return inner
-
-
-def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: float) -> str:
-    """The unit of the reference that a calibration document says, or what it must be by its magnitude."""
-    units = calibration_part(document, where=where).get("units")
-    said = units.get("reference") if isinstance(units, Mapping) else None
-    return said if isinstance(said, str) and said else reference_unit_of(magnitude)
-
-
-def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[str, float], float]:
-    """Sensor, channel references and reference magnitude of a calibration document. Raises InputError."""
-    part = calibration_part(document, where=where)
-    try:
-        k, m, b = (np.array(part[name], dtype=float) for name in ("scale_factor", "misalignment", "bias"))
-        effects = []
-        for name, held in part.get("effects", {}).items():
-            effect, q = effect_of(name, {n: float(v["value"]) for n, v in held.items()})
-            lacking = [n for n in (*(c.name for c in effect.coefficients), *effect.shape) if n not in held]
-            if lacking:
-                raise KeyError(f"effects.{name}.{lacking[0]}")
-            effects.append((effect, q))
-        reference = {str(n): float(v) for n, v in part.get("channel_reference", {}).items()}
-        magnitude = float(part.get("reference", 1.0))
-    except KeyError as e:
-        raise InputError(f"{where}: {e.args[0]}: missing, or no effect of that name is known") from e
-    except (TypeError, ValueError, AttributeError, OverflowError) as e:
-        raise InputError(f"{where}: not numbers where numbers belong ({e})") from e
-    if any(v.shape != (3,) or not np.isfinite(v).all() for v in (k, m, b)) or not np.all(k):
-        raise InputError(
-            f"{where}: scale_factor, misalignment, bias: expected three numbers each, none zero in the first"
-        )
-    _require_finite(effects, reference, magnitude, where)
-    return Sensor(k, m, b, tuple(effects)), reference, magnitude
-
-
-def _require_finite(
-    effects: Sequence[tuple[Effect, Floats]], reference: Mapping[str, float], magnitude: float, where: str
-) -> None:
-    """JSON as Python reads it has NaN."""
-    for effect, values in effects:
-        if not np.isfinite(values).all():
-            raise InputError(f"{where}: effects.{effect.name}: expected finite numbers")
-        for need in effect.needs:
-            if need not in reference:
-                raise InputError(f"{where}: channel_reference.{need}: missing; the effect {effect.name} needs it")
-    for name, value in reference.items():
-        if not math.isfinite(value):
-            raise InputError(f"{where}: channel_reference.{name}: expected a finite number")
-    if not 0 < magnitude < math.inf:
-        raise InputError(f"{where}: reference: expected a positive number")

@@ -18,15 +18,14 @@ from triaxcal.sensor import Sensor
 from triaxcald.documents import (
     UNCERTAINTY_DIGITS,
     Document,
-    calibration_part,
     number,
     numbers,
     probability,
-    sensor_of,
     uncertainty,
 )
 from triaxcald.errors import InputError
 from triaxcald.held_errors import correlation_of, effect_errors_of, linear_errors_of
+from triaxcald.held_sensor import calibration_part, sensor_of
 from triaxcald.inputs import Measured
 
 ANGLE_DIGITS = 8

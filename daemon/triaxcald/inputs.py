@@ -10,7 +10,7 @@ from typing import Any
 
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.quality import QualityDetector
+from triaxcal.quality import QualityDetector, untrusted_poses
 from triaxcal.stillness.detector import StillnessDetector, Windows
 from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
@@ -71,9 +71,10 @@ def measure(
     except InvalidData as e:
         raise InputError(f"{name}: {e}") from e
     spans = detector.spans()
-    poses = poses_of(windows, spans)
+    seen = judge.findings(windows, spans)
+    poses = poses_of(windows, spans, untrusted_poses(seen))
     counted = [f"duplicate_samples: {samples.duplicates}"] if samples.duplicates else []
-    quality = together(counted, judge.findings(windows, spans))
+    quality = together(counted, seen)
     return Measured(name, poses, windows, quality + creeping(poses))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Held, Pose, held_of, poses_of
-from triaxcal.quality import Finding, QualityDetector
+from triaxcal.quality import Finding, QualityDetector, untrusted_poses
 from triaxcal.stillness.detector import Span, StillnessDetector, Windows
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
@@ -100,7 +100,8 @@ class Pipeline:
         """The still poses of the whole stream."""
         self._detector.finish()
         self._quality.finish()
-        return self.poses()
+        windows = self.windows
+        return [] if windows is None else poses_of(windows, self._still(windows), untrusted_poses(self._seen(windows)))
 
     def data_quality(self) -> list[str]:
         """What the raw stream is to be blamed for, one line each."""
@@ -116,10 +117,11 @@ class Pipeline:
             found.append(f"out_of_order_samples: {self.counts['out_of_order']}, left out")
         if self.counts["errors"]:
             found.append(f"bus_errors: {self.counts['errors']} records")
-        windows = self.windows
+        return together(found, self._seen(self.windows))
+
+    def _seen(self, windows: Windows | None) -> list[Finding]:
         unit = self.bundle.profile.output.unit if self.stream == READINGS else "g"
-        seen = self._quality.findings(windows, self._still(windows) if windows else [], unit=unit)
-        return together(found, seen)
+        return self._quality.findings(windows, self._still(windows) if windows else [], unit=unit)
 
 
 def together(counted: Sequence[str], seen: Iterable[Finding]) -> list[str]:

@@ -8,7 +8,8 @@ from typing import Any
 from triaxcal.agreement import Agreement, Common, SharedShape
 from triaxcal.loop import Loop
 from triaxcal.runs import residuals_by_run
-from triaxcald.documents import Document, error, in_units_of, number, probability, uncertainty
+from triaxcald.documents import Document, error, number, probability, uncertainty
+from triaxcald.units import in_units_of
 
 
 def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Document:
@@ -17,9 +18,9 @@ def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Doc
         {
             "recording": name,
             "poses": r.poses,
-            "before_rms_g": error(r.before_rms_g),
-            "after_rms_g": error(r.after_rms_g),
-            "noise_floor_g": error(r.noise_floor_g),
+            "before_rms_g": error(r.before_rms_g, loop.after.reference),
+            "after_rms_g": error(r.after_rms_g, loop.after.reference),
+            "noise_floor_g": error(r.noise_floor_g, loop.after.reference),
         }
         for name, r in zip(names, residuals_by_run(loop.before, loop.after), strict=True)
     ]

@@ -19,15 +19,14 @@ from triaxcald.documents import (
     Document,
     by_parameter,
     calibration_document,
-    calibration_part,
     number,
     numbers,
     probability,
-    sensor_of,
     uncertainty,
 )
 from triaxcald.errors import InputError
 from triaxcald.held_errors import correlation_of, effect_errors_of, linear_errors_of
+from triaxcald.held_sensor import calibration_part, sensor_of
 
 
 def turning_document(found: RotationFit, *, output_unit: str, reference_unit: str) -> Document:

@@ -14,7 +14,8 @@ from triaxcal.errors import Refused
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.profile import BUILT_IN, Bundle, parse_bundle
 from triaxcald.certificate import Certified, certify, roles
-from triaxcald.documents import sensor_of, to_text
+from triaxcald.documents import to_text
+from triaxcald.held_sensor import sensor_of
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.reader import Recording

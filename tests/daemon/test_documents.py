@@ -23,18 +23,17 @@ from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated
 from triaxcald.documents import (
     calibration_document,
-    calibration_part,
     error,
     loop_document,
     number,
     numbers,
     poses_document,
     probability,
-    sensor_of,
     to_text,
     uncertainty,
 )
 from triaxcald.errors import InputError
+from triaxcald.held_sensor import calibration_part, sensor_of
 
 SECOND = effect_named("second_order_nonlinearity")
 TRUTH = Sensor(
@@ -65,6 +64,14 @@ def test_an_error_of_the_magnitude_lies_on_a_grid_that_no_last_bit_reaches() -> 
     assert error(1.23456789e-6) == error(1.23456789e-6 + 3e-16) == 1.23457e-6
     assert (error(3e-12), error(None), error(float("nan"))) == (0.0, None, None)
     assert (uncertainty(1.23456789e-6), probability(0.123456789)) == (1.23457e-6, 0.1235)
+
+
+def test_the_grid_of_errors_is_as_fine_as_the_reference_is_small() -> None:
+    assert error(1.23456789e-6, 1.0013) == error(1.23456789e-6, 0.998) == error(1.23456789e-6)
+    assert error(5.4321e-10, 5e-5) == 5.4321e-10
+    assert error(5.43214e-10, 5e-5) == 5.43214e-10
+    assert error(1.2345678e-3, 48_000.0) == 1.235e-3
+    assert error(1e-320, 1e-320) == 0.0
 
 
 def test_a_document_reads_back_and_ends_with_a_line() -> None:

@@ -62,9 +62,11 @@ def test_the_samples_of_a_text_are_judged_like_those_of_a_recording(tmp_path: Pa
     del lines[701:704]
     path = tmp_path / "a.csv"
     path.write_text("".join(lines))
-    found = {q.split(":")[0]: q for q in measure(str(path)).data_quality}
+    measured = measure(str(path))
+    found = {q.split(":")[0]: q for q in measured.data_quality}
     assert found["stuck_output"].startswith(f"stuck_output: y repeats {float(frozen):.7g} for 100 samples")
     assert "in the pose that begins at 4." in found["stuck_output"]
+    assert [p.fault for p in measured.poses if p.fault] == ["stuck_output"]
     assert found["missing_samples"] == "missing_samples: 3 of 1200 by the times, at 7.0 s"
 
 

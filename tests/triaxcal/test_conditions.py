@@ -17,10 +17,12 @@ from triaxcal.conditions import (
     references,
     with_scale,
 )
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SCATTER, SINCE_START, TIME
+from triaxcal.effects.channel import ChannelBias
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.errors import InvalidData
 from triaxcal.fit import fit
+from triaxcal.loop import diagnose
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -71,6 +73,39 @@ def test_a_channel_that_one_pose_lacks_is_none_at_all(three: list[Pose]) -> None
     poses = [*three[:2], replace(three[2], channels={"temp_c": 26.0})]
     assert "supply_v" not in channels_of(poses)
     assert "temp_c.rate" not in channels_of([*three[:2], replace(three[2], rates={})])
+
+
+@pytest.mark.parametrize("name", [TIME, SINCE_START, HELD, RUN, "before_x", "change_x", "scatter_x", "temp_c.rate"])
+def test_a_logged_channel_stands_beside_the_derived_condition_of_its_name(name: str, three: list[Pose]) -> None:
+    logged = [4.0, 7.0, 5.5]
+    poses = [replace(p, channels=p.channels | {name: v}) for p, v in zip(three, logged, strict=True)]
+    found, clean = (with_scale(channels_of(p), p, K, B) for p in (poses, three))
+    added = set(found) - set(clean)
+    (condition,) = added
+    assert found[condition].tolist() == logged
+    assert all(np.array_equal(found[n], clean[n]) for n in clean)
+    # It counts from its mean, elsewhere and for single readings too, as any other channel does.
+    reference = references(found)
+    assert reference[condition] == 5.5
+    assert conditions_elsewhere(poses, reference, K, B)[condition].tolist() == [-1.5, 1.5, 0.0]
+    given = {"temp_c": np.zeros(1), "supply_v": np.zeros(1), name: np.array([6.0])}
+    assert of_readings(given | ({} if name == TIME else {TIME: np.zeros(1)}), {condition: 5.5}, 1)[condition] == [0.5]
+    with pytest.raises(InvalidData, match=f"no channel {name},"):
+        conditions_elsewhere(three, reference, K, B)
+
+
+def test_an_effect_of_a_channel_is_found_whatever_the_channel_is_called(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    rng = np.random.default_rng(0)
+    names = [HELD, SINCE_START, "before_y", "scatter_z", "supply.rate", "temp_c.rate"]
+    for name in names:
+        logged = 5 + rng.standard_normal(26)
+        sensor = replace(paper_unit, effects=((ChannelBias("c"), np.array([2e-4, 0.0, -1e-4])),))
+        poses = noisy_poses(sensor, twenty_six, 1.5e-5, rng, channels={"c": logged}, channel_reference={"c": 5.0})
+        poses = [replace(p, channels={name: p.channels["c"]}) for p in poses]
+        loop = diagnose(poses, signs=(-1, -1, -1))
+        assert [f.effect for f in loop.findings] == [f"channel_bias:{name}"]
 
 
 def test_the_pose_before_and_the_scatter_come_in_g_along_the_axes(three: list[Pose]) -> None:

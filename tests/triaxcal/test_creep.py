@@ -149,3 +149,25 @@ def test_creep_that_nothing_explains_makes_no_effect_and_is_left_where_the_magni
     assert loop.unexplained.significant is along
     wider = loop.after.standard_errors / fit(poses, signs=MINUS).standard_errors
     assert np.all(wider > 1.1) if along else np.all(wider < 1.05)
+
+
+def test_in_another_recording_the_channel_explains_creep_and_the_clock_does_not(
+    warm: list[Pose], paper_unit: Sensor, twenty_six: np.ndarray, rates: np.ndarray
+) -> None:
+    warmth = effect_named("temperature_bias")
+    model = fit(without_creep(warm), signs=MINUS, effects=[warmth, BiasDrift()])
+    other = creeping(paper_unit, twenty_six, 7, rates[:, None] * HOLD_S * SENSITIVITY, rates)
+    for before, after in zip(other, with_creep_left(other, model, elsewhere=True), strict=True):
+        assert np.linalg.norm(after.creep) < 0.1 * np.linalg.norm(before.creep)
+    steep = replace(model, sensor=replace(model.sensor, effects=((BiasDrift(), np.full(3, 1e-3)),)))
+    assert with_creep_left(other, steep, elsewhere=True) == other
+
+
+def test_the_noise_floor_of_held_out_poses_has_only_the_creep_that_the_model_does_not_explain(
+    warm: list[Pose], paper_unit: Sensor, twenty_six: np.ndarray, rates: np.ndarray
+) -> None:
+    check = creeping(paper_unit, twenty_six, 3, rates[:, None] * HOLD_S * SENSITIVITY, rates)
+    loop = diagnose(warm, signs=MINUS, check=check)
+    assert loop.held_out is not None
+    assert loop.held_out.noise_floor_g == pytest.approx(SIGMA_G, rel=0.1)
+    assert loop.held_out.after_rms_g < 2 * SIGMA_G

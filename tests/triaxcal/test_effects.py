@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +18,26 @@ from triaxcal.effects import CATALOGUE, TIME, Effect, catalogue_for, effect_name
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
-from triaxcal.effects.contract import BEFORE, CHANGE, DERIVED, HELD, RUN, SCATTER, SINCE_START, rate_of
+from triaxcal.effects.contract import (
+    BEFORE,
+    CHANGE,
+    DERIVED,
+    HELD,
+    RUN,
+    SCATTER,
+    SINCE_START,
+    channel_of,
+    condition_of,
+    is_derived,
+    rate_of,
+)
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.plugins import plugins
 from triaxcal.effects.warm_up import WarmUp
+from triaxcal.errors import InvalidData
+from triaxcal.fit import fit
 from triaxcal.loop import diagnose
+from triaxcal.search.candidates import Ground, faults_of
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
@@ -145,8 +162,12 @@ def test_each_part_is_one_axis_or_a_group_that_acts_on_its_own(effect: Effect) -
 
 def test_hysteresis_by_the_way_goes_through_zero_where_hardly_anything_changed() -> None:
     reversal = Hysteresis("reversal")
-    change = {n: np.array([v]) for n, v in zip(CHANGE, (2.5e-4, -5e-4, 2e-3), strict=True)}
-    assert np.diag(reversal.basis(S, change)[0]) == pytest.approx([0.25, -0.5, 1.0])
+    # Whatever the unit of the reference.
+    for reference in (1.0, 9.80665, 5e4, 4.8e-5):
+        order = 10.0 ** np.rint(np.log10(reference))
+        change = {n: np.array([v * order]) for n, v in zip(CHANGE, (2.5e-4, -5e-4, 2e-3), strict=True)}
+        s = reference * np.array([[0.61, -0.5, 0.6]])
+        assert np.diag(reversal.basis(s, change)[0]) == pytest.approx([0.25, -0.5, 1.0])
     assert reversal.needs == CHANGE
     assert Hysteresis().needs == BEFORE
 
@@ -291,13 +312,37 @@ def test_every_logged_channel_gets_a_bias_and_a_scale_factor_effect_of_its_own()
     assert catalogue_for(DERIVED) == (*CATALOGUE, *plugins()[0])
 
 
-@pytest.mark.xfail(strict=True, reason="taken for the rate of another channel")
-def test_a_logged_channel_may_be_called_a_rate() -> None:
-    assert "channel_bias:flow.rate" in [e.name for e in catalogue_for([*DERIVED, "flow.rate"])]
+@pytest.mark.parametrize("channel", ["flow.rate", "temp_c.rate", TIME, HELD, "before_x", f"{HELD}.logged", "x.logged"])
+def test_a_logged_channel_may_have_any_name(channel: str) -> None:
+    condition = condition_of(channel)
+    assert not is_derived(condition)
+    assert channel_of(condition) == channel
+    effects = catalogue_for([*DERIVED, rate_of("flow"), rate_of("temp_c"), condition, rate_of(condition)])
+    assert [e.name for e in effects[-2:]] == [f"channel_bias:{channel}", f"channel_scale_factor:{channel}"]
+    for effect in effects[-2:]:
+        assert effect.needs == (condition,)
+        assert effect_named(effect.name) == effect
+
+
+def test_no_two_logged_channels_are_one_condition() -> None:
+    channels = [
+        TIME,
+        "supply_v",
+        "supply_v.logged",
+        *(f"{n}{'.logged' * k}" for n in (HELD, "a.rate") for k in range(4)),
+    ]
+    assert len({condition_of(c) for c in channels}) == len(channels)
+    # Names that collide with nothing stay as documents have them.
+    assert [condition_of(c) for c in ("temp_c", "supply_v", "supply_v.logged")] == [
+        "temp_c",
+        "supply_v",
+        "supply_v.logged",
+    ]
 
 
 def test_every_effect_is_one_file_of_its_own_name() -> None:
-    files = {m.name for m in pkgutil.iter_modules(triaxcal.effects.__path__)} - {"contract", "part", "plugins"}
+    files = {m.name for m in pkgutil.iter_modules(triaxcal.effects.__path__)}
+    files -= {"contract", "catalogue", "part", "wrapped", "plugins"}
     # The two effects of a channel are one file, as they are one thought and have the channel in their names. Those of
     # several recordings, and the empirical term, are not searched for in a recording by itself.
     assert files == {e.name for e in CATALOGUE} | {"channel", "in_run", "run_bias", "empirical"}
@@ -366,18 +411,31 @@ g_explodes = dosimetry_effects:Explodes
 """
 
 
+Install = Callable[[str, str], None]
+
+
 @pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Installs a distribution by its code and its entry points."""
+
+    def install(code: str, points: str) -> None:
+        info = tmp_path / "dosimetry_effects-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: dosimetry-effects\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(points)
+        (tmp_path / "dosimetry_effects.py").write_text(code)
+        monkeypatch.delitem(sys.modules, "dosimetry_effects", raising=False)
+        monkeypatch.syspath_prepend(tmp_path)
+        plugins.cache_clear()
+
+    yield install
+    plugins.cache_clear()
+
+
+@pytest.fixture
+def installed(install: Install) -> None:
     """A distribution with one effect that works among six that do not."""
-    info = tmp_path / "dosimetry_effects-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: dosimetry-effects\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(POINTS)
-    (tmp_path / "dosimetry_effects.py").write_text(GOOD)
-    monkeypatch.syspath_prepend(tmp_path)
-    plugins.cache_clear()
-    yield
-    plugins.cache_clear()
+    install(GOOD, POINTS)
 
 
 @pytest.mark.usefixtures("installed")
@@ -418,6 +476,86 @@ def test_a_broken_effect_gives_its_reason_and_leaves_the_others_alone() -> None:
     assert "finite" in reasons["e_endless"]
     assert "name" in reasons["f_nameless"]
     assert reasons["g_explodes"] == "OSError: no such table"
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ("name='temperature_bias'", "the name temperature_bias is taken by triaxcal"),
+        ("name='run_bias'", "the name run_bias is taken by triaxcal"),
+        ("name='run_scale_factor'", "the name run_scale_factor is taken by triaxcal"),
+        ("name='empirical'", "the name empirical is taken by triaxcal"),
+        ("name='linear'", "the name linear is taken by triaxcal"),
+        ("name='channel_bias:dose_gy'", "the name channel_bias:dose_gy is that of an effect of a channel"),
+        ("name='channel_scale_factor:x'", "the name channel_scale_factor:x is that of an effect of a channel"),
+        ("name='fine', needs='dose_gy'", "needs: expected a tuple of names, not 'dose_gy'"),
+        ("name='fine', needs=('dose_gy', 3)", "needs: expected a tuple of names"),
+        ("name='radiation'", "the name radiation is taken by another effect of another package"),
+        ("name='fine', coefficients=(Coefficient('x', 'g'),) * 2", "names of their own, not x, x"),
+    ],
+)
+def test_an_effect_is_refused_by_what_it_says_of_itself(changed: str, reason: str, install: Install) -> None:
+    points = "[triaxcal.effects]\na_radiation = dosimetry_effects:Radiation\nb_other = dosimetry_effects:other\n"
+    install(f"{GOOD}\nother = Radiation({changed})\n", points)
+    found, ((name, why),) = plugins()
+    assert [e.name for e in found] == ["radiation"]
+    assert name == "b_other"
+    assert reason in why
+
+
+def test_an_effect_that_has_no_value_for_a_unit_in_use_is_refused(install: Install) -> None:
+    code = GOOD.replace('needs: tuple = ("dose_gy",)', 'needs: tuple = ("since_start_s",)')
+    install(code.replace("dose_gy", "since_start_s"), "[triaxcal.effects]\na = dosimetry_effects:Radiation\n")
+    assert "finite" in dict(plugins()[1])["a"]
+
+
+FAILING = {
+    "raises": ("basis", 'raise RuntimeError("no such table")', "RuntimeError: no such table"),
+    "flat": ("basis", "return np.zeros((len(s), 3))", "expected finite numbers of shape (26, 3, 1), not (26, 3)"),
+    "endless": ("basis", "return np.full((len(s), 3, 1), np.nan)", "not infinite ones or none"),
+    "huge": ("basis", "return np.full((len(s), 3, 1), 1e200)", "not infinite ones or none"),
+    "text": ("basis", "return [['a']]", "ValueError"),
+    "slope": ("slope", "raise KeyError('dose')", "KeyError: 'dose'"),
+    "variants": ("variants", "raise ValueError('none')", "ValueError: none"),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", FAILING)
+def test_an_effect_that_fails_on_real_poses_is_left_out_with_its_reason(
+    kind: str, install: Install, paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    method, does, reason = FAILING[kind]
+    arguments = "self, conditions" if method == "variants" else "self, s, conditions"
+    install(
+        f"""{GOOD}
+class Failing(Radiation):
+    def {method}({arguments}):
+        if len(conditions["dose_gy"]) > 10:
+            {does}
+        return super().{method}({arguments.removeprefix("self, ")})
+""",
+        "[triaxcal.effects]\na = dosimetry_effects:Failing\n",
+    )
+    ((radiation,), broken) = plugins()
+    assert not broken
+    rng = np.random.default_rng(0)
+    dose = rng.uniform(0, 100, 26)
+    sensor = replace(paper_unit, effects=((ChannelBias("dose_gy"), np.array([8e-6, 0.0, 0.0])),))
+    poses = noisy_poses(sensor, twenty_six, 1.5e-5, rng, channels={"dose_gy": dose})
+    loop = diagnose(poses, signs=(-1, -1, -1))
+    assert [f.effect for f in loop.findings] == ["channel_bias:dose_gy"]
+    assert loop.search is not None
+    ground = Ground.at(loop.search.problem, loop.search.linear.state)
+    ((name, why),) = faults_of(ground, [*CATALOGUE, radiation]).items()
+    assert name == "radiation"
+    assert reason in why
+    # Who asks for it all the same gets one line that names it.
+    asked = partial(fit, poses, signs=(-1, -1, -1), effects=[radiation])
+    if method == "variants":
+        asked = partial(radiation.variants, ground.problem.conditions)
+    with pytest.raises(InvalidData, match="the effect radiation of another package: "):
+        asked()
 
 
 def test_no_plugin_is_there_where_none_is_installed() -> None:

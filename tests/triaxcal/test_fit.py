@@ -256,3 +256,27 @@ def test_arguments_that_make_no_sense_are_named(
     poses = noisy_poses(paper_unit, fourteen, 1e-5, np.random.default_rng(0))
     with pytest.raises(InvalidData, match=why):
         fit(poses, **arguments)  # type: ignore[arg-type]
+
+
+def test_a_pose_whose_outputs_were_stuck_is_left_out_whatever_its_noise_says(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """A frozen output has no noise: taken as it is, the pose would outweigh all others."""
+    poses = noisy_poses(paper_unit, twenty_six, 1.5e-5, np.random.default_rng(0))
+    frozen = replace(poses[7], mean=poses[7].mean * 1.001, covariance=poses[7].covariance * 1e-8, fault="stuck_output")
+    with_it = fit([*poses[:7], frozen, *poses[8:]], signs=MINUS)
+    without = fit([*poses[:7], *poses[8:]], signs=MINUS)
+    assert np.array_equal(with_it.values, without.values)
+    assert np.array_equal(with_it.covariance, without.covariance)
+    assert [i for i, p in enumerate(with_it.poses) if not p.used] == [7]
+    assert with_it.poses[7].pose is frozen
+    assert f"the pose at {frozen.at} (stuck_output)" in with_it.warnings[0]
+
+
+def test_a_faulty_pose_and_a_spoiled_one_are_both_left_out(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, 1.5e-5, np.random.default_rng(1))
+    poses[3] = replace(poses[3], mean=poses[3].mean * 1.01, fault="saturation")
+    poses[12] = replace(poses[12], mean=poses[12].mean + 1e-3 * twenty_six[12] * paper_unit.scale_factor)
+    found = fit(poses, signs=MINUS)
+    assert [i for i, p in enumerate(found.poses) if not p.used] == [3, 12]
+    assert [i for i, p in enumerate(fit(poses, signs=MINUS, aside=(3, 5)).poses) if not p.used] == [3, 5]

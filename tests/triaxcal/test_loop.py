@@ -394,3 +394,59 @@ def test_the_loop_refuses_as_the_fit_does(paper_unit: Sensor, fourteen: np.ndarr
     poses = noisy_poses(paper_unit, np.tile(fourteen[:6], (4, 1)), SIGMA_G, np.random.default_rng(0))
     with pytest.raises(Refused, match="6 distinct directions"):
         diagnose(poses, signs=MINUS)
+
+
+def test_poses_that_the_fit_carries_are_not_refused_because_a_trial_leaves_one_out(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    """Ten directions beside an effect: without one of them most do not carry nine parameters."""
+    carried = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        sensor = unit_with(paper_unit, rng, "temperature_bias")
+        poses = poses_of(sensor, fourteen[rng.permutation(14)[:10]], rng)
+        try:
+            fit(poses, signs=MINUS)
+        except Refused:
+            continue
+        carried += 1
+        diagnose(poses, signs=MINUS)
+    assert carried >= 10
+
+
+def test_a_faulty_pose_tells_the_loop_nothing(with_effects: Make, twenty_six: np.ndarray) -> None:
+    sensor = with_effects(second_order_nonlinearity=[4e-4, -5e-4, 6e-4])
+    poses = poses_of(sensor, twenty_six, np.random.default_rng(0))
+    bad = replace(poses[5], mean=poses[5].mean * 1.002, covariance=poses[5].covariance * 1e-8, fault="saturation")
+    check = [replace(poses[3], mean=poses[3].mean * 2, fault="stuck_output"), *poses[:5]]
+    loop = diagnose([*poses[:5], bad, *poses[6:]], signs=MINUS, check=check)
+    clean = diagnose([*poses[:5], *poses[6:]], signs=MINUS, check=poses[:5])
+    assert names(loop) == names(clean)
+    assert loop.held_out == clean.held_out
+    assert np.array_equal(loop.after.values, clean.after.values)
+    for c in (loop.before, loop.after, loop.findings[0].step):
+        assert len(c.poses) == 26
+        assert not c.poses[5].used
+        assert "(saturation)" in c.warnings[0]
+
+
+def test_an_effect_too_small_to_be_named_is_seen_all_the_same(with_effects: Make, twenty_six: np.ndarray) -> None:
+    """Of a size that a name does not pay for, but that the effect's own test sees in most recordings."""
+    seen, found, runs = 0, 0, 12
+    for seed in range(runs):
+        sensor = with_effects(temperature_bias=[7e-6, -7e-6, 7e-6])
+        loop = diagnose(poses_of(sensor, twenty_six, np.random.default_rng(seed)), signs=MINUS)
+        found += bool(loop.findings)
+        seen += bool(loop.findings) or loop.unexplained.significant
+        if not loop.findings and loop.unexplained.significant:
+            assert "the nearest effect is" in loop.unexplained.lead
+    assert seen > found
+    assert not wrong(loop, "temperature_bias")
+
+
+def test_the_reason_never_speaks_of_an_error_that_is_not_known(with_effects: Make, fourteen: np.ndarray) -> None:
+    sensor = with_effects(second_order_nonlinearity=[4e-4, -6e-4, 5e-4])
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        loop = diagnose(noisy_poses(sensor, fourteen[rng.permutation(14)], SIGMA_G, rng), signs=MINUS)
+        assert all("unknown" not in f.reason for f in loop.findings)

@@ -3,13 +3,16 @@ vector, in a fit of nine parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from triaxcal.calibration import Calibration
+from triaxcal.effects import Effect
+from triaxcal.effects.bias_drift import BiasDrift
+from triaxcal.effects.empirical import Empirical
 from triaxcal.fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -31,13 +34,13 @@ def ups() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def fitted(paper_unit: Sensor, ups: np.ndarray) -> Fitted:
-    """The linear fit to poses whose outputs are off by ``off_g`` (n,3)."""
+    """The fit of the linear model, or one with effects, to poses whose outputs are off by ``off_g`` (n,3)."""
 
-    def make(off_g: np.ndarray, seed: int = 0) -> Calibration:
+    def make(off_g: np.ndarray, seed: int = 0, effects: Sequence[Effect] = ()) -> Calibration:
         rng = np.random.default_rng(seed)
         poses = noisy_poses(paper_unit, ups, SIGMA_G, rng, channels={"supply_v": 5 + 0.1 * CHANNEL}, hold_s=HOLD_S)
         moved = [replace(p, mean=p.mean + paper_unit.scale_factor * e) for p, e in zip(poses, off_g, strict=True)]
-        return fit(moved, signs=MINUS, aside=())
+        return fit(moved, signs=MINUS, aside=(), effects=effects)
 
     return make
 
@@ -142,6 +145,38 @@ def test_where_nothing_stands_out_nothing_is_made_up(fitted: Fitted, ups: np.nda
         text = lead(fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)), seed), {})
         leads += text != "no candidate comes near, and no pose, pattern or channel stands out"
     # binom.isf(1e-3, 40, 0.01)
+    assert leads <= 4
+
+
+MANY: list[Sequence[Effect]] = [[BiasDrift(3)], [Empirical("even")], [BiasDrift(3), Empirical("even")]]
+
+
+@pytest.mark.parametrize("effects", MANY, ids=lambda e: len(e))
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [(odd, "an odd pattern"), (by_channel, "supply_v"), (wave, "a wave along the output of axis y")],
+)
+def test_beside_effects_in_the_model_the_lead_is_what_they_leave(
+    pattern: Callable[[np.ndarray], np.ndarray],
+    words: str,
+    effects: Sequence[Effect],
+    fitted: Fitted,
+    ups: np.ndarray,
+) -> None:
+    """They absorb a part of every pattern, as the nine parameters do."""
+    first = lead(fitted(12 * pattern(ups), 0, effects), {}).split("; ")[0]
+    assert words in first
+    assert int(first.split("%")[0]) > 95
+
+
+@pytest.mark.parametrize("effects", MANY, ids=lambda e: len(e))
+def test_beside_effects_in_the_model_nothing_is_made_up(
+    effects: Sequence[Effect], fitted: Fitted, ups: np.ndarray
+) -> None:
+    runs, leads = 40, 0
+    for seed in range(runs):
+        off = 8 * SIGMA_G * ups * np.random.default_rng(1000 + seed).standard_normal((N, 1))
+        leads += "goes with" in lead(fitted(off, seed, effects), {})
     assert leads <= 4
 
 

@@ -1,4 +1,4 @@
-"""The catalogue of effects. A new effect is one file and one line here, or an entry point of another package."""
+"""The effects that are known: our own, those of other packages, and those of any logged channel."""
 
 from __future__ import annotations
 
@@ -7,43 +7,15 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.bias_step import BiasStep
+from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR, ChannelBias, ChannelScaleFactor
-from triaxcal.effects.contract import DERIVED, TIME, Coefficient, Effect
-from triaxcal.effects.cross_coupling import CrossCoupling
+from triaxcal.effects.contract import TIME, Coefficient, Effect, channel_of, is_derived
 from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.in_run import InRuns, runs_named
 from triaxcal.effects.plugins import plugins
 from triaxcal.effects.run_bias import BETWEEN_RUNS
-from triaxcal.effects.scale_factor_asymmetry import ScaleFactorAsymmetry
-from triaxcal.effects.second_order_nonlinearity import SecondOrderNonlinearity
-from triaxcal.effects.temperature_bias import TemperatureBias
-from triaxcal.effects.temperature_bias_quadratic import TemperatureBiasQuadratic
-from triaxcal.effects.temperature_scale_factor import TemperatureScaleFactor
-from triaxcal.effects.thermal_gradient import RATE, ThermalGradient
-from triaxcal.effects.third_order_nonlinearity import ThirdOrderNonlinearity
-from triaxcal.effects.vibration_rectification import VibrationRectification
-from triaxcal.effects.warm_up import WarmUp
 
-CATALOGUE: tuple[Effect, ...] = (
-    SecondOrderNonlinearity(),
-    ThirdOrderNonlinearity(),
-    ScaleFactorAsymmetry(),
-    CrossCoupling(),
-    TemperatureBias(),
-    TemperatureBiasQuadratic(),
-    TemperatureScaleFactor(),
-    ThermalGradient(),
-    BiasDrift(),
-    WarmUp(),
-    BiasStep(),
-    Hysteresis(),
-    VibrationRectification(),
-)
-"""Those of our own that need no channel but the temperature."""
-OWN_CHANNELS = (*DERIVED, "temp_c", RATE)
+TEMPERATURE = "temp_c"
 
 
 def catalogue_for(conditions: Collection[str]) -> tuple[Effect, ...]:
@@ -52,7 +24,7 @@ def catalogue_for(conditions: Collection[str]) -> tuple[Effect, ...]:
     """
     effects = (*CATALOGUE, *plugins()[0])
     # A channel that an effect of somebody else needs is that effect's business, and may be any other's too.
-    others = sorted(c for c in conditions if c not in OWN_CHANNELS and not c.endswith(".rate"))
+    others = sorted(channel_of(c) for c in conditions if c != TEMPERATURE and not is_derived(c))
     return (*effects, *(made(c) for c in others for made in (ChannelBias, ChannelScaleFactor)))
 
 

@@ -8,7 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import (
+    Coefficient,
+    Effect,
+    condition_of,
+    no_slope,
+    on_each_axis,
+    per_axis,
+    per_axis_slope,
+    xyz,
+)
 
 BIAS, SCALE_FACTOR = "channel_bias:", "channel_scale_factor:"
 
@@ -29,14 +38,14 @@ class ChannelBias(Effect):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (self.channel,)
+        return (condition_of(self.channel),)
 
     @property
     def remedy(self) -> str:
         return f"Hold {self.channel} steadier, or correct the bias by it, in the host."
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return on_each_axis(conditions[self.channel])
+        return on_each_axis(conditions[condition_of(self.channel)])
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
@@ -58,14 +67,14 @@ class ChannelScaleFactor(Effect):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (self.channel,)
+        return (condition_of(self.channel),)
 
     @property
     def remedy(self) -> str:
         return f"Hold {self.channel} steadier, or correct the scale factor by it, in the host."
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis(s * conditions[self.channel][:, None])
+        return per_axis(s * conditions[condition_of(self.channel)][:, None])
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis_slope(np.repeat(conditions[self.channel][:, None], 3, axis=1))
+        return per_axis_slope(np.repeat(conditions[condition_of(self.channel)][:, None], 3, axis=1))

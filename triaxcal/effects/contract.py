@@ -32,12 +32,32 @@ RUN = "run_index"
 CLOCKS = (TIME, SINCE_START, HELD)
 """Conditions that follow from when and for how long the unit was held."""
 DERIVED = (*CLOCKS, *BEFORE, *CHANGE, *SCATTER, RUN)
-"""Conditions that no channel has to be logged for."""
+"""Conditions that no channel has to be logged for, beside the rates of those that are."""
+LOGGED = ".logged"
 
 
 def rate_of(channel: str) -> str:
     """The name of the condition that is a channel's rate of change, per second."""
     return f"{channel}.rate"
+
+
+def is_derived(condition: str) -> bool:
+    """Whether a condition follows from the poses, whatever is logged."""
+    return condition in DERIVED or condition.endswith(rate_of(""))
+
+
+def condition_of(channel: str) -> str:
+    """The name of the condition that a logged channel is: its own, with `LOGGED` where a derived condition has that."""
+    bare = channel
+    while bare.endswith(LOGGED):
+        bare = bare.removesuffix(LOGGED)
+    return channel + LOGGED if is_derived(bare) else channel
+
+
+def channel_of(condition: str) -> str:
+    """The logged channel that a condition is: the inverse of `condition_of`."""
+    bare = condition.removesuffix(LOGGED)
+    return bare if condition_of(bare) == condition else condition
 
 
 @dataclass(frozen=True)

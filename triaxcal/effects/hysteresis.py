@@ -11,8 +11,9 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import BEFORE, CHANGE, Coefficient, Effect, no_slope, per_axis, xyz
 
 KINDS = {"memory": "", "reversal": "sign_"}
-REVERSAL_G = 1e-3
-"""The change along an axis at which its sign is certain; below it the effect goes through zero in a straight line."""
+REVERSAL = 1e-3
+"""The change along an axis at which its sign is certain, in parts of the specific force's order of magnitude; below it
+the effect goes through zero in a straight line."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,11 @@ class Hysteresis(Effect):
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         values = np.stack([conditions[n] for n in self.needs], axis=1)
-        return per_axis(values if self.kind == "memory" else np.clip(values / REVERSAL_G, -1.0, 1.0))
+        if self.kind == "memory":
+            return per_axis(values)
+        # In powers of ten, so that it is the same in every pose: the reference may be 1 g, 50 µT or 5e-5 T.
+        length = np.maximum(np.linalg.norm(s, axis=1, keepdims=True), 1e-100)
+        return per_axis(np.clip(values / (REVERSAL * 10.0 ** np.rint(np.log10(length))), -1.0, 1.0))
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return no_slope(s)

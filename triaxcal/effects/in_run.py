@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.effects.contract import CLOCKS, RUN, SINCE_START, TIME, Coefficient, Effect
+from triaxcal.effects.wrapped import Wrapped
 
 NAMED = re.compile(r"(.+)_run([1-9]\d*)")
 
@@ -21,38 +21,29 @@ def of_clocks(effect: Effect) -> bool:
 
 
 @dataclass(frozen=True)
-class InRuns(Effect):
-    """``effect`` in ``runs`` (0-based); in the others it is zero, or, where it is `Effect.lasting`, what it was before
+class InRuns(Wrapped):
+    """``whole`` in ``runs`` (0-based); in the others it is zero, or, where it is `Effect.lasting`, what it was before
     in earlier ones. Coefficients are named ``x_run2`` for x in the second recording.
     """
 
-    effect: Effect
     runs: tuple[int, ...]
 
     @property
-    def name(self) -> str:
-        return self.effect.name
-
-    @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        own = self.effect.coefficients
+        own = self.whole.coefficients
         return tuple(Coefficient(f"{c.name}_run{run + 1}", c.unit, c.part) for run in self.runs for c in own)
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (*self.effect.needs, RUN)
-
-    @property
-    def remedy(self) -> str:
-        return self.effect.remedy
+        return (*self.whole.needs, RUN)
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        parts = [np.where(there[:, None, None], self.effect.basis(s, c), 0.0) for there, c in self._by_run(conditions)]
+        parts = [np.where(there[:, None, None], self.whole.basis(s, c), 0.0) for there, c in self._by_run(conditions)]
         return np.concatenate(parts, axis=-1)
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         parts = [
-            np.where(there[:, None, None, None], self.effect.slope(s, c), 0.0) for there, c in self._by_run(conditions)
+            np.where(there[:, None, None, None], self.whole.slope(s, c), 0.0) for there, c in self._by_run(conditions)
         ]
         return np.concatenate(parts, axis=-1)
 
@@ -60,23 +51,16 @@ class InRuns(Effect):
         """For each run: where it acts (n,), and conditions whose clocks stand outside the run as they do in use."""
         index = conditions[RUN]
         for run in self.runs:
-            outside = np.where((index < run) & self.effect.lasting, -np.inf, np.inf)
+            outside = np.where((index < run) & self.whole.lasting, -np.inf, np.inf)
             held = dict(conditions)
             if TIME in held:
                 held[TIME] = np.where(index == run, held[TIME], 0.0)
             if SINCE_START in held:
                 held[SINCE_START] = np.where(index == run, held[SINCE_START], outside)
-            yield (index == run) | (self.effect.lasting & (index < run)), held
-
-    @property
-    def shape(self) -> Mapping[str, tuple[float, str]]:
-        return self.effect.shape
+            yield (index == run) | (self.whole.lasting & (index < run)), held
 
     def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
-        return tuple(InRuns(v, self.runs) for v in self.effect.variants(longest(conditions, self.runs)))
-
-    def shaped(self, values: Mapping[str, float]) -> Self:
-        return replace(self, effect=self.effect.shaped(values))
+        return tuple(InRuns(v, self.runs) for v in self.whole.variants(longest(conditions, self.runs)))
 
 
 def longest(conditions: Mapping[str, Floats], runs: Iterable[int]) -> dict[str, Floats]:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Coefficient, Effect
+from triaxcal.effects.wrapped import Wrapped
 
 
 @dataclass(frozen=True, eq=False)
-class Part(Effect):
+class Part(Wrapped):
     """``whole`` with its p coefficients held to ``mix @ q`` of fewer, ``mix`` (p,q)."""
 
-    whole: Effect
     mix: Floats
 
     @classmethod
@@ -25,10 +24,6 @@ class Part(Effect):
         """The coefficients of some parts alone."""
         kept = [i for i, c in enumerate(whole.coefficients) if c.part in parts]
         return cls(whole, np.eye(len(whole.coefficients))[:, kept])
-
-    @property
-    def name(self) -> str:
-        return self.whole.name
 
     @property
     def selects(self) -> bool:
@@ -52,33 +47,11 @@ class Part(Effect):
         largest = np.argmax(np.abs(self.mix), axis=0)
         return tuple(Coefficient(f"combination_{k + 1}", own[int(i)].unit) for k, i in enumerate(largest))
 
-    @property
-    def needs(self) -> tuple[str, ...]:
-        return self.whole.needs
-
-    @property
-    def remedy(self) -> str:
-        return self.whole.remedy
-
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return np.asarray(self.whole.basis(s, conditions) @ self.mix)
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return np.asarray(self.whole.slope(s, conditions) @ self.mix)
-
-    @property
-    def shape(self) -> Mapping[str, tuple[float, str]]:
-        return self.whole.shape
-
-    @property
-    def forms(self) -> tuple[Effect, ...]:
-        return (self,)
-
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
-        return (self,)
-
-    def shaped(self, values: Mapping[str, float]) -> Self:
-        return replace(self, whole=self.whole.shaped(values))
 
 
 def whole(effect: Effect) -> Effect:

@@ -8,31 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import HELD, SINCE_START, TIME, Coefficient, Effect
+from triaxcal.effects.contract import HELD, SINCE_START, TIME, Effect
 from triaxcal.effects.in_run import of_clocks
+from triaxcal.effects.wrapped import Wrapped
 
 POSES = 27
 HELD_SHARE = 0.01
 
 
 @dataclass(frozen=True)
-class OnPlansClock(Effect):
+class OnPlansClock(Wrapped):
     """``whole`` with a shape that suits a recording two units long, by `TIME` alone."""
 
-    whole: Effect
     needs: tuple[str, ...] = (TIME,)
-
-    @property
-    def name(self) -> str:
-        return self.whole.name
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return self.whole.coefficients
-
-    @property
-    def remedy(self) -> str:
-        return self.whole.remedy
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return self.whole.basis(s, _clocks(conditions[TIME]))

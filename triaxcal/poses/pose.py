@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -16,7 +16,7 @@ from triaxcal.stillness.detector import Span
 from triaxcal.stillness.windows import Windows, resolution, rounding_variance
 
 SHAKEN, QUIET = 2.0, 0.1
-"""Poses are shaken in which the outputs scatter with so many times the variance that a tenth of all poses keep below."""
+"""Poses are shaken in which the outputs scatter with so many times the variance of the quietest tenth of them."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class Pose:
     than noise, else zero. ``rates`` are the channels' slopes, per second, over the span and half its length on either
     side; ``channel_errors`` and ``rate_errors`` the standard errors of both from the scatter about those slopes.
     ``before`` (3,) is the mean of the pose before, None in the first; ``scatter`` (3,) the variance of a sample inside
-    the span, output units squared.
+    the span, output units squared. ``fault`` is what its samples are to be blamed for (`triaxcal.quality`), if at all:
+    no fit uses such a pose.
     """
 
     start_s: float
@@ -59,6 +60,7 @@ class Pose:
     scatter: Floats = field(default_factory=lambda: np.zeros(3))
     shared_dof: float = float("inf")
     run: Run = field(default_factory=Run)
+    fault: str = ""
 
     def __post_init__(self) -> None:
         if self.mean.shape != (3,) or self.covariance.shape != (3, 3):
@@ -119,8 +121,16 @@ def held_of(w: Windows, spans: Sequence[Span]) -> list[Held]:
     ]
 
 
-def poses_of(w: Windows, spans: Sequence[Span]) -> list[Pose]:
-    """The poses of the still spans, in order of time."""
+def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None = None) -> list[Pose]:
+    """The poses of the still spans, in order of time. ``faults`` name those, by index, whose samples are not to be
+    trusted: they tell nothing of the noise of the others.
+    """
+    if faults:
+        sound = iter(poses_of(w, [s for i, s in enumerate(spans) if i not in faults]))
+        return [
+            replace(p, fault=faults[i]) if i in faults else replace(next(sound), before=p.before)
+            for i, p in enumerate(poses_of(w, spans))
+        ]
     if not spans:
         return []
     tracks = [_track(w, s) for s in spans]

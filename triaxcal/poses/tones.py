@@ -35,21 +35,19 @@ class Cleaned:
 
 
 def without_tones(track: Track) -> Cleaned:
-    """A sine of amplitude A and j cycles adds about A/πj to a mean at most, half the square of that over the phases, and
-    half of this over the parts of a cycle that are left.
+    """A sine of amplitude A and j cycles adds about A/πj to a mean at most; half the square of that over the phases,
+    and half of this over the parts of a cycle that are left.
     """
     q = track.deviation.shape[1]
     variance, left, tones = np.zeros(q), track.deviation, 0
     if len(track) < WINDOWS_LEAST:
         return Cleaned(track, variance)
-    x = track.centred()
-    while tones < TONES_MOST and (frequency := _loudest(track, left)) is not None:
-        angle = 2 * np.pi * frequency * x
-        columns = np.stack([np.ones_like(x), x, np.cos(angle), np.sin(angle)], axis=1)
-        coefficients = np.linalg.lstsq(columns, left, rcond=None)[0]
-        left = left - columns[:, 2:] @ coefficients[2:]
+    while tones < TONES_MOST and (found := _loudest(track, left)) is not None:
+        frequency = _refined(track, left[:, found[1]], found[0])
+        sines, coefficients = _fitted(track, left, frequency)
+        left = left - sines @ coefficients
         most = 1 / (track.length * np.sin(np.pi * frequency))
-        variance = variance + (coefficients[2:] ** 2).sum(axis=0) / 4 * most**2
+        variance = variance + (coefficients**2).sum(axis=0) / 4 * most**2
         tones += 1
     if tones:
         # Frequency, amplitude and phase took some of the noise with them.
@@ -58,8 +56,26 @@ def without_tones(track: Track) -> Cleaned:
     return Cleaned(track, variance)
 
 
-def _loudest(track: Track, deviation: Floats) -> float | None:
-    """Frequency, in cycles a window, of what stands out most in the spectrum; None where nothing does."""
+def _fitted(track: Track, deviation: Floats, frequency: float) -> tuple[Floats, Floats]:
+    """Cosine and sine (n,2) of a frequency, and their amplitudes (2,q) beside a straight line."""
+    x = track.centred()
+    angle = 2 * np.pi * frequency * x
+    columns = np.stack([np.cos(angle), np.sin(angle), np.ones_like(x), x], axis=1)
+    return columns[:, :2], np.linalg.lstsq(columns, deviation, rcond=None)[0][:2]
+
+
+def _refined(track: Track, deviation: Floats, frequency: float) -> float:
+    """The frequency by one step of Gauss and Newton for deviations (n,), at most half a cycle a pose away."""
+    sines, (a, b) = _fitted(track, deviation, frequency)
+    rest = deviation - sines @ (a, b)
+    by_frequency = 2 * np.pi * track.centred() * (b * sines[:, 0] - a * sines[:, 1])
+    columns = np.concatenate([sines, by_frequency[:, None]], axis=1)
+    step = float(np.linalg.lstsq(columns, rest, rcond=None)[0][2])
+    return frequency + float(np.clip(step, -0.5 / track.length, 0.5 / track.length))
+
+
+def _loudest(track: Track, deviation: Floats) -> tuple[float, int] | None:
+    """Frequency, in cycles a window, and column of what stands out most in the spectrum; None where nothing does."""
     n = track.length
     taper = np.sin(np.pi * (track.place - track.place[0] + 0.5) / n) ** 2
     filled = np.zeros((n, deviation.shape[1]))
@@ -78,4 +94,4 @@ def _loudest(track: Track, deviation: Floats) -> float | None:
     below, at, above = np.log(np.maximum(power[peak - 1 : peak + 2, column], 1e-300))
     bend = below - 2 * at + above
     beside = 0.5 * (below - above) / bend if bend < 0 else 0.0
-    return float(peak + np.clip(beside, -0.5, 0.5)) / (PADDED * n)
+    return float(peak + np.clip(beside, -0.5, 0.5)) / (PADDED * n), column

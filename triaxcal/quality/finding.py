@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,8 @@ from triaxcal.stillness.windows import Windows
 
 AXES = "xyz"
 POSES_NAMED = 8
+UNTRUSTED = ("saturation", "stuck_output")
+"""Faults for which a mean is not that of the acceleration."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,11 @@ class Finding:
     @property
     def line(self) -> str:
         return f"{self.name}: {self.text}"
+
+
+def untrusted_poses(findings: Iterable[Finding]) -> dict[int, str]:
+    """By index, the still spans in which the outputs do not follow the acceleration, with the name of the fault."""
+    return {i: f.name for f in findings if f.name in UNTRUSTED for i in f.poses}
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The search for effects: candidates, what each would gain, what it takes to believe it, and what would do as well."""
 
-from triaxcal.search.alternatives import alternatives
+from triaxcal.search.alternatives import NEAR, alternatives
 from triaxcal.search.apart import telling_apart
 from triaxcal.search.search import FAMILYWISE, Model, Nearest, Search
 
-__all__ = ["FAMILYWISE", "Model", "Nearest", "Search", "alternatives", "telling_apart"]
+__all__ = ["FAMILYWISE", "NEAR", "Model", "Nearest", "Search", "alternatives", "telling_apart"]

@@ -62,9 +62,18 @@ def _near(search: Search, without: Model, taken: Sequence[str], best: float) -> 
 
 
 def _jointly(search: Search, effect: Effect, now: Model) -> list[tuple[str, Model]]:
-    """Where two effects were found: the names in pairs of two others that explain as much, for the first of the two."""
-    if len(now.effects) != 2 or effect is not now.effects[0]:
+    """Where two effects were found: the names in other pairs that explain as much. Of a pair that has one of the two,
+    in whatever form, its other name stands for the other; of a pair of two others, both stand for the first.
+    """
+    if len(now.effects) != 2:
         return []
-    taken = {e.name for e in now.effects}
-    near = [m for m in search.pairs_from(search.linear) if search.score(m) < search.score(now) + NEAR]
-    return [(e.name, m) for m in near if not taken & {e.name for e in m.effects} for e in m.effects]
+    taken = [e.name for e in now.effects]
+    mine = effect.name
+    out = []
+    for m in search.pairs_from(search.linear):
+        names = {e.name for e in m.effects}
+        kept = names & set(taken)
+        stands = mine not in names and (kept or mine == taken[0])
+        if stands and search.score(m) < search.score(now) + NEAR:
+            out += [(name, m) for name in sorted(names - kept)]
+    return out

@@ -14,12 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import SCATTER, Effect, rate_of
+from triaxcal.effects.contract import SCATTER, Effect, condition_of, rate_of
 from triaxcal.effects.part import Part
+from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise
 from triaxcal.visibility import VISIBLE
 
+NOTHING = 1e-9
+"""The size of a column that shows nothing, beside the largest of its effect."""
 AXES = 3
 """Of effects with so many parts two may act as well as one or all."""
 MOVES = 3.0
@@ -80,7 +83,7 @@ class Ground:
     def shown(self, columns: Floats, least: float = VISIBLE) -> tuple[Floats, Floats]:
         """Orthonormal basis (n,q) of what shows of columns (n,p), and the combinations (p,q) of them that show."""
         size = np.linalg.norm(columns, axis=0)
-        there = size > 1e-9
+        there = size > NOTHING * size.max(initial=0.0)
         scaled = columns[:, there] / size[there]
         rest = scaled - self.model @ (self.model.T @ scaled)
         left, singular, right = np.linalg.svd(rest, full_matrices=False)
@@ -91,11 +94,28 @@ class Ground:
         return left[:, kept], mix
 
 
+def faults_of(ground: Ground, catalogue: Sequence[Effect]) -> dict[str, str]:
+    """Effects of other packages that cannot be used on these poses, though they could be loaded: name → reason."""
+    found = {}
+    for effect in catalogue:
+        if is_foreign(effect) and all(n in ground.problem.channel_reference for n in effect.needs):
+            try:
+                for variant in effect.variants(ground.problem.conditions):
+                    ground.columns(variant)
+                    variant.slope(ground.s, ground.problem.conditions)
+            except EffectFault as e:
+                found[effect.name] = e.reason
+    return found
+
+
 def candidates_of(ground: Ground, catalogue: Sequence[Effect], still: set[str]) -> tuple[list[Candidate], set[str]]:
     """All that show, and the names of the effects that show in full. ``still`` are conditions that do not move."""
     found: list[tuple[Effect, Floats]] = []
     full: set[str] = set()
+    faulty = faults_of(ground, catalogue)
     for effect in catalogue:
+        if effect.name in faulty:
+            continue
         if any(n not in ground.problem.channel_reference or n in still for n in effect.needs):
             continue
         for variant in effect.variants(ground.problem.conditions):
@@ -136,9 +156,9 @@ def still_conditions(poses: Sequence[Pose]) -> set[str]:
     still = set()
     for name in sorted(set.intersection(*(set(p.channels) for p in poses))):
         if not _moves([p.channels[name] for p in poses], [p.channel_errors.get(name, 0.0) for p in poses]):
-            still.add(name)
+            still.add(condition_of(name))
         if not _moves([p.rates.get(name, 0.0) for p in poses], [p.rate_errors.get(name, 0.0) for p in poses]):
-            still.add(rate_of(name))
+            still.add(rate_of(condition_of(name)))
     scatter = np.array([p.scatter for p in poses])
     chance = np.sqrt(2 / np.array([max(p.samples, 2) for p in poses]))
     share = scatter.std(axis=0) / np.maximum(scatter.mean(axis=0), 1e-300)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -34,6 +35,10 @@ LIKE_NOISE, MUCH_BETTER = 2.0, 10.0
 or else the model only bends to the poses."""
 MOST = 9.0
 """Where something is left beside it, an effect is named that explains so many times as much."""
+CARRIES = 0.05
+"""A pose of which the model leaves less than this share carries a parameter, and cannot be left out."""
+FORMS, REACH = 3, 1000
+"""Of pairs with the same two names so many are fitted, from so many of the best pairs."""
 PARTNERS = 60
 """In pairs, one of the two is among so many that are best by themselves; of each name the best is among them."""
 
@@ -135,7 +140,7 @@ class Search:
         return found
 
     def coincidence(self, m: Model) -> float:
-        """Probability that the best of all candidates would explain as much of residuals as large as these are, did they
+        """Probability that the best of all candidates would explain as much of residuals as large as these, did they
         lie in any direction: small where a model has been put to the test."""
         left, dof = self.left(m.effects), self.left(())
         rest = min(max(m.chi2, left) / max(self.linear.chi2, 1e-300), 1.0)
@@ -262,14 +267,16 @@ class Search:
         if not beside.candidates:
             return None
         own = np.eye(len(ground.y)) - ground.model @ ground.model.T
-        own = own / np.maximum(np.linalg.norm(own, axis=0), 1e-300)
+        size = np.linalg.norm(own, axis=0)
+        own = own / np.maximum(size, 1e-300)
         some = beside.candidates[0].effect
         poses = [Candidate(some, own[:, i : i + 1], len(own)) for i in range(len(own))]
         gains = Gains.of([*poses, *beside.candidates], ground.y)
         both = gains.pairs(np.arange(len(own)))[:, len(own) :]
         scores = deviance(float(ground.y @ ground.y) - both, beside.left - 1) + beside.prices
         scores[:, ~np.isfinite(beside.scores)] = np.inf
-        return int(np.argmin(scores) // scores.shape[1])
+        scores[size < CARRIES] = np.inf
+        return int(np.argmin(scores) // scores.shape[1]) if np.isfinite(scores).any() else None
 
     def _trials(self, now: Model) -> list[Model]:
         models = self.singles_from(now)
@@ -291,10 +298,13 @@ class Search:
         same = np.array([[names[i] == n for n in names] for i in rows])
         scores[same | (degrees < self.kept)] = np.inf
         out: dict[frozenset[int], tuple[Effect, ...]] = {}
-        for at in np.argsort(scores, axis=None, kind="stable")[: 4 * SECOND_LOOK]:
+        seen = Counter[frozenset[str]]()
+        for at in np.argsort(scores, axis=None, kind="stable")[:REACH]:
             i, j = int(rows[at // len(candidates)]), int(at % len(candidates))
-            if np.isfinite(scores.flat[at]):
-                out.setdefault(frozenset((i, j)), (candidates[i].effect, candidates[j].effect))
+            pair, both = frozenset((i, j)), frozenset((names[i], names[j]))
+            if np.isfinite(scores.flat[at]) and pair not in out and seen[both] < FORMS:
+                seen[both] += 1
+                out[pair] = (candidates[i].effect, candidates[j].effect)
         return list(out.values())[:SECOND_LOOK]
 
     def _earned(self, trial: Model, now: Model, note: bool = True) -> bool:
@@ -323,15 +333,25 @@ class Search:
             without = self.model(rest)
             if without is None:
                 continue
-            trial = without
-            if self.earned(effect, rest, now) < FAMILYWISE:
-                trial = min([now, *self.singles_from(without)], key=self.score)
-            if trial is not now and (fitted := self.fitted(trial.effects)) is not None:
-                now, self.best = trial, fitted
+            if self.earned(effect, rest, now) >= FAMILYWISE:
+                now, self.best = self._taken(without) or (now, self.best)
+                continue
+            base = self.fitted(rest)
+            for trial in sorted(self.singles_from(without), key=self.score):
+                if self.score(trial) >= self.score(now):
+                    break
+                taken = self._taken(trial) if self.earned_all(trial) else None
+                if taken and base and not _no_better(taken[1], base):
+                    now, self.best = taken
+                    break
         better = refined(now.effects, self.problem, lambda effects: self._cost(effects))
-        if better != now.effects and (model := self.model(better)) and (fitted := self.fitted(model.effects)):
-            now, self.best = model, fitted
+        if better != now.effects and (model := self.model(better)):
+            now, self.best = self._taken(model) or (now, self.best)
         return now
+
+    def _taken(self, m: Model) -> tuple[Model, Calibration] | None:
+        fitted = self.fitted(m.effects)
+        return None if fitted is None else (m, fitted)
 
     def _cost(self, effects: Sequence[Effect]) -> float:
         model = self.model(effects)

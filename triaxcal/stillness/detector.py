@@ -36,6 +36,8 @@ MOTION = 2.0
 """Of a random walk, the strongest colour that noise has, a quarter of the squared steps is below 0.4 of the scatter."""
 SLIGHT = 0.01
 """Slow vibration moves the outputs from window to window by no more than this share of their range."""
+FROZEN_WINDOWS = 3
+"""An output is frozen that repeats one reading over so many windows, though noise is wider than its steps."""
 
 
 @dataclass(frozen=True)
@@ -66,20 +68,23 @@ def find_spans(w: Windows) -> list[Span]:
     """The still spans of a stream of windows, at least 0.4 s long."""
     # Rounding of a digital output leaves windows without any scatter; a step of it is noise all the same.
     raw, step = w.variance, resolution(w)
+    frozen = _frozen(w, step)
+    live, stuck = np.asarray(~frozen.any(axis=1)), np.asarray(frozen.all(axis=1))
     w = replace(w, variance=np.maximum(raw, step**2 / 4))
-    calm = np.asarray((w.variance <= quiet_limit(w.variance, w.size - 1)).all(axis=1))
+    calm = np.asarray((w.variance <= quiet_limit(w.variance[live], w.size - 1)).all(axis=1)) & ~stuck
     if _only_moves(w, calm):
         return []
-    residue = rounding_variance(step, np.median(raw[calm], axis=0)) if calm.any() else np.zeros(3)
-    found, noise = _still_runs(w, calm, residue)
+    known = calm & live
+    residue = rounding_variance(step, np.median(raw[known], axis=0)) if known.any() else np.zeros(3)
+    found, noise = _still_runs(w, calm, live, residue)
     for _ in range(2):
-        inside = _inside(w, found)
+        inside = _inside(w, found) & live
         if inside.sum() < 2 * SPAN_LEAST_WINDOWS:
             break
-        calm = np.asarray((w.variance <= _limit_within(w.variance[inside], w.size - 1)).all(axis=1))
-        found, noise = _still_runs(w, calm, residue)
+        calm = np.asarray((w.variance <= _limit_within(w.variance[inside], w.size - 1)).all(axis=1)) & ~stuck
+        found, noise = _still_runs(w, calm, live, residue)
     taken, pieces = _quiet_pieces(w, found, noise)
-    shaken = shaken_runs(w, taken, noise)
+    shaken = shaken_runs(w, [*taken, *runs(stuck, w.joined)], noise)
     disturbed = ~_steady(w, calm, noise)
     spans = _rejoin(w, sorted([*pieces, *shaken], key=lambda p: int(p[0])), noise, disturbed)
     quiet = np.zeros(len(w), dtype=bool)
@@ -101,11 +106,32 @@ def _quiet_pieces(w: Windows, found: list[Ints], noise: NoiseScales) -> tuple[li
     return taken, pieces
 
 
-def _still_runs(w: Windows, calm: Bools, residue: Floats) -> tuple[list[Ints], NoiseScales]:
-    """Runs of windows that are calm and do not move, and the noise they were judged by."""
-    noise = NoiseScales.learned(w, calm, residue, first=True)
+def _frozen(w: Windows, step: Floats) -> Bools:
+    """(m,3) windows in which an axis is frozen: they show no noise, and nothing is learned from them. Nor is it a pose
+    where all axes are: what the unit does meanwhile, nobody knows.
+
+    An output whose ``step`` is as wide as its noise repeats readings too, but it does so again and again, or else
+    changes by a step or two.
+    """
+    frozen = np.zeros((len(w), 3), dtype=bool)
+    # One reading that differs by a step makes more of either.
+    repeats = w.variance < step**2 / (2 * w.size)
+    same = np.abs(np.diff(w.mean, axis=0, prepend=w.mean[:1])) < step / (2 * w.size)
+    for axis in range(3):
+        found = runs(repeats[:, axis], w.joined & same[:, axis])
+        live = w.variance[~repeats[:, axis], axis]
+        again = sum(map(len, found)) - max(map(len, found), default=0)
+        if again < len(live) and np.quantile(live, 0.01) > step[axis] ** 2:
+            for run in found:
+                frozen[run, axis] = len(run) >= FROZEN_WINDOWS
+    return frozen
+
+
+def _still_runs(w: Windows, calm: Bools, live: Bools, residue: Floats) -> tuple[list[Ints], NoiseScales]:
+    """Runs of windows that are calm and do not move, and the noise they were judged by, learned from the ``live``."""
+    noise = NoiseScales.learned(w, calm & live, residue, first=True)
     for _ in range(2):
-        noise = NoiseScales.learned(w, _steady(w, calm, noise), residue)
+        noise = NoiseScales.learned(w, _steady(w, calm, noise) & live, residue)
     still = _steady(w, calm, noise)
     return [run for run in runs(still, w.joined) if len(run) >= SPAN_LEAST_WINDOWS], noise
 

@@ -68,7 +68,9 @@ def _scale(differences: Floats, quantile: float, residue: Floats, white: Floats,
         sigma = half / np.sqrt(2)
     else:
         sigma = np.sqrt(white)
-    return np.asarray(np.maximum(sigma, np.sqrt(2 * residue)))
+    sigma = np.maximum(sigma, np.sqrt(2 * residue))
+    # An axis that hardly ever changes from window to window may still scatter inside them.
+    return np.asarray(np.where(sigma > 0, sigma, np.sqrt(white)))
 
 
 def contrasts(

@@ -78,8 +78,10 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
 
 
-def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
-    recording = parser.add_argument("recording", metavar="REC", help=".mcap, .csv, .csv.gz or - for standard input")
+def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, several: str = "") -> None:
+    """``several`` says of what there may be several recordings."""
+    what = ".mcap, .csv, .csv.gz or - for standard input"
+    recording = parser.add_argument("recording", metavar="REC", help=f"{what}; {several}" if several else what)
     if optional:
         recording.nargs, recording.required = "?", False
     if several:

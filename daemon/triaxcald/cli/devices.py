@@ -18,8 +18,9 @@ from triaxcald.certificate import REFERENCE_TEMPERATURE, is_passing, roles
 from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
-from triaxcald.documents import number, sensor_of
+from triaxcald.documents import number
 from triaxcald.errors import InputError
+from triaxcald.held_sensor import sensor_of
 from triaxcald.inputs import read_document
 from triaxcald.provision.explain import explain
 from triaxcald.provision.identity import check_identity, same_serial

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,16 @@ from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, add_uncertainty, positive, writable
 from triaxcald.cli.console import emit
-from triaxcald.cli.several import as_one_unit, measured_each, show_agreement, show_by_recording
-from triaxcald.cli.showing import Choice, chosen, judge, show_calibration, show_loop, warn
+from triaxcald.cli.several import (
+    as_one_unit,
+    channels_of_some,
+    measured_check,
+    measured_each,
+    named_quality,
+    show_agreement,
+    show_by_recording,
+)
+from triaxcald.cli.showing import Choice, chosen, judge, show_calibration, show_loop, telling_data_quality, warn
 from triaxcald.cli.ways import Way, add_ways, chosen_way, telling_default_signs
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
@@ -33,13 +42,13 @@ def register(commands: Any) -> None:
     _add_results(p)
     p.set_defaults(run=fit_command)
     p = commands.add_parser("diagnose", help="find, add and judge effects that the linear model lacks")
-    add_recording(p, several=True)
+    add_recording(p, several="several are of one unit, in order of time")
     _add_results(p)
     p.add_argument(
         "--units", action="store_true", help="each recording is of another unit: judge each, then whether they agree"
     )
     p.add_argument("--empirical", action="store_true", help="describe what no effect explains by a smooth term")
-    p.add_argument("--check", metavar="REC2", help="another recording, whose poses no fit sees")
+    p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
     p.set_defaults(run=diagnose_command)
 
 
@@ -58,7 +67,7 @@ def fit_command(a: argparse.Namespace) -> int:
         return _fit_by(way, a)
     measured = measure(a.recording)
     choice = chosen(a, measured)
-    with telling_default_signs(a, measured):
+    with telling_data_quality(measured), telling_default_signs(a, measured):
         calibration = fit(measured.poses, signs=choice.signs, reference=choice.reference)
     document = documents.calibration_document(
         calibration, output_unit=choice.output_unit, reference_unit=choice.reference_unit, stated=choice.stated
@@ -88,14 +97,21 @@ def _fit_by(way: Callable[[argparse.Namespace], Way], a: argparse.Namespace) -> 
 def diagnose_command(a: argparse.Namespace) -> int:
     writable(a.output)
     writable(a.report)
+    if a.units:
+        _require_alone(a)
     recordings = measured_each(a)
     if a.units:
         return _diagnose_units(a, recordings)
     names = [m.name for m in recordings]
     measured = as_one_unit(recordings, a)
-    check = measure(a.check).poses if a.check else None
+    check = measured_check(measured, a)
     choice = chosen(a, measured)
-    loop = _loop(a, measured, choice, check)
+    loop = _loop(a, measured, choice, check.poses if check else None)
+    if len(names) > 1:
+        warnings = (*loop.after.warnings, *channels_of_some(recordings))
+        loop = replace(loop, after=replace(loop.after, warnings=warnings))
+    if check:
+        measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
     document = _loop_document(loop, measured, choice)
     if len(names) > 1:
         document = with_recordings(document, loop, names)
@@ -112,7 +128,7 @@ def diagnose_command(a: argparse.Namespace) -> int:
 
 
 def _loop(a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequence[Pose] | None = None) -> Loop:
-    with telling_default_signs(a, measured):
+    with telling_data_quality(measured), telling_default_signs(a, measured):
         return diagnose(
             measured.poses, signs=choice.signs, reference=choice.reference, check=check, empirical=a.empirical
         )
@@ -128,17 +144,20 @@ def _loop_document(loop: Loop, measured: Measured, choice: Choice) -> documents.
     )
 
 
-def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> int:
-    if len(recordings) < 2:
+def _require_alone(a: argparse.Namespace) -> None:
+    if len(a.recording) < 2:
         raise InputError("--units: whether units agree takes two recordings or more")
     for option, given in (("--check", a.check), ("--report", a.report)):
         if given:
             raise InputError(f"{option}: not with --units; diagnose the recording of one unit with it")
+
+
+def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> int:
     names, choices = [m.name for m in recordings], [chosen(a, m) for m in recordings]
     loops = []
     for measured, choice in zip(recordings, choices, strict=True):
         try:
-            loops.append(_loop(a, measured, choice))
+            loops.append(_loop(a, replace(measured, data_quality=named_quality(measured)), choice))
         except Refused as e:
             raise Refused(f"{measured.name}: {e}", wanted=e.wanted) from e
     found = agreement(loops)
@@ -155,7 +174,7 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
     else:
         show_agreement(found, names, loops, choices)
         for measured, loop in zip(recordings, loops, strict=True):
-            warn([f"{measured.name}: {line}" for line in (*loop.after.warnings, *measured.data_quality)])
+            warn([*(f"{measured.name}: {line}" for line in loop.after.warnings), *named_quality(measured)])
     return max(judge(a.limit, loop.after.residual.rms_g) for loop in loops)
 
 
@@ -168,5 +187,10 @@ def _write(a: argparse.Namespace, measured: Measured, document: documents.Docume
         limits = {"limits": {"rms_g": a.limit}} if a.limit else None
         unit = chosen(a, measured).output_unit
         overview = overview_of(measured.windows, measured.poses, unit) if measured.windows is not None else None
-        page = render_report(document, title=measured.name, stream=overview, certificate=limits)
+        page = render_report(document, title=_title(measured.name), stream=overview, certificate=limits)
         write_text(a.report, page)
+
+
+def _title(name: str) -> str:
+    """Of a report: the file's name, wherever it lies."""
+    return "standard input" if name == "-" else Path(name).name

@@ -26,7 +26,9 @@ from triaxcald.cli.showing import chosen, warn
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.framing import Source, frame_document, own_source, source_under
+from triaxcald.held_sensor import sensor_of
 from triaxcald.inputs import measure, read_document, require_unit
+from triaxcald.units import reference_unit_of
 
 OWN = "own"
 NO_FACE = "*"
@@ -38,7 +40,7 @@ Labels = list[tuple[str, float | None]]
 
 def register(commands: Any) -> None:
     p = commands.add_parser("frame", help="units on one fixture in the frame of its faces")
-    add_recording(p, several=True)
+    add_recording(p, several="one of each unit")
     p.add_argument(
         "--calibration",
         action="append",
@@ -185,7 +187,7 @@ def _source(a: argparse.Namespace, name: str, calibration: str, taken: Sequence[
             called, measured, fitted, output_unit=choice.output_unit, reference_unit=choice.reference_unit
         )
     document = read_document(calibration)
-    sensor, _, reference = documents.sensor_of(document, where=calibration)
+    sensor, _, reference = sensor_of(document, where=calibration)
     signs = a.sign or measured.signs
     if signs and any(k * s < 0 for k, s in zip(sensor.scale_factor, signs, strict=True)):
         whose = "--sign" if a.sign else f"{name}: signs"
@@ -201,7 +203,7 @@ def _source(a: argparse.Namespace, name: str, calibration: str, taken: Sequence[
         document,
         where=calibration,
         output_unit=choice.output_unit,
-        reference_unit=a.reference_unit or documents.reference_unit_of(reference),
+        reference_unit=a.reference_unit or reference_unit_of(reference),
     )
 
 

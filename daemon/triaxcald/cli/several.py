@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
 
 from triaxcal.agreement import Agreement
 from triaxcal.errors import Refused
 from triaxcal.loop import Loop
 from triaxcal.runs import residuals_by_run, together
-from triaxcald.cli.console import micro, table
-from triaxcald.cli.showing import Choice, chosen
+from triaxcald.cli.console import table
+from triaxcald.cli.showing import Choice, chosen, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure
 
@@ -20,14 +22,32 @@ def measured_each(a: argparse.Namespace) -> list[Measured]:
     """The recordings that the arguments name. Raises InputError where one is named twice, Refused for one without a
     pose among several."""
     names: list[str] = a.recording
-    twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
+    places = [_place(name) for name in names]
+    twice = next((n for i, n in enumerate(names) if places[i] in places[:i]), None)
     if twice is not None:
         raise InputError(f"{twice}: given twice; a recording counts once")
+    if a.check and _place(a.check) in places:
+        raise InputError(f"--check {a.check}: is what is diagnosed; held-out poses are of another recording")
     out = [measure(name) for name in names]
     empty = next((m for m in out if not m.poses), None)
     if empty is not None and len(out) > 1:
+        warn(named_quality(empty))
         raise Refused(f"{empty.name}: no still pose")
     return out
+
+
+def measured_check(measured: Measured, a: argparse.Namespace) -> Measured | None:
+    """The recording of the held-out poses, where the arguments name one. Raises InputError where it is not alike."""
+    if not a.check:
+        return None
+    check = measure(a.check)
+    _require_alike(measured, check, a)
+    return check
+
+
+def _place(name: str) -> Path | None:
+    """Where a recording lies, however its path is written; None for standard input."""
+    return None if name == "-" else Path(name).resolve()
 
 
 def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measured:
@@ -35,24 +55,42 @@ def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measur
     first = recordings[0]
     if len(recordings) == 1:
         return first
-    for other in recordings[1:]:
-        _require_alike(first, other, a)
+    for one, other in combinations(recordings, 2):  # the first may not say of which unit it is
+        _require_alike(one, other, a, hint="; --units judges units side by side")
     return replace(
         first,
         name=f"{first.name} and {len(recordings) - 1} more",
         poses=together([m.poses for m in recordings]),
         windows=None,
-        data_quality=[f"{m.name}: {line}" for m in recordings for line in m.data_quality],
+        data_quality=[line for m in recordings for line in named_quality(m)],
         unit=next((m.unit for m in recordings if m.unit), None),
     )
 
 
-def _require_alike(first: Measured, other: Measured, a: argparse.Namespace) -> None:
+def named_quality(m: Measured) -> list[str]:
+    """Its data quality, where that stands beside another recording's."""
+    return [f"{m.name}: {line}" for line in m.data_quality]
+
+
+def _require_alike(first: Measured, other: Measured, a: argparse.Namespace, *, hint: str = "") -> None:
+    """``hint`` is for recordings of two units."""
     ours, theirs = ({"unit": _serial(m), **_settings(chosen(a, m))} for m in (first, other))
     for what, said in theirs.items():
         if said != ours[what] and not (what == "unit" and None in (said, ours[what])):
-            hint = "; --units judges units side by side" if what == "unit" else ""
-            raise InputError(f"{other.name}: {what}: {said}; {first.name} has {ours[what]}{hint}")
+            more = hint if what == "unit" else ""
+            raise InputError(f"{other.name}: {what}: {said}; {first.name} has {ours[what]}{more}")
+
+
+def channels_of_some(recordings: Sequence[Measured]) -> list[str]:
+    """A line for each channel that not all of several recordings have: no effect of it can be put to all poses."""
+    logged = {m.name: set.intersection(*(set(p.channels) for p in m.poses)) for m in recordings if m.poses}
+    out = []
+    for channel in sorted(set().union(*logged.values())):
+        lacking = [name for name, channels in logged.items() if channel not in channels]
+        if lacking:
+            having = ", ".join(name for name in logged if name not in lacking)
+            out.append(f"channel {channel}: in {having}, but not in {', '.join(lacking)}; no effect of it was tried")
+    return out
 
 
 def _serial(m: Measured) -> str | None:
@@ -63,24 +101,26 @@ def _settings(choice: Choice) -> dict[str, str | None]:
     return {
         "signs of the scale factors": ",".join("+" if s > 0 else "-" for s in choice.signs),
         "reference": f"{choice.reference:g} {choice.reference_unit}",
-        "output unit": choice.output_unit,
+        "output unit": choice.output_unit or "not stated",
     }
 
 
 def show_by_recording(loop: Loop, names: Sequence[str], choice: Choice) -> None:
+    small = choice.small
     table(
-        f"by recording, {choice.micro_unit} rms",
+        f"by recording, {small} rms",
         ["", "poses", "before", "after", "noise floor"],
         [
-            [name, r.poses, micro(r.before_rms_g), micro(r.after_rms_g), micro(r.noise_floor_g)]
+            [name, r.poses, *(small.told(v) for v in (r.before_rms_g, r.after_rms_g, r.noise_floor_g))]
             for name, r in zip(names, residuals_by_run(loop.before, loop.after), strict=True)
         ],
     )
 
 
 def show_agreement(found: Agreement, names: Sequence[str], loops: Sequence[Loop], choices: Sequence[Choice]) -> None:
+    small = choices[0].small
     table(
-        f"each unit by itself, {choices[0].micro_unit}",
+        f"each unit by itself, {small}",
         ["", "finding", "verdict", "would do as well", "cross-validated before", "after", "noise floor"],
         [
             [
@@ -88,9 +128,9 @@ def show_agreement(found: Agreement, names: Sequence[str], loops: Sequence[Loop]
                 ", ".join(f.effect for f in loop.findings) or "none",
                 ", ".join(f.verdict for f in loop.findings),
                 ", ".join(dict.fromkeys(other for f in loop.findings for other in f.alternatives)),
-                micro(loop.before.residual.cross_validated_rms_g),
-                micro(loop.after.residual.cross_validated_rms_g),
-                micro(loop.after.residual.noise_floor_g),
+                small.told(loop.before.residual.cross_validated_rms_g),
+                small.told(loop.after.residual.cross_validated_rms_g),
+                small.told(loop.after.residual.noise_floor_g),
             ]
             for name, loop in zip(names, loops, strict=True)
         ],

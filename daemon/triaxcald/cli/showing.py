@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from triaxcal.calibration import Calibration
+from triaxcal.errors import Refused
 from triaxcal.gravity import local_gravity_g
 from triaxcal.loop import Loop
 from triaxcal.uncertainty import Budget, Combined, Stated, budget
-from triaxcald import documents
-from triaxcald.cli.console import micro, say, table
+from triaxcald.cli.console import say, table
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
+from triaxcald.units import ErrorUnit, grouped, in_units_of, reference_unit_of
 
 
 @dataclass(frozen=True)
@@ -26,8 +29,8 @@ class Choice:
     stated: Stated
 
     @property
-    def micro_unit(self) -> str:
-        return documents.micro_unit(self.reference_unit)
+    def small(self) -> ErrorUnit:
+        return ErrorUnit.of(self.reference_unit, self.reference)
 
 
 def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
@@ -45,7 +48,7 @@ def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
         a.sign or measured.signs or (1, 1, 1),
         reference,
         a.output_unit or (measured.profile.output.unit if measured.profile else ""),
-        a.reference_unit or documents.reference_unit_of(reference),
+        a.reference_unit or reference_unit_of(reference),
         _stated(a, measured),
     )
 
@@ -69,11 +72,11 @@ def _stated(a: argparse.Namespace, measured: Measured) -> Stated:
 def show_calibration(c: Calibration, choice: Choice) -> None:
     b = budget(c, choice.stated)
     show_coefficients(c, choice, b.parameters)
-    r, micro_unit = c.residual, choice.micro_unit
+    r, small = c.residual, choice.small
     p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
     print(
-        f"{len(c.poses)} poses: residual rms {micro(r.rms_g)} {micro_unit}, cross-validated "
-        f"{micro(r.cross_validated_rms_g)} {micro_unit}, noise floor {micro(r.noise_floor_g)} {micro_unit}, "
+        f"{len(c.poses)} poses: residual rms {small.in_full(r.rms_g)}, cross-validated "
+        f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.in_full(r.noise_floor_g)}, "
         f"lack of fit p {p}"
     )
     show_budget(b, choice)
@@ -83,11 +86,9 @@ def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = N
     """``whole`` is their uncertainty with all that the budget has, where there is one."""
     rows = []
     unit = choice.reference_unit
-    of_scale = f"{choice.output_unit or 'output'}/{documents.grouped(unit)}"
+    of_scale = f"{choice.output_unit or 'output'}/{grouped(unit)}"
     units = {"scale_factor": of_scale, "misalignment": "rad", "bias": unit}
-    of_effects = {
-        f"{e.name}.{k.name}": documents.in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients
-    }
+    of_effects = {f"{e.name}.{k.name}": in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients}
     for i, (name, value, error) in enumerate(zip(c.parameters, c.values, c.standard_errors, strict=True)):
         expanded = [f"± {whole.expanded[i]:.2g}"] if whole else []
         of = of_effects.get(name, units.get(name.split(".")[0], ""))
@@ -104,39 +105,41 @@ def _percent(share: float) -> str:
 
 
 def show_budget(b: Budget, choice: Choice) -> None:
-    unit = choice.micro_unit
-    rows = [[line.source, line.evaluation, micro(line.magnitude), _percent(b.share(line))] for line in b.components]
+    small = choice.small
+    rows = [
+        [line.source, line.evaluation, small.told(line.magnitude), _percent(b.share(line))] for line in b.components
+    ]
     whole = b.magnitude
-    rows.append(["combined", "", micro(float(whole.standard)), ""])
+    rows.append(["combined", "", small.told(float(whole.standard)), ""])
     rows.append(
-        [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", micro(float(whole.expanded)), ""]
+        [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", small.told(float(whole.expanded)), ""]
     )
-    table(f"uncertainty of the magnitude, {unit}", ["source", "type", "standard", "share"], rows)
-    by = documents.in_words_of(b.dominant.halved_by, choice.reference_unit)
-    print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {micro(b.magnitude_if_halved)} {unit})")
+    table(f"uncertainty of the magnitude, {small}", ["source", "type", "standard", "share"], rows)
+    by = small.in_words(b.dominant.halved_by)
+    print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
     for line in b.not_evaluated:
         print(f"not evaluated: {line}")
 
 
 def show_loop(loop: Loop, choice: Choice) -> None:
-    b, f = loop.before.residual, loop.after.residual
+    b, f, small = loop.before.residual, loop.after.residual, choice.small
     rows = [
-        ["residual rms", micro(b.rms_g), micro(f.rms_g)],
-        ["cross-validated rms", micro(b.cross_validated_rms_g), micro(f.cross_validated_rms_g)],
+        ["residual rms", small.told(b.rms_g), small.told(f.rms_g)],
+        ["cross-validated rms", small.told(b.cross_validated_rms_g), small.told(f.cross_validated_rms_g)],
     ]
     if loop.held_out:
-        rows.append(["held-out rms", micro(loop.held_out.before_rms_g), micro(loop.held_out.after_rms_g)])
-    rows.append(["noise floor", micro(b.noise_floor_g), micro(f.noise_floor_g)])
-    table(f"error of the magnitude, {choice.micro_unit}", ["", "before", "after"], rows)
+        rows.append(["held-out rms", small.told(loop.held_out.before_rms_g), small.told(loop.held_out.after_rms_g)])
+    rows.append(["noise floor", small.told(b.noise_floor_g), small.told(f.noise_floor_g)])
+    table(f"error of the magnitude, {small}", ["", "before", "after"], rows)
     for finding in loop.findings:
-        print(f"{finding.verdict}: {finding.effect} ({documents.in_words_of(finding.reason, choice.reference_unit)})")
+        print(f"{finding.verdict}: {finding.effect} ({small.in_words(finding.reason)})")
     if not loop.findings:
         print("no effect of the catalogue shows")
     if loop.unexplained.significant:
-        lead = documents.in_words_of(loop.unexplained.lead, choice.reference_unit)
-        print(f"unexplained: {micro(loop.unexplained.rms_g)} {choice.micro_unit} rms; {lead}")
+        lead = small.in_words(loop.unexplained.lead)
+        print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")
     for line in loop.advice:
-        print(f"advice: {documents.in_words_of(line, choice.reference_unit)}")
+        print(f"advice: {small.in_words(line)}")
 
 
 def judge(limit: float | None, rms: float) -> int:
@@ -146,6 +149,16 @@ def judge(limit: float | None, rms: float) -> int:
     return 0
 
 
-def warn(lines: list[str]) -> None:
+def warn(lines: Iterable[str]) -> None:
     for line in lines:
         say(f"warning: {line}")
+
+
+@contextmanager
+def telling_data_quality(measured: Measured) -> Iterator[None]:
+    """What spoils a recording may be why it is refused."""
+    try:
+        yield
+    except Refused:
+        warn(measured.data_quality)
+        raise

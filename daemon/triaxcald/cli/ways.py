@@ -19,7 +19,7 @@ from triaxcald import documents, ways_in
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.arguments import not_negative, within
 from triaxcald.cli.console import micro, table
-from triaxcald.cli.showing import Choice, chosen, show_coefficients
+from triaxcald.cli.showing import Choice, chosen, show_coefficients, telling_data_quality
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, read_document, require_unit
 
@@ -91,7 +91,7 @@ def _turning(a: argparse.Namespace) -> Way:
     quality = [line for line in measured.data_quality if not line.startswith("creeping_pose")]
     measured = replace(measured, data_quality=quality)
     choice = chosen(a, measured)
-    with telling_default_signs(a, measured):
+    with telling_data_quality(measured), telling_default_signs(a, measured):
         found = fit_rotation(moments, signs=choice.signs, reference=choice.reference)
     document = ways_in.turning_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     calibration = found.calibration
@@ -105,13 +105,13 @@ def _turning(a: argparse.Namespace) -> Way:
 
 def _show_turning(found: RotationFit, choice: Choice) -> None:
     show_coefficients(found.calibration, choice)
-    r, unit = found.calibration.residual, choice.micro_unit
+    r, small = found.calibration.residual, choice.small
     p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
     noise = ", ".join(f"{v:.3g}" for v in found.noise_g)
     print(f"{found.samples} samples, whose noise is {noise} {choice.reference_unit} in x, y, z")
     print(
-        f"{found.stretches} stretches: |a| off by {micro(r.rms_g)} {unit} rms, of which noise is "
-        f"{micro(r.noise_floor_g)} {unit}, lack of fit p {p}"
+        f"{found.stretches} stretches: |a| off by {small.in_full(r.rms_g)} rms, of which noise is "
+        f"{small.in_full(r.noise_floor_g)}, lack of fit p {p}"
     )
 
 
@@ -120,14 +120,15 @@ def _attitudes(a: argparse.Namespace) -> Way:
     measured = measure(a.recording)
     choice = chosen(a, measured)
     poses, rows = match(rows, measured.poses, path=a.attitudes, recording=measured.name)
-    found = fit_attitudes(
-        poses,
-        np.array([row.up for row in rows]),
-        names=[row.name for row in rows],
-        signs=a.sign or measured.signs,
-        reference=choice.reference,
-        attitude_error_rad=a.attitude_error,
-    )
+    with telling_data_quality(measured):
+        found = fit_attitudes(
+            poses,
+            np.array([row.up for row in rows]),
+            names=[row.name for row in rows],
+            signs=a.sign or measured.signs,
+            reference=choice.reference,
+            attitude_error_rad=a.attitude_error,
+        )
     document = ways_in.attitudes_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     return measured, document, found.calibration, lambda: _show_attitudes(found, choice)
 
@@ -137,14 +138,14 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
     show_coefficients(c, choice)
     table(
         "attitudes",
-        ["", "start s", "off µrad", "off, standard errors", f"|a| off {choice.micro_unit}", "used"],
+        ["", "start s", "off µrad", "off, standard errors", f"|a| off {choice.small}", "used"],
         [
             [
                 row.name,
                 f"{pose.pose.start_s:.1f}",
                 micro(row.off_rad),
                 f"{row.off:.1f}",
-                micro(pose.residual_g),
+                choice.small.told(pose.residual_g),
                 "yes" if pose.used else "no",
             ]
             for row, pose in zip(found.attitudes, c.poses, strict=True)
@@ -164,11 +165,12 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
         f"error of the attitudes by axis: {micro(found.attitude_error_rad)} µrad ({how}); with what residuals say it "
         f"raises the standard errors by a factor of up to {cost:.2f}"
     )
+    small = choice.small
     r, p = c.residual, "—" if c.residual.lack_of_fit_p is None else f"{c.residual.lack_of_fit_p:.2g}"
     print(
-        f"{len(c.poses)} poses: |a| off by {micro(r.rms_g)} {choice.micro_unit} rms, cross-validated "
-        f"{micro(r.cross_validated_rms_g)} {choice.micro_unit}, noise floor {micro(r.noise_floor_g)} "
-        f"{choice.micro_unit}, lack of fit p {p}"
+        f"{len(c.poses)} poses: |a| off by {small.in_full(r.rms_g)} rms, cross-validated "
+        f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.told(r.noise_floor_g)} "
+        f"{small}, lack of fit p {p}"
     )
 
 
@@ -189,7 +191,7 @@ def _passport(a: argparse.Namespace) -> Way:
         output_unit=choice.output_unit or units.get("output", ""),
         reference_unit=a.reference_unit or units.get("reference") or choice.reference_unit,
     )
-    with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
+    with telling_data_quality(measured), np.errstate(all="ignore"):  # numbers out of a file may be any
         found = refine(measured.poses, passport)
     document = ways_in.passport_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     return measured, document, found.calibration, lambda: _show_passport(found, choice)
@@ -215,9 +217,9 @@ def _show_passport(found: Refinement, choice: Choice) -> None:
             )
         ],
     )
-    r, unit = c.residual, choice.micro_unit
+    r, small = c.residual, choice.small
     p = "—" if found.conflict_p is None else f"{found.conflict_p:.2g}"
     print(
-        f"|a| off by {micro(r.rms_g)} {unit} rms, noise floor {micro(r.noise_floor_g)} {unit}; passport and poses "
+        f"|a| off by {small.in_full(r.rms_g)} rms, noise floor {small.in_full(r.noise_floor_g)}; passport and poses "
         f"agree with p {p}"
     )

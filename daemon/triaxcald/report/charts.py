@@ -9,37 +9,38 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from triaxcald.report.figures import clean, micro, micro_g
+from triaxcald.report.figures import MICRO_G, clean, micro, micro_g, unit_label
 from triaxcald.report.ink import AXES, BAND, FLOOR, draw, hang_grid
 from triaxcald.report.over_time import stage_colours
 from triaxcald.report.stages import HeldOut, Stage
 from triaxcald.report.stream import StreamOverview
+from triaxcald.units import ErrorUnit
 
 Group = tuple[str, list[tuple[str, float]], float | None]
 _LONGEST_LABEL = 34
 
 
-def bars_picture(stages: Sequence[Stage], held_out: HeldOut | None) -> Markup | None:
-    """Errors of every stage in µg against the noise floor, or None when none is known."""
+def bars_picture(stages: Sequence[Stage], held_out: HeldOut | None, unit: ErrorUnit = MICRO_G) -> Markup | None:
+    """Errors of every stage against the noise floor, or None when none is known."""
     groups = _bar_groups(stages, held_out)
     if not groups:
         return None
     colours = stage_colours(stages)
-    told = [f"{name}: " + ", ".join(f"{s} {micro_g(v)}" for s, v in bars) for name, bars, _ in groups]
+    told = [f"{name}: " + ", ".join(f"{s} {micro_g(v, unit)}" for s, v in bars) for name, bars, _ in groups]
     rows = sum(len(bars) + 1 for _, bars, _ in groups)
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         marks_g = [floor_g or 0.0 for _, _, floor_g in groups] + [v for _, bars, _ in groups for _, v in bars]
-        axis_end_ug = 1.28e6 * (max(marks_g) or 1e-6)
+        axis_end = 1.28 * (unit.count(max(marks_g)) or 1.0)
         top, ticks, names = 0.0, [], []
         for name, bars, floor_g in groups:
             axes.annotate(name, (0, top - 0.62), (2, 0), textcoords="offset points", va="center", weight="bold")
             ticks += [top + i for i in range(len(bars))]
             names += [label[:_LONGEST_LABEL] for label, _ in bars]
-            _bar_group(axes, top, bars, floor_g, colours, axis_end_ug, named=not top)
+            _bar_group(axes, top, bars, floor_g, colours, axis_end, unit, named=not top)
             top += len(bars) + 0.9
-        axes.set(xlim=(0, axis_end_ug), ylim=(top - 1.3, -1.0), xlabel="error of the magnitude, µg")
+        axes.set(xlim=(0, axis_end), ylim=(top - 1.3, -1.0), xlabel=f"error of the magnitude, {unit_label(unit)}")
         axes.set_yticks(ticks, labels=names)
         hang_grid(axes, "x")
         axes.tick_params(axis="y", length=0)
@@ -89,17 +90,17 @@ def _bar_groups(stages: Sequence[Stage], held_out: HeldOut | None) -> list[Group
 
 def _bar_group(
     axes: Axes, top: float, bars: list[tuple[str, float]], floor_g: float | None,
-    colours: dict[str, str], axis_end_ug: float, *, named: bool,
+    colours: dict[str, str], axis_end: float, unit: ErrorUnit, *, named: bool,
 ) -> None:  # fmt: skip
     for i, (label, value_g) in enumerate(bars):
-        axes.barh(top + i, value_g * 1e6, 0.78, color=colours[label])
-        just_below = floor_g is not None and 0.0 <= floor_g * 1e6 - value_g * 1e6 < 0.25 * axis_end_ug
-        at_ug = (floor_g if just_below and floor_g else value_g) * 1e6
-        note = micro(value_g) + (f"  ({_times(value_g / floor_g)} × floor)" if floor_g else "")
-        axes.annotate(note, (at_ug, top + i), (4, 0), textcoords="offset points", va="center", fontsize=8)
+        axes.barh(top + i, unit.count(value_g), 0.78, color=colours[label])
+        just_below = floor_g is not None and 0.0 <= unit.count(floor_g - value_g) < 0.25 * axis_end
+        at = unit.count(floor_g if just_below and floor_g else value_g)
+        note = micro(value_g, unit) + (f"  ({_times(value_g / floor_g)} × floor)" if floor_g else "")
+        axes.annotate(note, (at, top + i), (4, 0), textcoords="offset points", va="center", fontsize=8)
     if floor_g is not None:
-        axes.vlines(floor_g * 1e6, top - 0.45, top + len(bars) - 0.5, color=FLOOR, lw=1.6, linestyles=(0, (3, 1.5)),
-                    label="noise floor" if named else "_nolegend_")  # fmt: skip
+        axes.vlines(unit.count(floor_g), top - 0.45, top + len(bars) - 0.5, color=FLOOR, lw=1.6,
+                    linestyles=(0, (3, 1.5)), label="noise floor" if named else "_nolegend_")  # fmt: skip
 
 
 def _times(ratio: float) -> str:

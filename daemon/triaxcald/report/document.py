@@ -11,9 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from triaxcald.report.figures import effect_title, number
+from triaxcald.report.figures import clean, effect_title, number
+from triaxcald.report.recordings import OfRecording, by_recording, file_names
 from triaxcald.report.stages import HeldOut, Residual, Stage, held_out_of, stages_of
 from triaxcald.report.untrusted import Vector, mapping, numbers, texts, vector, words
+from triaxcald.units import ErrorUnit
 
 _OF_A_POSE = (
     "start_s", "end_s", "before_residual_g", "residual_g", "studentized", "leverage", "standard_error_g",
@@ -30,7 +32,9 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Pose:
-    """`direction` is the unit vector of up in the sensor's frame; `mean` in output units."""
+    """`direction` is the unit vector of up in the sensor's frame; `mean` in output units; `recording` that of several
+    whose clock its times are on.
+    """
 
     number: int
     start_s: float | None
@@ -43,6 +47,7 @@ class Pose:
     leverage: float | None
     used: bool
     standard_error_g: float | None = None
+    recording: str = ""
     channels: Mapping[str, float | None] = field(default_factory=dict)
 
     @property
@@ -79,7 +84,8 @@ class Unexplained:
 @dataclass(frozen=True)
 class Outcome:
     """Everything the page shows of one document. `stages` run from the plain model to the final one;
-    `searched` tells a loop, which looked for effects, from a fit, which did not.
+    `searched` tells a loop, which looked for effects, from a fit, which did not. `recordings` are their names where
+    there are several.
     """
 
     refused: str | None
@@ -94,6 +100,9 @@ class Outcome:
     centre: Vector | None
     output_unit: str
     reference_unit: str
+    reference: float | None
+    recordings: tuple[str, ...]
+    by_recording: tuple[OfRecording, ...]
     poses: tuple[Pose, ...]
     condition: float | None
     blind_to: tuple[str, ...]
@@ -108,6 +117,11 @@ class Outcome:
         return self.stages[-1].residual if self.stages else Residual()
 
     @property
+    def small(self) -> ErrorUnit:
+        """The unit in which errors are told."""
+        return ErrorUnit.of(self.reference_unit, 1.0 if self.reference is None else self.reference)
+
+    @property
     def poses_used(self) -> int:
         return sum(pose.used for pose in self.poses)
 
@@ -117,7 +131,8 @@ def read_document(document: Mapping[str, object]) -> Outcome:
     looped = str(document.get("format", "")).startswith("triaxcal.loop/")
     calibration = mapping(document.get("calibration")) if looped else document
     matrix, centre = _matrix(calibration.get("matrix")), vector(calibration.get("centre"))
-    poses = tuple(_poses(calibration, matrix, centre))
+    names = file_names(texts(document.get("recordings")))
+    poses = tuple(_poses(calibration, matrix, centre, names))
     held_out = held_out_of(document)
     before_g, after_g = [pose.before_residual_g for pose in poses], [pose.residual_g for pose in poses]
     effects = mapping(calibration.get("effects"))
@@ -135,7 +150,10 @@ def read_document(document: Mapping[str, object]) -> Outcome:
         matrix=matrix,
         centre=centre,
         output_unit=_output_unit(units),
-        reference_unit=str(mapping(units).get("reference") or "g"),
+        reference_unit=clean(mapping(units).get("reference") or "g"),
+        reference=number(calibration.get("reference")),
+        recordings=tuple(names.values()),
+        by_recording=tuple(by_recording(document.get("by_recording"), names)),
         poses=poses,
         condition=number(calibration.get("condition")),
         blind_to=texts(calibration.get("blind_to")),
@@ -223,7 +241,10 @@ def _linear(calibration: Mapping[str, object], units: object) -> Iterator[Coeffi
 
 
 def _poses(
-    calibration: Mapping[str, object], matrix: tuple[Vector, ...] | None, centre: Vector | None
+    calibration: Mapping[str, object],
+    matrix: tuple[Vector, ...] | None,
+    centre: Vector | None,
+    recordings: Mapping[str, str],
 ) -> Iterator[Pose]:
     entries = calibration.get("poses")
     for i, entry in enumerate(entries if isinstance(entries, (list, tuple)) else [], start=1):
@@ -234,6 +255,7 @@ def _poses(
             mean=mean,
             direction=vector(known.get("direction")) or _direction(mean, matrix, centre),
             used=known.get("used") is None or bool(known["used"]),
+            recording=recordings.get(str(known.get("recording")), ""),
             channels=numbers(known.get("channels")),
             **{name: number(known.get(name)) for name in _OF_A_POSE},
         )

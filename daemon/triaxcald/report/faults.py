@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from triaxcald.report.document import Pose
-from triaxcald.report.figures import micro
+from triaxcald.report.figures import micro_g
 from triaxcald.report.meanings import QUALITY
+from triaxcald.units import ErrorUnit
 
 _TAKE_AGAIN = "take again"
+_NAMED = re.compile(rf"(.+?: )?({'|'.join(QUALITY)}): (.*)", re.DOTALL)
+"""A fault, behind the recording's name where there are several."""
 
 
 @dataclass(frozen=True)
@@ -25,18 +29,19 @@ def faults_of(lines: Iterable[str]) -> tuple[Fault, ...]:
     """Those that spoil poses first."""
     found = []
     for line in lines:
-        name, colon, text = line.partition(": ")
-        known = QUALITY.get(name) if colon else None
-        found.append(Fault(known or "", text if known else line, _TAKE_AGAIN in line))
+        named = _NAMED.fullmatch(line)
+        title, text = (QUALITY[named[2]], (named[1] or "") + named[3]) if named else ("", line)
+        found.append(Fault(title, text, _TAKE_AGAIN in line))
     return tuple(sorted(found, key=lambda fault: not fault.spoils))
 
 
-def left_out(poses: Sequence[Pose]) -> tuple[str, ...]:
+def left_out(poses: Sequence[Pose], unit: ErrorUnit) -> tuple[str, ...]:
     """The poses that the fit did not use, with where they are and by how much they are off."""
     return tuple(
         f"Pose {pose.number}"
         + ("" if pose.start_s is None else f", at {pose.start_s:.1f} s")
-        + ("" if pose.residual_g is None else f": off by {micro(pose.residual_g)} µg")
+        + (f" of {pose.recording}" if pose.recording else "")
+        + ("" if pose.residual_g is None else f": off by {micro_g(pose.residual_g, unit)}")
         for pose in poses
         if not pose.used
     )

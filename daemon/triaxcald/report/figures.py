@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 
+from triaxcald.units import ErrorUnit
+
+MICRO_G = ErrorUnit()
 MISSING = "—"
 _LARGEST = 1e30
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
@@ -52,16 +55,29 @@ def digits(value: float | None, significant: int = 3) -> str:
     return fixed(value, max(0, significant - 1 - int(exponent)))
 
 
-def micro(value_g: float | None) -> str:
-    """An error in g as a bare number of µg, three digits."""
+def micro(value_g: float | None, unit: ErrorUnit = MICRO_G) -> str:
+    """An error in the unit of the reference as a bare number of the small ``unit``, three digits."""
     if value_g is None:
         return MISSING
-    value_ug = value_g * 1e6
-    return fixed(value_ug, 2) if abs(value_ug) < 0.1 else digits(value_ug)
+    count = unit.count(value_g)
+    return fixed(count, 2) if abs(count) < 0.1 else digits(count)
 
 
-def micro_g(value_g: float | None) -> str:
-    return MISSING if value_g is None else f"{micro(value_g)} µg"
+def micro_g(value_g: float | None, unit: ErrorUnit = MICRO_G) -> str:
+    if value_g is None:
+        return MISSING
+    return f"{micro(value_g, unit)}{' ' if unit.unit == 'g' else ' × '}{unit_label(unit)}"
+
+
+def unit_label(unit: ErrorUnit) -> str:
+    """As it stands beside an axis or over a column."""
+    return "µg" if unit.unit == "g" else f"{power(unit.exponent)} {clean(unit.unit)}"
+
+
+def in_full(value: float) -> str:
+    """`value` with all the digits that documents have."""
+    mantissa, _, exponent = f"{value:.10g}".partition("e")
+    return (mantissa + (f" × {power(int(exponent))}" if exponent else "")).replace("-", "−")
 
 
 def power(exponent: int) -> str:

@@ -11,13 +11,18 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from triaxcald.report.figures import clean, digits, effect_title
+from triaxcal.effects.contract import RUN
+from triaxcald.report.figures import clean, digits, effect_title, power
+
+_ALONE = "{by}, in recording {n} alone"
+_AGAINST_FIRST = "{by} in recording {n}, −{by} in recording 1"
 
 
 @dataclass(frozen=True)
 class Meaning:
     """``clause`` says it in a clause, ``because`` what usually makes it; ``factors`` what a coefficient is multiplied
     by, by its name with ``*`` in place of the axis; ``symbols`` what the letters mean. ``{c}`` is the channel.
+    ``in_run`` says what a coefficient of recording ``{n}`` is multiplied by where ``{by}`` is that of a single one.
     """
 
     clause: str
@@ -27,6 +32,7 @@ class Meaning:
     symbols: str = ""
     reference: tuple[str, str] | None = None
     """A letter of the formula and the channel whose reference it is."""
+    in_run: str = _ALONE
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,7 @@ class Told:
 
 _T = ("T₀", "temp_c")
 _C = ("c₀", "{c}")
+_OF_RUNS = "q: one for each recording, their sum zero; where one recording alone differs, zero in the others"
 _MEANINGS = {
     "second_order_nonlinearity": Meaning(
         "the output bends with the square of the input",
@@ -115,7 +122,19 @@ _MEANINGS = {
         "the bias jumps at one moment",
         "A knock, a change of the supply, a part that came loose. It belongs to this recording, not to the unit.",
         "e = −q before t₁, 0 after it", {"*": "−1 before t₁, 0 after", "at": "t₁"},
-        "t₁: seconds since the recording began",
+        "t₁: seconds since the recording began", in_run="{by}, t₁ in recording {n}; all earlier ones are before it",
+    ),
+    "run_bias": Meaning(
+        "the bias comes back a little different at every start",
+        "What is switched off and on does not settle in quite the same place. It belongs to these recordings, not to "
+        "the unit.",
+        "e = q", {"*": "1"}, _OF_RUNS, in_run=_AGAINST_FIRST,
+    ),
+    "run_scale_factor": Meaning(
+        "the scale factor comes back a little different at every start",
+        "What is switched off and on does not settle in quite the same place, or something that nobody logged was "
+        "different. It belongs to these recordings, not to the unit.",
+        "e = q s", {"*": "s"}, _OF_RUNS, in_run=_AGAINST_FIRST,
     ),
     "hysteresis": Meaning(
         "the reading depends on the pose before",
@@ -156,6 +175,8 @@ _NAME = re.compile(
     + "|".join(sorted((*_MEANINGS, *QUALITY), key=len, reverse=True))
     + r")(?!\w)"
 )
+_RUN = re.compile(r"(.+)_run([1-9]\d{0,3})(_alone)?")
+_TIMES = re.compile(r"(?<=\d) 1e([+-]\d{1,3})(?= \S)")
 _EXPONENT = re.compile(r"(?<![\w.])(?<!\d )(\d(?:\.\d{1,8})?)e[+-]\d{1,2}(?![\w.])")
 
 
@@ -168,7 +189,9 @@ def told(effect: str, references: Mapping[str, float | None]) -> Told:
     letter, name = meaning.reference or ("", "")
     value = references.get(name.replace("{c}", channel))
     where = [meaning.symbols] if meaning.symbols else []
-    if letter and value is not None:
+    if letter == "t₀" and RUN in references:
+        where.append("t₀: the middle of each recording's poses")
+    elif letter and value is not None:
         where.append(f"{letter} = {value:.6g}".replace("-", "−"))
     clause, because, formula, symbols = (
         text.replace("{c}", channel) for text in (meaning.clause, meaning.because, meaning.formula, "; ".join(where))
@@ -179,7 +202,21 @@ def told(effect: str, references: Mapping[str, float | None]) -> Told:
 def factor(effect: str, coefficient: str) -> tuple[str, str]:
     """The axis that a coefficient acts on, and what it is multiplied by; empty where that is not known."""
     meaning, _ = _meaning(effect)
-    factors = meaning.factors if meaning else {}
+    coefficient, run, alone = run_of(coefficient)
+    axis, by = _factor(meaning.factors if meaning else {}, coefficient)
+    if meaning is None or run is None or not by:
+        return axis, by
+    return axis, (_ALONE if alone else meaning.in_run).format(by=by, n=run)
+
+
+def run_of(coefficient: str) -> tuple[str, int | None, bool]:
+    """A coefficient's name without the recording that it names (the first is 1, None where it names none), and whether
+    that differs from all others, which are alike."""
+    found = _RUN.fullmatch(coefficient)
+    return (found[1], int(found[2]), bool(found[3])) if found else (coefficient, None, False)
+
+
+def _factor(factors: Mapping[str, str], coefficient: str) -> tuple[str, str]:
     if coefficient in factors:
         return (coefficient[0] if re.fullmatch(r"[xyz]_[xyz]{2}", coefficient) else ""), factors[coefficient]
     for axis in "xyz":
@@ -192,6 +229,7 @@ def factor(effect: str, coefficient: str) -> tuple[str, str]:
 def in_plain(text: str, *, begins: bool = True) -> str:
     """A sentence of a document with names and powers of ten as people write them; ``begins``: with a capital."""
     said = _EXPONENT.sub(lambda found: digits(float(found[0]), len(found[1].replace(".", ""))), text)
+    said = _TIMES.sub(lambda found: f" × {power(int(found[1]))}", said)
     said = _NAME.sub(lambda found: _plain(found[0]), said)
     return said[:1].upper() + said[1:] if begins else said
 

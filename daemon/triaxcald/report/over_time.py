@@ -1,8 +1,9 @@
-"""The residuals along the time of the recording, step by step, above the channels that moved meanwhile."""
+"""The residuals along the time of each recording, step by step, above the channels that moved meanwhile."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from markupsafe import Markup
@@ -12,9 +13,10 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from triaxcald.report.document import Pose
-from triaxcald.report.figures import clean
+from triaxcald.report.figures import MICRO_G, clean, unit_label
 from triaxcald.report.ink import AFTER, BAND, BEFORE, FLOOR, INK, MUTED, STEP, draw, hang_grid
 from triaxcald.report.stages import Stage
+from triaxcald.units import ErrorUnit
 
 _CONSPICUOUS = 3.0
 _MOST_MARKED = 8
@@ -23,36 +25,71 @@ _MOST_BARS = 120
 _FIGURE_IN, _PANEL_IN = (8.0, 0.9), 1.35
 
 
+def time_pictures(
+    poses: Sequence[Pose],
+    stages: Sequence[Stage],
+    noise_floor_g: float | None,
+    *,
+    moments_in: Callable[[str], Mapping[str, float]],
+    unit: ErrorUnit,
+) -> list[tuple[str, Markup]]:
+    """One a recording, each by its own clock, with the recording's name; ``moments_in`` it are marked."""
+    pictures: list[tuple[str, Markup]] = []
+    for recording in dict.fromkeys(pose.recording for pose in poses):
+        rows = np.array([pose.recording == recording for pose in poses])
+        drawing = time_picture(
+            [pose for pose in poses if pose.recording == recording],
+            [_in_rows(stage, rows) for stage in stages],
+            noise_floor_g,
+            moments=moments_in(recording),
+            unit=unit,
+            name=f"time{len(pictures) or ''}",
+        )
+        if drawing is not None:
+            pictures.append((recording, drawing))
+    return pictures
+
+
+def _in_rows(stage: Stage, rows: NDArray[np.bool_]) -> Stage:
+    residual_g = None if stage.pose_residual_g is None else stage.pose_residual_g[rows]
+    known = residual_g is not None and not np.isnan(residual_g).all()
+    return replace(stage, pose_residual_g=residual_g if known else None)
+
+
 def time_picture(
     poses: Sequence[Pose],
     stages: Sequence[Stage],
     noise_floor_g: float | None,
     *,
     moments: Mapping[str, float] | None = None,
+    unit: ErrorUnit = MICRO_G,
+    name: str = "time",
 ) -> Markup | None:
-    """A panel a stage, each on its own scale, and one for each logged channel that moved; ``moments`` are marked."""
+    """A panel a stage, each on its own scale, and one for each logged channel that moved; ``moments`` are marked. All
+    poses are of one recording."""
     shown = [stage for stage in stages if stage.pose_residual_g is not None]
     if not shown:
         return None
     place, label = _places(poses)
     logged = _moving_channels(poses)
-    alt = f"Residual of {len(poses)} poses in order of time, {' and '.join(s.label.lower() for s in shown)}"
+    of = f" of {clean(poses[0].recording)}" if poses[0].recording else ""
+    alt = f"Residual of {len(poses)} poses{of} in order of time, {' and '.join(s.label.lower() for s in shown)}"
     if logged:
-        alt += f", above {', '.join(clean(name) for name in logged)}"
+        alt += f", above {', '.join(clean(channel) for channel in logged)}"
     rows = len(shown) + len(logged)
 
     def paint(figure: Figure) -> None:
         panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
         colours = stage_colours(stages)
         for axes, stage in zip(panels, shown, strict=False):
-            _noise_band(axes, noise_floor_g)
-            _residuals(axes, place, poses, stage, colours[stage.label])
+            _noise_band(axes, noise_floor_g, unit)
+            _residuals(axes, place, poses, stage, colours[stage.label], unit)
             axes.set_title(stage.label, loc="left", weight="bold")
-            axes.set_ylabel("residual, µg")
-        _mark_conspicuous(panels[len(shown) - 1], place, poses, shown[-1])
-        for axes, (name, values) in zip(panels[len(shown) :], logged.items(), strict=True):
+            axes.set_ylabel(f"residual, {unit_label(unit)}")
+        _mark_conspicuous(panels[len(shown) - 1], place, poses, shown[-1], unit)
+        for axes, (channel, values) in zip(panels[len(shown) :], logged.items(), strict=True):
             axes.plot(place, values, "s-", color=MUTED, ms=3, lw=0.8)
-            axes.set_title(f"Channel {clean(name)[:40]}, mean of each pose", loc="left")
+            axes.set_title(f"Channel {clean(channel)[:40]}, mean of each pose", loc="left")
         for axes in panels:
             _mark_moments(axes, moments if "time" in label else None, named=axes is panels[0])
             axes.yaxis.set_major_locator(MaxNLocator(4))
@@ -63,7 +100,7 @@ def time_picture(
         if handles[0]:
             figure.legend(*handles, loc="outside upper right", ncols=3)
 
-    return draw("time", alt, (_FIGURE_IN[0], _FIGURE_IN[1] + _PANEL_IN * rows), paint)
+    return draw(name, alt, (_FIGURE_IN[0], _FIGURE_IN[1] + _PANEL_IN * rows), paint)
 
 
 def stage_colours(stages: Sequence[Stage]) -> dict[str, str]:
@@ -97,36 +134,38 @@ def _moving_channels(poses: Sequence[Pose]) -> dict[str, NDArray[np.float64]]:
     return dict(list(moving.items())[:_MOST_CHANNELS])
 
 
-def _noise_band(axes: Axes, noise_floor_g: float | None) -> None:
+def _noise_band(axes: Axes, noise_floor_g: float | None, unit: ErrorUnit) -> None:
     axes.axhline(0, color=MUTED, lw=0.7)
     if noise_floor_g is not None:
         for factor in (2, 1):
-            reach = factor * noise_floor_g * 1e6
+            reach = factor * unit.count(noise_floor_g)
             axes.axhspan(-reach, reach, color=BAND, lw=0, label="±1, ±2 noise floors" if factor == 2 else None)
 
 
-def _residuals(axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, colour: str) -> None:
+def _residuals(
+    axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, colour: str, unit: ErrorUnit
+) -> None:
     """With one standard error of the pose either way, as far as it is known."""
     assert stage.pose_residual_g is not None
-    used, residual_ug = np.array([pose.used for pose in poses]), stage.pose_residual_g * 1e6
+    used, residual = np.array([pose.used for pose in poses]), unit.count(1.0) * stage.pose_residual_g
     size = 4.0 if len(poses) <= 100 else 2.2
     if len(poses) <= _MOST_BARS:
-        half_ug = np.array([(pose.standard_error_g or 0.0) * 1e6 for pose in poses])
-        axes.vlines(place, residual_ug - half_ug, residual_ug + half_ug, color=colour, lw=0.9)
-    axes.plot(place[used], residual_ug[used], "o-", color=colour, ms=size, lw=0.6)
-    axes.plot(place[~used], residual_ug[~used], "x", color=colour, ms=size + 2.0, mew=1.6)
+        half = np.array([unit.count(pose.standard_error_g or 0.0) for pose in poses])
+        axes.vlines(place, residual - half, residual + half, color=colour, lw=0.9)
+    axes.plot(place[used], residual[used], "o-", color=colour, ms=size, lw=0.6)
+    axes.plot(place[~used], residual[~used], "x", color=colour, ms=size + 2.0, mew=1.6)
     if (~used).any() and used.any():
-        _keep_used_in_sight(axes, residual_ug, used)
+        _keep_used_in_sight(axes, residual, used)
 
 
-def _keep_used_in_sight(axes: Axes, residual_ug: NDArray[np.float64], used: NDArray[np.bool_]) -> None:
+def _keep_used_in_sight(axes: Axes, residual: NDArray[np.float64], used: NDArray[np.bool_]) -> None:
     """Poses left out may be off by a hundred times what the others are: those are drawn at the edge, as arrows."""
-    reach = 3.0 * float(np.nanmax(np.abs(residual_ug[used])))
-    if not float(np.nanmax(np.abs(residual_ug))) > 2 * reach > 0:
+    reach = 3.0 * float(np.nanmax(np.abs(residual[used])))
+    if not float(np.nanmax(np.abs(residual))) > 2 * reach > 0:
         return
     axes.set_ylim(-reach, reach)
     at = axes.lines[-1].get_xdata()
-    for x, y in zip(np.asarray(at), residual_ug[~used], strict=True):
+    for x, y in zip(np.asarray(at), residual[~used], strict=True):
         if abs(y) > reach:
             axes.plot([x], [np.sign(y) * 0.93 * reach], "^" if y > 0 else "v", color=FLOOR, ms=6)
 
@@ -140,7 +179,9 @@ def _mark_moments(axes: Axes, moments: Mapping[str, float] | None, *, named: boo
             )
 
 
-def _mark_conspicuous(axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage) -> None:
+def _mark_conspicuous(
+    axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, unit: ErrorUnit
+) -> None:
     """Numbers beside the poses a metrologist looks up first: not used, or far out for their noise."""
     assert stage.pose_residual_g is not None
     conspicuous = [
@@ -151,7 +192,7 @@ def _mark_conspicuous(axes: Axes, place: NDArray[np.float64], poses: Sequence[Po
     low, high = axes.get_ylim()
     for _, pose, at, residual_g in sorted(conspicuous, key=lambda entry: -entry[0])[:_MOST_MARKED]:
         note = f"pose {pose.number}" + ("" if pose.used else ", not used")
-        y = float(np.clip(residual_g * 1e6, low + 0.07 * (high - low), high - 0.12 * (high - low)))
+        y = float(np.clip(unit.count(residual_g), low + 0.07 * (high - low), high - 0.12 * (high - low)))
         left = at > place.min() + 0.8 * np.ptp(place)
         axes.annotate(
             note, (at, y), (-7 if left else 7, 3), textcoords="offset points", fontsize=7, color=INK,

@@ -6,16 +6,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
-from triaxcald.documents import micro_unit
 from triaxcald.report import figures
 from triaxcald.report.budget import read_uncertainty
 from triaxcald.report.charts import bars_picture, stream_picture
-from triaxcald.report.document import Finding, Outcome, read_document
+from triaxcald.report.document import read_document
 from triaxcald.report.faults import faults_of, left_out
 from triaxcald.report.meanings import factor, in_plain, told
-from triaxcald.report.over_time import time_picture
+from triaxcald.report.moments import bracket, moments_in
+from triaxcald.report.over_time import time_pictures
 from triaxcald.report.registers import read_device
 from triaxcald.report.sphere import sphere_picture
 from triaxcald.report.stream import StreamOverview
@@ -43,57 +43,28 @@ def render_report(
     document with `refused` gives the reason in place of a result. The same input gives the same bytes.
     """
     outcome, papers = read_document(document), certificate or {}
+    unit = outcome.small
     limits = {name: figures.number(value) for name, value in mapping(papers.get("limits")).items()}
     floor_g = outcome.final.noise_floor_g
     uncertainty = read_uncertainty(mapping(document.get("calibration")) or document)
-    page = _ENVIRONMENT.get_template("report.html").render(
+    return _ENVIRONMENT.get_template("report.html").render(
         title=title,
         outcome=outcome,
+        unit=unit,
         verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None),
         uncertainty=uncertainty,
-        bars=bars_picture(outcome.stages, outcome.held_out),
-        sphere=sphere_picture(outcome.poses, outcome.stages, floor_g),
-        over_time=time_picture(outcome.poses, outcome.stages, floor_g, moments=_moments(outcome)),
+        bars=bars_picture(outcome.stages, outcome.held_out, unit),
+        sphere=sphere_picture(outcome.poses, outcome.stages, floor_g, unit),
+        over_time=time_pictures(
+            outcome.poses, outcome.stages, floor_g, moments_in=lambda name: moments_in(outcome, name), unit=unit
+        ),
         faults=faults_of(outcome.data_quality),
-        left_out=left_out(outcome.poses),
+        left_out=left_out(outcome.poses, unit),
         device=read_device(papers, outcome),
         told=lambda effect: told(effect, outcome.channel_reference),
-        bracket=lambda finding: _bracket(finding, outcome),
+        bracket=lambda finding: bracket(finding, outcome),
         streams=stream_picture(stream) if stream is not None else None,
         provenance=list(_entries(papers)),
-    )
-    # Pictures and sentences are written for g, which nearly all references are in.
-    if outcome.reference_unit == "g":
-        return page
-    unit = figures.clean(outcome.reference_unit)
-    for name in (str(escape(figures.clean(micro_unit(outcome.reference_unit)))), "µg"):
-        page = page.replace(f" {name}", f" × 10⁻⁶ {escape(unit)}").replace(name, f"10⁻⁶ {escape(unit)}")
-    return page.replace(", × 10⁻⁶", ", 10⁻⁶")
-
-
-def _moments(outcome: Outcome) -> dict[str, float]:
-    """Moments that effects of the model name, in s."""
-    moments = ((f.effect, f.shape("at")) for f in outcome.findings if f.in_model)
-    return {figures.clean(figures.effect_title(name)): at_s for name, at_s in moments if at_s is not None}
-
-
-def _bracket(finding: Finding, outcome: Outcome) -> str:
-    """Between which poses a moment lies that the magnitude tells no nearer; empty where there is none."""
-    at_s = finding.shape("at")
-    timed = [pose for pose in outcome.poses if pose.start_s is not None and pose.end_s is not None]
-    if at_s is None or not timed:
-        return ""
-    within = [p for p in timed if (p.start_s or 0.0) <= at_s <= (p.end_s or 0.0)]
-    if within:
-        return f"The moment lies in pose {within[0].number}."
-    before = [p for p in timed if (p.end_s or 0.0) < at_s]
-    after = [p for p in timed if (p.start_s or 0.0) > at_s]
-    if not (before and after):
-        return ""
-    first, last = max(before, key=lambda p: p.end_s or 0.0), min(after, key=lambda p: p.start_s or 0.0)
-    return (
-        f"The moment lies between pose {first.number} and pose {last.number}, that is between {first.end_s:.1f} s and "
-        f"{last.start_s:.1f} s; the poses tell it no nearer."
     )
 
 
@@ -128,8 +99,8 @@ def _environment() -> Environment:
     )
     environment.globals["factor"] = factor
     for function in (
-        in_plain, figures.digits, figures.effect_title, figures.fixed, figures.micro, figures.micro_g, figures.p_value,
-        figures.plus_minus,
+        in_plain, figures.digits, figures.effect_title, figures.fixed, figures.in_full, figures.micro, figures.micro_g,
+        figures.p_value, figures.plus_minus, figures.unit_label,
     ):  # fmt: skip
         environment.filters[function.__name__] = function
     return environment

@@ -14,9 +14,10 @@ from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from triaxcald.report.document import Pose
-from triaxcald.report.figures import micro
+from triaxcald.report.figures import MICRO_G, micro, unit_label
 from triaxcald.report.ink import GRID, INK, MUTED, draw
 from triaxcald.report.stages import Stage
+from triaxcald.units import ErrorUnit
 
 # Readable on white and on near-black alike: saturated ends, a middle grey for "no more than noise".
 _COLOURS = LinearSegmentedColormap.from_list(
@@ -27,7 +28,9 @@ _EQUATOR = 0.02
 _MOST_NUMBERED = 40
 
 
-def sphere_picture(poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g: float | None) -> Markup | None:
+def sphere_picture(
+    poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g: float | None, unit: ErrorUnit = MICRO_G
+) -> Markup | None:
     """Poses on two equal-area hemispheres coloured by residual, or None without directions or residuals."""
     shown = [stage for stage in stages if stage.pose_residual_g is not None]
     if not shown or all(pose.direction is None for pose in poses):
@@ -49,7 +52,7 @@ def sphere_picture(poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g
             pair[0].set_title(stage.label, loc="left", weight="bold", pad=8)
         for axes in grid.flat[2 * len(shown) :]:
             axes.axis("off")
-        _colour_bar(figure, grid, norm, 0.2 / height_in)
+        _colour_bar(figure, grid, norm, 0.2 / height_in, unit)
 
     return draw("sphere", alt, (8.0, height_in), paint)
 
@@ -107,12 +110,12 @@ def _markers(axes: Axes, side: int, here: Sequence[tuple[Pose, float]], norm: Bo
             axes.annotate(str(pose.number), (x, y), (4.5, 4.5), textcoords="offset points", fontsize=6.5)
 
 
-def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, share: float) -> None:
+def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, share: float, unit: ErrorUnit) -> None:
     bar = figure.colorbar(
         ScalarMappable(norm, _COLOURS), ax=grid, orientation="horizontal", fraction=share, pad=0.02, aspect=37,
         spacing="uniform",
     )  # fmt: skip
-    bar.set_ticks(list(norm.boundaries), labels=[micro(edge) for edge in norm.boundaries])
+    bar.set_ticks(list(norm.boundaries), labels=[micro(edge, unit) for edge in norm.boundaries])
     bar.ax.tick_params(labelsize=7)
-    bar.set_label("residual of the magnitude, µg (grey: within one noise floor; every colour doubles)")
+    bar.set_label(f"residual of the magnitude, {unit_label(unit)} (grey: within one noise floor; every colour doubles)")
     bar.outline.set_edgecolor(MUTED)

@@ -10,6 +10,7 @@ from triaxcald.report.document import Finding, Outcome
 from triaxcald.report.faults import faults_of
 from triaxcald.report.figures import micro_g
 from triaxcald.report.meanings import told
+from triaxcald.units import ErrorUnit
 
 _SIGNIFICANT_P = 0.01
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
@@ -49,7 +50,7 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
     checks = tuple(_checks(outcome, {**outcome.limits, **certificate_limits}))
     if outcome.refused is not None:
         return Verdict("refused", "Refused", outcome.refused, (), checks)
-    reservations = (*_reservations(outcome, checks), *_beyond_limits(checks, expanded_g))
+    reservations = (*_reservations(outcome, checks), *_beyond_limits(checks, expanded_g, outcome.small))
     errors = f"{_found(outcome)}{_errors(outcome)}"
     open_checks = [check for check in checks if check.passed is None]
     exceeded = [check.name for check in checks if check.passed is False]
@@ -135,20 +136,21 @@ def _errors(outcome: Outcome) -> str:
     if name == "held-out" and outcome.held_out is not None:
         floor_g = outcome.held_out.noise_floor_g
     after = pairs[-1] if pairs else None
-    text = f"Error of the magnitude, {name}: {micro_g(after)} rms"
+    unit = outcome.small
+    text = f"Error of the magnitude, {name}: {micro_g(after, unit)} rms"
     if len(pairs) > 1 and pairs[0] is not None:
-        text += f", {micro_g(pairs[0])} before"
-    return f"{text}; noise floor {micro_g(floor_g)}."
+        text += f", {micro_g(pairs[0], unit)} before"
+    return f"{text}; noise floor {micro_g(floor_g, unit)}."
 
 
-def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None) -> list[str]:
+def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None, unit: ErrorUnit) -> list[str]:
     """What no residual can show: an error of the reference is the same in every pose, and fitted away."""
     least = min((c.limit_g for c in checks if c.limit_g is not None), default=None)
     if least is None or expanded_g is None or expanded_g <= least:
         return []
     return [
-        f"The expanded uncertainty of the magnitude, {micro_g(expanded_g)}, is above the limit of {micro_g(least)}; "
-        "residuals alone were judged by it."
+        f"The expanded uncertainty of the magnitude, {micro_g(expanded_g, unit)}, is above the limit of "
+        f"{micro_g(least, unit)}; residuals alone were judged by it."
     ]
 
 

@@ -30,7 +30,7 @@ from triaxcald.report.page import render_report
 from triaxcald.report.stream import overview_of
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, Station
-from triaxcald.station.write_back import NEW_UNCHECKED, NEW_VERIFIED, UNCERTAIN, WriteBack, corrected
+from triaxcald.station.write_back import NEW_UNCHECKED, NEW_UNJUDGED, NEW_VERIFIED, UNCERTAIN, WriteBack, corrected
 from triaxcald.verification import Verification
 
 CERTIFICATE = "certificate.json"
@@ -193,7 +193,7 @@ class UnitRun:
             self.progress.stage(self.name, "writing the registers")
             back = self._write_back = WriteBack(self.place, self.station.file, writer, collect)
             await back.run(device, certified.image, identity.serial, tumble)
-            code = 0 if back.state in (NEW_VERIFIED, NEW_UNCHECKED) else 1
+            code = 0 if back.state in (NEW_VERIFIED, NEW_UNJUDGED, NEW_UNCHECKED) else 1
         self.progress.stage(self.name, "writing the report")
         page = await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS])
         writer.attach("report.html", "text/html", page.encode())

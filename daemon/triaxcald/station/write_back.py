@@ -27,6 +27,7 @@ VERIFICATION_FILE = "verification.json"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
 UNTOUCHED, RESTORED = "old calibration untouched", "old calibration restored and verified"
 NEW_VERIFIED = "the device holds the new calibration, verified"
+NEW_UNJUDGED = "the device holds the new calibration, read back; its output is not judged, as the station has no limit"
 NEW_UNCHECKED = "the device holds the new calibration, not verified by physics: it has no corrected stream"
 UNCERTAIN = "NOT restored"
 """What a state begins with where nobody can vouch for what the device holds."""
@@ -92,7 +93,7 @@ class WriteBack:
         self.writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
         if document["verdict"] == "outside limits":
             return False
-        self.state = NEW_VERIFIED
+        self.state = NEW_VERIFIED if document["verdict"] == "within limits" else NEW_UNJUDGED
         return True
 
     async def _undo(self, device: Device, report: ProvisionReport) -> None:

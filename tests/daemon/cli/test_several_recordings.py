@@ -117,12 +117,38 @@ def test_a_person_sees_what_units_agree_on(settling: list[Path], triaxcal: Run) 
 
 def test_what_does_not_go_together_is_said_in_a_line(runs: list[Path], triaxcal: Run, tmp_path: Path) -> None:
     triaxcal("diagnose", runs[0], runs[0]).failed(2, "one.csv", "given twice")
+    other_spelling = runs[0].parent / ".." / runs[0].parent.name / runs[0].name
+    triaxcal("diagnose", runs[0], other_spelling).failed(2, "one.csv", "given twice")
     triaxcal("diagnose", "--units", runs[0]).failed(2, "--units", "two recordings")
     triaxcal("diagnose", "--units", *runs, "--check", runs[0]).failed(2, "--check", "not with --units")
     triaxcal("diagnose", "--units", *runs, "--report", tmp_path / "r.html").failed(2, "--report", "not with --units")
     short = tmp_path / "short.csv"
     short.write_text("\n".join(runs[0].read_text("utf-8").splitlines()[:15]) + "\n", "utf-8")
     triaxcal("diagnose", runs[0], short).failed(3, "short.csv", "no still pose")
+
+
+def test_a_channel_that_one_of_several_recordings_lacks_is_told(
+    runs: list[Path], triaxcal: Run, tmp_path: Path
+) -> None:
+    head, *rows = runs[1].read_text("utf-8").splitlines()
+    warm = tmp_path / "warm.csv"
+    warm.write_text(f"{head},temp_c\n" + "".join(f"{row},{20 + 1e-3 * i}\n" for i, row in enumerate(rows)), "utf-8")
+    told = f"channel temp_c: in {warm}, but not in {runs[0]}; no effect of it was tried"
+    done = triaxcal("diagnose", runs[0], warm)
+    assert done.err.count("temp_c") == done.err.count(f"warning: {told}\n") == 1
+    assert told in triaxcal("diagnose", runs[0], warm, "--json").json["calibration"]["warnings"]
+    assert "temp_c" not in triaxcal("diagnose", *runs).err
+
+
+def test_help_says_that_the_order_of_several_recordings_is_that_of_time(triaxcal: Run) -> None:
+    assert "in order of time" in " ".join(triaxcal("diagnose", "--help").out.split())
+
+
+def test_two_units_are_told_apart_behind_a_recording_that_names_none(triaxcal: Run) -> None:
+    folder = Path(__file__).parents[3] / "recordings"
+    names = ("paper-unit.csv.gz", "can-second-order.mcap", "modbus-temperature-bias.mcap")
+    done = triaxcal("diagnose", *(folder / name for name in names), "--sign=-,-,-", "--output-unit", "V")
+    done.failed(2, "modbus-temperature-bias.mcap: unit: 1002", "can-second-order.mcap has 1001", "--units")
 
 
 def test_recordings_with_other_settings_are_not_of_one_unit(finished_run: Any, runs: list[Path], triaxcal: Run) -> None:

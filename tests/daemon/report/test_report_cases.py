@@ -168,6 +168,39 @@ def test_the_leads_of_what_is_unexplained_are_a_list(words: dict[str, Any]) -> N
     assert text.count(HOSTILE) == 1
 
 
+def test_how_much_is_left_is_told_only_where_it_is_significant(words: dict[str, Any]) -> None:
+    words["unexplained"] = {"significant": False, "p_value": 0.4, "rms_g": 2.81e-6, "lead": ""}
+    _, text = page(words)
+    assert "Nothing beyond noise shows, p: 0.40." in text
+    assert "2.81" not in text
+    words["unexplained"] |= {"significant": True, "p_value": 1e-3}
+    assert "More is left than noise accounts for: 2.81 µg rms beyond the noise floor, p: 0.0010." in page(words)[1]
+
+
+@pytest.mark.parametrize(
+    ("reference", "unit", "said"),
+    [
+        (None, None, "1 g"),
+        (1.0, "g", "1 g"),
+        (1.000957342, "g", "1.000957342 g"),
+        (5e-5, "T", "5 × 10⁻⁵ T"),
+        (None, "µT", "reference"),
+    ],
+)
+def test_the_formula_of_the_residual_has_the_reference_that_it_is_against(
+    words: dict[str, Any], reference: float | None, unit: str | None, said: str
+) -> None:
+    words["calibration"]["units"] = {"output": "V", "reference": unit}
+    words["calibration"]["reference"] = reference
+    assert f"rᵢ = |aᵢ| − {said}," in page(words)[1]
+
+
+def test_a_fault_of_another_recording_keeps_its_title(words: dict[str, Any]) -> None:
+    words["data_quality"] = ["b/check.csv: saturation: x at 2.1 in 687 samples: take again"]
+    _, text = page(words)
+    assert "Readings at the end of the range : b/check.csv: x at 2.1 in 687 samples: take again" in text
+
+
 def test_poses_left_out_are_named_above_all_figures(loop: dict[str, Any]) -> None:
     loop["calibration"]["poses"][4] |= {"used": False, "residual_g": 3.062e-3}
     html, text = page(loop)

@@ -10,9 +10,11 @@ import pytest
 
 from triaxcal.effects import CATALOGUE, effect_named
 from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SCATTER, SINCE_START, Effect
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, Effect
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.hysteresis import Hysteresis
+from triaxcal.effects.in_run import InRuns
+from triaxcal.effects.run_bias import RunBias, RunScaleFactor
 from triaxcald.report.meanings import factor, in_plain, told
 
 FORMS = [form for effect in (*CATALOGUE, effect_named("channel_bias:fan rpm")) for form in effect.forms]
@@ -80,6 +82,36 @@ def test_every_effect_of_the_catalogue_is_told_in_words(effect: Effect) -> None:
         assert factor(effect.name, c.name)[1], c.name
 
 
+@pytest.mark.parametrize("effect", [RunBias(3), RunBias(3, alone=2), RunScaleFactor(3), RunScaleFactor(3, alone=0)])
+def test_what_differs_between_recordings_is_multiplied_by_what_the_page_says(effect: RunBias) -> None:
+    run = np.array([0.0, 1.0, 2.0, 1.0, 0.0])
+    basis = effect.basis(S, {RUN: run})
+    size = S if effect.name == "run_scale_factor" else np.ones((5, 3))
+    for i, coefficient in enumerate(effect.coefficients):
+        axis, text = factor(effect.name, coefficient.name)
+        k = "xyz".index(axis)
+        alone = re.fullmatch(r"(1|s), in recording (\d) alone", text)
+        against = re.fullmatch(r"(1|s) in recording (\d), −\1 in recording 1", text)
+        said = alone or against
+        assert said is not None
+        assert (said[1] == "s") == (effect.name == "run_scale_factor")
+        share = (run == int(said[2]) - 1).astype(float) - ((run == 0) if against else 0.0)
+        np.testing.assert_allclose(basis[:, k, i], share * size[:, k])
+    known = told(effect.name, {})
+    assert known.because
+    assert known.clause != known.title.lower()
+
+
+def test_an_effect_of_the_clocks_in_one_recording_says_in_which() -> None:
+    effect = InRuns(BiasDrift(2), (2,))
+    said = {c.name: factor("bias_drift", c.name) for c in effect.coefficients}
+    assert said["x_run3"] == ("x", "t − t₀, in recording 3 alone")
+    assert said["y2_run3"] == ("y", "(t − t₀)², in recording 3 alone")
+    several = told("bias_drift", {"t_s": 0.0, RUN: 0.0}).symbols
+    assert several.endswith("t₀: the middle of each recording's poses")
+    assert "t₀ = " not in several
+
+
 def test_references_and_channels_are_put_into_the_formula() -> None:
     assert told("temperature_bias", {"temp_c": 23.4}).symbols == "T: temp_c; T₀ = 23.4"
     channel = told("channel_bias:fan rpm", {"fan rpm": 1200.0})
@@ -100,7 +132,7 @@ def test_an_effect_of_somebody_else_is_shown_by_its_name() -> None:
         ("warm_up cannot be told from bias_drift here", "Warm up cannot be told from bias drift here"),
         ("record while temp_c moves", "Record while temp_c moves"),
         ("from 1.53e+04 µg, p below 1e-12", "From 15300 µg, p below 1 × 10⁻¹²"),
-        ("15300 1e-6 µT", "15300 1e-6 µT"),
+        ("15300 1e-6 µT", "15300 × 10⁻⁶ µT"),
         ("temperature_bias_quadratic with warm_upper", "Temperature bias quadratic with warm_upper"),
     ],
 )  # fmt: skip

@@ -22,7 +22,7 @@ from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
 from triaxcald.station import line as station_line
 from triaxcald.station.config import load_station
 from triaxcald.station.line import Outcome, UnitRun, run_station
-from triaxcald.station.write_back import NEW_UNCHECKED, NEW_VERIFIED, RESTORED
+from triaxcald.station.write_back import NEW_UNCHECKED, NEW_UNJUDGED, RESTORED
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())
@@ -74,7 +74,7 @@ def test_a_standard_error_that_is_closed_in_the_check_poses_stops_nothing(worksh
             out, _ = process.communicate(timeout=60)
         assert b"check poses: " in said
         assert process.returncode == 0, out
-        assert NEW_VERIFIED.encode() in out
+        assert NEW_UNJUDGED.encode() in out
         assert Stored.from_image(served.unit.eeprom).calibration != OLD.calibration
 
 
@@ -133,10 +133,10 @@ def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_
         assert served.unit.eeprom != OLD.image()
     assert done.code == 4
     (unit,) = done.json["units"]
-    assert (unit["exit_code"], unit["device_state"]) == (4, NEW_VERIFIED)
+    assert (unit["exit_code"], unit["device_state"]) == (4, NEW_UNJUDGED)
     assert "No space left on device" in unit["error"]
     assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
-    assert unit["error"].endswith(NEW_VERIFIED)
+    assert unit["error"].endswith(NEW_UNJUDGED)
 
 
 async def test_the_table_and_the_document_say_that_the_old_calibration_is_back(
@@ -205,7 +205,7 @@ def test_an_internal_error_in_one_unit_does_not_disturb_the_other(
     units = {u["unit"]: u for u in done.json["units"]}
     assert (units["good"]["exit_code"], units["good"]["error"]) == (0, None)
     assert Path(units["good"]["report"]).stat().st_size > 0
-    assert (units["bad"]["exit_code"], units["bad"]["device_state"]) == (4, NEW_VERIFIED)
+    assert (units["bad"]["exit_code"], units["bad"]["device_state"]) == (4, NEW_UNJUDGED)
     assert units["bad"]["error"].startswith("unit bad: internal error: ValueError('a fault of the program'); ")
     assert units["bad"]["report"] is None
 

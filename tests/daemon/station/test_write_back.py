@@ -23,7 +23,7 @@ from triaxcald.simulation.unit import Faults
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station, load_station
 from triaxcald.station.line import UnitRun
-from triaxcald.station.write_back import NEW_VERIFIED, RESTORED, UNCERTAIN, WriteBack
+from triaxcald.station.write_back import NEW_UNJUDGED, RESTORED, UNCERTAIN, WriteBack
 
 OLD = Stored(factory_calibration())
 QUICK = {"speed": 60.0}
@@ -108,12 +108,12 @@ async def _no_pose(check: Collection) -> None:
     """Check poses that nobody judges."""
 
 
-async def test_what_is_verified_stays_and_is_said_to_be_verified(open_bench: OpenBench) -> None:
+async def test_what_no_limit_judges_stays_and_is_not_said_to_be_verified(open_bench: OpenBench) -> None:
     async with open_bench() as bench:
         back = bench.write_back(_no_pose)
         assert back.state is None
         await bench.run(back)
-        assert back.state == NEW_VERIFIED
+        assert back.state == NEW_UNJUDGED
         assert _stored_bias(bench.served) == pytest.approx(BIAS)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal.errors import InvalidData
-from triaxcal.poses.pose import Pose
+from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Tumble
 
@@ -148,3 +148,23 @@ def test_a_machine_that_shakes_the_stand_does_not_make_poses_creep(
     poses = detect(t_s, paper_unit.output(path.specific_force(t_s) + shaken + noise, {}))[2]
     assert len(poses) == 14
     assert not any(p.creep.any() for p in poses)
+
+
+def test_a_faulty_span_is_named_and_tells_nothing_of_the_noise_of_the_others(
+    paper_unit: Sensor, twenty_six: np.ndarray, detect: Detect
+) -> None:
+    path = Tumble(twenty_six, hold_s=5.0, move_s=1.5)
+    t_s = np.arange(int(100 * path.round_s)) / 100
+    noise = 1e-4 * np.random.default_rng(0).standard_normal((len(t_s), 3)) * paper_unit.scale_factor
+    u = paper_unit.output(path.specific_force(t_s), {}) + noise
+    windows, spans, clean = detect(t_s, u)
+    assert [p.fault for p in clean] == [""] * 26
+    u[(t_s > clean[9].start_s) & (t_s < clean[9].end_s), 0] = clean[9].mean[0]
+    windows, spans, _ = detect(t_s, u)
+    assert len(spans) == 26
+    poses = poses_of(windows, spans, {9: "stuck_output"})
+    assert [p.fault for p in poses] == [""] * 9 + ["stuck_output"] + [""] * 16
+    for before, after in zip(clean, poses, strict=True):
+        if not after.fault:
+            assert after.standard_error == pytest.approx(before.standard_error, rel=0.05)
+    assert poses[10].before == pytest.approx(poses[9].mean)

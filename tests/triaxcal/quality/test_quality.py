@@ -107,7 +107,7 @@ def test_a_stream_without_noise_is_blamed_for_nothing() -> None:
     assert judged(*stream(2, sigma=0.0)) == []
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning:triaxcal.stillness")  # where most windows of an axis are constant
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("seed", range(4))
 def test_quiet_poses_beside_a_machine_are_not_frozen(seed: int) -> None:
     time_ns, u = stream(seed, sigma=0.2 * NOISE)

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import Effect, effect_named
+from triaxcal.effects.part import Part
 from triaxcal.poses.pose import Pose
-from triaxcal.search import Search, alternatives
+from triaxcal.search import Model, Search, alternatives
 from triaxcal.sensor import Sensor
 
 Recorded = Callable[..., list[Pose]]
 Searched = Callable[..., Search]
 WARMTH, DRIFT = effect_named("temperature_bias"), effect_named("bias_drift")
+CROSS = effect_named("cross_coupling")
 Q = np.array([2e-4, -3e-4, 2.5e-4])
 T_S = (np.arange(26) + 0.5) * 10.0
 
@@ -112,3 +114,56 @@ def test_beside_a_second_effect_alternatives_are_sought_with_it_in_the_model(
 
 def names_of(search: Search, effects: Sequence[Effect]) -> dict[str, tuple[str, ...]]:
     return {e.name: tuple(alternatives(search, e, search.found)) for e in effects}
+
+
+def of_cross_coupling(paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, seed: int) -> list[Pose]:
+    rng = np.random.default_rng(seed)
+    sensor = replace(paper_unit, effects=((CROSS, 6e-4 * rng.standard_normal(len(CROSS.coefficients))),))
+    where = fourteen[rng.permutation(14)] + 0.06 * rng.standard_normal((14, 3))
+    return recorded(sensor, seed, where=where / np.linalg.norm(where, axis=1, keepdims=True))
+
+
+def test_fourteen_poses_list_what_they_cannot_test_where_chance_would_explain_as_much(
+    paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, searched: Searched
+) -> None:
+    """Five degrees of freedom, of which cross coupling takes all: whatever is found instead is found by chance."""
+    others = catalogue("temperature_bias", "second_order_nonlinearity", "bias_drift", "warm_up", "hysteresis")
+    listed, found = 0, 0
+    for seed in range(6):
+        search = searched(of_cross_coupling(paper_unit, fourteen, recorded, seed), [*others, CROSS])
+        assert {m.effects[0].name for m in search.untestable()} >= {"cross_coupling"}
+        for model in search.singles_from(search.linear):
+            if model.effects[0].name != "cross_coupling" and not search.left_over(model):
+                found += 1
+                search.found = model
+                listed += "cross_coupling" in alternatives(search, model.effects[0], model)
+    assert listed == found > 0
+
+
+def test_a_single_number_that_explains_all_is_no_coincidence(
+    paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, searched: Searched
+) -> None:
+    one = Part.of(WARMTH, "y")
+    sensor = replace(paper_unit, effects=((one, np.array([6e-4])),))
+    search = searched(recorded(sensor, 0, where=fourteen), [WARMTH, CROSS])
+    model = search.model([one])
+    assert model is not None
+    assert search.coincidence(model) < 1e-4
+    search.found = model
+    assert "cross_coupling" not in alternatives(search, one, model)
+
+
+def test_coincidence_is_the_chance_of_a_random_direction(
+    paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, searched: Searched
+) -> None:
+    """Residuals of the same size in random directions, of which one given candidate explains as much."""
+    search = searched(recorded(paper_unit, 0, where=fourteen), [WARMTH])
+    search.tests = 1.0
+    dof, rank = search.left([]), 3
+    rng = np.random.default_rng(3)
+    r = rng.standard_normal((200_000, dof)) * 30 / np.sqrt(dof)
+    share = np.sum(r[:, rank:] ** 2, axis=1) / np.sum(r**2, axis=1)
+    for chi2 in (40.0, 150.0):
+        model = Model((WARMTH,), search.linear.state, chi2, 0.0)
+        search.linear = replace(search.linear, chi2=900.0)
+        assert search.coincidence(model) == pytest.approx(np.mean(share < chi2 / 900), rel=0.05)

@@ -14,8 +14,10 @@ from triaxcal.effects.contract import SCATTER
 from triaxcal.effects.part import Part
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.poses.pose import Pose
+from triaxcal.problem import solve
 from triaxcal.search.candidates import Candidate, Ground, candidates_of, still_conditions
 from triaxcal.sensor import Sensor
+from triaxcal.start import problem_of, start, with_history
 
 Recorded = Callable[..., list[Pose]]
 GroundOf = Callable[[list[Pose]], Ground]
@@ -80,6 +82,33 @@ def test_every_effect_is_tried_whole_on_all_axes_and_on_each_axis_alone(poses: l
         assert {("x", "y", "z"), ("x",), ("y",), ("z",)} <= kinds
         assert len(kinds) == len(own)
         assert {c.tries for c in own} == {len(own)}
+
+
+@pytest.mark.parametrize("reference", [1e-8, 5e4])
+def test_what_shows_is_the_same_in_any_unit(
+    reference: float, paper_unit: Sensor, recorded: Recorded, directions: np.ndarray
+) -> None:
+    shaken = 1e-6 * (1 + np.arange(26) % 3)
+    poses = [replace(p, scatter=np.full(3, v)) for p, v in zip(recorded(paper_unit, 0), shaken, strict=True)]
+    shown = []
+    for size in (1.0, reference):
+        scaled = [
+            replace(
+                p,
+                mean=p.mean * size,
+                covariance=p.covariance * size**2,
+                before=None if p.before is None else p.before * size,
+                scatter=p.scatter * size**2,
+            )
+            for p in poses
+        ]
+        problem = problem_of(scaled, signs=(-1, -1, -1), reference=size)
+        state = start(problem, scaled, (-1, -1, -1))
+        problem = with_history(problem, scaled, state.sensor(problem))
+        found, full = candidates_of(Ground.at(problem, solve(problem, state, ())), CATALOGUE, set())
+        shown.append(([(c.name, c.rank, [k.name for k in c.effect.coefficients]) for c in found], full))
+    assert shown[0] == shown[1]
+    assert {"third_order_nonlinearity", "vibration_rectification", "hysteresis"} <= shown[0][1]
 
 
 def test_every_variant_of_a_shape_is_tried(poses: list[Pose], ground: Ground) -> None:

@@ -274,6 +274,42 @@ def test_one_stuck_axis_hides_no_pose_of_the_others(paper_unit: Sensor, twenty_s
     assert all(p.mean[2] == pytest.approx(1.25) and np.isfinite(p.covariance).all() for p in poses)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("axes", [[0], [0, 1, 2]])
+@pytest.mark.parametrize("share", [0.1, 0.17, 0.22, 0.4, 0.7])
+def test_a_frozen_output_hides_no_pose_elsewhere(
+    share: float, axes: list[int], paper_unit: Sensor, twenty_six: np.ndarray, detect: Detect
+) -> None:
+    stream = tumbled(paper_unit, twenty_six)
+    n = len(stream.u)
+    begin, end = n // 5, n // 5 + int(share * n)
+    u = stream.u.copy()
+    u[begin:end, axes] = u[begin, axes]
+    clean, found = detect(stream.t_s, stream.u)[2], detect(stream.t_s, u)[2]
+    # A window may begin in a pose and end in what is frozen.
+    away = [p for p in clean if p.end_s < begin / 100 - 0.1 or p.start_s > end / 100 + 0.1]
+    assert len(away) >= 26 * (1 - share) - 2
+    for p in away:
+        (same,) = [f for f in found if p.start_s - 0.3 < f.start_s and f.end_s < p.end_s + 0.3]
+        assert same.end_s - same.start_s > 3.0
+
+
+@pytest.mark.parametrize("every_s", [3.0, 7.1])
+def test_an_output_that_freezes_again_and_again_is_no_pose_and_splits_none(
+    every_s: float, paper_unit: Sensor, twenty_six: np.ndarray, detect: Detect
+) -> None:
+    stream = tumbled(paper_unit, twenty_six)
+    u = stream.u.copy()
+    for begin in np.arange(0.0, stream.path.round_s, every_s):
+        at = np.flatnonzero((stream.t_s >= begin) & (stream.t_s < begin + 1.0))
+        u[at] = u[at[0]]
+    poses = detect(stream.t_s, u)[2]
+    assert_each_once(stream, poses)
+    truth = paper_unit.output(twenty_six, {})
+    for i, p in enumerate(poses):
+        assert np.max(np.abs((p.mean - truth[i]) / p.standard_error)) < 6
+
+
 @pytest.mark.parametrize("count", [0, 1, 5, 11])
 def test_too_few_samples_for_a_window_are_an_error(count: int, detect: Detect) -> None:
     with pytest.raises(InvalidData, match="too few samples"):

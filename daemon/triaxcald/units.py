@@ -1,0 +1,71 @@
+"""How units are written: small errors of the magnitude, and coefficients where the reference is not in g."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+SMALLEST = 1e-250
+"""Of references: beyond it powers of ten end."""
+_MICRO_G = re.compile(r"(?<![\w.])([+-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?) µg(?!\w)")
+_CHANNEL = re.compile(r"(\[.*\])")
+_G = re.compile(r"(?<![A-Za-zµ_])g(?![A-Za-z_])")
+
+
+@dataclass(frozen=True)
+class ErrorUnit:
+    """The unit in which errors of the magnitude are told to people: ``unit``, that of the reference vector, times ten
+    to the ``exponent``. µg as it is."""
+
+    unit: str = "g"
+    exponent: int = -6
+
+    @classmethod
+    def of(cls, reference_unit: str, reference: float) -> ErrorUnit:
+        """About a millionth of the reference, by a power of a thousand: 1e-6 µT of 50 µT, 1e-12 T of 5e-5 T."""
+        if reference_unit == "g" or not 0 < reference < math.inf:
+            return cls(reference_unit)
+        return cls(reference_unit, 3 * math.floor((math.log10(max(reference, SMALLEST)) + 0.5) / 3) - 6)
+
+    def __str__(self) -> str:
+        return "µg" if self.unit == "g" else f"1e{self.exponent} {self.unit}"
+
+    def count(self, value: float) -> float:
+        """A ``value`` in the reference's unit as a number of these."""
+        return value * 10.0**-self.exponent
+
+    def told(self, value: float | None) -> str:
+        return "—" if value is None else f"{self.count(value):.1f}"
+
+    def in_full(self, value: float | None) -> str:
+        return f"{self.told(value)} {self}"
+
+    def in_words(self, text: str) -> str:
+        """What the metrology says in words, where it writes µg for a millionth of the reference's unit."""
+        return text if self.unit == "g" else _MICRO_G.sub(self._instead, text)
+
+    def _instead(self, found: re.Match[str]) -> str:
+        number = found[1]
+        if self.exponent != -6:
+            number = f"{self.count(float(number) * 1e-6):{'+' if number[0] == '+' else ''}.3g}"
+        return f"{number} {self}"
+
+
+def in_units_of(unit: str, reference_unit: str) -> str:
+    """A coefficient's unit, which the metrology writes with g for the unit of the reference vector, and with the names
+    of channels in brackets."""
+    if reference_unit == "g":
+        return unit
+    parts = _CHANNEL.split(unit)
+    return "".join(p if p.startswith("[") else _G.sub(lambda _: grouped(reference_unit), p) for p in parts)
+
+
+def grouped(unit: str) -> str:
+    """A unit as it stands below a fraction bar."""
+    return f"({unit})" if set(unit) & set(" /") else unit
+
+
+def reference_unit_of(reference: float) -> str:
+    """g where the magnitude can be gravity in units of g, else what the caller did not name."""
+    return "g" if 0.9 <= reference <= 1.1 else "reference unit"

@@ -1,0 +1,93 @@
+"""diagnose --check: poses of another recording of the same unit, and what speaks against them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from triaxcal.plan.directions import directions
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+
+Run = Callable[..., Any]
+RECORDINGS = Path(__file__).parents[3] / "recordings"
+RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
+REPEATED = "duplicate_samples: 1"
+
+
+def write(path: Path, seed: int, *, count: int = 14, repeated: bool = False) -> Path:
+    """A recording as text; ``repeated``: with a sample that came twice."""
+    up = np.array([v for _, v in directions(14)])[np.random.default_rng(seed).permutation(14)][:count]
+    sensor = Sensor(np.full(3, 2.0), np.array([2e-3, -1e-3, 1e-3]), np.array([1e-3, 2e-3, -1e-3]))
+    unit = SyntheticUnit(sensor, Tumble(up, HOLD_S, MOVE_S), np.full(3, 2e-4), Environment(), seed=seed)
+    t_s = np.arange(int(count * (HOLD_S + MOVE_S) * RATE_HZ)) / RATE_HZ
+    rows = [f"{t:.3f},{x:.9f},{y:.9f},{z:.9f}\n" for t, (x, y, z) in zip(t_s, unit.sample(t_s)[0], strict=True)]
+    if repeated:
+        rows.insert(50, rows[50])
+    path.write_text("t_s,ux,uy,uz\n" + "".join(rows), "utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("check")
+    write(folder / "main.csv", 1)
+    write(folder / "later.csv", 2)
+    write(folder / "check.csv", 3, repeated=True)
+    write(folder / "few.csv", 4, count=5, repeated=True)
+    return folder
+
+
+def test_a_check_recording_of_another_unit_is_an_error_that_names_both_serials(triaxcal: Run) -> None:
+    main, check = RECORDINGS / "can-second-order.mcap", RECORDINGS / "modbus-temperature-bias.mcap"
+    triaxcal("diagnose", main, "--check", check).failed(2, f"{check}: unit: 1002; {main} has 1001")
+
+
+def test_a_check_recording_that_is_read_otherwise_is_an_error(folder: Path, triaxcal: Run) -> None:
+    done = triaxcal("diagnose", RECORDINGS / "can-second-order.mcap", "--check", folder / "check.csv")
+    done.failed(2, "check.csv: signs of the scale factors: +,+,+", "-,-,-")
+
+
+def test_what_is_diagnosed_is_no_check_however_its_path_is_written(folder: Path, triaxcal: Run) -> None:
+    main, later = folder / "main.csv", folder / "later.csv"
+    (folder / "link.csv").unlink(missing_ok=True)
+    (folder / "link.csv").symlink_to(later)
+    for check in (later, folder / ".." / folder.name / "later.csv", folder / "link.csv"):
+        for recordings in ([later], [main, later]):
+            done = triaxcal("diagnose", *recordings, "--check", check)
+            done.failed(2, f"--check {check}: ", "another recording")
+            assert done.err.count("\n") == 1
+
+
+def test_what_spoils_the_check_recording_stands_behind_its_name(folder: Path, triaxcal: Run) -> None:
+    main, check = folder / "main.csv", folder / "check.csv"
+    document = triaxcal("diagnose", main, "--check", check, "--json").json
+    assert document["data_quality"] == [f"{check}: {REPEATED}"]
+    assert document["held_out"]["poses"] == 14
+    assert f"warning: {check}: {REPEATED}\n" in triaxcal("diagnose", main, "--check", check).err
+    assert triaxcal("diagnose", main, "--json").json["data_quality"] == []
+
+
+@pytest.mark.parametrize("command", [["fit"], ["fit", "--turning"], ["diagnose"]])
+def test_a_refusal_is_told_with_what_spoils_the_recording(folder: Path, triaxcal: Run, command: list[str]) -> None:
+    done = triaxcal(*command, folder / "few.csv", "--json")
+    done.failed(3, "refused")
+    assert f"warning: {REPEATED}\n" in done.err
+
+
+def test_of_several_units_a_refusal_names_the_recording_that_is_spoiled(folder: Path, triaxcal: Run) -> None:
+    few = folder / "few.csv"
+    done = triaxcal("diagnose", "--units", folder / "main.csv", few)
+    done.failed(3, "few.csv")
+    assert f"warning: {few}: {REPEATED}\n" in done.err
+
+
+def test_a_report_is_headed_by_the_name_of_the_file_alone(folder: Path, triaxcal: Run) -> None:
+    page = folder / "page.html"
+    assert triaxcal("fit", folder / "main.csv", "--report", page).code == 0
+    assert "<h1>main.csv</h1>" in page.read_text("utf-8")
+    assert str(folder) not in page.read_text("utf-8")

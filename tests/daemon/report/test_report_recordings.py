@@ -1,0 +1,138 @@
+"""The page of several recordings: each by its own clock, and what is of which."""
+
+from __future__ import annotations
+
+import copy
+import re
+from html import unescape
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from triaxcald.report import render_report
+
+_spec = spec_from_file_location("sample_documents", Path(__file__).with_name("sample_documents.py"))
+assert _spec is not None
+assert _spec.loader is not None
+samples = module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+_SAMPLE = samples.loop_document(14)
+FIRST, SECOND = "/data/monday/first.csv", "/data/tuesday/second.csv"
+AT_S = 38.0
+
+
+@pytest.fixture
+def loop() -> dict[str, Any]:
+    """Seven poses of either recording, at the same times of their clocks, and a step between poses 1 and 2 of the
+    second."""
+    document = copy.deepcopy(_SAMPLE)
+    known = {"x_run2": {"value": 2e-3, "standard_error": 1e-5, "unit": "g"}, "at": {"value": AT_S, "unit": "s"}}
+    finding = document["findings"][0] | {"effect": "bias_step", "coefficients": known}
+    document["findings"] = [finding]
+    calibration = document["calibration"]
+    calibration |= {"terms": ["linear", "bias_step"], "effects": {"bias_step": known}}
+    poses = calibration["poses"]
+    for i, pose in enumerate(poses):
+        pose["recording"] = FIRST if i < 7 else SECOND
+        pose |= {name: poses[i % 7][name] for name in ("start_s", "end_s")}
+    document["recordings"] = [FIRST, SECOND]
+    document["by_recording"] = [
+        {"recording": name, "poses": 7, "before_rms_g": 9e-4, "after_rms_g": after_g, "noise_floor_g": 1.5e-5}
+        for name, after_g in ((FIRST, 1.2e-5), (SECOND, 1.7e-5))
+    ]
+    return document
+
+
+def page(document: dict[str, Any]) -> tuple[str, str]:
+    """The page, and what a reader sees of it, with a bar between cells of tables."""
+    html = render_report(document, title="unit")
+    body = re.sub(r"<style.*?</style>|<svg.*?</svg>", " ", html, flags=re.DOTALL)
+    body = re.sub(r"</t[hd]>\s*<t[hd][^>]*>", " | ", body)
+    return html, " ".join(unescape(re.sub(r"<[^>]+>", " ", body)).split())
+
+
+def test_a_moment_lies_between_poses_of_the_recording_whose_clock_it_is_on(loop: dict[str, Any]) -> None:
+    said = "The moment lies between pose 8 and pose 9 of second.csv, that is between 36.0 s and 46.0 s"
+    assert said in page(loop)[1]
+    loop["findings"][0]["coefficients"]["at"]["value"] = 50.0
+    assert "The moment lies in pose 9 of second.csv." in page(loop)[1]
+    del loop["findings"][0]["coefficients"]["x_run2"]
+    assert "The moment lies" not in page(loop)[1]
+
+
+def test_each_recording_has_its_picture_over_time_and_the_moment_is_marked_in_its_own(loop: dict[str, Any]) -> None:
+    html, text = page(loop)
+    pictures = {
+        label: svg
+        for label, svg in re.findall(r'<svg role="img" aria-label="([^"]*)"(.*?)</svg>', html, flags=re.DOTALL)
+        if "in order of time" in label
+    }
+    assert [label.partition(" in order")[0] for label in pictures] == [
+        "Residual of 7 poses of first.csv",
+        "Residual of 7 poses of second.csv",
+    ]
+    assert [">Bias step</text>" in svg for svg in pictures.values()] == [False, True]
+    assert "second.csv, by its own clock. Residual of each pose at its middle" in text
+    ids = re.findall(r' id="([^"]+)"', html)
+    assert len(ids) == len(set(ids))
+
+
+def test_every_pose_and_every_residual_names_its_recording(loop: dict[str, Any]) -> None:
+    loop["calibration"]["poses"][8] |= {"used": False, "residual_g": 3.062e-3}
+    _, text = page(loop)
+    assert "Pose | Recording | Start, s" in text
+    assert re.search(r"\b7 \| first\.csv \| 246\.0 \| .* 8 \| second\.csv \| 6\.0 \| 36\.0 \|", text)
+    assert "Pose 9, at 46.0 s of second.csv: off by 3062 µg" in text
+    assert "1. first.csv | 7 | 900 µg | 12.0 µg | 15.0 µg 2. second.csv | 7 | 900 µg | 17.0 µg" in text
+
+
+def test_recordings_of_the_same_name_keep_their_folders(loop: dict[str, Any]) -> None:
+    for pose in loop["calibration"]["poses"]:
+        pose["recording"] = str(Path(pose["recording"]).with_name("run.csv"))
+    loop["recordings"] = ["/data/monday/run.csv", "/data/tuesday/run.csv"]
+    assert "pose 9 of /data/tuesday/run.csv" in page(loop)[1]
+
+
+def test_a_coefficient_of_one_recording_says_so(loop: dict[str, Any]) -> None:
+    _, text = page(loop)
+    assert "x_run2 | x | −1 before t₁, 0 after, t₁ in recording 2; all earlier ones are before it |" in text
+
+
+def test_a_single_recording_has_no_word_of_several(loop: dict[str, Any]) -> None:
+    _, text = page(_SAMPLE)
+    assert "Recording |" not in text
+    assert "by its own clock" not in text
+
+
+@pytest.mark.parametrize("damage", [None, 3, "first.csv", [], [None, {}], [FIRST]])
+def test_damaged_names_of_recordings_still_give_a_page(loop: dict[str, Any], damage: object) -> None:
+    loop["recordings"] = loop["by_recording"] = damage
+    loop["calibration"]["poses"][3]["recording"] = damage
+    loop["findings"][0]["coefficients"]["x_run" + "9" * 5000] = {"value": 1.0}
+    assert "Bias step" in page(loop)[1]
+
+
+@pytest.mark.parametrize("unit", ["T", "<uT>", "µg-like"])
+def test_names_with_the_unit_of_errors_in_them_stay_as_they_are(loop: dict[str, Any], unit: str) -> None:
+    """Where the reference is not in g."""
+    loop["calibration"]["units"] = {"reference": unit, "output": "V"}
+    loop["calibration"]["reference"] = 5e-5
+    for pose in loop["calibration"]["poses"]:
+        pose["channels"] = {"dust µg": pose["channels"]["temp_c"]}
+    loop["data_quality"] = ["odd: 1e-6 µg is in channel dust µg"]
+    html, text = page(loop)
+    assert "above dust µg" in html
+    assert "odd: 1e-6 µg is in channel dust µg" in text
+    assert html.count("µg") - html.count("dust µg") - html.count("1e-6 µg") == html.count("µg-like")
+    assert f"residual, 10⁻¹² {unit}" in unescape(html)
+
+
+def test_errors_of_a_small_reference_have_digits(loop: dict[str, Any]) -> None:
+    loop["calibration"]["units"] = {"reference": "T", "output": "V"}
+    loop["calibration"]["reference"] = 5e-5
+    for residual in (loop["before"], loop["after"]):
+        residual |= {"rms_g": 6.54e-10, "cross_validated_rms_g": 6.54e-10, "noise_floor_g": 7.25e-10}
+    loop["held_out"] = None
+    assert "654 × 10⁻¹² T rms, 654 × 10⁻¹² T before; noise floor 725 × 10⁻¹² T." in page(loop)[1]

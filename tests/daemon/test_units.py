@@ -1,0 +1,60 @@
+"""Units as they are written where the reference is not in g."""
+
+from __future__ import annotations
+
+import pytest
+
+from triaxcald.units import ErrorUnit, in_units_of
+
+
+@pytest.mark.parametrize(
+    ("unit", "of_tesla"),
+    [
+        ("g", "T"),
+        ("g/g²", "T/T²"),
+        ("g/s²", "T/s²"),
+        ("g/(K/s)", "T/(K/s)"),
+        ("1/[gyro]", "1/[gyro]"),
+        ("g/[voltage_v]", "T/[voltage_v]"),
+        ("g/[g]", "T/[g]"),
+        ("g/[a]g[b]", "T/[a]g[b]"),
+        ("mg/deg", "mg/deg"),
+    ],
+)
+def test_g_is_replaced_as_a_unit_and_in_no_name(unit: str, of_tesla: str) -> None:
+    assert in_units_of(unit, "T") == of_tesla
+    assert in_units_of(unit, "g") == unit
+
+
+def test_a_unit_with_a_fraction_stands_in_brackets() -> None:
+    assert in_units_of("g/g", r"\1/s") == r"(\1/s)/(\1/s)"
+
+
+@pytest.mark.parametrize(
+    ("unit", "reference", "text", "number"),
+    [
+        ("g", 0.998, "µg", "2.0"),
+        ("reference unit", 9.80665, "1e-6 reference unit", "2.0"),
+        ("µT", 48.0, "1e-6 µT", "2.0"),
+        ("nT", 48_000.0, "1e-3 nT", "0.0"),
+        ("T", 5e-5, "1e-12 T", "2000000.0"),
+        ("T", 1e-320, "1e-258 T", None),
+    ],
+)
+def test_errors_are_told_in_about_millionths_of_the_reference(
+    unit: str, reference: float, text: str, number: str | None
+) -> None:
+    small = ErrorUnit.of(unit, reference)
+    assert str(small) == text
+    assert number is None or small.told(2e-6) == number
+    assert small.told(None) == "—"
+
+
+def test_a_sentence_has_the_unit_of_the_reference_behind_numbers_alone() -> None:
+    said = "channel_bias:dust_µg: from 1.53e+04 µg to 12 µg, one pose (-3.2 µg, +4 µg)"
+    assert ErrorUnit.of("g", 1.0).in_words(said) == said
+    assert (
+        ErrorUnit.of("µT", 48.0).in_words(said)
+        == "channel_bias:dust_µg: from 1.53e+04 1e-6 µT to 12 1e-6 µT, one pose (-3.2 1e-6 µT, +4 1e-6 µT)"
+    )
+    assert ErrorUnit.of("T", 5e-5).in_words("from 0.00153 µg to +1.2e-05 µg") == "from 1.53e+03 1e-12 T to +12 1e-12 T"
