@@ -14,7 +14,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import conditions_elsewhere
-from triaxcal.effects.contract import SINCE_START, TIME
+from triaxcal.effects.contract import SINCE_START, TIME, channel_of, is_derived
 from triaxcal.poses.pose import Pose
 
 
@@ -51,8 +51,8 @@ def _change(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> Float
         for name in held:
             if name in (TIME, SINCE_START):
                 at[name] = held[name] if elsewhere else held[name] + half
-            elif all(name in p.rates for p in poses):
-                at[name] = held[name] + half * np.array([p.rates[name] for p in poses])
+            elif not is_derived(name) and all(channel_of(name) in p.rates for p in poses):
+                at[name] = held[name] + half * np.array([p.rates[channel_of(name)] for p in poses])
         ends.append(at)
     s = sensor.along_axes(np.array([p.mean for p in poses]), held)
     first, last = (sensor.departure(s, at) for at in ends)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from itertools import starmap
 
 import numpy as np
 from scipy import special
@@ -22,13 +23,14 @@ from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.part import Part
+from triaxcal.effects.plugins import plugins
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.fit import fit, with_faulty
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.runs import by_run, expected_of
 from triaxcal.search import NEAR, Search, alternatives, telling_apart
-from triaxcal.search.candidates import still_conditions
+from triaxcal.search.candidates import Ground, faults_of, still_conditions
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start, with_history
 from triaxcal.unexplained import Unexplained, unexplained_of
@@ -134,7 +136,10 @@ def diagnose(
     smooth = _described(after, signs) if empirical and unexplained.significant else None
     if smooth is not None:
         after = smooth
-    blind = tuple(e.name for e in effects if e.name not in search.full)
+    faulty = faults_of(Ground.at(search.problem, search.linear.state), effects)
+    blind = tuple(e.name for e in effects if e.name not in search.full and e.name not in faulty)
+    if catalogue is None:
+        faulty = dict(plugins()[1]) | faulty
     findings = tuple(
         _finding(search, e, after, step, found.rivals if e is found.adopted[0] else ())
         for e, step in zip(found.adopted, steps, strict=False)
@@ -148,7 +153,7 @@ def diagnose(
         findings=findings,
         unexplained=unexplained,
         held_out=_held_out(before, after, check) if check is not None else None,
-        advice=tuple(_advice(findings, unexplained, blind)),
+        advice=(*_advice(findings, unexplained, blind), *starmap(_left_out, faulty.items())),
         search=search,
     )
 
@@ -381,6 +386,10 @@ def magnitude_errors(
 
 def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def _left_out(name: str, why: str) -> str:
+    return f"the effect {name} of another package was left out: {why}"
 
 
 def _advice(findings: Sequence[Finding], unexplained: Unexplained, blind: Sequence[str]) -> list[str]:

@@ -550,6 +550,7 @@ class Failing(Radiation):
     ((name, why),) = faults_of(ground, [*CATALOGUE, radiation]).items()
     assert name == "radiation"
     assert reason in why
+    assert f"the effect radiation of another package was left out: {why}" in loop.advice
     # Who asks for it all the same gets one line that names it.
     asked = partial(fit, poses, signs=(-1, -1, -1), effects=[radiation])
     if method == "variants":

@@ -8,7 +8,19 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.conditions import at_reference
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, Effect
+from triaxcal.effects.contract import (
+    BEFORE,
+    CHANGE,
+    HELD,
+    RUN,
+    SCATTER,
+    SINCE_START,
+    TIME,
+    Effect,
+    channel_of,
+    is_derived,
+    rate_of,
+)
 from triaxcal.plan.directions import directions, spiral
 from triaxcal.search.search import Model, Search
 
@@ -63,7 +75,8 @@ def goes_with(effect: Effect) -> str:
         return HISTORY
     if needs <= set(SCATTER):
         return SHAKING
-    return sorted(needs)[0].removesuffix(".rate")
+    first = sorted(needs)[0]
+    return channel_of(first.removesuffix(rate_of("")) if is_derived(first) else first)
 
 
 def _directions(search: Search, mine: Model, other: Model, name: str) -> str:
