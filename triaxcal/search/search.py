@@ -367,9 +367,11 @@ class Search:
     # Tests.
 
     def p_value(self, before: float, after: float, rank: int, left: int) -> float:
-        """Of a drop of chi-square: against the noise, and against what is left where more than noise is left."""
+        """Of a drop of chi-square: against the noise, which what is left tells as well as the poses' own does, and
+        against what is left alone where that is more than noise."""
         drop = max(before - after, 0.0) / rank
-        p = float(stats.f.sf(drop, rank, self.pure))
+        degrees = self.pure + max(left, 0)
+        p = float(stats.f.sf(drop * degrees / (self.pure + after), rank, degrees))
         if left > 0 and stats.f.sf(after / left, left, self.pure) < FAMILYWISE:
             p = max(p, float(stats.f.sf(drop / (after / left), rank, left)))
         return max(p, P_LEAST)

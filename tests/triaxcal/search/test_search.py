@@ -94,6 +94,15 @@ def test_a_drop_is_judged_by_the_noise_or_by_what_is_left_where_that_is_more(sea
     assert search.p_value(254.0, 224.0, 3, 14) == pytest.approx(stats.f.sf(30.0 / 3 / 16, 3, 14), rel=1e-9)
 
 
+def test_noise_that_few_windows_tell_is_told_by_what_is_left_too(search: Search) -> None:
+    """A drop of 30 in 3 degrees of freedom beside 14 in 14: an F test against the noise of poses and rest together."""
+    known, search.pure = search.pure, 9.0
+    p = search.p_value(44.0, 14.0, 3, 14)
+    search.pure = known
+    assert p == pytest.approx(stats.f.sf(10.0 / ((9 + 14) / 23), 3, 23), rel=1e-9)
+    assert p < stats.f.sf(10.0, 3, 9) / 5
+
+
 def test_what_an_effect_adds_beside_others_is_its_drop_of_chi_square(search: Search) -> None:
     both, alone = search.model([SECOND, WARMTH]), search.model([SECOND])
     assert both is not None
