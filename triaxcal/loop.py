@@ -122,8 +122,9 @@ def diagnose(
     found = _explained(quiet, _aside(linear), signs, reference, effects)
     search, before, steps = found.search, linear, [linear]
     # Poses in which |a| itself creeps are something that is left, not an excuse for it.
-    model = fit(quiet, signs=signs, reference=reference)
-    if found.adopted:
+    if not found.adopted:
+        model = fit(quiet, signs=signs, reference=reference)
+    else:
         before = fit(poses, signs=signs, reference=reference, aside=found.aside)
         model = fit(quiet, signs=signs, reference=reference, effects=found.adopted, aside=found.aside)
         left = with_creep_left(poses, model)

@@ -16,7 +16,7 @@ from triaxcal.errors import Refused
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, solve
-from triaxcal.pure_error import pure_error_dof
+from triaxcal.pure_error import lack_of_fit_p, pure_error_dof
 from triaxcal.search.candidates import Candidate, Ground, candidates_of, still_conditions
 from triaxcal.search.familywise import familywise, independent_tests
 from triaxcal.search.gains import Gains
@@ -113,14 +113,13 @@ class Search:
         """Fitted; None where the poses cannot carry it."""
         key = tuple(map(id, effects))
         if key not in self._known:
-            self._known[key] = tuple(effects), self._solved(tuple(effects))
+            carried = self.left(effects) >= self.kept
+            self._known[key] = tuple(effects), self._solved(tuple(effects)) if carried else None
         return self._known[key][1]
 
     def _solved(self, effects: tuple[Effect, ...]) -> Model | None:
-        if self.left(effects) < self.kept:
-            return None
         try:
-            state = solve(self.problem, State(self.linear.state.theta, ()), effects)
+            state = solve(self.problem, self.linear.state, effects)
         except Refused:
             return None
         return self._model(effects, state, sum(self.price(e) for e in effects))
@@ -131,13 +130,9 @@ class Search:
         for c in self.candidates:
             left = self.left((c.effect,))
             chi2 = float(ground.y @ ground.y - np.sum((c.basis.T @ ground.y) ** 2))
-            if 0 <= left < self.kept and (left == 0 or stats.f.sf(chi2 / left, left, self.pure) > FAMILYWISE):
-                try:
-                    state = solve(self.problem, self.linear.state, (c.effect,))
-                except Refused:
-                    continue
-                found.append(self._model((c.effect,), state, self.price(c.effect)))
-        return found
+            if 0 <= left < self.kept and not self._beyond_noise(chi2, left):
+                found.append(self._solved((c.effect,)))
+        return [m for m in found if m is not None]
 
     def coincidence(self, m: Model) -> float:
         """Probability that the best of all candidates would explain as much of residuals as large as these, did they
@@ -163,8 +158,11 @@ class Search:
 
     def left_over(self, m: Model) -> bool:
         """Whether the residuals are more than noise."""
-        left = self.left(m.effects)
-        return left > 0 and float(stats.f.sf(m.chi2 / left, left, self.pure)) < FAMILYWISE
+        return self._beyond_noise(m.chi2, self.left(m.effects))
+
+    def _beyond_noise(self, chi2: float, left: int) -> bool:
+        p = lack_of_fit_p(chi2, left, self.pure)
+        return p is not None and p < FAMILYWISE
 
     # The steps.
 
@@ -372,7 +370,7 @@ class Search:
         drop = max(before - after, 0.0) / rank
         degrees = self.pure + max(left, 0)
         p = float(stats.f.sf(drop * degrees / (self.pure + after), rank, degrees))
-        if left > 0 and stats.f.sf(after / left, left, self.pure) < FAMILYWISE:
+        if self._beyond_noise(after, left):
             p = max(p, float(stats.f.sf(drop / (after / left), rank, left)))
         return max(p, P_LEAST)
 
