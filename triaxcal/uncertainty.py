@@ -20,7 +20,7 @@ from triaxcal.effects import CATALOGUE, Effect
 from triaxcal.errors import InvalidData
 from triaxcal.gravity import local_gravity_g
 from triaxcal.plan.directions import directions
-from triaxcal.problem import Problem, State, linearise, parameters_by_theta
+from triaxcal.problem import Problem, State, by_shape, linearise, parameters_by_theta
 from triaxcal.pure_error import DOF_MOST, pure_error_dof
 from triaxcal.start import problem_of, with_history
 
@@ -162,9 +162,11 @@ class _Ground:
         self.state = State.of(self.problem, sensor)
         self.effects = self.state.effects
         _, J, self.error = linearise(self.problem, self.state)
-        self.weighted = J / self.error[:, None]
+        # What the shapes of effects were chosen by blurs the parameters too.
+        self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
+        self.gain = _pinv(self.weighted)
         self.G = parameters_by_theta(self.problem, self.state)
-        self.by_residual = -self.G @ _pinv(self.weighted) / self.error
+        self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
         """(p,n): shift of the parameters for an error of each pose's residual."""
         self.sphere = self._sphere(calibration, {})
         _, J, _ = linearise(self.sphere, self.state)
@@ -263,16 +265,16 @@ def _temperature(calibration: Calibration, ground: _Ground) -> tuple[list[Compon
     spread = np.concatenate([[_sensitivity(e, calibration.reference)] * len(e.coefficients) for e in missing])
     p = len(ground.state.theta)
     Z = J[:, p:] * spread / s[:, None]
-    S = _pinv(ground.weighted)
-    rest = Z - ground.weighted @ (S @ Z)
+    absorbed = ground.gain @ Z
+    rest = Z - ground.weighted @ absorbed
     # With the prior's width as unit: what the poses do not show stays as wide as it was.
     left = np.linalg.inv(np.eye(extra) + rest.T @ rest)
     mean = -left @ rest.T @ (r / s)
-    through = ground.G @ (S @ Z)
+    through = ground.G @ absorbed[:p]
     after = r / s + rest @ mean
     taken = extra - float(np.trace(left))  # degrees of freedom, fewer than coefficients where the data say little
     before_ratio, after_ratio = (
-        float(v @ v) / max(len(r) - p - dof, 1e-9) for v, dof in ((r / s, 0.0), (after, taken))
+        float(v @ v) / max(len(r) - ground.weighted.shape[1] - dof, 1e-9) for v, dof in ((r / s, 0.0), (after, taken))
     )
     beyond = min(max(after_ratio - 1, 0.0) / (before_ratio - 1), 1.0) if before_ratio > 1 else 1.0
     moved = float(np.ptp(ground.problem.channels[TEMPERATURE]))

@@ -202,6 +202,18 @@ def test_residuals_beyond_noise_are_a_line_of_their_own(paper_unit: Sensor, twen
     np.testing.assert_allclose(b.parameters.coverage, stats.t.ppf(0.975, 17), rtol=0.02)
 
 
+def test_a_time_constant_that_had_to_be_found_belongs_to_the_noise(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    """Nothing is lacking in a model whose residuals are noise, however uncertain a shape of it makes its values."""
+    warming = effect_named("warm_up").shaped({"time_constant": 400.0})
+    truth = replace(paper_unit, effects=((warming, np.array([3e-3, -2e-3, 1e-3])),))
+    c = fit(noisy_poses(truth, twenty_six, NOISE, np.random.default_rng(5)), signs=SIGNS, effects=[warming], aside=())
+    assert c.inflation == 1
+    assert c.shape_errors["warm_up.time_constant"] > 0
+    b = budget(c)
+    assert [line.source for line in b.components] == ["noise"]
+    np.testing.assert_allclose(b.parameters.standard, c.standard_errors, rtol=1e-6)
+
+
 def test_what_nobody_stated_is_said_not_to_be_evaluated(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, aside=())
     assert [line.split(":")[0] for line in budget(c).not_evaluated] == ["reference", "temperature"]
