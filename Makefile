@@ -19,7 +19,7 @@ demo: $(READY)  ## the whole line on two simulated units
 	$(BIN)/triaxcal demo --out demo-out
 
 test: $(READY)  ## the whole test suite
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 bench: $(READY)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)

@@ -3,7 +3,7 @@
     python benchmarks/quality.py            # some minutes
     python benchmarks/quality.py --quick    # fewer seeds
 
-Clean streams are those of `stillness.py`, and steps of many widths against the noise. One line a condition: streams,
+Clean streams are those of `streams.py`, and steps of many widths against the noise. One line a condition: streams,
 and how many of them got which name. A fault is counted as found where its name is given, and nothing but its name.
 """
 
@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.stillness import CONDITIONS, Condition, Stream, made
+from benchmarks.streams import CONDITIONS, Condition, Stream, made
 from triaxcal.arrays import Floats, Ints
 from triaxcal.quality import Finding, QualityDetector
 from triaxcal.stillness.detector import StillnessDetector

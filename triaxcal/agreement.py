@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize, stats
+import scipy
 
+from triaxcal.distributions import chi2_sf
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.part import Part
 from triaxcal.errors import InvalidData
@@ -249,7 +250,7 @@ def _shared(name: str, unit: str, j: _Joint, units: Sequence[_Unit], some: Seque
     value = _lowest(together, grid)
     own = [_lowest(profile, grid) for profile in profiles]
     apart = sum(profile(value) - profile(x) for profile, x in zip(profiles, own, strict=True))
-    p = float(stats.chi2.sf(max(apart, 0.0), len(some) - 1)) if len(some) > 1 else None
+    p = float(chi2_sf(max(apart, 0.0), len(some) - 1)) if len(some) > 1 else None
     errors = [_error(profile, x, grid) for profile, x in zip(profiles, own, strict=True)]
     return SharedShape(value, _error(together, value, grid), unit, tuple(some), tuple(zip(own, errors, strict=True)), p)
 
@@ -276,7 +277,9 @@ def _lowest(profile: Callable[[float], float], grid: Sequence[float]) -> float:
     low, high = grid[max(at - 1, 0)], grid[at + 1] if at + 1 < len(grid) else _beyond(grid)
     if not low < high:
         return grid[at]
-    found = optimize.minimize_scalar(profile, bounds=(low, high), method="bounded", options={"xatol": 1e-3 * high})
+    found = scipy.optimize.minimize_scalar(
+        profile, bounds=(low, high), method="bounded", options={"xatol": 1e-3 * high}
+    )
     return float(found.x) if found.fun < values[at] - 1e-3 else grid[at]
 
 

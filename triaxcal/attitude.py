@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from scipy import stats
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration, PoseResult, Residual
+from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.plan.directions import most_wanted
 from triaxcal.poses.pose import Pose
@@ -332,7 +332,7 @@ def _warnings(found: AttitudeFit, s: TurntableSolution) -> list[str]:
     used = [p for p in c.poses if p.used]
     left = sum(1 - p.leverage for p in used)
     chi2 = sum((p.residual_g / p.standard_error_g) ** 2 for p in used)
-    if left > 0.5 and stats.f.sf(chi2 / left, left, max(s.data.dof, 1.0)) < LACK_OF_FIT:
+    if left > 0.5 and f_sf(chi2 / left, left, max(s.data.dof, 1.0)) < LACK_OF_FIT:
         worst = max(used, key=lambda p: abs(p.studentized))
         name = found.attitudes[c.poses.index(worst)].name
         out.append(

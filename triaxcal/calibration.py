@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg
 
 from triaxcal.arrays import Floats
 from triaxcal.conditions import channels_of, conditions, of_readings, with_scale
+from triaxcal.distributions import t_ppf
 from triaxcal.effects.part import Part, mix_of
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose
@@ -130,7 +131,7 @@ class Calibration:
         """
         if not 0 < level < 1:
             raise InvalidData(f"a level of confidence lies between 0 and 1, not at {level}")
-        return float(stats.t.ppf((1 + level) / 2, self.dof))
+        return float(t_ppf((1 + level) / 2, self.dof))
 
     def interval(self, level: float = 0.95) -> tuple[Floats, Floats]:
         """Lower and upper ends for `parameters`, each of which holds its truth with probability ``level``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from triaxcal.arrays import Floats
 
@@ -23,7 +23,7 @@ def first_order(n: int, time_constant: float, rng: np.random.Generator) -> Float
     phi = np.exp(-1 / time_constant)
     start = rng.standard_normal((1, 3))
     drive = rng.standard_normal((n, 3)) * np.sqrt(1 - phi**2)
-    return np.asarray(signal.lfilter([1.0], [1.0, -phi], drive, axis=0, zi=phi * start)[0])
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -phi], drive, axis=0, zi=phi * start)[0])
 
 
 def flicker(n: int, corner: float, rng: np.random.Generator) -> Floats:

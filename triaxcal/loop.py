@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from itertools import starmap
 
 import numpy as np
 from scipy import special
@@ -19,48 +18,26 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import channels_of, conditions_elsewhere
 from triaxcal.creep import with_creep_left, without_creep
+from triaxcal.description import described
 from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
-from triaxcal.effects.empirical import Empirical
-from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import InvalidData, Refused
+from triaxcal.findings import Finding, advice_of, description_of, finding_of, why_not_shown
 from triaxcal.fit import fit, with_faulty
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.runs import by_run, expected_of
-from triaxcal.search import NEAR, Search, alternatives, telling_apart
+from triaxcal.search import NEAR, Search, alternatives
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start, with_history
 from triaxcal.unexplained import Unexplained, unexplained_of
 
-DESCRIBES = 1.4
-"""A smooth term has to lower the cross-validated error by this factor: less is chance among so many coefficients."""
 ANYTHING = 4
 """An effect beside others, with so many alternatives, is none."""
 ROUNDS_MOST = 3
 """Effects and spoiled poses are sought in turn so often."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """An effect that the data show. ``coefficients`` name → (value, standard error, unit).
-
-    ``verdict`` is "adopted" where the name is earned, "confounded" where ``alternatives`` fit as well.
-    """
-
-    effect: str
-    verdict: str
-    p_value: float
-    coefficients: Mapping[str, tuple[float, float | None, str]]
-    alternatives: tuple[str, ...]
-    reason: str
-    remedy: str
-    step: Calibration
-    """The model with this effect and those before it."""
-    apart: tuple[str, ...] = ()
-    """What to record so as to tell it from its alternatives."""
 
 
 @dataclass(frozen=True)
@@ -120,43 +97,61 @@ def diagnose(
     # What moves the bias also makes poses creep: to the search that is no error of their means.
     quiet = without_creep(poses)
     found = _explained(quiet, _aside(linear), signs, reference, effects)
-    search, before, steps = found.search, linear, [linear]
+    search, given = found.search, _Given(poses, signs, reference, found.aside)
+    before, steps = linear, [linear]
     # Poses in which |a| itself creeps are something that is left, not an excuse for it.
     if not found.adopted:
         model = fit(quiet, signs=signs, reference=reference)
     else:
-        before = fit(poses, signs=signs, reference=reference, aside=found.aside)
-        model = fit(quiet, signs=signs, reference=reference, effects=found.adopted, aside=found.aside)
-        left = with_creep_left(poses, model)
-        steps = [
-            fit(left, signs=signs, reference=reference, effects=found.adopted[:count], aside=found.aside)
-            for count in range(1, len(found.adopted) + 1)
-        ]
-    after = steps[-1]
+        before = given.fit(())
+        model = replace(given, poses=quiet).fit(found.adopted)
+        given = replace(given, poses=with_creep_left(poses, model))
+        steps = [given.fit(found.adopted[:count]) for count in range(1, len(found.adopted) + 1)]
     unexplained = unexplained_of(model, search.passed_over, search.nearest())
-    smooth = _described(after, signs) if empirical and unexplained.significant else None
+    smooth, undescribed = described(steps[-1], unexplained, signs) if empirical else (None, "")
+    after = smooth or steps[-1]
+    findings: list[Finding] = []
+    for effect, step in zip(found.adopted, steps, strict=False):
+        others = [e for e in found.adopted if e is not effect]
+        without = given.tried(others) if others else before
+        rivals = () if findings else found.rivals
+        findings.append(finding_of(search, effect, (without, steps[-1]), after, step, rivals))
     if smooth is not None:
-        after = smooth
+        findings.append(description_of(smooth, steps[-1]))
+        unexplained = unexplained_of(smooth, search.passed_over)
     faulty = faults_of(Ground.at(search.problem, search.linear.state), effects)
-    blind = tuple(e.name for e in effects if e.name not in search.full and e.name not in faulty)
+    blind = {e.name: why_not_shown(search, e) for e in effects if e.name not in search.full and e.name not in faulty}
     if catalogue is None:
         faulty = dict(plugins()[1]) | faulty
-    findings = tuple(
-        _finding(search, e, after, step, found.rivals if e is found.adopted[0] else ())
-        for e, step in zip(found.adopted, steps, strict=False)
-    )
-    if smooth is not None:
-        findings = (*findings, _description(smooth, steps[-1]))
-        unexplained = unexplained_of(smooth, search.passed_over)
     return Loop(
-        before=before.with_blind_to(blind),
-        after=after.with_blind_to(blind),
-        findings=findings,
+        before=before.with_blind_to(tuple(blind)),
+        after=after.with_blind_to(tuple(blind)),
+        findings=tuple(findings),
         unexplained=unexplained,
         held_out=_held_out(before, after, check) if check is not None else None,
-        advice=(*_advice(findings, unexplained, blind), *starmap(_left_out, faulty.items())),
+        advice=tuple(advice_of(findings, unexplained, undescribed, blind, faulty)),
         search=search,
     )
+
+
+@dataclass(frozen=True)
+class _Given:
+    """Poses, and how they are fitted whatever the effects."""
+
+    poses: Sequence[Pose]
+    signs: Sequence[float]
+    reference: float
+    aside: tuple[int, ...]
+
+    def fit(self, effects: Sequence[Effect]) -> Calibration:
+        return fit(self.poses, signs=self.signs, reference=self.reference, effects=effects, aside=self.aside)
+
+    def tried(self, effects: Sequence[Effect]) -> Calibration | None:
+        """None where the poses cannot carry it."""
+        try:
+            return self.fit(effects)
+        except Refused:
+            return None
 
 
 @dataclass(frozen=True)
@@ -270,92 +265,6 @@ def _criterion(found: _Found, n: int) -> float:
     return found.search.score(found.search.found) + aside * float(np.log(n)) + 2 * choice
 
 
-def _finding(
-    search: Search,
-    effect: Effect,
-    after: Calibration,
-    step: Calibration,
-    rivals: Sequence[Sequence[Effect]],
-) -> Finding:
-    """``rivals`` explain as much with other poses left out as spoiled."""
-    found = alternatives(search, effect, search.found)
-    taken = {e.name for e in search.found.effects}
-    for rival in rivals:
-        model = search.model(rival)
-        found |= {e.name: model for e in rival if model and e.name not in taken | found.keys()}
-    others = [e for e in search.found.effects if e is not effect]
-    rest = search.fitted(others) if others else None
-    without = rest.residual if rest else search.before.residual
-    p = search.earned(effect, others)
-    old, new = without.cross_validated_rms_g, after.residual.cross_validated_rms_g
-    reason = f"familywise p {_probability(p)}"
-    if old is not None and new is not None:
-        reason = (
-            f"with it the cross-validated error {'falls' if new < old else 'goes'} from {_micro(old)} to "
-            f"{_micro(new)} (noise floor {_micro(after.residual.noise_floor_g)}); {reason}"
-        )
-    if isinstance(effect, Part) and not effect.selects:
-        reason += f"; of its coefficients these poses show only {effect.formula}, which they share in that proportion"
-    if found:
-        reason += f"; {', '.join(found)} would do as well on these poses"
-    return Finding(
-        effect=effect.name,
-        verdict="confounded" if found else "adopted",
-        p_value=p,
-        coefficients=after.coefficients_of(effect.name),
-        alternatives=tuple(found),
-        reason=reason,
-        remedy=effect.remedy,
-        step=step,
-        apart=tuple(telling_apart(search, effect, found)),
-    )
-
-
-def _described(after: Calibration, signs: Sequence[float]) -> Calibration | None:
-    """The model with the smooth term that lowers the cross-validated error most; None where none does."""
-    poses = [p.pose for p in after.poses]
-    effects = [e for e, _ in after.sensor.effects]
-    trials = []
-    for form in Empirical().forms:
-        try:
-            trial = fit(poses, signs=signs, reference=after.reference, effects=[*effects, form], aside=_aside(after))
-        except Refused:
-            continue
-        if trial.residual.cross_validated_rms_g is not None:
-            trials.append(trial)
-    best = min(trials, key=lambda t: t.residual.cross_validated_rms_g or np.inf, default=None)
-    old = after.residual.cross_validated_rms_g
-    if best is None or old is None or (best.residual.cross_validated_rms_g or np.inf) > old / DESCRIBES:
-        return None
-    return best
-
-
-def _description(smooth: Calibration, without: Calibration) -> Finding:
-    effect = smooth.sensor.effects[-1][0]
-    return Finding(
-        effect=effect.name,
-        verdict="adopted",
-        p_value=without.residual.lack_of_fit_p or 0.0,
-        coefficients=smooth.coefficients_of(effect.name),
-        alternatives=(),
-        reason=(
-            "asked for: a smooth term that describes what is left and explains nothing; with it the cross-validated "
-            f"error falls from {_micro(without.residual.cross_validated_rms_g)} to "
-            f"{_micro(smooth.residual.cross_validated_rms_g)}"
-        ),
-        remedy=effect.remedy,
-        step=smooth,
-    )
-
-
-def _micro(value: float | None) -> str:
-    return "unknown" if value is None else f"{value * 1e6:.3g} µg"
-
-
-def _probability(p: float) -> str:
-    return "below 1e-12" if p < 1e-12 else f"{p:.1e}"
-
-
 def _held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HeldOut:
     """Raises InvalidData where the check poses lack a channel that the effects need."""
     if not check:
@@ -387,22 +296,3 @@ def magnitude_errors(
 
 def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _left_out(name: str, why: str) -> str:
-    return f"the effect {name} of another package was left out: {why}"
-
-
-def _advice(findings: Sequence[Finding], unexplained: Unexplained, blind: Sequence[str]) -> list[str]:
-    out = [f"{f.effect}: {f.remedy}" for f in findings if f.verdict == "adopted"]
-    for f in findings:
-        if f.verdict == "confounded":
-            out.append(f"{f.effect} cannot be told from {', '.join(f.alternatives)} here: {'; '.join(f.apart)}")
-    if unexplained.significant:
-        out.append("something is left that no candidate explains: look at the lead, and record more poses")
-    if blind:
-        names = ", ".join(blind)
-        out.append(
-            f"these poses cannot show in full {names}: too few directions, or no such channel, or it stood still"
-        )
-    return out

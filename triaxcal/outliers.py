@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.distributions import f_sf
 
 ALARM = 0.005
 """Probability that a clean set loses a pose, or a pair."""
@@ -100,12 +100,12 @@ class _Judge:
     def excess(self, after: float, left: int) -> float:
         """What is left, ``after`` in ``left`` degrees of freedom, over the noise; 1 where that explains it."""
         known = self.pure_dof >= 1
-        return 1.0 if known and stats.f.sf(after / left, left, self.pure_dof) >= EXCESS else after / left
+        return 1.0 if known and f_sf(after / left, left, self.pure_dof) >= EXCESS else after / left
 
     def by_rest(self, taken: float, size: int) -> float:
         """Probability that ``size`` rows take so much, against what is left without them alone."""
         after, left = max(self.chi2 - taken, 1e-300), self.left - size
-        return float(stats.f.sf(taken / size / (after / left), size, left))
+        return float(f_sf(taken / size / (after / left), size, left))
 
     def p(self, taken: float, rows: Ints, before: float, left: int) -> float:
         """Of ``rows`` that take so much of ``before``: against the noise, or what is left where that is more."""
@@ -113,9 +113,9 @@ class _Judge:
         after, left_after = max(before - taken, 0.0), left - size
         excess = self.excess(after, left_after)
         dof = float(self.dof[rows].min())
-        p = float(stats.f.sf(taken / size, size, dof)) if dof >= 1 else 0.0
+        p = float(f_sf(taken / size, size, dof)) if dof >= 1 else 0.0
         if excess != 1.0:
-            p = max(p, float(stats.f.sf(taken / size / excess, size, left_after)))
+            p = max(p, float(f_sf(taken / size / excess, size, left_after)))
         return max(p, 1e-300) * (1 + 1e-9 * after)  # of two that are beyond doubt, the one that leaves less
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Floats
+from triaxcal.distributions import f_sf
 from triaxcal.poses.pose import Pose
 
 DOF_MOST = 1e6
@@ -44,7 +44,7 @@ def lack_of_fit_p(chi2: float, left: int, pure_dof: float) -> float | None:
 
     None where nothing is left, or where the noise is not known.
     """
-    return float(stats.f.sf(chi2 / left, left, pure_dof)) if left > 0 and pure_dof >= 1 else None
+    return float(f_sf(chi2 / left, left, pure_dof)) if left > 0 and pure_dof >= 1 else None
 
 
 def raised(chi2: float, left: int, pure_dof: float) -> tuple[float, float]:
@@ -62,6 +62,6 @@ def raised(chi2: float, left: int, pure_dof: float) -> tuple[float, float]:
         return float(np.sqrt(ratio)), float(left)
     if ratio <= 1:
         return 1.0, pure_dof + left
-    p, at_one = float(stats.f.sf(ratio, left, pure_dof)), float(stats.f.sf(1.0, left, pure_dof))
+    p, at_one = float(f_sf(ratio, left, pure_dof)), float(f_sf(1.0, left, pure_dof))
     doubt = max(0.0, (p - BEYOND_DOUBT) / (at_one - BEYOND_DOUBT))
     return float(np.sqrt(ratio)), float(1 / (doubt / (pure_dof + left) + (1 - doubt) / left))

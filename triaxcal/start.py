@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Floats
 from triaxcal.conditions import channels_of, references, with_scale
+from triaxcal.distributions import chi2_ppf
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.plan.directions import dilution, distinct, linear_design, most_wanted
@@ -30,7 +30,8 @@ def problem_of(poses: Sequence[Pose], *, signs: Sequence[float] = (1, 1, 1), ref
     """Raises InvalidData, Refused where there are fewer than nine poses."""
     if len(poses) < POSES_LEAST:
         raise Refused(
-            f"{len(poses)} still poses; nine parameters need at least {POSES_LEAST}, 14 or 26 are better",
+            f"{len(poses)} still pose{'s' * (len(poses) != 1)}; nine parameters need at least {POSES_LEAST}, "
+            "14 or 26 are better",
             wanted=wanted_for(poses, signs),
         )
     u = np.array([p.mean for p in poses])
@@ -127,7 +128,7 @@ def rough_directions(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[Flo
     if (many := distinct(a, ROUGH_APART_DEG)) < ROUGH_LEAST:
         return nothing
     # With few degrees of freedom left a triad that is no sphere may pass for one: the least that 5 % of them show.
-    shown = float(np.sqrt(many / stats.chi2.ppf(0.05, many - 4)))
+    shown = float(np.sqrt(many / chi2_ppf(0.05, many - 4)))
     unlike = max(TRIAD_UNLIKE_SPHERE, shown * float(np.std(radii) / np.mean(radii)))
     unsure_rad = unlike / max(smallest, 1e-9)
     return (a * np.asarray(signs), unsure_rad) if unsure_rad < ROUGH_LIMIT_RAD else nothing

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize, stats
+import scipy
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.distributions import f_sf
 from triaxcal.errors import Refused
 from triaxcal.frame.faces import nearest_rotation
 from triaxcal.poses.pose import Pose
@@ -110,7 +111,7 @@ def solved(data: TurntableData, error_rad: float | None) -> TurntableSolution:
         low, high = high, high + 2
         if low > np.log(ERROR_MOST):
             raise Refused(CONTRADICTION)
-    best = float(np.exp(optimize.brentq(excess, low, high, xtol=1e-2)))
+    best = float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-2)))
     return replace(iterated(data, best), estimated=True)
 
 
@@ -211,6 +212,6 @@ def wrong_by_residual(s: TurntableSolution) -> Ints:
     taken = np.einsum("ni,nij,nj->n", s.rest, np.linalg.pinv(s.free, rcond=1e-9, hermitian=True), s.rest)
     most = float(np.max(taken))
     after = max(s.chi2 - most, 1e-300)
-    p = float(stats.f.sf(most / 3, 3, max(s.data.dof, 1.0)))
-    p = max(p, float(stats.f.sf(most / 3 / (after / left), 3, left))) * n
+    p = float(f_sf(most / 3, 3, max(s.data.dof, 1.0)))
+    p = max(p, float(f_sf(most / 3 / (after / left), 3, left))) * n
     return np.flatnonzero(taken > (1 - RIVAL) * most) if p < ALARM else np.zeros(0, dtype=int)

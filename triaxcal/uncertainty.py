@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import at_reference
+from triaxcal.distributions import t_ppf
 from triaxcal.effects import CATALOGUE, Effect
 from triaxcal.errors import InvalidData
 from triaxcal.gravity import local_gravity_g
@@ -98,7 +98,7 @@ class Combined:
 
     @property
     def coverage(self) -> Floats:
-        return np.asarray(stats.t.ppf((1 + self.level) / 2, self.dof))
+        return np.asarray(t_ppf((1 + self.level) / 2, self.dof))
 
     @property
     def expanded(self) -> Floats:

@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, PoseResult
 from triaxcal.conditions import channels_of, with_scale
+from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, channel_of
+from triaxcal.figures import micro_g, plain, probability
 from triaxcal.plan.directions import linear_design
 from triaxcal.search import Nearest
 
@@ -23,6 +24,8 @@ LEAD = 0.01
 """Probability of a pattern as clear as this by chance, the choice among all patterns allowed for, up to which it is a
 lead."""
 LEADS_MOST = 3
+HINT = 0.05
+"""Familywise p up to which an effect that was passed over for it is a hint."""
 PERIODS = 24
 NAMES = {TIME: "the time", RUN: "the recording", HELD: "how long the pose was held"}
 NAMES |= {b: f"the pose before, along {b[-1]}" for b in BEFORE}
@@ -75,13 +78,20 @@ def lead(after: Calibration, passed_over: Mapping[str, str], nearest: Nearest | 
     worst = max(used, key=lambda p: abs(p.studentized))
     parts = []
     if worst.studentized**2 > 0.5 * sum(p.studentized**2 for p in used):
-        parts.append(f"most of it is one pose, at {worst.pose.at} ({worst.residual_g * 1e6:+.3g} µg): was it still?")
+        parts.append(f"most of it is one pose, at {worst.pose.at} ({micro_g(worst.residual_g, '+')}): was it still?")
     parts += _clear_patterns(after, used, _patterns(after, used))
-    near = dict(passed_over)
+    near = {name: why for name, why in passed_over.items() if _is_hint(why)}
     if nearest is not None and nearest.p_value < SIGNIFICANT:
-        near.setdefault(nearest.effect, f"p = {nearest.p_value:.2g}, but it explains too little for what it adds")
+        why = f"p {probability(nearest.p_value)}, but it explains too little for what it adds"
+        near.setdefault(nearest.effect, why)
     parts += [f"the nearest effect is {name}, not adopted: {why}" for name, why in list(near.items())[:2]]
     return "; ".join(parts) or "no candidate comes near, and no pose, pattern or channel stands out"
+
+
+def _is_hint(why: str) -> bool:
+    """Whether the reason why an effect was passed over is any other than that it may well be chance."""
+    said, _, p = why.partition("p = ")
+    return bool(said) or not p or float(p) < HINT
 
 
 def _clear_patterns(after: Calibration, used: Sequence[PoseResult], patterns: Sequence[_Pattern]) -> list[str]:
@@ -102,7 +112,7 @@ def _clear_patterns(after: Calibration, used: Sequence[PoseResult], patterns: Se
         if not q or rest < 2:
             continue
         share = float(np.sum((basis.T @ y) ** 2)) / total
-        p = float(stats.f.sf(share / q / max((1 - share) / rest, 1e-12), q, rest)) * len(patterns)
+        p = float(f_sf(share / q / max((1 - share) / rest, 1e-12), q, rest)) * len(patterns)
         if p < min(LEAD, found.get(pattern.family, (LEAD, ""))[0]):
             found[pattern.family] = (p, f"{share:.0%} of it goes with {pattern.text}")
     return [text for _, text in sorted(found.values())[:LEADS_MOST]]
@@ -133,14 +143,14 @@ def _patterns(after: Calibration, used: Sequence[PoseResult]) -> list[_Pattern]:
             said = NAMES.get(name, channel_of(name))
             out.append(_Pattern(scaled[:, None], said, name))
             out.append(_Pattern(scaled[:, None] * direction, f"{said}, as a bias", name))
-    out += _waves(held[TIME], np.ones((len(poses), 1)), "a swing in time with a period of {:.3g} s", 2.0)
+    out += _waves(held[TIME], np.ones((len(poses), 1)), "a swing in time with a period of {} s", 2.0, digits=3)
     for i, axis in enumerate("xyz"):
         s = direction[:, i]
-        out += _waves(s, direction[:, i : i + 1], f"a wave along the output of axis {axis}, {{:.2g}} g long", 5.0)
+        out += _waves(s, direction[:, i : i + 1], f"a wave along the output of axis {axis}, {{}} g long", 5.0, digits=2)
     return out
 
 
-def _waves(x: Floats, size: Floats, text: str, most: float) -> list[_Pattern]:
+def _waves(x: Floats, size: Floats, text: str, most: float, digits: int) -> list[_Pattern]:
     """Sines of many periods, from a few poses apart to the whole range; each counts as chosen among them."""
     whole = float(np.ptp(x)) or 1.0
     finest = max(len(x) / 2.5, 2.0) if most < 3 else 2 * most
@@ -148,7 +158,7 @@ def _waves(x: Floats, size: Floats, text: str, most: float) -> list[_Pattern]:
     for cycles in np.geomspace(0.8, finest, PERIODS):
         angle = 2 * np.pi * cycles * x / whole
         columns = np.concatenate([np.sin(angle)[:, None] * size, np.cos(angle)[:, None] * size], axis=1)
-        out.append(_Pattern(columns, text.format(whole / cycles), text))
+        out.append(_Pattern(columns, text.format(plain(whole / cycles, digits)), text))
     return out
 
 

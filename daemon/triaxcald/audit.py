@@ -21,7 +21,7 @@ from triaxcald.recording.schema import RECOVERY_RECORD, Phase, RawDigest
 from triaxcald.station.config import parse_station
 from triaxcald.station.line import CERTIFICATE
 from triaxcald.station.write_back import REGISTERS_AFTER, VERIFICATION_FILE
-from triaxcald.verification import verification_document, verify
+from triaxcald.verification import verification_document, verified
 
 MOST = 8
 """So many differences are listed, the others counted."""
@@ -94,8 +94,8 @@ def _audit(name: str, recording: Recording) -> Audit:
             return Audit(name, tuple(checked), (*differences, missing))
         check, check_digest = replay(VERIFICATION, (CORRECTED,))
         document = verification_document(
-            verify(tumble[CORRECTED].finish(), station.reference),
-            verify(check[CORRECTED].finish(), station.reference),
+            verified(tumble[CORRECTED], station.reference),
+            verified(check[CORRECTED], station.reference),
             limit_g=station.limits.verification_rms_g,
             raw_sha256=check_digest.hexdigest(),
         )

@@ -19,15 +19,16 @@ import numpy as np
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import channels_of, with_scale
 from triaxcal.effects import Effect
-from triaxcal.effects.contract import DERIVED, rate_of
 from triaxcal.effects.part import whole
+from triaxcal.figures import micro_g
 from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
-from triaxcald.documents import Document, budget_document, error, loop_document, number
+from triaxcald.choices import is_passing
+from triaxcald.documents import Document, budget_document, error, holds_of, loop_document, number
 from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
@@ -97,6 +98,7 @@ def certify(
             data_quality=pipeline.data_quality() + creeping(poses),
             output_unit=profile.output.unit,
             stated=station.stated,
+            held_by_device=held,
         ),
         "not_written": why_not_written(profile),
         "registers": _registers_document(image, held, loop, poses, station.stated) if image and held else None,
@@ -139,18 +141,13 @@ def why_not_written(profile: Profile) -> str | None:
     return f"the device has no register for {', '.join(missing)}" if missing else None
 
 
-def is_passing(effect: Effect) -> bool:
-    """Whether an effect is the recording's rather than the unit's, so that no register could hold it."""
-    return bool(effect.needs) and all(n in DERIVED or n.endswith(rate_of("")) for n in effect.needs)
-
-
 def _held_by_device(
     profile: Profile, full: Calibration, poses: list[Pose], signs: tuple[int, int, int], reference: float
 ) -> Calibration | None:
     """The calibration with those effects alone that the device has registers for.
 
     Refitted, not cut: without an effect the other coefficients have other best values. Effects of time stay in the
-    fit, since they belong to this recording and not to the unit; the registers then hold the values at its middle.
+    fit, since they belong to this recording and not to the unit; what the registers then hold is said in words.
     """
     if why_not_written(profile):
         return None
@@ -177,6 +174,7 @@ def _registers_document(
     return {
         "terms": in_registers,
         "left_to_host": host,
+        "holds": holds_of(held),
         "rms_g": error(held.residual.rms_g),
         "rounding_rms_g": error(rounding_cost(image, held, poses)),
         "uncertainty": budget_document(held, budget(held, replace(stated, rounding=_steps(image)))),
@@ -239,5 +237,5 @@ def _outside(loop: Loop, limits: Limits) -> list[str]:
         ("cross_validated_rms_g", residual.cross_validated_rms_g, limits.cross_validated_rms_g),
     ):
         if limit is not None and not (value is not None and value <= limit):
-            out.append(f"{name} {'unknown' if value is None else f'{value:.3g}'} is above the limit {limit:.3g}")
+            out.append(f"{name} {micro_g(value)} is above the limit {micro_g(limit)}")
     return out

@@ -15,9 +15,11 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Residual
+from triaxcal.conditions import held_at
 from triaxcal.loop import Loop
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Budget, Stated, budget
+from triaxcald.choices import choices_of
 from triaxcald.units import SMALLEST, ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]
@@ -114,6 +116,12 @@ def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, 
     }
 
 
+def holds_of(c: Calibration) -> list[str]:
+    """In words, under which conditions scale factor, misalignment and bias are all of a reading; none where always."""
+    several = any(p.pose.run.of > 1 for p in c.poses)
+    return list(held_at([effect for effect, _ in c.sensor.effects], c.channel_reference, several=several))
+
+
 def calibration_document(
     c: Calibration,
     *,
@@ -143,6 +151,7 @@ def calibration_document(
         },
         "reference": number(c.reference),
         "channel_reference": {name: number(v) for name, v in c.channel_reference.items()},
+        "holds": holds_of(c),
         "scale_factor": numbers(c.sensor.scale_factor),
         "misalignment": numbers(c.sensor.misalignment),
         "bias": numbers(c.sensor.bias),
@@ -229,7 +238,9 @@ def loop_document(
     output_unit: str = "",
     reference_unit: str = "g",
     stated: Stated | None = None,
+    held_by_device: Calibration | None = None,
 ) -> Document:
+    """``held_by_device`` is the calibration that a device has registers for, None where there is no such device."""
     calibration = calibration_document(
         loop.after, output_unit=output_unit, reference_unit=reference_unit, stated=stated
     )
@@ -267,6 +278,14 @@ def loop_document(
                 "pose_residual_g": [error(p.residual_g, reference) for p in f.step.poses],
             }
             for f in loop.findings
+        ],
+        "choices": [
+            {
+                "corrected_by": list(choice.corrected_by),
+                "terms": list(choice.terms),
+                **residual_document(choice.residual, reference),
+            }
+            for choice in choices_of(loop, held_by_device)
         ],
         "unexplained": {
             "significant": loop.unexplained.significant,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration, Residual
 from triaxcal.effects import Effect, effect_of
 from triaxcal.sensor import Sensor
 from triaxcald.errors import InputError
@@ -57,6 +58,23 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
         )
     _require_finite(effects, reference, magnitude, where)
     return Sensor(k, m, b, tuple(effects)), reference, magnitude
+
+
+def model_of(sensor: Sensor, channel_reference: Mapping[str, float], magnitude: float) -> Calibration:
+    """A held sensor as the model of other poses. What only its fit could tell is not a number."""
+    n, unknown = 9 + sum(len(q) for _, q in sensor.effects), math.nan
+    return Calibration(
+        sensor=sensor,
+        covariance=np.full((n, n), unknown),
+        reference=magnitude,
+        channel_reference=channel_reference,
+        residual=Residual(unknown, unknown, None, unknown, None),
+        poses=(),
+        condition=unknown,
+        dilution=unknown,
+        inflation=unknown,
+        dof=unknown,
+    )
 
 
 def _require_finite(

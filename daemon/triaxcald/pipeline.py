@@ -32,6 +32,7 @@ class Pipeline:
         self._detector = StillnessDetector()
         self._quality = QualityDetector()
         self._spans: tuple[int, list[Span]] = (0, [])
+        self._findings: list[Finding] | None = None
         self._last_ns: int | None = None
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
@@ -50,6 +51,7 @@ class Pipeline:
         for name in ("missing", "duplicates", "incomplete", "errors"):
             self.counts[name] += getattr(block, name)
         if len(block):
+            self._findings = None
             if self._begin_ns is None:
                 self._begin_ns = int(block.time_ns[0])
             latest = np.maximum.accumulate(np.r_[self._last_ns or -(2**62), block.time_ns[:-1]])
@@ -100,6 +102,7 @@ class Pipeline:
         """The still poses of the whole stream."""
         self._detector.finish()
         self._quality.finish()
+        self._findings = None
         windows = self.windows
         return [] if windows is None else poses_of(windows, self._still(windows), untrusted_poses(self._seen(windows)))
 
@@ -120,8 +123,11 @@ class Pipeline:
         return together(found, self._seen(self.windows))
 
     def _seen(self, windows: Windows | None) -> list[Finding]:
-        unit = self.bundle.profile.output.unit if self.stream == READINGS else "g"
-        return self._quality.findings(windows, self._still(windows) if windows else [], unit=unit)
+        """The findings so far, judged once for the same samples."""
+        if self._findings is None:
+            unit = self.bundle.profile.output.unit if self.stream == READINGS else "g"
+            self._findings = self._quality.findings(windows, self._still(windows) if windows else [], unit=unit)
+        return self._findings
 
 
 def together(counted: Sequence[str], seen: Iterable[Finding]) -> list[str]:

@@ -6,6 +6,8 @@ import math
 import re
 from dataclasses import dataclass
 
+from triaxcal.figures import plain
+
 SMALLEST = 1e-250
 """Of references: beyond it powers of ten end."""
 _MICRO_G = re.compile(r"(?<![\w.])([+-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?) µg(?!\w)")
@@ -48,7 +50,7 @@ class ErrorUnit:
     def _instead(self, found: re.Match[str]) -> str:
         number = found[1]
         if self.exponent != -6:
-            number = f"{self.count(float(number) * 1e-6):{'+' if number[0] == '+' else ''}.3g}"
+            number = plain(self.count(float(number) * 1e-6), sign="+" if number[0] == "+" else "")
         return f"{number} {self}"
 
 

@@ -1,34 +1,62 @@
-"""Verification by physics: |a| in check poses, from the device's own corrected output."""
+"""Verification by physics: |a| in check poses, from the device's own corrected output or under a calibration.
+
+Poses in which the outputs do not follow the acceleration (`triaxcal.quality`) stay in the documents, marked, and count
+for nothing.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.distributions import f_sf
 from triaxcal.poses.pose import Pose
 from triaxcald.documents import Document, error, number, uncertainty
+from triaxcald.pipeline import Pipeline, creeping
+
+WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"
+BY_CHANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Verification:
-    """Errors of the magnitude that the device itself reports, (n,) in g, and their standard errors from noise."""
+    """Errors of the magnitude, (n,) in the unit of the reference, and their standard errors from noise.
 
-    poses: list[Pose]
+    The figures are over the poses that can be trusted, None where there are none. ``data_quality`` is what the stream
+    is to be blamed for, one line each.
+    """
+
+    poses: Sequence[Pose]
     error_g: Floats
     standard_error_g: Floats
+    data_quality: tuple[str, ...] = ()
+
+    @property
+    def untrusted(self) -> list[Pose]:
+        return [p for p in self.poses if p.fault]
 
     @property
     def rms_g(self) -> float | None:
-        return _rms(self.error_g)
+        return _rms(self._trusted(self.error_g))
+
+    @property
+    def max_abs_g(self) -> float | None:
+        values = self._trusted(self.error_g)
+        return float(np.max(np.abs(values))) if len(values) else None
 
     @property
     def noise_floor_g(self) -> float | None:
-        return _rms(self.standard_error_g)
+        return _rms(self._trusted(self.standard_error_g))
+
+    def _trusted(self, values: Floats) -> Floats:
+        return np.delete(values, [i for i, p in enumerate(self.poses) if p.fault])
 
 
-def verify(poses: list[Pose], reference: float) -> Verification:
+def verify(poses: Sequence[Pose], reference: float) -> Verification:
     """``poses`` of the corrected stream, in units of the reference vector."""
     if not poses:
         return Verification([], np.zeros(0), np.zeros(0))
@@ -36,35 +64,70 @@ def verify(poses: list[Pose], reference: float) -> Verification:
     length = np.linalg.norm(a, axis=1)
     n = a / np.maximum(length[:, None], 1e-300)
     covariance = np.array([p.covariance for p in poses])
-    return Verification(list(poses), length - reference, np.sqrt(np.einsum("ni,nij,nj->n", n, covariance, n)))
+    return Verification(poses, length - reference, np.sqrt(np.einsum("ni,nij,nj->n", n, covariance, n)))
+
+
+def verified(pipeline: Pipeline, reference: float) -> Verification:
+    """The whole of a corrected stream, with what it is to be blamed for. Finishes the ``pipeline``."""
+    poses = pipeline.finish()
+    quality = pipeline.data_quality() + creeping(poses)
+    return replace(verify(poses, reference), data_quality=tuple(quality))
 
 
 def _rms(values: Floats) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
+def trust(pose: Pose) -> dict[str, Any]:
+    """Whether a pose counts, as it stands in documents."""
+    return {"used": not pose.fault, "fault": pose.fault or None}
+
+
+def pose_rows(found: Verification, reference: float = 1.0) -> list[Document]:
+    """Pose by pose, the untrusted ones among them."""
+    return [
+        {
+            "start_s": number(p.start_s),
+            "end_s": number(p.end_s),
+            "error_g": error(float(e), reference),
+            "standard_error_g": uncertainty(float(s)),
+            **trust(p),
+        }
+        for p, e, s in zip(found.poses, found.error_g, found.standard_error_g, strict=True)
+    ]
+
+
+def _verdict(before: Verification, after: Verification, limit_g: float | None) -> str:
+    if limit_g is not None:
+        return WITHIN if after.rms_g is not None and after.rms_g <= limit_g else OUTSIDE
+    return WORSE if _is_worse(before, after) else UNJUDGED
+
+
+def _is_worse(before: Verification, after: Verification) -> bool:
+    """Whether errors so much larger would be chance in less than `BY_CHANCE` of poses no worse than before (F-test),
+    where noisier poses have more to be forgiven."""
+    old, new, floor, noise = before.rms_g, after.rms_g, before.noise_floor_g, after.noise_floor_g
+    if old is None or new is None or floor is None or noise is None:
+        return False
+    expected = old**2 + max(noise**2 - floor**2, 0.0)
+    count = [len(v.poses) - len(v.untrusted) for v in (after, before)]
+    return bool(f_sf(new**2 / max(expected, 1e-300), *count) < BY_CHANCE)
+
+
 def verification_document(
     before: Verification, after: Verification, *, limit_g: float | None, raw_sha256: str
 ) -> Document:
-    """``before``: the device's output with its old registers; ``after``: with the new ones, after a power cycle."""
+    """``before``: the device's output with its old registers; ``after``: with the new ones, after a restart."""
     rms = after.rms_g
-    within = None if limit_g is None else rms is not None and rms <= limit_g
     return {
         "format": "triaxcal.verification/1",
         "raw_sha256": raw_sha256,
         "before_rms_g": error(before.rms_g),
         "after_rms_g": error(rms),
-        "after_max_abs_g": error(float(np.max(np.abs(after.error_g)))) if len(after.error_g) else None,
+        "after_max_abs_g": error(after.max_abs_g),
         "noise_floor_g": error(after.noise_floor_g),
         "limit_rms_g": number(limit_g),
-        "verdict": "not judged" if within is None else "within limits" if within else "outside limits",
-        "poses": [
-            {
-                "start_s": number(p.start_s),
-                "end_s": number(p.end_s),
-                "error_g": error(float(e)),
-                "standard_error_g": uncertainty(float(s)),
-            }
-            for p, e, s in zip(after.poses, after.error_g, after.standard_error_g, strict=True)
-        ],
+        "verdict": _verdict(before, after, limit_g),
+        "poses": pose_rows(after),
+        "data_quality": list(after.data_quality),
     }

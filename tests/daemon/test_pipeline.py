@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from triaxcal.poses.pose import Pose
-from triaxcal.quality import Finding
+from triaxcal.quality import Finding, QualityDetector
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, load_bundle
 from triaxcald.pipeline import Pipeline, together
@@ -117,6 +118,29 @@ def test_a_frozen_axis_is_said_however_the_records_are_cut(
     assert found[0].startswith("stuck_output: x repeats ")
     assert " for 100 samples, first at 10.0 s" in found[0]
     assert pieces.data_quality() == whole.data_quality()
+
+
+def test_the_same_samples_are_judged_once_for_poses_and_data_quality(
+    records: list[tuple[int, int, int, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = []
+    findings = QualityDetector.findings
+
+    def counted(self: QualityDetector, *arguments: Any, **options: Any) -> list[Finding]:
+        judged.append(self.samples)
+        return findings(self, *arguments, **options)
+
+    monkeypatch.setattr(QualityDetector, "findings", counted)
+    pipeline = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(records[:6000])])
+    assert pipeline.data_quality() == pipeline.data_quality() == []
+    assert len(judged) == 1
+    pipeline.feed(RawBatch.of(records[6000:]))
+    pipeline.data_quality()
+    assert len(judged) == 2
+    pipeline.finish()
+    pipeline.data_quality()
+    assert len(judged) == 3
+    assert judged[-1] == 2001
 
 
 def test_what_was_counted_as_missing_is_not_said_again_by_the_times() -> None:

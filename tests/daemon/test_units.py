@@ -57,4 +57,4 @@ def test_a_sentence_has_the_unit_of_the_reference_behind_numbers_alone() -> None
         ErrorUnit.of("µT", 48.0).in_words(said)
         == "channel_bias:dust_µg: from 1.53e+04 1e-6 µT to 12 1e-6 µT, one pose (-3.2 1e-6 µT, +4 1e-6 µT)"
     )
-    assert ErrorUnit.of("T", 5e-5).in_words("from 0.00153 µg to +1.2e-05 µg") == "from 1.53e+03 1e-12 T to +12 1e-12 T"
+    assert ErrorUnit.of("T", 5e-5).in_words("from 0.00153 µg to +1.2e-05 µg") == "from 1530 1e-12 T to +12 1e-12 T"

@@ -550,12 +550,12 @@ class Failing(Radiation):
     ((name, why),) = faults_of(ground, [*CATALOGUE, radiation]).items()
     assert name == "radiation"
     assert reason in why
-    assert f"the effect radiation of another package was left out: {why}" in loop.advice
+    assert f"the effect radiation of the package dosimetry-effects was left out: {why}" in loop.advice
     # Who asks for it all the same gets one line that names it.
     asked = partial(fit, poses, signs=(-1, -1, -1), effects=[radiation])
     if method == "variants":
         asked = partial(radiation.variants, ground.problem.conditions)
-    with pytest.raises(InvalidData, match="the effect radiation of another package: "):
+    with pytest.raises(InvalidData, match="the effect radiation of the package dosimetry-effects: "):
         asked()
 
 

@@ -13,8 +13,9 @@ from triaxcal.effects import CATALOGUE, TIME, Coefficient, Effect, effect_named,
 from triaxcal.effects.contract import SCATTER, rate_of
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData, Refused
+from triaxcal.findings import Finding
 from triaxcal.fit import fit
-from triaxcal.loop import Finding, Loop, diagnose
+from triaxcal.loop import Loop, diagnose
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

@@ -3,6 +3,7 @@ vector, in a fit of nine parameters."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from triaxcal.effects import Effect
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.empirical import Empirical
 from triaxcal.fit import fit
+from triaxcal.search import Nearest
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.unexplained import Unexplained, lead, unexplained_of
@@ -183,10 +185,28 @@ def test_beside_effects_in_the_model_nothing_is_made_up(
 def test_effects_that_came_near_are_told_with_their_reasons(fitted: Fitted, ups: np.ndarray) -> None:
     rng = np.random.default_rng(1000)
     c = fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)))
-    text = lead(c, {"warm_up": "p = 0.2", "hysteresis": "p = 0.3", "bias_step": "p = 0.4"})
-    assert "the nearest effect is warm_up, not adopted: p = 0.2" in text
-    assert "hysteresis, not adopted: p = 0.3" in text
+    text = lead(c, {"warm_up": "p = 0.02", "hysteresis": "the poses cannot carry it", "bias_step": "p = 0.03"})
+    assert "the nearest effect is warm_up, not adopted: p = 0.02" in text
+    assert "hysteresis, not adopted: the poses cannot carry it" in text
     assert "bias_step" not in text
+
+
+def test_what_chance_may_well_have_done_is_no_lead(fitted: Fitted, ups: np.ndarray) -> None:
+    rng = np.random.default_rng(1000)
+    c = fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)))
+    text = lead(c, {"warm_up": "p = 1", "hysteresis": "p = 0.2", "bias_step": "p = 0.04"})
+    assert text == "the nearest effect is bias_step, not adopted: p = 0.04"
+    assert lead(c, {"warm_up": "p = 1"}) == "no candidate comes near, and no pose, pattern or channel stands out"
+
+
+def test_numbers_of_a_lead_have_no_exponent(fitted: Fitted, ups: np.ndarray) -> None:
+    off = np.zeros((N, 3))
+    off[3] = 4e-3 * ups[3]
+    text = lead(fitted(off), {}, Nearest("warm_up", 0.0))
+    found = re.match(r"most of it is one pose, at 30.0 s \(\+(\d{4})\.\d µg\)", text)
+    assert found, text
+    assert 3000 < int(found[1]) < 4000
+    assert "warm_up, not adopted: p < 1e-12, but" in text
 
 
 def test_a_channel_that_stands_still_is_no_lead(paper_unit: Sensor, ups: np.ndarray) -> None:

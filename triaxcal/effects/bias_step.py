@@ -35,6 +35,10 @@ class BiasStep(Effect):
         return no_slope(s)
 
     @property
+    def absent(self) -> str:
+        return f"after the step at {self.at_s:.1f} s"
+
+    @property
     def shape(self) -> Mapping[str, tuple[float, str]]:
         return {"at": (self.at_s, "s")}
 

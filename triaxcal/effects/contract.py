@@ -93,10 +93,21 @@ class Effect(Protocol):
         """(n,3,3,p): derivative of `basis` by s, as [n, axis, by axis, coefficient]."""
         ...
 
+    def advice(self, largest: float, floor: float) -> str:
+        """Its remedy, with numbers where it can: for the ``largest`` of its coefficients, where errors up to ``floor``
+        [g] do not matter. `remedy`, unless said otherwise."""
+        return self.remedy
+
     @property
     def shape(self) -> Mapping[str, tuple[float, str]]:
         """What the effect has beside its coefficients: name → (value, unit). None, unless said otherwise."""
         return {}
+
+    @property
+    def absent(self) -> str:
+        """Under which conditions it adds nothing, in words, where that does not follow from its ``needs``: nothing,
+        unless said otherwise."""
+        return ""
 
     @property
     def lasting(self) -> bool:

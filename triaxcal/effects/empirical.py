@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import factorial
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import TIME, Coefficient, Effect
 
 KINDS = {"odd": 3, "even": 4, "time": 4}
 Terms = tuple[tuple[float, int, int, int], ...]
 """A polynomial: (factor, powers of x, y, z)."""
+Table = tuple[Ints, Floats]
+"""Polynomials side by side: the powers (m,3) of the monomials in them, and each one's factors (m,p)."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +64,10 @@ class Empirical(Effect):
         """Harmonics (n,p) of the direction of s, and their gradient (n,3,p) by s."""
         degree = KINDS[self.kind]
         length = np.linalg.norm(s, axis=1)
-        values = np.stack([_value(p, s) for p in harmonics(degree)], axis=1)
-        gradient = np.stack(
-            [np.stack([_value(_derived(p, i), s) for i in range(3)], axis=1) for p in harmonics(degree)], axis=2
-        )
+        of_values, of_gradient = _tables(degree)
+        powers = np.cumprod(np.insert(np.repeat(s[:, :, None], degree, axis=2), 0, 1.0, axis=2), axis=2)
+        values = _valued(of_values, powers)
+        gradient = _valued(of_gradient, powers).reshape(len(s), 3, -1)
         whole = length[:, None] ** degree
         inward = degree * values[:, None, :] * s[:, :, None] / (length[:, None] ** (degree + 2))[:, :, None]
         return values / whole, gradient / whole[:, :, None] - inward
@@ -97,8 +99,26 @@ def _laplace(plane: Mapping[tuple[int, int], float]) -> dict[tuple[int, int], fl
     return out
 
 
-def _value(terms: Terms, s: Floats) -> Floats:
-    return np.asarray(sum((c * s[:, 0] ** i * s[:, 1] ** j * s[:, 2] ** k for c, i, j, k in terms), np.zeros(len(s))))
+@cache
+def _tables(degree: int) -> tuple[Table, Table]:
+    """Of the harmonics, and of their derivatives by x, by y, by z."""
+    polynomials = harmonics(degree)
+    return _table(polynomials), _table([_derived(p, axis) for axis in range(3) for p in polynomials])
+
+
+def _table(polynomials: Sequence[Terms]) -> Table:
+    rows = sorted({(i, j, k) for terms in polynomials for _, i, j, k in terms})
+    factors = np.zeros((len(rows), len(polynomials)))
+    for column, terms in enumerate(polynomials):
+        for c, i, j, k in terms:
+            factors[rows.index((i, j, k)), column] += c
+    return np.array(rows), factors
+
+
+def _valued(table: Table, powers: Floats) -> Floats:
+    """The polynomials (n,p) where the coordinates have the ``powers`` (n,3,d+1)."""
+    (i, j, k), factors = table[0].T, table[1]
+    return np.asarray((powers[:, 0, i] * powers[:, 1, j] * powers[:, 2, k]) @ factors)
 
 
 def _derived(terms: Terms, axis: int) -> Terms:

@@ -34,6 +34,12 @@ class Hysteresis(Effect):
     def coefficients(self) -> tuple[Coefficient, ...]:
         return xyz("g/g" if self.kind == "memory" else "g", KINDS[self.kind] + "{}")
 
+    @property
+    def absent(self) -> str:
+        if self.kind == "memory":
+            return "after a pose with no specific force along the axis"
+        return "with no change along the axis since the pose before"
+
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         values = np.stack([conditions[n] for n in self.needs], axis=1)
         if self.kind == "memory":

@@ -37,6 +37,11 @@ class InRuns(Wrapped):
     def needs(self) -> tuple[str, ...]:
         return (*self.whole.needs, RUN)
 
+    @property
+    def absent(self) -> str:
+        # What lasts begins in one run, by whose clock its moment is told.
+        return self.whole.absent + (f" of recording {self.runs[0] + 1}" if self.whole.lasting else "")
+
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         parts = [np.where(there[:, None, None], self.whole.basis(s, c), 0.0) for there, c in self._by_run(conditions)]
         return np.concatenate(parts, axis=-1)

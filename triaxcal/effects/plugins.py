@@ -24,6 +24,8 @@ from triaxcal.errors import InvalidData
 GROUP = "triaxcal.effects"
 LINEAR = "linear"
 """What documents call the nine parameters, among the names of effects."""
+UNKNOWN = "another package"
+"""What a package is called that does not say its name."""
 LARGEST = 1e100
 """Squares of what an effect adds have to be numbers too."""
 
@@ -31,16 +33,18 @@ T = TypeVar("T")
 
 
 class EffectFault(InvalidData):
-    """An effect of another package cannot be used as it is, for this ``reason``."""
+    """An effect of another ``package`` cannot be used as it is, for this ``reason``."""
 
-    def __init__(self, name: str, reason: str) -> None:
-        super().__init__(f"the effect {name} of another package: {reason}")
+    def __init__(self, name: str, package: str, reason: str) -> None:
+        super().__init__(f"the effect {name} of {package}: {reason}")
         self.reason = reason
 
 
 @dataclass(frozen=True)
 class Foreign(Wrapped):
     """An effect of another package. Raises EffectFault, and nothing else, where that fails or gives no numbers."""
+
+    package: str = UNKNOWN
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return self._array(lambda: self.whole.basis(s, conditions), (len(s), 3, len(self.coefficients)))
@@ -52,16 +56,23 @@ class Foreign(Wrapped):
     def needs(self) -> tuple[str, ...]:
         return tuple(self.whole.needs)
 
+    def advice(self, largest: float, floor: float) -> str:
+        return str(self._asked(lambda: self.whole.advice(largest, floor)))
+
+    @property
+    def absent(self) -> str:
+        return str(self._asked(lambda: self.whole.absent))
+
     @property
     def lasting(self) -> bool:
         return self.whole.lasting
 
     @property
     def forms(self) -> tuple[Effect, ...]:
-        return tuple(map(Foreign, self._asked(lambda: tuple(self.whole.forms))))
+        return tuple(Foreign(e, self.package) for e in self._asked(lambda: tuple(self.whole.forms)))
 
     def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
-        return tuple(map(Foreign, self._asked(lambda: tuple(self.whole.variants(conditions)))))
+        return tuple(Foreign(e, self.package) for e in self._asked(lambda: tuple(self.whole.variants(conditions))))
 
     def shaped(self, values: Mapping[str, float]) -> Self:
         return replace(self, whole=self._asked(lambda: self.whole.shaped(values)))
@@ -70,7 +81,7 @@ class Foreign(Wrapped):
         got = self._asked(lambda: np.asarray(ask(), dtype=float))
         if got.shape != shape or not (np.abs(got) < LARGEST).all():
             seen = f"{got.shape}" if got.shape != shape else "infinite ones or none"
-            raise EffectFault(self.name, f"expected finite numbers of shape {shape}, not {seen}")
+            raise EffectFault(self.name, self.package, f"expected finite numbers of shape {shape}, not {seen}")
         return got
 
     def _asked(self, ask: Callable[[], T]) -> T:
@@ -78,7 +89,7 @@ class Foreign(Wrapped):
             with np.errstate(all="ignore"):  # what comes of it is looked at
                 return ask()
         except Exception as e:  # whatever somebody else's code raises is the reason that is told
-            raise EffectFault(self.name, _reason(e)) from e
+            raise EffectFault(self.name, self.package, _reason(e)) from e
 
 
 def is_foreign(effect: Effect) -> bool:
@@ -107,14 +118,27 @@ def _loaded(point: EntryPoint, others: Collection[str]) -> tuple[Effect | None, 
         thing = point.load()
         effect: Any = thing() if isinstance(thing, type) else thing
         _check(effect)
-        _try(Foreign(effect))
+        _try(Foreign(effect, _package(point)))
         if effect.name in others:
             raise ValueError(f"the name {effect.name} is taken by another effect of another package")
     except EffectFault as e:
         return None, e.reason
     except Exception as e:  # noqa: BLE001 - whatever somebody else's code raises is the reason that is told
         return None, _reason(e)
-    return Foreign(effect), ""
+    return Foreign(effect, _package(point)), ""
+
+
+def package_of(name: str) -> str:
+    """The package that an effect is of, or an entry point that is broken, by its name."""
+    effect = next((e for e in plugins()[0] if e.name == name), None)
+    if isinstance(effect, Foreign):
+        return effect.package
+    point = next((p for p in entry_points(group=GROUP) if p.name == name), None)
+    return _package(point) if point else UNKNOWN
+
+
+def _package(point: EntryPoint) -> str:
+    return f"the package {point.dist.name}" if point.dist else UNKNOWN
 
 
 def _check(effect: Any) -> None:

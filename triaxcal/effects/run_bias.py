@@ -47,6 +47,12 @@ class RunBias(Effect):
             return xyz(self.unit, f"{{}}_run{self.alone + 1}_alone")
         return tuple(c for k in range(2, self.runs + 1) for c in xyz(self.unit, f"{{}}_run{k}"))
 
+    @property
+    def absent(self) -> str:
+        if self.alone is not None:
+            return f"in all recordings but recording {self.alone + 1}"
+        return "in the mean over the recordings"
+
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return np.concatenate([c[:, None, None] * np.eye(3) for c in self._contrasts(conditions)], axis=2)
 

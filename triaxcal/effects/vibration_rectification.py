@@ -20,6 +20,10 @@ class VibrationRectification(Effect):
     needs: tuple[str, ...] = SCATTER
     remedy: str = "Stop what shakes the stand while poses are held, or stand the fixture on something that damps."
 
+    @property
+    def absent(self) -> str:
+        return "with readings that do not scatter"
+
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return per_axis(np.stack([conditions[n] for n in SCATTER], axis=1))
 

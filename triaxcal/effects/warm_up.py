@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -30,6 +31,15 @@ class WarmUp(Effect):
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
+
+    def advice(self, largest: float, floor: float) -> str:
+        """After how long no more than the floor is left. Whoever records from the moment of switching on waits as
+        long; who began later has waited before."""
+        if not 0 < floor < abs(largest):
+            return self.remedy
+        wait_s = self.time_constant_s * math.log(abs(largest) / floor)
+        wait = f"{math.ceil(wait_s)} s" if wait_s < 120 else f"{math.ceil(wait_s / 60)} minutes"
+        return f"{self.remedy} What is left of it is below the noise floor from {wait} after the first sample on."
 
     @property
     def shape(self) -> Mapping[str, tuple[float, str]]:

@@ -38,6 +38,13 @@ class Wrapped(Effect):
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return self.whole.slope(s, conditions)
 
+    def advice(self, largest: float, floor: float) -> str:
+        return self.whole.advice(largest, floor)
+
+    @property
+    def absent(self) -> str:
+        return self.whole.absent
+
     @property
     def shape(self) -> Mapping[str, tuple[float, str]]:
         return self.whole.shape

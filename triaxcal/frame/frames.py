@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from triaxcal.arrays import Floats
+from triaxcal.distributions import chi2_sf, t_ppf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.frame.faces import LABELS, axis_of, nearest_rotation, opposite
 from triaxcal.frame.fixture import Fixture, fixture_of
@@ -76,7 +76,7 @@ class UnitFrame:
 
     def coverage_factor(self, level: float = 0.95) -> Floats:
         """(3,): Student's t for ``dof``."""
-        return np.asarray(stats.t.ppf((1 + level) / 2, self.dof))
+        return np.asarray(t_ppf((1 + level) / 2, self.dof))
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Frames:
 
     @property
     def lack_of_fit_p(self) -> float | None:
-        return float(stats.chi2.sf(self.chi2, self.left)) if self.left else None
+        return float(chi2_sf(self.chi2, self.left)) if self.left else None
 
     def between(self, i: int, j: int) -> tuple[Floats, Floats]:
         """Rotation vector (3,) rad from the sensor's frame of unit i to that of j, and its covariance (3,3).
@@ -124,7 +124,7 @@ def frames(standings: Sequence[Standing], *, datum: Datum | None = None) -> Fram
     joint = _Joint(standings, faces, datum).connected().solved()
     n = 3 * len(standings)
     left = sum(2 * len(s.faces) for s in standings) - n - 2 * len(faces) + 3
-    p = float(stats.chi2.sf(joint.chi2, left)) if left else 1.0
+    p = float(chi2_sf(joint.chi2, left)) if left else 1.0
     inflation = float(np.sqrt(joint.chi2 / left)) if p < LACK_OF_FIT else 1.0
     covariance = joint.covariance * inflation**2
     dofs = _dof(joint, standings) if inflation == 1 else [np.full(3, float(left))] * len(standings)

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Bools, Floats
+from triaxcal.distributions import chi2_isf, chi2_sf, t_isf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.frame.faces import Labelling
 from triaxcal.frame.verticals import Verticals
@@ -92,7 +92,7 @@ def _turns(found: Verticals, rows: Sequence[int]) -> Floats:
     quarter = np.round((angle - angle[0]) / (np.pi / 2)) % 4 * (np.pi / 2)
     designs = [_felt_by(turn), _felt_by(quarter)]
     half_left, quarter_left = (float(np.sum((y - H @ (np.linalg.pinv(H) @ y)) ** 2)) for H in designs)
-    beyond = stats.chi2.sf(half_left * len(noise) / float(np.trace(noise)), left) < SHOWS
+    beyond = chi2_sf(half_left * len(noise) / float(np.trace(noise)), left) < SHOWS
     return quarter if beyond and quarter_left < half_left / 4 else turn
 
 
@@ -155,7 +155,7 @@ def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[str]]:
             continue
         middle = float(np.median(rest))
         scatter = float(np.hypot(error, np.std(rest, ddof=1) * np.sqrt(1 + 1 / len(rest))))
-        far = abs(m - middle) > float(stats.t.isf(SHOWS, len(rest) - 1)) * scatter
+        far = abs(m - middle) > float(t_isf(SHOWS, len(rest) - 1)) * scatter
         where = f"the poses with {face.label} up (the first at {found.poses[face.rows[0]].start_s:.1f} s)"
         if far and m < SHORT * middle:
             still.add(face.label)
@@ -169,7 +169,7 @@ def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[str]]:
     single = [f for f in faces if not f.headed and (not f.resolved or f.label in still)]
     if single and len(pairs) - len(still) < PAIRS_LEAST:
         # One or two pairs among faces that stood one way may be poses repeated, without a turn.
-        still |= {f.label for f, m, error in pairs if m**2 < stats.chi2.isf(SHOWS, 2) * error**2}
+        still |= {f.label for f, m, error in pairs if m**2 < chi2_isf(SHOWS, 2) * error**2}
     return [replace(f, turn=np.zeros(len(f.rows))) if f.label in still else f for f in faces], warnings
 
 
@@ -177,7 +177,7 @@ def tilt_of_others(faces: Sequence[Face], found: Verticals) -> float:
     """rms tilt where it is resolved. Raises Refused where too few faces show one."""
     pairs = pairs_of(faces, found)
     chi2 = sum((m / error) ** 2 for _, m, error in pairs)
-    if len(pairs) < PAIRS_LEAST or stats.chi2.sf(chi2, 2 * len(pairs)) > SHOWS:
+    if len(pairs) < PAIRS_LEAST or chi2_sf(chi2, 2 * len(pairs)) > SHOWS:
         have = f"{len(pairs)} faces" if len(pairs) > 1 else "one face" if pairs else "no face"
         raise Refused(
             f"{have} of {len(faces)} stood in two orientations half a turn apart"

@@ -12,9 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, stats
+import scipy
 
 from triaxcal.arrays import Floats
+from triaxcal.distributions import chi2_sf
 from triaxcal.frame.faces import Labelling, axis_of
 from triaxcal.frame.orientations import FLOOR_RAD, LARGE_RAD, SHOWS, Assumed, Face, felt, tilt_of_others, turned
 from triaxcal.frame.verticals import Verticals
@@ -107,7 +108,7 @@ def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None
     seating, dof = assumed.seating or 0.0, 0
     solved = _solve(found, labelling, faces, prior, seating)
     left, chi2 = _misfit(solved)
-    p = float(stats.chi2.sf(chi2, left)) if left else None
+    p = float(chi2_sf(chi2, left)) if left else None
     if assumed.seating is None and p is not None and p < SIGNIFICANT:
         begin, dof = solved.up, left
         seating = _seating(lambda s: _misfit(_solve(found, labelling, faces, prior, s, begin))[1], left)
@@ -285,7 +286,7 @@ def _seating(chi2_at: Callable[[float], float], left: int) -> float:
     high = 1e-6
     while chi2_at(high) > left and high < 1:
         high *= 4
-    return float(optimize.brentq(lambda s: chi2_at(s) - left, 0.0, high, xtol=1e-6 * high, rtol=1e-6))
+    return float(scipy.optimize.brentq(lambda s: chi2_at(s) - left, 0.0, high, xtol=1e-6 * high, rtol=1e-6))
 
 
 def _turning(solved: _Solved, turn: float) -> Floats:
@@ -319,11 +320,11 @@ def _table(solved: _Solved, assumed: Assumed, p: float | None) -> tuple[Table, l
         along = solved.vector / max(size, 1e-300)
         error = float(np.sqrt(along @ solved.vector_covariance @ along))
         chi2 = float(solved.vector @ np.linalg.solve(solved.vector_covariance, solved.vector))
-        shows = bool(stats.chi2.sf(chi2, 2) < SHOWS)
+        shows = bool(chi2_sf(chi2, 2) < SHOWS)
         table = Table(size, error, "measured", shows, p, solved.vector, solved.vector_covariance)
     else:
         chi2 = sum(float(t.tilt @ np.linalg.solve(t.covariance, t.tilt)) for t in resolved)
-        shows = bool(stats.chi2.sf(chi2, 2 * len(resolved)) < SHOWS)
+        shows = bool(chi2_sf(chi2, 2 * len(resolved)) < SHOWS)
         error = float(np.sqrt(np.mean([t.standard_error**2 for t in resolved]) / len(resolved)))
         table = Table(_rms(resolved), error, "measured", shows, p)
     if not table.shows:

@@ -15,9 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, special, stats
+from scipy import fft, special
 
 from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.distributions import chi2_isf, t_isf
 
 BANDS = 1.25
 """Ordinates of a periodogram are gathered in bands whose edges rise by this factor."""
@@ -204,7 +205,7 @@ def _fits(p: Periodogram, expected: Floats) -> bool:
         for i, e in zip(p.power.T, expected.T, strict=True)
     ]
     misfit = float((np.square(off) / weight).sum())
-    return misfit < float(stats.chi2.isf(MISFIT, np.size(off)))
+    return misfit < float(chi2_isf(MISFIT, np.size(off)))
 
 
 def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Floats, Floats]:
@@ -247,7 +248,7 @@ def _mixed_dof(share: Floats, variance: Floats, dof: Floats) -> float:
         middle = (low + high) / 2
         beyond = float(share @ (2 * special.stdtr(dof, -middle * np.sqrt(mean / variance))))
         low, high = (middle, high) if beyond > 1 - DOF_LEVEL else (low, middle)
-    reach = stats.t.isf((1 - DOF_LEVEL) / 2, DOF_GRID)
+    reach = t_isf((1 - DOF_LEVEL) / 2, DOF_GRID)
     return float(np.interp(-low, -reach, DOF_GRID))
 
 

@@ -38,8 +38,11 @@ class Pose:
 
     ``channels`` are means over the span; ``t_s`` is the middle of the span, like ``start_s`` and ``end_s`` in seconds
     from the first sample. ``creep`` (3,) is the change of the outputs along the span, output units, where it is more
-    than noise, else zero. ``rates`` are the channels' slopes, per second, over the span and half its length on either
-    side; ``channel_errors`` and ``rate_errors`` the standard errors of both from the scatter about those slopes.
+    than noise, else zero; ``trend`` (3,) the same whether it is noise or not, and ``trend_error`` the standard error of
+    its part along the measured vector, infinite where it is not known. ``rates`` are the channels' slopes in the middle
+    of the span, per second, and ``bends`` their second derivatives, per second², from the span and half its length on
+    either side; ``channel_errors``, ``rate_errors`` and ``bend_errors`` the standard errors of mean, slope and bend
+    from the scatter that these leave.
     ``before`` (3,) is the mean of the pose before, None in the first; ``scatter`` (3,) the variance of a sample inside
     the span, output units squared. ``fault`` is what its samples are to be blamed for (`triaxcal.quality`), if at all:
     no fit uses such a pose.
@@ -53,9 +56,13 @@ class Pose:
     dof: float
     channels: Mapping[str, float] = field(default_factory=dict)
     creep: Floats = field(default_factory=lambda: np.zeros(3))
+    trend: Floats = field(default_factory=lambda: np.zeros(3))
+    trend_error: float = float("inf")
     channel_errors: Mapping[str, float] = field(default_factory=dict)
     rates: Mapping[str, float] = field(default_factory=dict)
     rate_errors: Mapping[str, float] = field(default_factory=dict)
+    bends: Mapping[str, float] = field(default_factory=dict)
+    bend_errors: Mapping[str, float] = field(default_factory=dict)
     before: Floats | None = None
     scatter: Floats = field(default_factory=lambda: np.zeros(3))
     shared_dof: float = float("inf")
@@ -145,12 +152,14 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
         [_correlation(w, s) * np.outer(e, e) for s, e in zip(spans, np.sqrt(noise.variance), strict=True)]
     )
     dof, shared_dof = noise.dof.min(axis=1), noise.common_dof
+    trend, trend_error = noise.slope * (length + 1), np.full(len(spans), np.inf)
     out = outward(mean)
     if out is not None:
         along, predicted = _along(w, spans, tracks, out, recording, creeping)
         covariance = _mended(covariance, out, along.variance[:, 0] * predicted**2)
         dof, shared_dof = along.dof[:, 0], along.common_dof
         # A unit that turns creeps across the measured vector; along it only where that shows by itself.
+        trend_error = along.slope_error[:, 0] * predicted * (length[:, 0] + 1)
         radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
         creep = creep - radial[:, None] * out
     covariance = covariance + np.diag(_rounding(w, spans))
@@ -166,9 +175,13 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
             shared_dof=shared_dof,
             channels={name: float(values[s.used].mean()) for name, values in w.channels.items()},
             creep=creep[i],
+            trend=trend[i],
+            trend_error=float(trend_error[i]),
             channel_errors={name: channel.error for name, channel in logged[i].items()},
             rates={name: channel.rate for name, channel in logged[i].items()},
             rate_errors={name: channel.rate_error for name, channel in logged[i].items()},
+            bends={name: channel.bend for name, channel in logged[i].items()},
+            bend_errors={name: channel.bend_error for name, channel in logged[i].items()},
             before=held[i - 1].mean if i else None,
             scatter=w.variance[s.used].mean(axis=0) * (w.size - 1) / w.size + w.mean[s.used].var(axis=0),
         )
@@ -177,30 +190,49 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
 
 
 class _Logged(NamedTuple):
-    """A channel about a pose: standard error of its mean, its rate per second and the standard error of that."""
+    """A channel about the middle of a pose: standard error of its mean; its rate per second and its bend per second²,
+    each with its standard error."""
 
     error: float
     rate: float
     rate_error: float
+    bend: float
+    bend_error: float
 
 
 def _logged(w: Windows, s: Span) -> dict[str, _Logged]:
-    """By least squares over the span and half its length on either side: a thermometer's steps and noise are spread
+    """By a parabola through the span and half its length on either side: a thermometer's steps and noise are spread
     over what is around the pose as well.
     """
     begin, end = int(w.start_ns[s.first]), int(w.end_ns[s.last])
     half = (end - begin) // 2
     first, last = np.searchsorted(w.start_ns, [begin - half, end + half])
-    t_s = (w.start_ns[first:last] - begin) * 1e-9
-    t_s = t_s - t_s.mean()
-    size = float(t_s @ t_s) or 1.0
+    t_s = (w.start_ns[first:last] + w.period_ns / 2 - (begin + end) / 2) * 1e-9
+    scale = max((end - begin) * 1e-9, 1e-9)
+    powers = np.vander(t_s / scale, 3, increasing=True)
+    gain = np.linalg.pinv(powers)
+    spread = np.sqrt((gain**2).sum(axis=1))
     out = {}
     for name, channel in w.channels.items():
         values = channel[first:last] - channel[first:last].mean()
-        rate = float(t_s @ values) / size
-        scatter = float(np.sqrt(np.sum((values - rate * t_s) ** 2) / max(len(t_s) - 2, 1)))
-        out[name] = _Logged(scatter / np.sqrt(len(s.used)), rate, scatter / np.sqrt(size))
+        middle, rate, bend = gain @ values
+        scatter = float(np.sqrt(np.sum((values - powers @ [middle, rate, bend]) ** 2) / max(len(t_s) - 3, 1)))
+        # A step of a coarse thermometer in the middle of what is looked at makes a slope of three quarters of it.
+        step = _step(channel)
+        out[name] = _Logged(
+            error=scatter / np.sqrt(len(s.used)),
+            rate=float(rate) / scale,
+            rate_error=float(np.hypot(scatter * spread[1], 0.75 * step)) / scale,
+            bend=2 * float(bend) / scale**2,
+            bend_error=float(np.hypot(2 * scatter * spread[2], 4 * step)) / scale**2,
+        )
     return out
+
+
+def _step(channel: Floats) -> float:
+    """By how much a channel moves where it stands still between its moves; zero where it is always on the move."""
+    moves = np.abs(np.diff(channel))
+    return float(np.median(moves[moves > 0])) if 0 < np.count_nonzero(moves) < len(moves) / 2 else 0.0
 
 
 def _track(w: Windows, s: Span) -> Track:

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from triaxcal.arrays import Bools, Floats
+from triaxcal.distributions import normal_isf
 from triaxcal.poses.noise_spectrum import Components, Spectrum, Track, fitted, periodogram
 from triaxcal.poses.tones import without_tones
 
@@ -24,13 +25,15 @@ FALSE_CREEP = 0.01
 @dataclass(frozen=True)
 class PoseNoise:
     """For k poses and q quantities, (k,q) each: variance of the mean, degrees of freedom behind it, least-squares slope
-    a window, and its significance in standard deviations. ``limit`` is where the latter is more than chance;
-    ``common_dof`` the degrees of freedom of what the variances of all poses have in common, the shape of the spectrum.
+    a window, its standard error, and its significance in standard deviations. ``limit`` is where the latter is more
+    than chance; ``common_dof`` the degrees of freedom of what the variances of all poses have in common, the shape of
+    the spectrum.
     """
 
     variance: Floats
     dof: Floats
     slope: Floats
+    slope_error: Floats
     significance: Floats
     limit: float
     common_dof: float
@@ -47,7 +50,7 @@ def pose_noise(tracks: Sequence[Track], recording: float, creeping: Bools | None
     tracks = [c.track for c in cleaned]
     slope = np.array([t.centred() @ t.deviation / (t.centred() @ t.centred()) for t in tracks])
     straight = [Track(t.place, t.deviation - t.centred()[:, None] * s) for t, s in zip(tracks, slope, strict=True)]
-    limit = float(stats.norm.isf(FALSE_CREEP / (2 * slope.size)))
+    limit = float(normal_isf(FALSE_CREEP / (2 * slope.size)))
     if creeping is None:
         # What creeps must not pass for slow noise: the first look is at what a straight line leaves.
         model = _Model.of(straight, recording, lowest=2)
@@ -61,7 +64,8 @@ def pose_noise(tracks: Sequence[Track], recording: float, creeping: Bools | None
         model = _Model.of(_mixed(tracks, straight, creeping), recording)
     significance = model.significance(tracks, slope)
     variance = model.mean_variance(tracks) + np.array([c.variance for c in cleaned])
-    return PoseNoise(variance, model.dof(), slope, significance, limit, model.common_dof)
+    error = model.slope_error(tracks) + model.vibration_slope(tracks)
+    return PoseNoise(variance, model.dof(), slope, error, significance, limit, model.common_dof)
 
 
 def _mixed(tracks: Sequence[Track], straight: Sequence[Track], creeping: Bools) -> list[Track]:
@@ -106,11 +110,15 @@ class _Model:
 
     def significance(self, tracks: Sequence[Track], slope: Floats) -> Floats:
         """(k,q) of slopes, in standard deviations; of what exceeds the slope that a vibration makes."""
-        variance = self.scale * np.array([self.spectrum.variance_of_slope(t) for t in tracks])
-        beyond = np.maximum(np.abs(slope) - self._vibration_slope(tracks), 0.0)
-        return np.asarray(np.sign(slope) * beyond / np.sqrt(np.maximum(variance, 1e-300)))
+        beyond = np.maximum(np.abs(slope) - self.vibration_slope(tracks), 0.0)
+        return np.asarray(np.sign(slope) * beyond / self.slope_error(tracks))
 
-    def _vibration_slope(self, tracks: Sequence[Track]) -> Floats:
+    def slope_error(self, tracks: Sequence[Track]) -> Floats:
+        """(k,q) standard error of the slopes by noise."""
+        variance = self.scale * np.array([self.spectrum.variance_of_slope(t) for t in tracks])
+        return np.asarray(np.sqrt(np.maximum(variance, 1e-300)))
+
+    def vibration_slope(self, tracks: Sequence[Track]) -> Floats:
         """(k,q) the largest slope that a sine of the scatter's size makes by the part of a period at its ends.
 
         Zero where the spectrum was fitted to the end: there is none then.

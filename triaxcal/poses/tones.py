@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from scipy import fft
-from scipy.ndimage import median_filter
 
 from triaxcal.arrays import Floats
 from triaxcal.poses.noise_spectrum import Track
@@ -81,7 +81,7 @@ def _loudest(track: Track, deviation: Floats) -> tuple[float, int] | None:
     filled = np.zeros((n, deviation.shape[1]))
     filled[track.place - track.place[0]] = deviation * taper[:, None]
     power = np.abs(fft.rfft(filled, PADDED * n, axis=0)) ** 2
-    usual = median_filter(power, size=(2 * PADDED * ABOUT + 1, 1), mode="reflect")
+    usual = scipy.ndimage.median_filter(power, size=(2 * PADDED * ABOUT + 1, 1), mode="reflect")
     ratio = (power / np.maximum(usual, 1e-300)).max(axis=1)
     first = int(np.ceil(PADDED * CYCLES_LEAST))
     last = len(power) - PADDED  # at half the rate of the windows sine and cosine are one

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import fft, stats
+from scipy import fft
 
 from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.distributions import gamma_sf
 from triaxcal.quality.finding import AXES, Holds
 
 MAINS_HZ = (50.0, 60.0)
@@ -209,7 +210,7 @@ def _peak(band: Band, ratio: Floats, clipped: Floats, segments: int, top: int) -
 def _raised(excess: float, shape: float, bins: float) -> float:
     """Probability that noise of ``shape`` degrees of freedom raises a bin by ``excess`` above a level from ``bins``."""
     held = shape / (1 + 1 / bins)
-    return float(stats.gamma.sf(excess * held, held))
+    return float(gamma_sf(excess * held, held))
 
 
 def _offset(excess: Floats, peak: int) -> float:

@@ -25,7 +25,7 @@ def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]
     if without is None:
         return {}
     found: list[tuple[str, Model]] = []
-    for candidate in _near(search, without, [e.name for e in now.effects], search.score(now)):
+    for candidate in _near(search, without, [e.name for e in now.effects], search.score_of_means(now)):
         other = search.model([*rest, candidate.effect])
         if other is None or search.score(other) > search.score(now) + NEAR:
             continue
@@ -41,7 +41,7 @@ def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]
         # So few poses would have shown one effect or another whatever it was: also one that they cannot test.
         for other in search.untestable():
             name = other.effects[0].name
-            if name not in {e.name for e in now.effects}:
+            if name not in {e.name for e in now.effects} and other.trends < now.trends + NEAR:
                 out.setdefault(name, other)
     return out
 

@@ -21,6 +21,7 @@ from triaxcal.effects.contract import (
     is_derived,
     rate_of,
 )
+from triaxcal.figures import plain
 from triaxcal.plan.directions import directions, spiral
 from triaxcal.search.search import Model, Search
 
@@ -94,8 +95,8 @@ def _directions(search: Search, mine: Model, other: Model, name: str) -> str:
     times = int(np.ceil((TOLD / max(sigma, 1e-9)) ** 2))
     how = {1: "one such pose"}.get(times, f"{times} such poses" if times <= 100 else f"only {times:.0e} such poses")
     return (
-        f"add poses with up at {where}: there it differs from {name} by up to {abs(off[chosen[0]]) * 1e6:.2g} µg, "
-        f"so that {how} would tell"
+        f"add poses with up at {where}: there it differs from {name} by up to "
+        f"{plain(abs(off[chosen[0]]) * 1e6, 2)} µg, so that {how} would tell"
     )
 
 

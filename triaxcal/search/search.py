@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration
+from triaxcal.distributions import beta_cdf, f_sf
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.fit import fit
@@ -21,6 +21,7 @@ from triaxcal.search.candidates import Candidate, Ground, candidates_of, still_c
 from triaxcal.search.familywise import familywise, independent_tests
 from triaxcal.search.gains import Gains
 from triaxcal.search.shape import refined, sharpened
+from triaxcal.trends import Trends
 
 FAMILYWISE = 0.01
 """Probability of any false finding on data with nothing inside."""
@@ -45,12 +46,14 @@ PARTNERS = 60
 
 @dataclass(frozen=True)
 class Model:
-    """Effects in the model, fitted: ``chi2`` of the residuals, and the price of the effects."""
+    """Effects in the model, fitted: ``chi2`` of the residuals, the price of the effects, and the deviance of the
+    ``trends`` inside the poses from those that it foretells."""
 
     effects: tuple[Effect, ...]
     state: State
     chi2: float
     price: float
+    trends: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,7 @@ class Search:
         # Kept with what they are of, so that no other object can come to have the same id.
         self._known: dict[tuple[int, ...], tuple[tuple[Effect, ...], Model | None]] = {}
         self._reckonings: dict[tuple[int, ...], tuple[Model, Beside]] = {}
+        self.trends = Trends.of(problem, poses)
         self.linear = self._model((), State(linear.theta[:9], ()), 0.0)
         ground = Ground.at(problem, self.linear.state)
         self.candidates, self.full = candidates_of(ground, catalogue, self.still)
@@ -106,8 +110,12 @@ class Search:
     # What a model is worth.
 
     def _model(self, effects: tuple[Effect, ...], state: State, price: float) -> Model:
-        r, _, s = linearise(self.problem, state)
-        return Model(effects, state, float(np.sum((r / s) ** 2)), price)
+        r, J, s = linearise(self.problem, state)
+        found = Model(effects, state, float(np.sum((r / s) ** 2)), price)
+        if self.trends is None:
+            return found
+        trends = np.array(self.trends.chi2(state, J / s[:, None]))
+        return replace(found, trends=float(deviance(trends, len(self.poses))))
 
     def model(self, effects: Sequence[Effect]) -> Model | None:
         """Fitted; None where the poses cannot carry it."""
@@ -139,7 +147,7 @@ class Search:
         lie in any direction: small where a model has been put to the test."""
         left, dof = self.left(m.effects), self.left(())
         rest = min(max(m.chi2, left) / max(self.linear.chi2, 1e-300), 1.0)
-        return familywise(float(stats.beta.cdf(rest, left / 2, (dof - left) / 2)), self.tests) if m.effects else 1.0
+        return familywise(float(beta_cdf(rest, left / 2, (dof - left) / 2)), self.tests) if m.effects else 1.0
 
     def price(self, effect: Effect) -> float:
         """What a model pays for an effect: Schwarz's for its coefficients, and the choice among all that was tried."""
@@ -153,7 +161,11 @@ class Search:
         return len(self.poses) - 9 - _parameters(effects)
 
     def score(self, m: Model) -> float:
-        """Deviance and price; the lower the better."""
+        """Deviance, more than the linear model has inside the poses, and price; the lower the better."""
+        return self.score_of_means(m) + m.trends - self.linear.trends
+
+    def score_of_means(self, m: Model) -> float:
+        """The same as far as the means of the poses tell it."""
         return float(deviance(np.array(m.chi2), self.left(m.effects))) + m.price
 
     def left_over(self, m: Model) -> bool:
@@ -369,9 +381,9 @@ class Search:
         against what is left alone where that is more than noise."""
         drop = max(before - after, 0.0) / rank
         degrees = self.pure + max(left, 0)
-        p = float(stats.f.sf(drop * degrees / (self.pure + after), rank, degrees))
+        p = float(f_sf(drop * degrees / (self.pure + after), rank, degrees))
         if self._beyond_noise(after, left):
-            p = max(p, float(stats.f.sf(drop / (after / left), rank, left)))
+            p = max(p, float(f_sf(drop / (after / left), rank, left)))
         return max(p, P_LEAST)
 
     def given(self, effect: Effect, others: Sequence[Effect], both: Model | None = None) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.part import whole
@@ -53,7 +53,7 @@ def _best_shape(effect: Effect, problem: Problem, cost: Callable[[Effect], float
         def of(x: float, name: str = name, effect: Effect = effect) -> Effect:
             return effect.shaped({n: v for n, (v, _) in effect.shape.items()} | {name: x})
 
-        found = optimize.minimize_scalar(
+        found = scipy.optimize.minimize_scalar(
             lambda x, of=of: cost(of(x)), bounds=(low, high), method="bounded", options={"xatol": 1e-3 * high}
         )
         # A step between two poses is anywhere between them; its middle is as good as any, and reads better.

@@ -13,9 +13,9 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
 from triaxcal.stillness.edges import SPAN_LEAST_WINDOWS, trimmed
 from triaxcal.stillness.noise_scales import SCALES, NoiseScales, contrasts
 from triaxcal.stillness.shaken import ALONE_S, runs, shaken_noise, shaken_runs
@@ -160,14 +160,14 @@ def quiet_limit(variance: Floats, dof: int) -> Floats:
     """
     limit = np.zeros(3)
     tried = np.unique(np.r_[np.geomspace(1, max(dof, 2), 40), dof])
-    reaches = -np.log(stats.chi2.ppf(stats.chi2.cdf(tried, tried) / 2, tried) / tried)
+    reaches = -np.log(chi2_ppf(chi2_cdf(tried, tried) / 2, tried) / tried)
     for axis in range(3):
         log = np.sort(np.log(np.maximum(variance[:, axis], 1e-300)))
         mode = _half_sample_mode(log)
         below = log[log < mode]
         reach = float(mode - np.median(below)) if len(below) else 0.0
         effective = tried[int(np.argmin(np.abs(reaches - reach)))]
-        limit[axis] = np.exp(mode) * stats.chi2.isf(FALSE_ALARM, effective) / effective
+        limit[axis] = np.exp(mode) * chi2_isf(FALSE_ALARM, effective) / effective
     return limit
 
 
@@ -188,9 +188,9 @@ def _limit_within(variance: Floats, most: int) -> Floats:
     log = np.log(np.maximum(variance, 1e-300))
     low, middle, high = np.quantile(log, [0.25, 0.5, 0.75], axis=0)
     tried = np.geomspace(0.5, most, 80)
-    spreads = np.log(stats.chi2.ppf(0.75, tried) / stats.chi2.ppf(0.25, tried))
+    spreads = np.log(chi2_ppf(0.75, tried) / chi2_ppf(0.25, tried))
     dof = np.interp(-(high - low), -spreads, tried)
-    return np.asarray(np.exp(middle) * stats.chi2.isf(FALSE_ALARM, dof) / stats.chi2.median(dof))
+    return np.asarray(np.exp(middle) * chi2_isf(FALSE_ALARM, dof) / chi2_ppf(0.5, dof))
 
 
 def _inside(w: Windows, pieces: list[Ints]) -> Bools:

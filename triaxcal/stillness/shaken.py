@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.stillness.edges import trimmed
@@ -82,7 +82,7 @@ def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]
 
 def _level(w: Windows) -> Floats:
     """(m,3) the usual variance about each window: a window that is shorter than a swing shows now more, now less."""
-    return np.asarray(median_filter(w.variance, size=(ABOUT, 1), mode="nearest"))
+    return np.asarray(scipy.ndimage.median_filter(w.variance, size=(ABOUT, 1), mode="nearest"))
 
 
 def _staying(w: Windows, rest: Bools, alike: Bools, level: Floats, noise: NoiseScales) -> Bools:

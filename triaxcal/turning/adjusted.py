@@ -10,7 +10,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from triaxcal.arrays import Floats
 from triaxcal.ellipsoid import coefficients
@@ -105,7 +105,7 @@ def noise(mean: Floats, shape: Floats) -> float:
         low, high = high, high * 4
         if high > 1:
             raise Refused(NO_ELLIPSOID)
-    return float(optimize.brentq(smallest, low, high, xtol=1e-18, rtol=1e-12)) / float(np.max(shape))
+    return float(scipy.optimize.brentq(smallest, low, high, xtol=1e-18, rtol=1e-12)) / float(np.max(shape))
 
 
 def _ellipsoid(mean: Floats, variance: Floats) -> Ellipsoid:

@@ -15,10 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.calibration import Calibration, Residual
+from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.plan.directions import linear_design, most_wanted
 from triaxcal.sensor import Sensor
@@ -138,7 +138,7 @@ def _without_spoiled(held: Summary) -> tuple[Summary, Ellipsoid, float]:
         judged = _Judged(held, e)
         z = judged.error / judged.noise
         z -= np.median(z)
-        bad: Bools = np.abs(z) > SPOILED_SIGMA * max(float(stats.median_abs_deviation(z, scale="normal")), 1.0)
+        bad: Bools = np.abs(z) > SPOILED_SIGMA * max(1.4826 * float(np.median(np.abs(z))), 1.0)
         if not bad.any() or len(z) < STRETCHES_LEAST or bad.sum() > max(SPOILED_MOST * len(z), 1):
             break
         held = held.only(~bad)
@@ -216,7 +216,7 @@ class _Judged:
         inverse = np.linalg.inv(self.information) / self.count
         leverage = self.counts * np.einsum("mi,ij,mj->m", self.mean_row, inverse, self.mean_row)
         left = float(np.sum(1 - np.clip(leverage, 0.0, 1.0)))
-        return float(stats.f.sf(float(np.sum((self.error / self.noise) ** 2)) / left, left, self.count - 9))
+        return float(f_sf(float(np.sum((self.error / self.noise) ** 2)) / left, left, self.count - 9))
 
     def covariance(self, *, raised: bool) -> tuple[Floats, float]:
         """(9,9) of the entries of T and o, and by how much its standard errors were raised at most.

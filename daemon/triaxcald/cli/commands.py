@@ -6,26 +6,39 @@ import io
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.metadata import version
 
 from triaxcal.errors import InvalidData, Refused
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
-from triaxcald.cli import devices, fitting, framing, line, measuring, planning, recordings
 from triaxcald.cli.arguments import OneLineParser
 from triaxcald.cli.console import say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import DaemonError
-from triaxcald.station.write_back import UNCERTAIN
 
 DONE, OUTSIDE, BAD_INPUT, REFUSED, DEVICE, INTERRUPTED = 0, 1, 2, 3, 4, 130
 
+ROOMS = {
+    "line": ("demo", "run", "sim", "record"),
+    "measuring": ("poses", "verify"),
+    "fitting": ("fit", "diagnose"),
+    "framing": ("frame",),
+    "planning": ("plan",),
+    "devices": ("provision", "registers", "devices"),
+    "recordings": ("audit", "log"),
+}
+"""The modules beside this one and their commands. Only what is asked for is imported: all would take longer than most
+work."""
 
-def parser() -> OneLineParser:
+
+def parser(first: str = "") -> OneLineParser:
+    """Knows the commands of the room of ``first``, the first argument; all of them where no room has it."""
     top = OneLineParser(prog="triaxcal", description="Calibrates three-axis accelerometers.")
     top.add_argument("--version", action="version", version=f"triaxcal {version('triaxcal')}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for room in (line, measuring, fitting, framing, planning, devices, recordings):
-        room.register(commands)
+    asked = [room for room, names in ROOMS.items() if first in names] or ([] if first == "--version" else ROOMS)
+    for room in asked:
+        import_module(f"triaxcald.cli.{room}").register(commands)
     return top
 
 
@@ -35,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal that knows no µ shall not end the work
     try:
-        chosen = parser().parse_args(arguments)
+        chosen = parser(*arguments[:1]).parse_args(arguments)
     except SystemExit as e:
         return int(e.code or 0)
     code: int = DONE
@@ -59,6 +72,8 @@ def main(arguments: Sequence[str]) -> int:
         say(f"triaxcal: {e}")
         return e.exit_code
     except Interrupted as e:
+        from triaxcald.station.write_back import UNCERTAIN
+
         say(f"triaxcal: {e}")
         return DEVICE if any(note.startswith(UNCERTAIN) for note in e.notes) else INTERRUPTED
     except KeyboardInterrupt:

@@ -6,14 +6,15 @@ import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from triaxcald.recording.schema import Phase
-from triaxcald.station.guidance import Guide
+if TYPE_CHECKING:  # every command says something, few show poses
+    from triaxcald.recording.schema import Phase
+    from triaxcald.station.guidance import Guide
 
 
 def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
@@ -94,8 +95,9 @@ class Bars:
         what = "check poses" if phase == "verification" else "poses"
         self._show(unit, completed=guide.found, total=guide.wanted, description=f"{what}: {guide.hint}")
         # Seconds that go by are for a terminal; a log gets a line for each pose, and where to turn next.
-        hint = f"; {guide.hint}" if guide.hint.startswith("next") else ""
-        self._plain(unit, f"{what}: {guide.found} of {guide.wanted}{hint}")
+        if not guide.hint.startswith("hold still"):
+            hint = f"; {guide.hint}" if guide.hint.startswith("next") else ""
+            self._plain(unit, f"{what}: {guide.found} of {guide.wanted}{hint}")
 
     def _show(self, unit: str, **values: Any) -> None:
         with suppress(OSError):  # the terminal has gone; the work goes on

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal.effects import CATALOGUE
-from triaxcal.effects.plugins import plugins
+from triaxcal.effects.plugins import package_of, plugins
 from triaxcal.errors import Refused
 from triaxcal_drivers.catalogue import listed
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
 from triaxcal_drivers.profile import BUILT_IN, load_bundle
-from triaxcald.certificate import REFERENCE_TEMPERATURE, is_passing, roles
+from triaxcald.certificate import REFERENCE_TEMPERATURE, roles
+from triaxcald.choices import is_passing
 from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
@@ -205,5 +206,5 @@ def _profile(path: Path) -> dict[str, Any]:
 def _effects() -> list[dict[str, Any]]:
     found, broken = plugins()
     own = [{"name": e.name, "origin": "triaxcal", "fault": None} for e in CATALOGUE]
-    others = [{"name": e.name, "origin": "another package", "fault": None} for e in found]
-    return [*own, *others, *({"name": name, "origin": "another package", "fault": why} for name, why in broken)]
+    others = [{"name": e.name, "origin": package_of(e.name), "fault": None} for e in found]
+    return [*own, *others, *({"name": name, "origin": package_of(name), "fault": why} for name, why in broken)]

@@ -16,6 +16,7 @@ from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, add_uncertainty, positive, writable
 from triaxcald.cli.console import emit
+from triaxcald.cli.results import show_calibration, show_loop
 from triaxcald.cli.several import (
     as_one_unit,
     channels_of_some,
@@ -25,13 +26,11 @@ from triaxcald.cli.several import (
     show_agreement,
     show_by_recording,
 )
-from triaxcald.cli.showing import Choice, chosen, judge, show_calibration, show_loop, telling_data_quality, warn
+from triaxcald.cli.showing import Choice, chosen, judge, telling_data_quality, warn
 from triaxcald.cli.ways import Way, add_ways, chosen_way, telling_default_signs
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, measure
-from triaxcald.report.page import render_report
-from triaxcald.report.stream import overview_of
 from triaxcald.several import agreement_document, with_recordings
 
 
@@ -184,6 +183,9 @@ def _write(a: argparse.Namespace, measured: Measured, document: documents.Docume
     if a.output:
         write_text(a.output, documents.to_text(document))
     if a.report:
+        from triaxcald.report.page import render_report  # matplotlib, which nothing else needs
+        from triaxcald.report.stream import overview_of
+
         limits = {"limits": {"rms_g": a.limit}} if a.limit else None
         unit = chosen(a, measured).output_unit
         overview = overview_of(measured.windows, measured.poses, unit) if measured.windows is not None else None

@@ -15,6 +15,7 @@ from triaxcald.cli.arguments import add_json, positive, seed, writable
 from triaxcald.cli.console import Bars, emit, micro, say, table
 from triaxcald.cli.devices import described
 from triaxcald.cli.interrupt import run_interruptible
+from triaxcald.cli.showing import counted
 from triaxcald.demo import DemoUnit, run_demo
 from triaxcald.documents import number
 from triaxcald.inputs import CALIBRATION
@@ -83,6 +84,7 @@ def _document(o: Outcome) -> dict[str, Any]:
         "before": result["before"] if result else None,
         "after": result["after"] if result else None,
         "findings": result["findings"] if result else [],
+        "choices": result["choices"] if result else [],
         "registers_written": list(o.provisioned.written) if o.provisioned else [],
         "device_state": o.device_state,
         "records_lost": o.lost,
@@ -125,7 +127,9 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     if o.provisioned:
         print(f"  {described(o.provisioned)}")
     if v:
-        print(f"  verified by physics: {v['verdict']}")
+        left_out = sum(not p["used"] for p in v["poses"])
+        poses = f"; {counted(len(v['poses']), left_out, 'check poses')}" if left_out else ""
+        print(f"  verified by physics: {v['verdict']}{poses}")
     if o.device_state:
         print(f"  {o.device_state}")
     elif o.certified.document["not_written"]:

@@ -10,10 +10,11 @@ def entry() -> None:
     """Console script. Needs the extra ``station``; says so where it is not installed."""
     try:
         from triaxcald.cli.commands import main
+
+        code = main(sys.argv[1:])
     except ModuleNotFoundError as e:
         sys.stderr.write(f"triaxcal: the module {e.name} is missing; pip install 'triaxcal[station]' brings it\n")
         sys.exit(2)
-    code = main(sys.argv[1:])
     _leave_nothing_unsaid()
     sys.exit(code)
 

@@ -8,17 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from triaxcal.calibration import Calibration
+from triaxcal.creep import with_creep_left
 from triaxcal.errors import Refused
 from triaxcal.loop import magnitude_errors
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, positive
-from triaxcald.cli.console import emit, table
-from triaxcald.cli.showing import judge, warn
-from triaxcald.documents import number
+from triaxcald.cli.console import emit
+from triaxcald.cli.showing import counted, judge, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
-from triaxcald.held_sensor import reference_unit_in, sensor_of
-from triaxcald.inputs import measure, read_document
+from triaxcald.held_sensor import model_of, reference_unit_in, sensor_of
+from triaxcald.inputs import Measured, measure, read_document
 from triaxcald.units import ErrorUnit
+from triaxcald.verification import Verification, pose_rows, trust
 
 
 def register(commands: Any) -> None:
@@ -35,12 +37,15 @@ def register(commands: Any) -> None:
 def poses(a: argparse.Namespace) -> int:
     measured = measure(a.recording)
     document = documents.poses_document(measured.poses)
+    for row, p in zip(document["poses"], measured.poses, strict=True):
+        row |= trust(p)
     document["data_quality"] = measured.data_quality
     if a.json:
         emit(document)
         return 0
-    table(
-        f"{len(measured.poses)} still poses in {measured.name}",
+    left_out = sum(bool(p.fault) for p in measured.poses)
+    show_poses(
+        f"{counted(len(measured.poses), left_out, 'still poses')} in {measured.name}",
         ["start s", "end s", "samples", "mean x", "mean y", "mean z", "standard error"],
         [
             [
@@ -52,6 +57,7 @@ def poses(a: argparse.Namespace) -> int:
             ]
             for p in measured.poses
         ],
+        measured.poses,
     )
     warn(measured.data_quality)
     return 0
@@ -65,43 +71,60 @@ def verify_command(a: argparse.Namespace) -> int:
     if a.reference and not math.isclose(a.reference, reference, rel_tol=1e-9):
         raise InputError(f"--reference {a.reference:g}: {a.calibration} was made for {reference:g}")
     measured = measure(a.recording)
-    if not measured.poses:
-        warn(measured.data_quality)
-        raise Refused(f"{a.recording}: no still pose")
-    with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
-        errors, noise = magnitude_errors(
-            sensor, measured.poses, channel_reference=channel_reference, reference=reference
-        )
-        rms, floor = float(np.sqrt(np.mean(errors**2))), float(np.sqrt(np.mean(noise**2)))
-    if not np.isfinite([*errors, *noise, rms]).all():
-        raise InputError(f"{a.calibration}: its numbers and the readings of {a.recording} give no finite magnitude")
+    with telling_data_quality(measured):
+        _require_trusted(measured)
+    found = _verified(measured, model_of(sensor, channel_reference, reference), where=a.calibration)
     result = {
         "format": "triaxcal.verify/1",
-        "rms_g": documents.error(rms, reference),
-        "max_abs_g": documents.error(float(np.max(np.abs(errors))), reference),
-        "noise_floor_g": documents.error(floor, reference),
-        "poses": [
-            {
-                "start_s": number(p.start_s),
-                "end_s": number(p.end_s),
-                "error_g": documents.error(float(e), reference),
-                "standard_error_g": documents.uncertainty(float(s)),
-            }
-            for p, e, s in zip(measured.poses, errors, noise, strict=True)
-        ],
+        "rms_g": documents.error(found.rms_g, reference),
+        "max_abs_g": documents.error(found.max_abs_g, reference),
+        "noise_floor_g": documents.error(found.noise_floor_g, reference),
+        "poses": pose_rows(found, reference),
+        "data_quality": measured.data_quality,
     }
     unit = a.reference_unit or reference_unit_in(document, where=a.calibration, magnitude=reference)
-    small = ErrorUnit.of(unit, reference)
     if a.json:
         emit(result)
     else:
-        table(
-            f"|a| − {reference:g} {unit} under {a.calibration}",
-            ["start s", f"error {small}", f"standard error {small}"],
-            [
-                [f"{p.start_s:.2f}", f"{small.count(e):+.1f}", small.told(s)]
-                for p, e, s in zip(measured.poses, errors, noise, strict=True)
-            ],
+        _show_verified(found, f"|a| − {reference:g} {unit} under {a.calibration}", ErrorUnit.of(unit, reference))
+        warn(measured.data_quality)
+    assert found.rms_g is not None
+    return judge(a.limit, found.rms_g)
+
+
+def _require_trusted(measured: Measured) -> None:
+    if not measured.poses:
+        raise Refused(f"{measured.name}: no still pose")
+    if all(p.fault for p in measured.poses):
+        faults = ", ".join(dict.fromkeys(p.fault for p in measured.poses))
+        raise Refused(f"{measured.name}: no still pose can be trusted: {len(measured.poses)} left out ({faults})")
+
+
+def _verified(measured: Measured, model: Calibration, *, where: str) -> Verification:
+    """Under a calibration of another recording. Raises InputError where what ``where`` holds gives no finite errors."""
+    with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
+        errors, noise = magnitude_errors(
+            model.sensor,
+            with_creep_left(measured.poses, model, elsewhere=True),
+            channel_reference=model.channel_reference,
+            reference=model.reference,
         )
-        print(f"rms {small.in_full(rms)}, noise floor {small.in_full(floor)}")
-    return judge(a.limit, rms)
+        found = Verification(measured.poses, errors, noise, tuple(measured.data_quality))
+        figures = np.array([*errors, *noise, found.rms_g, found.noise_floor_g], dtype=float)
+    if not np.isfinite(figures).all():
+        raise InputError(f"{where}: its numbers and the readings of {measured.name} give no finite magnitude")
+    return found
+
+
+def _show_verified(found: Verification, title: str, small: ErrorUnit) -> None:
+    show_poses(
+        title,
+        ["start s", f"error {small}", f"standard error {small}"],
+        [
+            [f"{p.start_s:.2f}", f"{small.count(e):+.1f}", small.told(s)]
+            for p, e, s in zip(found.poses, found.error_g, found.standard_error_g, strict=True)
+        ],
+        found.poses,
+    )
+    poses = counted(len(found.poses), len(found.untrusted))
+    print(f"{poses}: rms {small.in_full(found.rms_g)}, noise floor {small.in_full(found.noise_floor_g)}")

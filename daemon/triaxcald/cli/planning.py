@@ -22,7 +22,7 @@ from triaxcal.visibility import Sight, sight, unseen_effects
 from triaxcald.cli.arguments import add_recording, count
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.lacking import Lacking, lacking
-from triaxcald.cli.showing import chosen
+from triaxcald.cli.showing import chosen, counted, telling_data_quality, warn
 from triaxcald.documents import Document, number, numbers, uncertainty
 from triaxcald.errors import InputError
 from triaxcald.inputs import measure
@@ -213,11 +213,14 @@ def _never_seen(document: Document) -> list[str]:
 def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
     measured = measure(a.recording)
     choice = chosen(a, measured)
-    found = lacking(measured.poses, effects, signs=choice.signs, reference=choice.reference)
+    had = [p for p in measured.poses if not p.fault]
+    with telling_data_quality(measured):
+        found = lacking(had, effects, signs=choice.signs, reference=choice.reference)
     sights = None if found.had is None else {e.name: sight(found.had.up, e) for e in CATALOGUE}
     document: Document = {
         "format": "triaxcal.plan/1",
-        "have": len(measured.poses),
+        "have": len(had),
+        "left_out": len(measured.poses) - len(had),
         "dilution": number(found.dilution),
         **(_seen(sights) if sights else {"blind_to": None, "sees": None}),
         "poses": [_added(found, pose) for pose in found.wanted],
@@ -228,10 +231,13 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
             "promised": _errors(found.now, found.noise),
             "moves": found.moves,
         }
+    document["data_quality"] = measured.data_quality
     if a.json:
         emit(document)
         return 0
-    title = f"the {len(measured.poses)} of {measured.name}"
+    if document["left_out"]:
+        print(f"{measured.name}: {counted(len(measured.poses), document['left_out'])}")
+    title = f"the {len(had)} of {measured.name}"
     if found.wanted:
         _show_wanted(f"poses worth adding to {title}", found)
     else:
@@ -239,7 +245,8 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
     for name, text in found.moves.items():
         print(f"{name}: {text}")
     if sights is not None:
-        print(f"the {len(measured.poses)} there are cannot show: {_list(document['blind_to'])}")
+        print(f"the {len(had)} there are cannot show: {_list(document['blind_to'])}")
+    warn(measured.data_quality)
     return 0
 
 

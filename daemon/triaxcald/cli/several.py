@@ -10,12 +10,25 @@ from pathlib import Path
 
 from triaxcal.agreement import Agreement
 from triaxcal.errors import Refused
+from triaxcal.figures import plain, probability
 from triaxcal.loop import Loop
 from triaxcal.runs import residuals_by_run, together
+from triaxcal.search.alternatives import NEAR
 from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, chosen, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure
+
+COLUMNS = {
+    "cross-validated": "rms error of |a| in each pose under a fit to all the others, without and with the findings",
+    "worse than the best": f"by how much its score, summed over the units, exceeds the best; {NEAR:g} is clear",
+    "gain": "by how much the summed score is better than without it",
+    "shown by": "units that gain more by it than chance would give",
+    "named by": "units that name it and nothing that would do as well",
+    "listed by": "units that have it among names of which each would do as well",
+    "not found by": "units that neither name nor list it",
+}
+"""What stands in the tables of several units."""
 
 
 def measured_each(a: argparse.Namespace) -> list[Measured]:
@@ -151,9 +164,15 @@ def show_agreement(found: Agreement, names: Sequence[str], loops: Sequence[Loop]
             for c in found.effects
         ],
     )
+    for column, meaning in COLUMNS.items():
+        print(f"{column}: {meaning}")
+    for name, loop in zip(names, loops, strict=True):
+        for line in loop.advice:
+            if line.startswith("empirical: "):
+                print(f"{name}: {small.in_words(line)}")
     print(f"the units {found.verdict}" if not found.verdict.startswith("no ") else found.verdict)
     for c in found.effects:
         for name, s in c.shapes.items():
-            known = "" if s.standard_error is None else f" ± {s.standard_error:.2g}"
-            alike = "" if s.p_value is None else f"; the units' own values agree with p {s.p_value:.2g}"
-            print(f"{c.effect}: {name} {s.value:.4g}{known} {s.unit}{alike}")
+            known = "" if s.standard_error is None else f" ± {plain(s.standard_error, 2)}"
+            alike = "" if s.p_value is None else f"; the units' own values agree with p {probability(s.p_value)}"
+            print(f"{c.effect}: {name} {plain(s.value, 4)}{known} {s.unit}{alike}")

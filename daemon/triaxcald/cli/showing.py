@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
-from triaxcal.calibration import Calibration
 from triaxcal.errors import Refused
 from triaxcal.gravity import local_gravity_g
-from triaxcal.loop import Loop
-from triaxcal.uncertainty import Budget, Combined, Stated, budget
+from triaxcal.poses.pose import Pose
+from triaxcal.uncertainty import Stated
 from triaxcald.cli.console import say, table
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
-from triaxcald.units import ErrorUnit, grouped, in_units_of, reference_unit_of
+from triaxcald.units import ErrorUnit, reference_unit_of
 
 
 @dataclass(frozen=True)
@@ -69,77 +69,18 @@ def _stated(a: argparse.Namespace, measured: Measured) -> Stated:
     return said
 
 
-def show_calibration(c: Calibration, choice: Choice) -> None:
-    b = budget(c, choice.stated)
-    show_coefficients(c, choice, b.parameters)
-    r, small = c.residual, choice.small
-    p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
-    print(
-        f"{len(c.poses)} poses: residual rms {small.in_full(r.rms_g)}, cross-validated "
-        f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.in_full(r.noise_floor_g)}, "
-        f"lack of fit p {p}"
-    )
-    show_budget(b, choice)
+def counted(poses: int, left_out: int, what: str = "poses") -> str:
+    """How many there are, those left out among them."""
+    what = what.removesuffix("s") if poses == 1 else what
+    return f"{poses} {what}" + (f", {left_out} of them left out" if left_out else "")
 
 
-def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = None) -> None:
-    """``whole`` is their uncertainty with all that the budget has, where there is one."""
-    rows = []
-    unit = choice.reference_unit
-    of_scale = f"{choice.output_unit or 'output'}/{grouped(unit)}"
-    units = {"scale_factor": of_scale, "misalignment": "rad", "bias": unit}
-    of_effects = {f"{e.name}.{k.name}": in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients}
-    for i, (name, value, error) in enumerate(zip(c.parameters, c.values, c.standard_errors, strict=True)):
-        expanded = [f"± {whole.expanded[i]:.2g}"] if whole else []
-        of = of_effects.get(name, units.get(name.split(".")[0], ""))
-        rows.append([name, f"{value:.9g}", f"{error:.2g}", *expanded, of])
-    told = [f"expanded ({whole.level:.0%})"] if whole else []
-    table("coefficients", ["", "value", "standard error", *told, "unit"], rows)
-    held = ", ".join(f"{name} = {value:g}" for name, value in c.channel_reference.items())
-    if held:
-        print(f"they hold at {held}")
-
-
-def _percent(share: float) -> str:
-    return "< 1%" if 0 < share < 0.01 else f"{share:.0%}"
-
-
-def show_budget(b: Budget, choice: Choice) -> None:
-    small = choice.small
-    rows = [
-        [line.source, line.evaluation, small.told(line.magnitude), _percent(b.share(line))] for line in b.components
-    ]
-    whole = b.magnitude
-    rows.append(["combined", "", small.told(float(whole.standard)), ""])
-    rows.append(
-        [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", small.told(float(whole.expanded)), ""]
-    )
-    table(f"uncertainty of the magnitude, {small}", ["source", "type", "standard", "share"], rows)
-    by = small.in_words(b.dominant.halved_by)
-    print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
-    for line in b.not_evaluated:
-        print(f"not evaluated: {line}")
-
-
-def show_loop(loop: Loop, choice: Choice) -> None:
-    b, f, small = loop.before.residual, loop.after.residual, choice.small
-    rows = [
-        ["residual rms", small.told(b.rms_g), small.told(f.rms_g)],
-        ["cross-validated rms", small.told(b.cross_validated_rms_g), small.told(f.cross_validated_rms_g)],
-    ]
-    if loop.held_out:
-        rows.append(["held-out rms", small.told(loop.held_out.before_rms_g), small.told(loop.held_out.after_rms_g)])
-    rows.append(["noise floor", small.told(b.noise_floor_g), small.told(f.noise_floor_g)])
-    table(f"error of the magnitude, {small}", ["", "before", "after"], rows)
-    for finding in loop.findings:
-        print(f"{finding.verdict}: {finding.effect} ({small.in_words(finding.reason)})")
-    if not loop.findings:
-        print("no effect of the catalogue shows")
-    if loop.unexplained.significant:
-        lead = small.in_words(loop.unexplained.lead)
-        print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")
-    for line in loop.advice:
-        print(f"advice: {small.in_words(line)}")
+def show_poses(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], poses: Sequence[Pose]) -> None:
+    """A table with a row for each pose, and, where some are at fault, with a column that says which and why."""
+    if any(p.fault for p in poses):
+        columns = [*columns, "left out"]
+        rows = [[*row, p.fault] for row, p in zip(rows, poses, strict=True)]
+    table(title, columns, rows)
 
 
 def judge(limit: float | None, rms: float) -> int:

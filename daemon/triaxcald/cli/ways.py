@@ -12,6 +12,7 @@ import numpy as np
 from triaxcal.attitude import AttitudeFit, fit_attitudes
 from triaxcal.calibration import Calibration
 from triaxcal.errors import Refused
+from triaxcal.figures import probability
 from triaxcal.passport import Refinement, refine
 from triaxcal.turning.moments import Moments
 from triaxcal.turning.rotation import RotationFit, fit_rotation
@@ -19,7 +20,8 @@ from triaxcald import documents, ways_in
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.arguments import not_negative, within
 from triaxcald.cli.console import micro, table
-from triaxcald.cli.showing import Choice, chosen, show_coefficients, telling_data_quality
+from triaxcald.cli.results import show_coefficients
+from triaxcald.cli.showing import Choice, chosen, telling_data_quality
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, read_document, require_unit
 
@@ -106,12 +108,11 @@ def _turning(a: argparse.Namespace) -> Way:
 def _show_turning(found: RotationFit, choice: Choice) -> None:
     show_coefficients(found.calibration, choice)
     r, small = found.calibration.residual, choice.small
-    p = "—" if r.lack_of_fit_p is None else f"{r.lack_of_fit_p:.2g}"
     noise = ", ".join(f"{v:.3g}" for v in found.noise_g)
     print(f"{found.samples} samples, whose noise is {noise} {choice.reference_unit} in x, y, z")
     print(
         f"{found.stretches} stretches: |a| off by {small.in_full(r.rms_g)} rms, of which noise is "
-        f"{small.in_full(r.noise_floor_g)}, lack of fit p {p}"
+        f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
     )
 
 
@@ -166,11 +167,11 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
         f"raises the standard errors by a factor of up to {cost:.2f}"
     )
     small = choice.small
-    r, p = c.residual, "—" if c.residual.lack_of_fit_p is None else f"{c.residual.lack_of_fit_p:.2g}"
+    r = c.residual
     print(
         f"{len(c.poses)} poses: |a| off by {small.in_full(r.rms_g)} rms, cross-validated "
         f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.told(r.noise_floor_g)} "
-        f"{small}, lack of fit p {p}"
+        f"{small}, lack of fit p {probability(r.lack_of_fit_p)}"
     )
 
 
@@ -218,8 +219,7 @@ def _show_passport(found: Refinement, choice: Choice) -> None:
         ],
     )
     r, small = c.residual, choice.small
-    p = "—" if found.conflict_p is None else f"{found.conflict_p:.2g}"
     print(
         f"|a| off by {small.in_full(r.rms_g)} rms, noise floor {small.in_full(r.noise_floor_g)}; passport and poses "
-        f"agree with p {p}"
+        f"agree with p {probability(found.conflict_p)}"
     )

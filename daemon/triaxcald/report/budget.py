@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from triaxcald.report.figures import effect_title, number
-from triaxcald.report.untrusted import mapping, texts, vector
+from triaxcald.report.figures import number
+from triaxcald.report.untrusted import mapping, numbers, texts, vector
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Uncertainty:
     coverage_factor: float | None
     expanded_g: float | None
     level_percent: float | None
-    expanded: tuple[tuple[str, tuple[float | None, ...]], ...]
+    expanded: Mapping[str, float | None]
     dominant: str
     halved_by: str
     if_halved_g: float | None
@@ -53,10 +53,7 @@ def read_uncertainty(calibration: Mapping[str, object]) -> Uncertainty | None:
         coverage_factor=number(whole.get("coverage_factor")),
         expanded_g=number(whole.get("expanded_g")),
         level_percent=None if level is None else 100 * level,
-        expanded=tuple(
-            (effect_title(name), vector(mapping(known.get("expanded")).get(name)) or (None, None, None))
-            for name in ("scale_factor", "misalignment", "bias")
-        ),
+        expanded=dict(_expanded(mapping(known.get("expanded")))),
         dominant=_words(known.get("dominant")),
         halved_by=str(known.get("halved_by") or ""),
         if_halved_g=number(known.get("magnitude_if_halved_g")),
@@ -72,6 +69,16 @@ def _line(entry: Mapping[str, object]) -> BudgetLine:
         number(entry.get("share")),
         str(entry.get("how") or ""),
     )
+
+
+def _expanded(known: Mapping[str, object]) -> Iterator[tuple[str, float | None]]:
+    """Of every coefficient, by a name like `bias.x` or `warm_up.x`."""
+    for group in ("scale_factor", "misalignment", "bias"):
+        for axis, value in zip("xyz", vector(known.get(group)) or (None, None, None), strict=True):
+            yield f"{group}.{axis}", value
+    for effect, values in mapping(known.get("effects")).items():
+        for name, value in numbers(values).items():
+            yield f"{effect}.{name}", value
 
 
 def _words(name: object) -> str:

@@ -35,12 +35,12 @@ def bars_picture(stages: Sequence[Stage], held_out: HeldOut | None, unit: ErrorU
         axis_end = 1.28 * (unit.count(max(marks_g)) or 1.0)
         top, ticks, names = 0.0, [], []
         for name, bars, floor_g in groups:
-            axes.annotate(name, (0, top - 0.62), (2, 0), textcoords="offset points", va="center", weight="bold")
+            axes.annotate(name, (0, top - 0.72), (2, 0), textcoords="offset points", va="center", weight="bold")
             ticks += [top + i for i in range(len(bars))]
             names += [label[:_LONGEST_LABEL] for label, _ in bars]
             _bar_group(axes, top, bars, floor_g, colours, axis_end, unit, named=not top)
-            top += len(bars) + 0.9
-        axes.set(xlim=(0, axis_end), ylim=(top - 1.3, -1.0), xlabel=f"error of the magnitude, {unit_label(unit)}")
+            top += len(bars) + 1.0
+        axes.set(xlim=(0, axis_end), ylim=(top - 1.4, -1.1), xlabel=f"error of the magnitude, {unit_label(unit)}")
         axes.set_yticks(ticks, labels=names)
         hang_grid(axes, "x")
         axes.tick_params(axis="y", length=0)
@@ -99,7 +99,7 @@ def _bar_group(
         note = micro(value_g, unit) + (f"  ({_times(value_g / floor_g)} × floor)" if floor_g else "")
         axes.annotate(note, (at, top + i), (4, 0), textcoords="offset points", va="center", fontsize=8)
     if floor_g is not None:
-        axes.vlines(unit.count(floor_g), top - 0.45, top + len(bars) - 0.5, color=FLOOR, lw=1.6,
+        axes.vlines(unit.count(floor_g), top - 0.41, top + len(bars) - 0.57, color=FLOOR, lw=1.6,
                     linestyles=(0, (3, 1.5)), label="noise floor" if named else "_nolegend_")  # fmt: skip
 
 

@@ -122,6 +122,12 @@ class Outcome:
         return ErrorUnit.of(self.reference_unit, 1.0 if self.reference is None else self.reference)
 
     @property
+    def mean_decimals(self) -> int:
+        """Of the poses' means, so that the largest has eight digits: a few hundredths of a millionth of 1 g."""
+        largest = max((abs(v) for pose in self.poses if pose.mean for v in pose.mean), default=0.0)
+        return int(np.clip(7 - np.floor(np.log10(largest)), 0, 12)) if largest else 0
+
+    @property
     def poses_used(self) -> int:
         return sum(pose.used for pose in self.poses)
 
@@ -158,11 +164,17 @@ def read_document(document: Mapping[str, object]) -> Outcome:
         condition=number(calibration.get("condition")),
         blind_to=texts(calibration.get("blind_to")),
         warnings=texts(calibration.get("warnings")),
-        data_quality=texts(document.get("data_quality")),
+        data_quality=tuple(_with_names(line, names) for line in texts(document.get("data_quality"))),
         advice=texts(document.get("advice")),
         limits=numbers(document.get("limits")),
         channel_reference=numbers(calibration.get("channel_reference")),
     )
+
+
+def _with_names(line: str, names: Mapping[str, str]) -> str:
+    """A line about one of several recordings begins with its path."""
+    path = next((path for path in names if line.startswith(f"{path}: ")), "")
+    return names[path] + line[len(path) :] if path else line
 
 
 def _matrix(value: object) -> tuple[Vector, ...] | None:

@@ -74,8 +74,10 @@ def unit_label(unit: ErrorUnit) -> str:
     return "µg" if unit.unit == "g" else f"{power(unit.exponent)} {clean(unit.unit)}"
 
 
-def in_full(value: float) -> str:
+def in_full(value: float | None) -> str:
     """`value` with all the digits that documents have."""
+    if value is None:
+        return MISSING
     mantissa, _, exponent = f"{value:.10g}".partition("e")
     return (mantissa + (f" × {power(int(exponent))}" if exponent else "")).replace("-", "−")
 

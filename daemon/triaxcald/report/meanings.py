@@ -228,10 +228,16 @@ def _factor(factors: Mapping[str, str], coefficient: str) -> tuple[str, str]:
 
 def in_plain(text: str, *, begins: bool = True) -> str:
     """A sentence of a document with names and powers of ten as people write them; ``begins``: with a capital."""
-    said = _EXPONENT.sub(lambda found: digits(float(found[0]), len(found[1].replace(".", ""))), text)
+    said = _EXPONENT.sub(lambda found: _written_out(found[0], found[1]), text)
     said = _TIMES.sub(lambda found: f" × {power(int(found[1]))}", said)
     said = _NAME.sub(lambda found: _plain(found[0]), said)
     return said[:1].upper() + said[1:] if begins else said
+
+
+def _written_out(number: str, mantissa: str) -> str:
+    """`1e-12` as 10⁻¹², with as many digits as it has."""
+    text = digits(float(number), len(mantissa.replace(".", "")))
+    return text.removeprefix("1 × ")
 
 
 def _plain(name: str) -> str:

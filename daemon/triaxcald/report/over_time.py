@@ -20,6 +20,8 @@ from triaxcald.units import ErrorUnit
 
 _CONSPICUOUS = 3.0
 _MOST_MARKED = 8
+_NOTE_SIZE = (0.14, 0.16)
+"""Width and height of a note beside a pose, in those of the panel."""
 _MOST_CHANNELS = 4
 _MOST_BARS = 120
 _FIGURE_IN, _PANEL_IN = (8.0, 0.9), 1.35
@@ -84,7 +86,7 @@ def time_picture(
         for axes, stage in zip(panels, shown, strict=False):
             _noise_band(axes, noise_floor_g, unit)
             _residuals(axes, place, poses, stage, colours[stage.label], unit)
-            axes.set_title(stage.label, loc="left", weight="bold")
+            axes.set_title(stage.title, loc="left", weight="bold")
             axes.set_ylabel(f"residual, {unit_label(unit)}")
         _mark_conspicuous(panels[len(shown) - 1], place, poses, shown[-1], unit)
         for axes, (channel, values) in zip(panels[len(shown) :], logged.items(), strict=True):
@@ -190,11 +192,19 @@ def _mark_conspicuous(
         if np.isfinite(residual_g) and (abs(pose.studentized or 0.0) > _CONSPICUOUS or not pose.used)
     ]
     low, high = axes.get_ylim()
-    for _, pose, at, residual_g in sorted(conspicuous, key=lambda entry: -entry[0])[:_MOST_MARKED]:
+    taken: list[tuple[float, float]] = []
+    for _, pose, at, residual_g in sorted(conspicuous, key=lambda entry: -entry[0]):
         note = f"pose {pose.number}" + ("" if pose.used else ", not used")
         y = float(np.clip(unit.count(residual_g), low + 0.07 * (high - low), high - 0.12 * (high - low)))
         left = at > place.min() + 0.8 * np.ptp(place)
+        across, along = (at - place.min()) / (np.ptp(place) or 1.0), (y - low) / (high - low)
+        # A note that would lie on another is left to the table.
+        if any(abs(across - x) < _NOTE_SIZE[0] and abs(along - z) < _NOTE_SIZE[1] for x, z in taken):
+            continue
+        taken.append((across, along))
         axes.annotate(
             note, (at, y), (-7 if left else 7, 3), textcoords="offset points", fontsize=7, color=INK,
             ha="right" if left else "left",
         )  # fmt: skip
+        if len(taken) == _MOST_MARKED:
+            return

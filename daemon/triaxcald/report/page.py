@@ -11,6 +11,7 @@ from markupsafe import Markup
 from triaxcald.report import figures
 from triaxcald.report.budget import read_uncertainty
 from triaxcald.report.charts import bars_picture, stream_picture
+from triaxcald.report.choices import choices_in, who_corrects
 from triaxcald.report.document import read_document
 from triaxcald.report.faults import faults_of, left_out
 from triaxcald.report.meanings import factor, in_plain, told
@@ -26,6 +27,7 @@ from triaxcald.report.verdict import judge
 _SHOWN_ELSEWHERE = {
     "format", "calibration", "loop", "before", "after", "held_out", "findings", "unexplained", "poses",
     "limits", "data_quality", "advice", "residual", "result", "registers", "verification", "not_written", "device",
+    "choices",
 }  # fmt: skip
 _LONGEST_LIST = 16
 
@@ -43,7 +45,7 @@ def render_report(
     document with `refused` gives the reason in place of a result. The same input gives the same bytes.
     """
     outcome, papers = read_document(document), certificate or {}
-    unit = outcome.small
+    unit, device = outcome.small, read_device(papers)
     limits = {name: figures.number(value) for name, value in mapping(papers.get("limits")).items()}
     floor_g = outcome.final.noise_floor_g
     uncertainty = read_uncertainty(mapping(document.get("calibration")) or document)
@@ -60,7 +62,9 @@ def render_report(
         ),
         faults=faults_of(outcome.data_quality),
         left_out=left_out(outcome.poses, unit),
-        device=read_device(papers, outcome),
+        device=device,
+        choices=choices_in(document, papers, outcome),
+        who_corrects=lambda finding: who_corrects(finding, device),
         told=lambda effect: told(effect, outcome.channel_reference),
         bracket=lambda finding: bracket(finding, outcome),
         streams=stream_picture(stream) if stream is not None else None,
@@ -78,7 +82,7 @@ def _entries(papers: Mapping[str, object], above: str = "") -> Iterator[tuple[st
             yield from _entries(value, f"{label}: ")
         elif not isinstance(value, (list, tuple)):
             yield label, "" if value is None else str(value)
-        elif len(value) <= _LONGEST_LIST and not any(isinstance(v, (Mapping, list, tuple)) for v in value):
+        elif 0 < len(value) <= _LONGEST_LIST and not any(isinstance(v, (Mapping, list, tuple)) for v in value):
             yield label, ", ".join(str(v) for v in value)
 
 

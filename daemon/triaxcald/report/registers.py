@@ -1,4 +1,4 @@
-"""What a station put into the device: the registers, what they cost, and what the device itself then measured."""
+"""What a station put into the device: the registers, and what the device itself then measured."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal.effects import effect_named
-from triaxcald.certificate import is_passing
-from triaxcald.report.document import Outcome
-from triaxcald.report.figures import effect_title, number
+from triaxcal.effects.run_bias import BETWEEN_RUNS
+from triaxcald.choices import is_passing
+from triaxcald.report.figures import number
 from triaxcald.report.untrusted import mapping, texts
 
 
@@ -24,14 +24,14 @@ class Word:
 
 @dataclass(frozen=True)
 class Device:
-    """``passing`` effects depend on how the poses were taken. ``choices`` are (who corrects what, rms error that
-    it leaves in g); ``checked`` the same of the device's own output; ``state`` says in words what it holds now.
+    """Effects: ``held`` are in its registers, for ``host`` it has none, ``passing`` depend on how the poses were taken.
+    ``checked`` are errors in g of the device's own output; ``state`` says in words what it holds now.
     """
 
     state: str
     not_written: str
-    choices: tuple[tuple[str, float | None], ...]
-    left_to_host: tuple[str, ...]
+    held: tuple[str, ...]
+    host: tuple[str, ...]
     passing: tuple[str, ...]
     rounding_rms_g: float | None
     checked: tuple[tuple[str, float | None], ...]
@@ -39,21 +39,20 @@ class Device:
     words: tuple[Word, ...]
 
 
-def read_device(papers: Mapping[str, object], outcome: Outcome) -> Device | None:
+def read_device(papers: Mapping[str, object]) -> Device | None:
     """None where the certificate tells nothing of a device."""
     known, checked = mapping(papers.get("registers")), mapping(papers.get("verification"))
     not_written = str(papers.get("not_written") or "")
     if not (known or checked or not_written):
         return None
     left = texts(known.get("left_to_host"))
-    passing, host = (tuple(effect_title(n).lower() for n in left if _passes(n) is kind) for kind in (True, False))
     words = known.get("words")
     return Device(
         state=str(papers.get("device") or ""),
         not_written=not_written,
-        choices=_choices(known, outcome, host) if known else (),
-        left_to_host=host,
-        passing=passing,
+        held=tuple(name for name in texts(known.get("terms")) if name != "linear"),
+        host=tuple(name for name in left if not passes(name)),
+        passing=tuple(name for name in left if passes(name)),
         rounding_rms_g=number(known.get("rounding_rms_g")),
         checked=_checked(checked),
         checked_verdict=str(checked.get("verdict") or ""),
@@ -61,33 +60,21 @@ def read_device(papers: Mapping[str, object], outcome: Outcome) -> Device | None
     )
 
 
-def _passes(effect: str) -> bool:
+def passes(effect: str) -> bool:
+    """Whether an effect of that name is the recording's rather than the unit's."""
     try:
         return is_passing(effect_named(effect))
     except KeyError:
-        return False
-
-
-def _choices(
-    known: Mapping[str, object], outcome: Outcome, host: tuple[str, ...]
-) -> tuple[tuple[str, float | None], ...]:
-    held = [effect_title(name).lower() for name in texts(known.get("terms")) if name != "linear"]
-    rows = []
-    if len(outcome.stages) > 1:
-        rows.append(("The linear model alone", outcome.stages[0].residual.rms_g))
-    rows.append(("The registers: linear" + "".join(f", {name}" for name in held), number(known.get("rms_g"))))
-    if host:
-        rows.append((f"The registers' model and, in the host, {', '.join(host)}", outcome.final.rms_g))
-    return tuple(rows)
+        return effect in {e.name for e in BETWEEN_RUNS}
 
 
 def _checked(known: Mapping[str, object]) -> tuple[tuple[str, float | None], ...]:
     if not known:
         return ()
     return (
-        ("Before, with the old registers, rms", number(known.get("before_rms_g"))),
-        ("After a power cycle, with the new ones, rms", number(known.get("after_rms_g"))),
-        ("After, largest", number(known.get("after_max_abs_g"))),
+        ("With the old registers, rms", number(known.get("before_rms_g"))),
+        ("With the new registers, rms", number(known.get("after_rms_g"))),
+        ("With the new registers, largest", number(known.get("after_max_abs_g"))),
         ("Noise floor of the check poses", number(known.get("noise_floor_g"))),
         ("Limit, rms", number(known.get("limit_rms_g"))),
     )

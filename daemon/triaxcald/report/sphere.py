@@ -26,6 +26,8 @@ _COLOURS = LinearSegmentedColormap.from_list(
 _MOST_DOUBLINGS = 7
 _EQUATOR = 0.02
 _MOST_NUMBERED = 40
+_LABEL_SIZE = (0.25, 0.14)
+"""Width and height of a number beside a pose, in radii of the sphere."""
 
 
 def sphere_picture(
@@ -49,7 +51,7 @@ def sphere_picture(
             for axes, side in zip(pair, (1, -1), strict=True):
                 _hemisphere(axes, side, poses, stage, norm)
                 axes.text(0, -1.52, "+Z half" if side > 0 else "−Z half", ha="center", color=MUTED, fontsize=8)
-            pair[0].set_title(stage.label, loc="left", weight="bold", pad=8)
+            pair[0].set_title(stage.title, loc="left", weight="bold", pad=8)
         for axes in grid.flat[2 * len(shown) :]:
             axes.axis("off")
         _colour_bar(figure, grid, norm, 0.2 / height_in, unit)
@@ -106,8 +108,22 @@ def _markers(axes: Axes, side: int, here: Sequence[tuple[Pose, float]], norm: Bo
             s=52 if numbered else 18, edgecolors=edge, linewidths=0.6, clip_on=False, zorder=3,
         )  # fmt: skip
     if numbered:
-        for (pose, _), (x, y) in zip(here, places, strict=True):
-            axes.annotate(str(pose.number), (x, y), (4.5, 4.5), textcoords="offset points", fontsize=6.5)
+        for (x, y), numbers in _labels([pose.number for pose, _ in here], places):
+            # Clear of the axes' names, which stand above the rim and to the right of it.
+            up = -9.0 if y > 0.85 and abs(x) < 0.3 else 7.5 if x > 0.85 and abs(y) < 0.2 else 4.5
+            axes.annotate(numbers, (x, y), (4.5, up), textcoords="offset points", fontsize=6.5)
+
+
+def _labels(numbers: Sequence[int], places: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], str]]:
+    """One for all poses whose own would lie on each other, as of a pose that is taken twice."""
+    groups: list[tuple[NDArray[np.float64], list[int]]] = []
+    for number, place in zip(numbers, places, strict=True):
+        near = next((g for at, g in groups if np.all(np.abs(place - at) < _LABEL_SIZE)), None)
+        if near is None:
+            groups.append((place, [number]))
+        else:
+            near.append(number)
+    return [(place, ", ".join(map(str, group))) for place, group in groups]
 
 
 def _colour_bar(figure: Figure, grid: NDArray[np.object_], norm: BoundaryNorm, share: float, unit: ErrorUnit) -> None:

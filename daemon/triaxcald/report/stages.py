@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.untrusted import mapping
 
+AFTER = "After"
+
 
 @dataclass(frozen=True)
 class Residual:
@@ -36,6 +38,11 @@ class Stage:
     pose_residual_g: NDArray[np.float64] | None = None
     adds: str = ""
     p_value: float | None = None
+
+    @property
+    def title(self) -> str:
+        """The label, with the effect that the last step added."""
+        return f"{self.label}: + {self.adds}" if self.label == AFTER and self.adds else self.label
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,7 @@ def stages_of(
         return (first,)
     steps = list(_steps(document.get("findings"), {str(t) for t in _entries(calibration.get("terms"))}, len(after_g)))
     adds, p_value = (steps[-1].adds, steps[-1].p_value) if steps else ("", None)
-    last = Stage("After", after, held_after_g, _series(after_g), adds, p_value)
+    last = Stage(AFTER, after, held_after_g, _series(after_g), adds, p_value)
     return (first, *(s for s in steps[:-1] if s.residual != Residual()), last)
 
 

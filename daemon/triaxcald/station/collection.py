@@ -105,6 +105,7 @@ class Collection:
         """
         pipeline = self.pipelines[stream]
         looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
+        counted_s: tuple[float, ...] = ()
         if stream == READINGS:
             directions(wanted)  # put in order once, before there are samples to lose
         watch = self._watch(stream, clock_s)
@@ -124,7 +125,9 @@ class Collection:
                     nominal_scale_factor=nominal_scale_factor,
                     plan=stream == READINGS,
                     repeat=plan.repeat and stream == READINGS,
+                    counted_s=counted_s,
                 )
+                counted_s = state.counted_s
                 took_s = clock_s() - host_s
                 next_host_s = host_s + took_s + max(LOOK_HOST_S, LOOK_SHARE * took_s)
                 tell(state)

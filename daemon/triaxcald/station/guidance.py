@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,8 @@ class Guide:
     """``found`` of ``wanted`` distinct poses; ``held_s`` how long the unit has been still now (0 when it moves).
 
     ``missing`` are the labels of the plan's poses that none has come near to, in the plan's order. ``repeat_due`` says
-    that the first pose is wanted once more, after all others.
+    that the first pose is wanted once more, after all others. ``counted_s`` are times inside the poses that were long
+    enough, for the next look.
     """
 
     found: int
@@ -31,6 +32,7 @@ class Guide:
     hint: str
     missing: tuple[str, ...] = ()
     repeat_due: bool = False
+    counted_s: tuple[float, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -47,16 +49,19 @@ def guide(
     nominal_scale_factor: Sequence[float] | None,
     plan: bool = True,
     repeat: bool = False,
+    counted_s: Collection[float] = (),
 ) -> Guide:
     """Judge the poses so far, which may come in any order; ``repeat`` asks for the first of them again at the end.
 
-    ``now_s`` is the time of the latest sample, counted as the poses' times are.
+    ``now_s`` is the time of the latest sample, counted as the poses' times are. A pose that lies about one of
+    ``counted_s`` was long enough once: it stays so where its ends have moved since, as more of the noise was seen.
     """
     last = poses[-1] if poses else None
     # A pose that is still growing ends a guard window before the latest sample.
     still_s = last.end_s - last.start_s if last is not None and now_s - last.end_s < 0.5 else 0.0
     up = _directions(poses, nominal_scale_factor)
-    held = [v for v, p in zip(up, poses, strict=True) if p.end_s - p.start_s >= hold_s]
+    enough = [p.end_s - p.start_s >= hold_s or any(p.start_s <= t <= p.end_s for t in counted_s) for p in poses]
+    held = [v for v, is_enough in zip(up, enough, strict=True) if is_enough]
     distinct: list[Floats] = []
     since: list[Floats] = []
     for v in held:
@@ -79,7 +84,8 @@ def guide(
         hint = f"next: {missing[0]} up"
     else:
         hint = "turn the unit to a pose not taken yet"
-    return Guide(found, wanted, still_s, hint, missing, due)
+    middles = tuple((p.start_s + p.end_s) / 2 for p, is_enough in zip(poses, enough, strict=True) if is_enough)
+    return Guide(found, wanted, still_s, hint, missing, due, middles)
 
 
 def _near(v: Floats, others: Sequence[Floats], degrees: float) -> bool:

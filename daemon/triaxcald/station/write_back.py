@@ -6,7 +6,7 @@ import json
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
-from triaxcal.errors import TriaxcalError
+from triaxcal.errors import Refused, TriaxcalError
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED
@@ -21,7 +21,7 @@ from triaxcald.provision.snapshot import Snapshot
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, StationFile
-from triaxcald.verification import Verification, verification_document, verify
+from triaxcald.verification import OUTSIDE, UNJUDGED, WITHIN, WORSE, Verification, verification_document, verified
 
 VERIFICATION_FILE = "verification.json"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
@@ -64,37 +64,40 @@ class WriteBack:
             self.writer.attach(REGISTERS_BEFORE, "application/json", _snapshot_text(report.before))
             self.writer.attach(REGISTERS_AFTER, "application/json", _snapshot_text(report.after))
             self.writer.event("provisioned", {"written": list(report.written)})
-            within = await self._verify(tumble)
+            verdict = await self._verify(tumble)
         except (DriverError, DaemonError, TriaxcalError) as e:
             await self._undo(device, report)
             raise StationError(f"verification failed: {e}") from e
         except BaseException:
             await self._undo(device, report)
             raise
-        if not within:
+        if verdict in (OUTSIDE, WORSE):
             await self._undo(device, report)
             self.writer.event("restored", {"state": self.state})
             if self.state != RESTORED:
-                raise StationError("verification outside limits")
+                raise StationError(f"verification {verdict}")
 
-    async def _verify(self, tumble: Collection) -> bool:
-        """Whether the device's own output is within the limit, or nobody asked."""
+    async def _verify(self, tumble: Collection) -> str:
+        """What the device's own output is judged to be."""
         if CORRECTED not in self.place.bundle.profile.streams:
             self.state = NEW_UNCHECKED
-            return True
+            return UNJUDGED
         check = Collection(VERIFICATION, self.place.bundle, self.place.address)
         await self.collect(check)
+        found = corrected(check, self.file.reference)
         document = self.verification = verification_document(
             corrected(tumble, self.file.reference),
-            corrected(check, self.file.reference),
+            found,
             limit_g=self.file.limits.verification_rms_g,
             raw_sha256=check.digest.hexdigest(),
         )
         self.writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
-        if document["verdict"] == "outside limits":
-            return False
-        self.state = NEW_VERIFIED if document["verdict"] == "within limits" else NEW_UNJUDGED
-        return True
+        if found.poses and found.rms_g is None:
+            faults = ", ".join(dict.fromkeys(p.fault for p in found.untrusted))
+            raise Refused(f"no check pose can be trusted: {len(found.poses)} left out ({faults})")
+        verdict = str(document["verdict"])
+        self.state = {WITHIN: NEW_VERIFIED, UNJUDGED: NEW_UNJUDGED}.get(verdict, self.state)
+        return verdict
 
     async def _undo(self, device: Device, report: ProvisionReport) -> None:
         recorded = RecordedDevice(device, _Recorder(self.writer, lenient=True))
@@ -111,7 +114,7 @@ class WriteBack:
 
 def corrected(collection: Collection, reference: float) -> Verification:
     """What the device itself reported of a collection's poses."""
-    return verify(collection.pipelines[CORRECTED].finish(), reference)
+    return verified(collection.pipelines[CORRECTED], reference)
 
 
 class _Recorder:

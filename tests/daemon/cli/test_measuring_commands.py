@@ -26,7 +26,7 @@ CALIBRATION = {
     "format", "terms", "units", "scale_factor", "misalignment", "bias", "matrix", "centre", "effects",
     "standard_error", "residual", "poses", "condition", "blind_to", "warnings",
 }  # fmt: skip
-LOOP = {"format", "before", "after", "findings", "unexplained", "data_quality", "advice", "calibration"}
+LOOP = {"format", "before", "after", "findings", "choices", "unexplained", "data_quality", "advice", "calibration"}
 FINDING = {
     "effect", "verdict", "p_value", "coefficients", "alternatives", "apart", "reason", "remedy", "residual",
     "pose_residual_g",
@@ -83,7 +83,8 @@ def test_poses_of_a_recording(finished_run: Any, triaxcal: Run) -> None:
     assert done.json["format"] == "triaxcal.poses/1"
     assert len(done.json["poses"]) >= 26
     for pose in done.json["poses"]:
-        assert set(pose) == {"start_s", "end_s", "samples", "mean", "standard_error", "channels"}
+        assert set(pose) == {"start_s", "end_s", "samples", "mean", "standard_error", "channels", "used", "fault"}
+        assert (pose["used"], pose["fault"]) == (True, None)
         assert np.shape(pose["mean"]) == np.shape(pose["standard_error"]) == (3,)
         assert pose["samples"] > 0
         assert "temp_c" in pose["channels"]
@@ -198,7 +199,7 @@ def test_verify_judges_a_recording_by_a_calibration(finished_run: Any, tmp_path:
     triaxcal("diagnose", finished_run.can, "-o", closed)
     done = triaxcal("verify", linear, finished_run.can, "--json")
     assert (done.code, done.err) == (0, "")
-    assert set(done.json) == {"format", "rms_g", "max_abs_g", "noise_floor_g", "poses"}
+    assert set(done.json) == {"format", "rms_g", "max_abs_g", "noise_floor_g", "poses", "data_quality"}
     _all_finite(done.json)
     assert done.json["rms_g"] == pytest.approx(fitted["residual"]["rms_g"], rel=0.05)
     assert len(done.json["poses"]) == len(fitted["poses"])

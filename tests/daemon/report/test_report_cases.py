@@ -257,16 +257,59 @@ def registers() -> dict[str, Any]:
 def test_a_certificate_tells_what_the_device_holds_and_what_each_choice_leaves(
     words: dict[str, Any], registers: dict[str, Any]
 ) -> None:
+    add(words, "temperature_bias", {"x": (1e-4, 1e-5, "g/K")})
     add(words, "third_order_nonlinearity", {"x": (1e-4, 1e-5, "g/g³")})
     _, text = page(words, registers)
     assert "The device holds the new calibration, verified." in text
-    assert "After a power cycle, with the new ones, rms | 6.50 µg" in text
-    assert "The linear model alone | 900 µg" in text
-    assert "The registers: linear, temperature bias | 44.0 µg" in text
+    assert "With the old registers, rms | 1300 µg With the new registers, rms | 6.50 µg" in text
+    assert "power cycle" not in text
+    assert "Registers: linear model alone | 900 µg | 1100 µg" in text
+    assert "Registers: linear model, temperature bias | 44.0 µg" in text
+    last = f"{words['after']['rms_g'] * 1e6:.3g}"
+    assert f"temperature bias; host: third-order nonlinearity | {last}" in text
     assert "no registers for third-order nonlinearity: the host has to correct it" in text
     assert "no register could hold: hysteresis" in text
-    assert "bias_x | bias.x | 0.00560000000 | 0.00561000000 | — | 85471ac0" in text
+    assert "Who corrects it The host: the device has no registers" in text
+    assert "bias_x | bias.x | 0.0056 | 0.00561 | | 85471ac0" in text
     assert "0.123456" not in text
+    assert text.index("The device holds") < text.index("Before and after")
+
+
+def test_choices_that_a_document_states_are_told_as_they_are(words: dict[str, Any], registers: dict[str, Any]) -> None:
+    add(words, "temperature_bias", {"x": (1e-4, 1e-5, "g/K")})
+    add(words, "third_order_nonlinearity", {"x": (1e-4, 1e-5, "g/g³")})
+    add(words, "warm_up", {"x": (1e-4, 1e-5, "g")})
+    in_registers = ["linear", "temperature_bias"]
+    words["choices"] = [
+        {"corrected_by": ["registers"], "terms": ["linear"], "rms_g": 9e-4},
+        {"corrected_by": ["registers", "process"], "terms": in_registers, "rms_g": 7e-5, "cross_validated_rms_g": 8e-5},
+        {"corrected_by": ["registers", "host", "process"], "terms": [*in_registers, "third_order_nonlinearity"]},
+    ]
+    _, text = page(words, registers)
+    assert "Registers: linear model alone | 900 µg | —" in text
+    assert "Registers: linear model, temperature bias; process: free of warm up | 70.0 µg | 80.0 µg" in text
+    assert "temperature bias; host: third-order nonlinearity; process: free of warm up | — | —" in text
+
+
+def test_without_a_device_the_choice_is_to_correct_the_effects_or_not(words: dict[str, Any]) -> None:
+    add(words, "third_order_nonlinearity", {"x": (1e-4, 1e-5, "g/g³")})
+    add(words, "warm_up", {"x": (1e-4, 1e-5, "g")})
+    _, text = page(words)
+    assert "Host or registers: linear model alone | 900 µg | 1100 µg" in text
+    assert "linear model, third-order nonlinearity; process: free of warm up |" in text
+    assert "Who corrects it The host, or the device where it has registers for it" in text
+    assert "Who corrects it Nobody: it depends on how these poses were taken" in text
+
+
+def test_where_nothing_was_found_there_is_nothing_to_choose(words: dict[str, Any]) -> None:
+    assert "Who corrects what" not in page(words)[1]
+
+
+@pytest.mark.parametrize("damage", [[None], [3, {}], [{"corrected_by": 7, "terms": [None], "rms_g": "x"}], {}])
+def test_damaged_choices_break_nothing(words: dict[str, Any], damage: object) -> None:
+    add(words, "warm_up", {"x": (1e-4, 1e-5, "g")})
+    words["choices"] = damage
+    assert "Warm up" in page(words)[1]
 
 
 def test_a_device_without_registers_says_why(words: dict[str, Any]) -> None:
@@ -276,8 +319,8 @@ def test_a_device_without_registers_says_why(words: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("damage", [3, "x", [], {"words": 7, "terms": None}, {"words": [None, 4]}])
-def test_damaged_registers_tell_nothing_and_break_nothing(loop: dict[str, Any], damage: object) -> None:
-    device = read_device({"registers": damage, "verification": damage}, read_document(loop))
+def test_damaged_registers_tell_nothing_and_break_nothing(damage: object) -> None:
+    device = read_device({"registers": damage, "verification": damage})
     assert device is None or not any(word.raw for word in device.words)
 
 
@@ -296,3 +339,40 @@ def test_a_small_set_of_poses_carries_its_numbers_and_a_large_one_does_not() -> 
         drawing = sphere_picture(outcome.poses, outcome.stages, 1.5e-5)
         assert drawing is not None
         assert (">13</text>" in drawing) is numbered
+
+
+def test_a_pose_taken_twice_has_one_label_with_both_numbers() -> None:
+    document = copy.deepcopy(_SAMPLE)
+    poses = document["calibration"]["poses"]
+    poses[9]["direction"] = poses[2]["direction"]
+    outcome = read_document(document)
+    drawing = sphere_picture(outcome.poses, outcome.stages, 1.5e-5)
+    assert drawing is not None
+    assert ">3, 10</text>" in drawing
+    assert ">3</text>" not in drawing
+
+
+def test_notes_that_would_lie_on_each_other_are_left_out() -> None:
+    document = samples.loop_document(60)
+    for pose in document["calibration"]["poses"]:
+        pose |= {"residual_g": 1e-5, "studentized": 0.5}
+    for number, residual_g in ((20, 9e-5), (21, 9.1e-5), (40, -9e-5)):
+        document["calibration"]["poses"][number - 1] |= {"residual_g": residual_g, "studentized": residual_g * 1e5}
+    outcome = read_document(document)
+    drawing = time_picture(outcome.poses, outcome.stages, None)
+    assert drawing is not None
+    assert ">pose 21</text>" in drawing
+    assert ">pose 40</text>" in drawing
+    assert ">pose 20</text>" not in drawing
+
+
+def test_panels_of_the_last_step_say_what_it_added(loop: dict[str, Any]) -> None:
+    add(loop, "channel_bias:supply_v", {"x": (1e-4, 1e-5, "g/[supply_v]")})
+    add(loop, "hysteresis", {"x": (1e-4, 1e-5, "g/g")})
+    assert page(loop)[0].count(">After: + hysteresis</text>") == 2
+
+
+def test_no_table_hides_its_rows_in_a_box(loop: dict[str, Any]) -> None:
+    html, _ = page(loop)
+    assert "max-height" not in html
+    assert "overflow: hidden" not in html

@@ -131,7 +131,7 @@ def test_an_effect_of_somebody_else_is_shown_by_its_name() -> None:
         ("channel_bias:supply_v: hold it", "Channel bias: supply_v: hold it"),
         ("warm_up cannot be told from bias_drift here", "Warm up cannot be told from bias drift here"),
         ("record while temp_c moves", "Record while temp_c moves"),
-        ("from 1.53e+04 µg, p below 1e-12", "From 15300 µg, p below 1 × 10⁻¹²"),
+        ("from 1.53e+04 µg, p below 1e-12", "From 15300 µg, p below 10⁻¹²"),
         ("15300 1e-6 µT", "15300 × 10⁻⁶ µT"),
         ("temperature_bias_quadratic with warm_upper", "Temperature bias quadratic with warm_upper"),
     ],

@@ -314,7 +314,8 @@ def test_four_hundred_poses_stay_below_a_megabyte_and_a_half() -> None:
 @pytest.fixture(scope="module")
 def budgeted(loop: dict[str, Any]) -> dict[str, Any]:
     document = copy.deepcopy(loop)
-    nine = {"scale_factor": [1e-5] * 3, "misalignment": [2e-6] * 3, "bias": [3e-6] * 3}
+    nine: dict[str, Any] = {"scale_factor": [1e-5] * 3, "misalignment": [2e-6] * 3, "bias": [3e-6] * 3}
+    nine["effects"] = {"second_order_nonlinearity": {"x": 4e-6, "y": 4e-6}}
     document["calibration"]["uncertainty"] = {
         "level": 0.95,
         "expanded": nine,
@@ -338,7 +339,9 @@ def test_the_budget_is_a_table_with_the_largest_source_first(budgeted: dict[str,
     assert page.row("Lack of fit")[3] == "< 1 %"
     assert "Dominant: reference. To halve it: know it better; combined then 22.0 µg." in page.text
     assert "thermometer: not stated" in page.text
-    assert page.row("Misalignment, rad")[1:] == ["± 2.0 × 10⁻⁶"] * 3
+    assert page.row("Misalignment x (αx)")[2] == "± 2.0 × 10⁻⁶"
+    assert page.row("Second-order nonlinearity, y")[2] == "± 4.0 × 10⁻⁶"
+    assert page.row("Second-order nonlinearity, z")[2] == ""
 
 
 def test_a_page_without_a_budget_has_no_section_on_it(page: Page) -> None:

@@ -82,10 +82,15 @@ def test_each_recording_has_its_picture_over_time_and_the_moment_is_marked_in_it
 def test_every_pose_and_every_residual_names_its_recording(loop: dict[str, Any]) -> None:
     loop["calibration"]["poses"][8] |= {"used": False, "residual_g": 3.062e-3}
     _, text = page(loop)
-    assert "Pose | Recording | Start, s" in text
-    assert re.search(r"\b7 \| first\.csv \| 246\.0 \| .* 8 \| second\.csv \| 6\.0 \| 36\.0 \|", text)
+    assert "Of recordings 1: first.csv, 2: second.csv Pose | Of | Start, s" in text
+    assert re.search(r"\b7 \| 1 \| 246\.0 \| .* 8 \| 2 \| 6\.0 \| 36\.0 \|", text)
     assert "Pose 9, at 46.0 s of second.csv: off by 3062 µg" in text
     assert "1. first.csv | 7 | 900 µg | 12.0 µg | 15.0 µg 2. second.csv | 7 | 900 µg | 17.0 µg" in text
+
+
+def test_a_fault_of_a_recording_names_its_file_without_the_folders(loop: dict[str, Any]) -> None:
+    loop["data_quality"] = [f"{loop['recordings'][1]}: creeping_pose: 2 of 7, the first at 25.2 s"]
+    assert "Outputs creep while the pose is held | second.csv: 2 of 7, the first at 25.2 s" in page(loop)[1]
 
 
 def test_recordings_of_the_same_name_keep_their_folders(loop: dict[str, Any]) -> None:
@@ -103,6 +108,7 @@ def test_a_coefficient_of_one_recording_says_so(loop: dict[str, Any]) -> None:
 def test_a_single_recording_has_no_word_of_several(loop: dict[str, Any]) -> None:
     _, text = page(_SAMPLE)
     assert "Recording |" not in text
+    assert "Of recordings" not in text
     assert "by its own clock" not in text
 
 

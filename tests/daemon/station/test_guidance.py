@@ -122,3 +122,15 @@ def test_without_a_nominal_scale_factor_the_range_of_the_outputs_serves() -> Non
     poses = [_pose(u * 700.0 + offset, 5.0 * i) for i, u in enumerate(UP)]
     assert _guide(poses, nominal_scale_factor=None).complete
     assert _guide(poses[:8], nominal_scale_factor=None).found == 8
+
+
+def test_a_pose_that_was_long_enough_once_stays_counted_when_its_ends_move() -> None:
+    """The ends of a still span are known better as more of the noise is seen."""
+    before = _guide([_pose(UP[0], 0.1, 3.2), _pose(UP[1], 10.0)])
+    shorter = [_pose(UP[0], 0.9, 2.4), _pose(UP[1], 10.0)]
+    assert (before.found, before.missing) == (2, tuple(LABELS[2:]))
+    after = _guide(shorter, counted_s=before.counted_s)
+    assert (after.found, after.missing) == (before.found, before.missing)
+    assert _guide(shorter, counted_s=after.counted_s).found == 2
+    assert _guide(shorter).found == 1
+    assert _guide([_pose(UP[1], 10.0)], counted_s=before.counted_s).found == 1

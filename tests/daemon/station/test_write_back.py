@@ -8,9 +8,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
 from triaxcal.errors import Refused
+from triaxcal.poses.pose import Pose
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device
 from triaxcald.errors import ProvisionError, RecordingError, StationError
@@ -24,6 +26,7 @@ from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station, load_station
 from triaxcald.station.line import UnitRun
 from triaxcald.station.write_back import NEW_UNJUDGED, RESTORED, UNCERTAIN, WriteBack
+from triaxcald.verification import Verification, verify
 
 OLD = Stored(factory_calibration())
 QUICK = {"speed": 60.0}
@@ -169,6 +172,39 @@ async def test_no_number_of_cancellations_stops_the_old_calibration_from_coming_
         await asyncio.wait([task])
         assert task.cancelled()
         assert len(struck) > 3
+        assert back.state == RESTORED
+        _holds_old(bench.served)
+
+
+async def test_check_poses_none_of_which_can_be_trusted_bring_the_old_calibration_back(
+    open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether the station has a limit or not."""
+    stuck = Pose(0.0, 2.0, 200, np.array([1.0, 0.0, 0.0]), 1e-10 * np.eye(3), 50.0, fault="stuck_output")
+    monkeypatch.setattr("triaxcald.station.write_back.corrected", lambda *_: verify([stuck], 1.0))
+    async with open_bench() as bench:
+        back = bench.write_back(_no_pose)
+        with pytest.raises(StationError, match=r"no check pose can be trusted: 1 left out \(stuck_output\)"):
+            await bench.run(back)
+        assert back.state == RESTORED
+        _holds_old(bench.served)
+
+
+async def test_without_a_limit_a_calibration_worse_than_the_old_one_does_not_stay(
+    open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outputs = iter([1 + 1e-3, 1 + 1e-5])  # the check poses are asked for first
+
+    def corrected(*_: object) -> Verification:
+        mean = np.array([next(outputs), 0.0, 0.0])
+        return verify([Pose(float(t), t + 2.0, 200, mean, 1e-10 * np.eye(3), 50.0) for t in range(6)], 1.0)
+
+    monkeypatch.setattr("triaxcald.station.write_back.corrected", corrected)
+    async with open_bench() as bench:
+        back = bench.write_back(_no_pose)
+        await bench.run(back)
+        assert back.verification
+        assert back.verification["verdict"] == "worse than before"
         assert back.state == RESTORED
         _holds_old(bench.served)
 

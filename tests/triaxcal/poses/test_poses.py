@@ -67,6 +67,50 @@ def test_channels_are_means_over_the_span_and_times_are_its_own(
         assert pose.start_s < pose.t_s < pose.end_s < path.round_s
 
 
+def test_rates_and_bends_of_a_channel_are_those_in_the_middle_of_each_pose(
+    paper_unit: Sensor, fourteen: np.ndarray, detect: Detect
+) -> None:
+    """In the first and the last pose too, where the channel is known to one side alone."""
+    path = Tumble(fourteen, hold_s=5.0, move_s=1.5)
+    t_s = np.arange(int(100 * path.round_s)) / 100
+    rng = np.random.default_rng(0)
+    u = paper_unit.output(path.specific_force(t_s), {}) + 1e-4 * rng.standard_normal((len(t_s), 3))
+    temp_c = 20 + 3 * np.sin(t_s / 20) + 5e-2 * rng.standard_normal(len(t_s))
+    poses = detect(t_s, u, {"temp_c": temp_c})[2]
+    truth = np.array([[3 / 20 * np.cos(p.t_s / 20), -3 / 400 * np.sin(p.t_s / 20)] for p in poses])
+    found = np.array([[p.rates["temp_c"], p.bends["temp_c"]] for p in poses])
+    error = np.array([[p.rate_errors["temp_c"], p.bend_errors["temp_c"]] for p in poses])
+    assert error.max() < 5e-3
+    assert np.abs((found - truth) / error).max() < 5
+
+
+def test_a_coarse_thermometer_says_how_little_it_knows_of_the_rate(
+    paper_unit: Sensor, fourteen: np.ndarray, detect: Detect
+) -> None:
+    path = Tumble(fourteen, hold_s=5.0, move_s=1.5)
+    t_s = np.arange(int(100 * path.round_s)) / 100
+    u = paper_unit.output(path.specific_force(t_s), {}) + 1e-4 * np.random.default_rng(0).standard_normal((len(t_s), 3))
+    for pose in detect(t_s, u, {"temp_c": np.round(20 + 0.01 * t_s)})[2]:
+        assert abs(pose.rates["temp_c"] - 0.01) < 2 * pose.rate_errors["temp_c"]
+
+
+@pytest.mark.parametrize("kind", ["white", "moving average of a window"])
+def test_pulls_of_trends_along_the_measured_vector_have_variance_one(
+    paper_unit: Sensor, fourteen: np.ndarray, detect: Detect, kind: str
+) -> None:
+    path = Tumble(fourteen, hold_s=5.0, move_s=1.5)
+    t_s = np.arange(int(50 * path.round_s)) / 50
+    pulls = []
+    for seed in range(SEEDS):
+        noise = noise_of(kind, np.random.default_rng(seed), len(t_s))
+        poses = detect(t_s, paper_unit.output(path.specific_force(t_s), {}) + 1e-4 * noise)[2]
+        up = fourteen / paper_unit.scale_factor
+        up = up / np.linalg.norm(up, axis=1, keepdims=True)
+        pulls += [u @ p.trend / p.trend_error for u, p in zip(up, poses, strict=True)]
+    assert len(pulls) == SEEDS * 14
+    assert np.mean(np.square(pulls)) == pytest.approx(1, abs=0.35)
+
+
 def test_correlation_between_axes_is_in_the_covariance(
     paper_unit: Sensor, fourteen: np.ndarray, detect: Detect
 ) -> None:

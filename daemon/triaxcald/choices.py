@@ -1,0 +1,49 @@
+"""What each way of correcting a unit leaves: the linear model alone, its registers, its registers and a host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from triaxcal.calibration import Calibration, Residual
+from triaxcal.effects import Effect
+from triaxcal.effects.contract import DERIVED, rate_of
+from triaxcal.loop import Loop
+
+REGISTERS, HOST, PROCESS = "registers", "host", "process"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """``terms`` are corrected by ``corrected_by``, in the order in which they act; ``residual`` is what is left in the
+    poses of the fit. With `PROCESS` among them, what belongs to the recording alone is taken as kept out of the next.
+    """
+
+    corrected_by: tuple[str, ...]
+    terms: tuple[str, ...]
+    residual: Residual
+
+
+def choices_of(loop: Loop, held: Calibration | None = None) -> tuple[Choice, ...]:
+    """From the least to the most. ``held`` is the calibration that the device has registers for, None without one:
+    then the host corrects everything, the linear part too."""
+    whole = [effect for effect, _ in loop.after.sensor.effects]
+    unit, process = _of_unit(loop.after), (PROCESS,) if any(map(is_passing, whole)) else ()
+    first = HOST if held is None else REGISTERS
+    out = [Choice((first,), ("linear",), loop.before.residual)] if whole else []
+    if held is None:
+        return (*out, Choice((first, *process), unit, loop.after.residual))
+    in_registers = _of_unit(held)
+    if process or len(in_registers) > 1 or not out:
+        out.append(Choice((first, *process), in_registers, held.residual))
+    if set(unit) - set(in_registers):
+        out.append(Choice((first, HOST, *process), unit, loop.after.residual))
+    return tuple(out)
+
+
+def is_passing(effect: Effect) -> bool:
+    """Whether an effect is the recording's rather than the unit's, so that no register could hold it."""
+    return bool(effect.needs) and all(n in DERIVED or n.endswith(rate_of("")) for n in effect.needs)
+
+
+def _of_unit(c: Calibration) -> tuple[str, ...]:
+    return ("linear", *(effect.name for effect, _ in c.sensor.effects if not is_passing(effect)))

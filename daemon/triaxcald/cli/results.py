@@ -1,0 +1,89 @@
+"""What a fit and a diagnosis found, as a person reads it at the console."""
+
+from __future__ import annotations
+
+from triaxcal.calibration import Calibration
+from triaxcal.figures import probability
+from triaxcal.loop import Loop
+from triaxcal.uncertainty import Budget, Combined, budget
+from triaxcald.cli.console import table
+from triaxcald.cli.showing import Choice, counted
+from triaxcald.documents import holds_of
+from triaxcald.units import grouped, in_units_of
+
+
+def show_calibration(c: Calibration, choice: Choice) -> None:
+    b = budget(c, choice.stated)
+    show_coefficients(c, choice, b.parameters)
+    r, small = c.residual, choice.small
+    poses = counted(len(c.poses), sum(not p.used for p in c.poses))
+    print(
+        f"{poses}: residual rms {small.in_full(r.rms_g)}, cross-validated "
+        f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.in_full(r.noise_floor_g)}, "
+        f"lack of fit p {probability(r.lack_of_fit_p)}"
+    )
+    show_budget(b, choice)
+
+
+def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = None) -> None:
+    """``whole`` is their uncertainty with all that the budget has, where there is one."""
+    rows = []
+    unit = choice.reference_unit
+    of_scale = f"{choice.output_unit or 'output'}/{grouped(unit)}"
+    units = {"scale_factor": of_scale, "misalignment": "rad", "bias": unit}
+    of_effects = {f"{e.name}.{k.name}": in_units_of(k.unit, unit) for e, _ in c.sensor.effects for k in e.coefficients}
+    for i, (name, value, error) in enumerate(zip(c.parameters, c.values, c.standard_errors, strict=True)):
+        expanded = [f"± {whole.expanded[i]:.2g}"] if whole else []
+        of = of_effects.get(name, units.get(name.split(".")[0], ""))
+        rows.append([name, f"{value:.9g}", f"{error:.2g}", *expanded, of])
+    for effect, _ in c.sensor.effects:
+        for name in effect.shape:
+            value, known, of = c.coefficients_of(effect.name)[name]
+            told = "—" if known is None else f"{known:.2g}"
+            rows.append([f"{effect.name}.{name}", f"{value:.6g}", told, *(["—"] if whole else []), of])
+    expanded_at = [f"expanded ({whole.level:.0%})"] if whole else []
+    table("coefficients", ["", "value", "standard error", *expanded_at, "unit"], rows)
+    if held := holds_of(c):
+        print(f"scale factor, misalignment and bias hold {'; '.join(held)}")
+
+
+def _percent(share: float) -> str:
+    return "< 1%" if 0 < share < 0.01 else f"{share:.0%}"
+
+
+def show_budget(b: Budget, choice: Choice) -> None:
+    small = choice.small
+    rows = [
+        [line.source, line.evaluation, small.told(line.magnitude), _percent(b.share(line))] for line in b.components
+    ]
+    whole = b.magnitude
+    rows.append(["combined", "", small.told(float(whole.standard)), ""])
+    rows.append(
+        [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", small.told(float(whole.expanded)), ""]
+    )
+    table(f"uncertainty of the magnitude, {small}", ["source", "type", "standard", "share"], rows)
+    by = small.in_words(b.dominant.halved_by)
+    print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
+    for line in b.not_evaluated:
+        print(f"not evaluated: {line}")
+
+
+def show_loop(loop: Loop, choice: Choice) -> None:
+    b, f, small = loop.before.residual, loop.after.residual, choice.small
+    rows = [
+        ["residual rms", small.told(b.rms_g), small.told(f.rms_g)],
+        ["cross-validated rms", small.told(b.cross_validated_rms_g), small.told(f.cross_validated_rms_g)],
+    ]
+    if loop.held_out:
+        rows.append(["held-out rms", small.told(loop.held_out.before_rms_g), small.told(loop.held_out.after_rms_g)])
+    rows.append(["noise floor", small.told(b.noise_floor_g), small.told(f.noise_floor_g)])
+    table(f"error of the magnitude, {small}", ["", "before", "after"], rows)
+    for finding in loop.findings:
+        print(f"{finding.verdict}: {finding.effect} ({small.in_words(finding.reason)})")
+    if not loop.findings:
+        print("no effect of the catalogue shows")
+    if loop.unexplained.significant:
+        lead = small.in_words(loop.unexplained.lead)
+        print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")
+    for line in loop.advice:
+        print(f"advice: {small.in_words(line)}")

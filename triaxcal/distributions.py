@@ -1,0 +1,74 @@
+"""Tails and quantiles of the usual distributions, by the functions that ``scipy.stats`` calls too.
+
+That package takes longer to import than most commands take for their work. Degrees of freedom and shapes that are not
+above zero give NaN. Arguments may be arrays, which broadcast.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from triaxcal.arrays import Bools, Floats
+
+Given = float | np.floating[Any] | np.integer[Any] | Floats
+
+
+def normal_isf(q: Given) -> Floats:
+    """What a standard normal variable exceeds with probability ``q``."""
+    return -np.asarray(special.ndtri(q))
+
+
+def t_ppf(q: Given, dof: Given) -> Floats:
+    """Quantile ``q`` of Student's t."""
+    return _defined(special.stdtrit(dof, q), np.greater(dof, 0))
+
+
+def t_isf(q: Given, dof: Given) -> Floats:
+    return -t_ppf(q, dof)
+
+
+def chi2_cdf(x: Given, dof: Given) -> Floats:
+    return _defined(special.chdtr(dof, np.maximum(x, 0.0)), np.greater(dof, 0))
+
+
+def chi2_sf(x: Given, dof: Given) -> Floats:
+    """Probability of a chi-square above ``x``."""
+    return _defined(special.chdtrc(dof, np.maximum(x, 0.0)), np.greater(dof, 0))
+
+
+def chi2_ppf(q: Given, dof: Given) -> Floats:
+    return _defined(2 * special.gammaincinv(np.divide(dof, 2), q), np.greater(dof, 0))
+
+
+def chi2_isf(q: Given, dof: Given) -> Floats:
+    """What chi-square exceeds with probability ``q``."""
+    return _defined(special.chdtri(dof, q), np.greater(dof, 0))
+
+
+def f_sf(x: Given, above: Given, below: Given) -> Floats:
+    """Probability of a ratio F above ``x``; degrees of freedom of its numerator and of its denominator."""
+    return _defined(special.fdtrc(above, below, np.maximum(x, 0.0)), np.greater(above, 0) & np.greater(below, 0))
+
+
+def f_logsf(x: Given, above: Given, below: Given) -> Floats:
+    """Its logarithm, exact near 1 too."""
+    x = np.maximum(x, 0.0)
+    with np.errstate(divide="ignore"):
+        tail, body = np.log(special.fdtrc(above, below, x)), np.log1p(-special.fdtr(above, below, x))
+    return np.where(x > special.fdtri(above, below, 0.5), tail, body)
+
+
+def gamma_sf(x: Given, shape: Given) -> Floats:
+    """Probability of a gamma variable of scale 1 above ``x``."""
+    return _defined(special.gammaincc(shape, np.maximum(x, 0.0)), np.greater(shape, 0))
+
+
+def beta_cdf(x: Given, a: Given, b: Given) -> Floats:
+    return _defined(special.betainc(a, b, np.clip(x, 0.0, 1.0)), np.greater(a, 0) & np.greater(b, 0))
+
+
+def _defined(value: Any, where: Bools | np.bool_) -> Floats:
+    return np.where(where, value, np.nan)

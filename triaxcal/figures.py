@@ -1,0 +1,27 @@
+"""How numbers are written in sentences: without an exponent where one can do without."""
+
+from __future__ import annotations
+
+P_LEAST = 1e-12
+"""Below this a probability says how well the noise is known, and no more."""
+
+
+def plain(value: float, digits: int = 3, sign: str = "") -> str:
+    """To so many significant digits, and with all those before the point; ``sign`` "+" also for what is positive."""
+    text = f"{value:{sign}.{digits}g}"
+    return f"{value:{sign}.0f}" if "e+" in text and abs(value) < 1e15 else text
+
+
+def micro_g(value: float | None, sign: str = "") -> str:
+    """A number of g in µg: to a tenth, as in tables, or to three digits where that is finer."""
+    if value is None:
+        return "unknown"
+    count = value * 1e6
+    return f"{count:{sign}.1f} µg" if 10 <= abs(count) < 1e15 else f"{plain(count, sign=sign)} µg"
+
+
+def probability(p: float | None) -> str:
+    """As it stands behind a "p"; a dash where there is none."""
+    if p is None:
+        return "—"
+    return f"< {P_LEAST:.0e}" if p < P_LEAST else f"{p:.2g}"

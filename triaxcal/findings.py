@@ -1,0 +1,151 @@
+"""What the loop found and what to do about it, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.calibration import Calibration
+from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, rate_of
+from triaxcal.effects.part import Part
+from triaxcal.effects.plugins import package_of
+from triaxcal.figures import micro_g, probability
+from triaxcal.search import Search, alternatives, telling_apart
+from triaxcal.unexplained import Unexplained
+
+OTHERS = ("", "the other effect", "the other two effects", "the other three effects", "the other four effects")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that the data show. ``coefficients`` name → (value, standard error, unit).
+
+    ``verdict`` is "adopted" where the name is earned, "confounded" where ``alternatives`` fit as well.
+    """
+
+    effect: str
+    verdict: str
+    p_value: float
+    coefficients: Mapping[str, tuple[float, float | None, str]]
+    alternatives: tuple[str, ...]
+    reason: str
+    remedy: str
+    step: Calibration
+    """The model with this effect and those before it."""
+    apart: tuple[str, ...] = ()
+    """What to record so as to tell it from its alternatives."""
+
+
+def finding_of(
+    search: Search,
+    effect: Effect,
+    compared: tuple[Calibration | None, Calibration],
+    after: Calibration,
+    step: Calibration,
+    rivals: Sequence[Sequence[Effect]],
+) -> Finding:
+    """``compared`` are the model that lacks this effect alone (None where the poses cannot carry it), and that with all
+    effects found; ``after`` is what is handed on. ``rivals`` explain as much with other poses left out."""
+    found = alternatives(search, effect, search.found)
+    taken = {e.name for e in search.found.effects}
+    for rival in rivals:
+        model = search.model(rival)
+        found |= {e.name: model for e in rival if model and e.name not in taken | found.keys()}
+    others = [e for e in search.found.effects if e is not effect]
+    p = search.earned(effect, others)
+    reason = f"{_fall(*compared, len(others))}familywise p {probability(p)}"
+    if isinstance(effect, Part) and not effect.selects:
+        reason += f"; of its coefficients these poses show only {effect.formula}, which they share in that proportion"
+    if found:
+        reason += f"; {', '.join(found)} would do as well on these poses"
+    return Finding(
+        effect=effect.name,
+        verdict="confounded" if found else "adopted",
+        p_value=p,
+        coefficients=after.coefficients_of(effect.name),
+        alternatives=tuple(found),
+        reason=reason,
+        remedy=effect.advice(_largest(after, effect), compared[1].residual.noise_floor_g),
+        step=step,
+        apart=tuple(telling_apart(search, effect, found)),
+    )
+
+
+def _largest(c: Calibration, effect: Effect) -> float:
+    """The largest coefficient of an effect, by its amount."""
+    return max(float(np.max(np.abs(q))) for e, q in c.sensor.whole.effects if e.name == effect.name)
+
+
+def _fall(without: Calibration | None, complete: Calibration, others: int) -> str:
+    """What an effect does to the cross-validated error; empty where that is not known."""
+    old = None if without is None else without.residual.cross_validated_rms_g
+    new = complete.residual.cross_validated_rms_g
+    if old is None or new is None:
+        return ""
+    beside = f", beside {OTHERS[others]}," if others else ""
+    return (
+        f"with it{beside} the cross-validated error {'falls' if new < old else 'goes'} from {micro_g(old)} to "
+        f"{micro_g(new)} (noise floor {micro_g(complete.residual.noise_floor_g)}); "
+    )
+
+
+def description_of(smooth: Calibration, without: Calibration) -> Finding:
+    """The empirical term, the last effect of ``smooth``."""
+    effect = smooth.sensor.effects[-1][0]
+    return Finding(
+        effect=effect.name,
+        verdict="adopted",
+        p_value=without.residual.lack_of_fit_p or 0.0,
+        coefficients=smooth.coefficients_of(effect.name),
+        alternatives=(),
+        reason=(
+            "asked for: a smooth term that describes what is left and explains nothing; with it the cross-validated "
+            f"error falls from {micro_g(without.residual.cross_validated_rms_g)} to "
+            f"{micro_g(smooth.residual.cross_validated_rms_g)}"
+        ),
+        remedy=effect.remedy,
+        step=smooth,
+    )
+
+
+def why_not_shown(search: Search, effect: Effect) -> str:
+    """Why poses cannot show an effect in full."""
+    known = search.problem.channel_reference
+    for name in effect.needs:
+        rate, channel = name.endswith(rate_of("")), channel_of(name.removesuffix(rate_of("")))
+        if name not in known and not (rate or is_derived(name)):
+            return f"channel {channel} is not logged in every pose"
+        if name not in known:
+            return f"how fast {channel} changes is not known in every pose" if rate else f"{name} is not known"
+        if name in search.still:
+            if name in SCATTER:
+                return "the readings scatter alike in all poses"
+            return f"{channel} changes no faster in one pose than in another" if rate else f"{channel} stood still"
+    if effect.needs:
+        return "too few poses, or what it goes with moved along with their directions"
+    return "the poses point in too few directions"
+
+
+def advice_of(
+    findings: Sequence[Finding],
+    unexplained: Unexplained,
+    undescribed: str,
+    blind: Mapping[str, str],
+    faulty: Mapping[str, str],
+) -> list[str]:
+    """``undescribed`` is why the empirical term that was asked for is not in the model; ``blind`` are effects that do
+    not show in full, ``faulty`` those of other packages that were left out, each with the reason why."""
+    out = [f"{f.effect}: {f.remedy}" for f in findings if f.verdict == "adopted"]
+    for f in findings:
+        if f.verdict == "confounded":
+            out.append(f"{f.effect} cannot be told from {', '.join(f.alternatives)} here: {'; '.join(f.apart)}")
+    if unexplained.significant:
+        out.append("something is left that no candidate explains: look at the lead, and record more poses")
+    if undescribed:
+        out.append(f"empirical: {undescribed}")
+    for why in dict.fromkeys(blind.values()):
+        names = ", ".join(name for name, reason in blind.items() if reason == why)
+        out.append(f"these poses cannot show in full {names}: {why}")
+    return out + [f"the effect {name} of {package_of(name)} was left out: {why}" for name, why in faulty.items()]

@@ -1,0 +1,90 @@
+"""How |a| goes inside the poses: data of its own beside the means.
+
+What moves the bias from pose to pose moves it inside the poses as well, unless it is something that a pose has all
+along. So an effect that explains the means foretells a slope for every pose; and of two that explain the means as well,
+often because the linear parameters make up for what they get wrong, one foretells slopes that are not there. As with
+the means, only the length of the vector is looked at: a unit may turn on its stand as it likes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import SINCE_START, TIME, channel_of, is_derived, rate_of
+from triaxcal.poses.pose import Pose
+from triaxcal.problem import Problem, State, linearise
+
+PLACES = np.linspace(-0.5, 0.5, 6)
+"""Where in a pose the model is asked, from its beginning to its end: enough to follow a step or a steep decay."""
+
+
+@dataclass(frozen=True)
+class Trends:
+    """``moments`` are the poses at `PLACES`, as problems whose covariance is that of the trends; ``errors`` (n,) by
+    condition those of the changes that the conditions are said to have gone through."""
+
+    moments: tuple[Problem, ...]
+    middle: Problem
+    errors: Mapping[str, Floats]
+
+    @classmethod
+    def of(cls, problem: Problem, poses: Sequence[Pose]) -> Trends | None:
+        """None where no pose knows its own."""
+        error = np.array([p.trend_error for p in poses])
+        if not np.isfinite(error).all():
+            return None
+        covariance = error[:, None, None] ** 2 * np.eye(3)
+        length = np.array([p.end_s - p.start_s for p in poses])
+        change, errors = _changes(problem, poses, length)
+        trend = np.array([p.trend for p in poses])
+        moments = tuple(
+            replace(
+                problem,
+                u=problem.u + x * trend,
+                covariance=covariance,
+                channels=dict(problem.channels) | {n: problem.channels[n] + x * c for n, c in change.items()},
+            )
+            for x in PLACES
+        )
+        return cls(moments, replace(problem, covariance=covariance), errors)
+
+    def chi2(self, state: State, weighted: Floats) -> float:
+        """How far the trends are from those that a model foretells, as a sum of squares of n; as near as the means,
+        whose weighted derivatives by theta (n, 9+p) are given, let the model come.
+        """
+        weights = PLACES / (PLACES @ PLACES)
+        r, J = 0.0, 0.0
+        for weight, moment in zip(weights, self.moments, strict=True):
+            at, by_theta, _ = linearise(moment, state)
+            r, J = r + weight * at, J + weight * by_theta
+        here, _, error = linearise(self.middle, state)
+        variance = error**2
+        for name in {n for e in state.effects for n in e.needs} & self.errors.keys():
+            channels = dict(self.middle.channels) | {name: self.middle.channels[name] + self.errors[name]}
+            there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
+            variance = variance + (there - here) ** 2
+        error = np.sqrt(variance)
+        stacked = np.concatenate([weighted, J / error[:, None]])
+        misses = np.concatenate([np.zeros(len(weighted)), r / error])
+        size = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
+        step = np.linalg.lstsq(stacked / size, misses, rcond=1e-13)[0]
+        return float(np.sum((misses - stacked / size @ step) ** 2))
+
+
+def _changes(problem: Problem, poses: Sequence[Pose], length: Floats) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """By condition, (n,) each: by how much it changes along each pose, and the standard error of that."""
+    change = dict.fromkeys((TIME, SINCE_START), length)
+    errors: dict[str, Floats] = {}
+    for name in problem.channels:
+        channel = channel_of(name)
+        if is_derived(name) or any(channel not in p.bends for p in poses):
+            continue
+        change[name] = length * np.array([p.rates[channel] for p in poses])
+        errors[name] = length * np.array([p.rate_errors[channel] for p in poses])
+        change[rate_of(name)] = length * np.array([p.bends[channel] for p in poses])
+        errors[rate_of(name)] = length * np.array([p.bend_errors[channel] for p in poses])
+    return {n: c for n, c in change.items() if n in problem.channels}, errors
