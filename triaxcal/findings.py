@@ -60,6 +60,9 @@ def finding_of(
         reason += f"; of its coefficients these poses show only {effect.formula}, which they share in that proportion"
     if found:
         reason += f"; {', '.join(found)} would do as well on these poses"
+    floor = compared[1].residual.noise_floor_g
+    if not effect.coefficients[0].unit.startswith("g"):
+        floor /= after.reference  # the effect is a share of the magnitude
     return Finding(
         effect=effect.name,
         verdict="confounded" if found else "adopted",
@@ -67,7 +70,7 @@ def finding_of(
         coefficients=after.coefficients_of(effect.name),
         alternatives=tuple(found),
         reason=reason,
-        remedy=effect.advice(_largest(after, effect), compared[1].residual.noise_floor_g),
+        remedy=effect.advice(_largest(after, effect), floor),
         step=step,
         apart=tuple(telling_apart(search, effect, found)),
     )

@@ -32,7 +32,7 @@ from triaxcal.search import NEAR, Search, alternatives
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start, with_history
-from triaxcal.unexplained import Unexplained, unexplained_of
+from triaxcal.unexplained import Unexplained, hints_of, unexplained_of
 
 ANYTHING = 4
 """An effect beside others, with so many alternatives, is none."""
@@ -107,7 +107,7 @@ def diagnose(
         model = replace(given, poses=quiet).fit(found.adopted)
         given = replace(given, poses=with_creep_left(poses, model))
         steps = [given.fit(found.adopted[:count]) for count in range(1, len(found.adopted) + 1)]
-    unexplained = unexplained_of(model, search.passed_over, search.nearest())
+    unexplained = unexplained_of(model, search.passed_over, search.nearest(), hints_of(search))
     smooth, undescribed = described(steps[-1], unexplained, signs) if empirical else (None, "")
     after = smooth or steps[-1]
     findings: list[Finding] = []

@@ -24,43 +24,40 @@ PLACES = np.linspace(-0.5, 0.5, 6)
 
 @dataclass(frozen=True)
 class Trends:
-    """``moments`` are the poses at `PLACES`, as problems whose covariance is that of the trends; ``errors`` (n,) by
-    condition those of the changes that the conditions are said to have gone through."""
+    """``inside`` are the poses at all `PLACES`, one place after the other, ``middle`` as they are in the middle, both
+    with the covariance of the trends; ``errors`` (n,) by condition those of the changes that the conditions are said to
+    have gone through."""
 
-    moments: tuple[Problem, ...]
+    inside: Problem
     middle: Problem
     errors: Mapping[str, Floats]
 
     @classmethod
     def of(cls, problem: Problem, poses: Sequence[Pose]) -> Trends | None:
-        """None where no pose knows its own."""
+        """None where the poses do not know theirs."""
         error = np.array([p.trend_error for p in poses])
         if not np.isfinite(error).all():
             return None
-        covariance = error[:, None, None] ** 2 * np.eye(3)
         length = np.array([p.end_s - p.start_s for p in poses])
         change, errors = _changes(problem, poses, length)
-        trend = np.array([p.trend for p in poses])
-        moments = tuple(
-            replace(
-                problem,
-                u=problem.u + x * trend,
-                covariance=covariance,
-                channels=dict(problem.channels) | {n: problem.channels[n] + x * c for n, c in change.items()},
-            )
-            for x in PLACES
+        change |= {n: np.zeros(len(poses)) for n in problem.channels.keys() - change.keys()}
+        middle = replace(problem, covariance=error[:, None, None] ** 2 * np.eye(3))
+        inside = replace(
+            middle,
+            u=_moved(problem.u, np.array([p.trend for p in poses])),
+            covariance=np.concatenate([middle.covariance] * len(PLACES)),
+            channels={n: _moved(v, change[n]) for n, v in problem.channels.items()},
         )
-        return cls(moments, replace(problem, covariance=covariance), errors)
+        return cls(inside, middle, errors)
 
     def chi2(self, state: State, weighted: Floats) -> float:
         """How far the trends are from those that a model foretells, as a sum of squares of n; as near as the means,
         whose weighted derivatives by theta (n, 9+p) are given, let the model come.
         """
-        weights = PLACES / (PLACES @ PLACES)
-        r, J = 0.0, 0.0
-        for weight, moment in zip(weights, self.moments, strict=True):
-            at, by_theta, _ = linearise(moment, state)
-            r, J = r + weight * at, J + weight * by_theta
+        everywhere, by_theta, _ = linearise(self.inside, state)
+        slope = PLACES / (PLACES @ PLACES)
+        r = slope @ everywhere.reshape(len(slope), -1)
+        J = np.tensordot(slope, by_theta.reshape(len(slope), *weighted.shape), 1)
         here, _, error = linearise(self.middle, state)
         variance = error**2
         for name in {n for e in state.effects for n in e.needs} & self.errors.keys():
@@ -73,6 +70,11 @@ class Trends:
         size = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
         step = np.linalg.lstsq(stacked / size, misses, rcond=1e-13)[0]
         return float(np.sum((misses - stacked / size @ step) ** 2))
+
+
+def _moved(values: Floats, change: Floats) -> Floats:
+    """(k·n,…) at all `PLACES` of what is ``values`` (n,…) in the middle."""
+    return np.concatenate([values + x * change for x in PLACES])
 
 
 def _changes(problem: Problem, poses: Sequence[Pose], length: Floats) -> tuple[dict[str, Floats], dict[str, Floats]]:

@@ -14,7 +14,7 @@ from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, channel_of
 from triaxcal.figures import micro_g, plain, probability
 from triaxcal.plan.directions import linear_design
-from triaxcal.search import Nearest
+from triaxcal.search import NEAR, Nearest, Search
 
 SIGNIFICANT = 0.01
 EITHER = 1.5
@@ -54,8 +54,11 @@ class _Pattern:
     family: str
 
 
-def unexplained_of(after: Calibration, passed_over: Mapping[str, str], nearest: Nearest | None = None) -> Unexplained:
-    """``passed_over`` are the effects that came near, each with the reason why it was not adopted.
+def unexplained_of(
+    after: Calibration, passed_over: Mapping[str, str], nearest: Nearest | None = None, hints: Sequence[str] = ()
+) -> Unexplained:
+    """``passed_over`` are the effects that came near, each with the reason why it was not adopted; ``hints`` what else
+    is known of what is left.
 
     Two tests, of which either tells: that of everything that is left, and that of the ``nearest`` single effect, which
     sees what is too little to be named.
@@ -69,17 +72,34 @@ def unexplained_of(after: Calibration, passed_over: Mapping[str, str], nearest: 
     if significant:
         # One loud pose may hide in the plain rms what the others show, each by its own noise.
         beyond = max(beyond, residual.noise_floor_g * float(np.sqrt(max(after.inflation**2 - 1, 0.0))))
-    return Unexplained(significant, p, beyond, lead(after, passed_over, nearest) if significant else "")
+    return Unexplained(significant, p, beyond, lead(after, passed_over, nearest, hints) if significant else "")
 
 
-def lead(after: Calibration, passed_over: Mapping[str, str], nearest: Nearest | None = None) -> str:
+def hints_of(search: Search) -> list[str]:
+    """What the poses tell of what is left but by their residuals."""
+    out = []
+    if search.trends_p() < LEAD:
+        out.append(
+            "inside the poses |a| moves too, so it goes with the time or something that changes, not the attitude"
+        )
+    if not search.found.effects:
+        limit = search.against_trends(search.found) + NEAR
+        few = dict.fromkeys(m.effects[0].name for m in search.untestable() if search.against_trends(m) < limit)
+        if few:
+            out.append(f"these poses are too few to test {', '.join(few)}")
+    return out
+
+
+def lead(
+    after: Calibration, passed_over: Mapping[str, str], nearest: Nearest | None = None, hints: Sequence[str] = ()
+) -> str:
     """The patterns that the residuals show beyond chance: on the sphere, in time, in one pose, in a channel."""
     used = [p for p in after.poses if p.used]
     worst = max(used, key=lambda p: abs(p.studentized))
     parts = []
     if worst.studentized**2 > 0.5 * sum(p.studentized**2 for p in used):
         parts.append(f"most of it is one pose, at {worst.pose.at} ({micro_g(worst.residual_g, '+')}): was it still?")
-    parts += _clear_patterns(after, used, _patterns(after, used))
+    parts += [*_clear_patterns(after, used, _patterns(after, used)), *hints]
     near = {name: why for name, why in passed_over.items() if _is_hint(why)}
     if nearest is not None and nearest.p_value < SIGNIFICANT:
         why = f"p {probability(nearest.p_value)}, but it explains too little for what it adds"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from triaxcal.creep import with_creep_left
+from triaxcal.effects import effect_named
 from triaxcal.effects.second_order_nonlinearity import SecondOrderNonlinearity
 from triaxcal.effects.temperature_bias import TemperatureBias
 from triaxcal.effects.warm_up import WarmUp
@@ -105,6 +106,44 @@ def test_a_warm_up_below_the_noise_floor_says_no_time() -> None:
     assert WarmUp(60.0).advice(1e-5, 2e-5) == WarmUp().remedy
     assert WarmUp(60.0).advice(1e-5, 0.0) == WarmUp().remedy
     assert "from 97 s after" in WarmUp(60.0).advice(-1e-4, 2e-5)  # 60 ln 5 = 96.6
+
+
+@pytest.mark.parametrize(
+    ("name", "steady"),
+    [
+        ("temperature_bias", "±0.2 K"),
+        ("temperature_scale_factor", "±0.2 K"),
+        ("thermal_gradient", "±0.2 K/s"),
+        ("channel_bias:supply_v", "±0.2 [supply_v]"),
+        ("channel_scale_factor:supply_v", "±0.2 [supply_v]"),
+    ],
+)
+def test_what_goes_with_a_channel_says_how_steady_is_steady_enough(name: str, steady: str) -> None:
+    effect = effect_named(name)
+    advice = effect.advice(-1e-4, 2e-5)
+    assert advice == f"{effect.remedy} Within {steady} what it does is below the noise floor."
+    assert effect.advice(-1e-4, 0.0) == effect.advice(0.0, 2e-5) == effect.remedy
+
+
+@pytest.mark.parametrize("reference", [1.0, 48.0])
+def test_how_steady_a_temperature_must_be_does_not_hang_on_the_units_of_the_reference(
+    paper_unit: Sensor, twenty_six: np.ndarray, reference: float
+) -> None:
+    effect, coefficients = effect_named("temperature_scale_factor"), np.array([1e-3, -5e-4, 2e-4])
+    unit = replace(paper_unit, bias=paper_unit.bias * reference, effects=((effect, coefficients),))
+    temp_c = 25 + 3 * np.sin(0.9 * np.arange(26))
+    rng = np.random.default_rng(0)
+    poses = noisy_poses(
+        unit,
+        reference * twenty_six,
+        1.5e-5 * reference,
+        rng,
+        channels={"temp_c": temp_c},
+        channel_reference={"temp_c": 25.0},
+    )
+    (finding,) = diagnose(poses, signs=MINUS, reference=reference).findings
+    assert finding.effect == effect.name
+    assert "Within ±0.015 K " in finding.remedy  # 15 µg of 1 g by 1e-3 / K
 
 
 BLIND = "these poses cannot show in full "

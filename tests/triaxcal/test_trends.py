@@ -133,3 +133,30 @@ def test_of_fourteen_poses_trends_tell_what_the_means_cannot(
         listed.append(of_time & {finding.effect, *finding.alternatives})
     assert listed[0]
     assert not listed[1]
+
+
+def test_what_is_left_and_moves_inside_the_poses_is_said_to_go_with_the_time(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """A temperature that nobody logged, up and down too often for a drift."""
+    rng = np.random.default_rng(8)
+    hot = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, 3 * SENSITIVITY),))
+    moves = "inside the poses |a| moves too"
+    kept = [replace(p, channels={}, rates={}, rate_errors={}, bends={}, bend_errors={}) for p in hot]
+    still = [replace(p, trend=np.zeros(3)) for p in kept]
+    drift = [effect_named("second_order_nonlinearity")]
+    loops = [diagnose(poses, signs=MINUS, catalogue=drift) for poses in (kept, still)]
+    assert [loop.unexplained.significant for loop in loops] == [True, True]
+    assert [moves in loop.unexplained.lead for loop in loops] == [True, False]
+
+
+def test_of_poses_too_few_for_an_effect_its_name_is_in_the_lead(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    """Thirteen leave four degrees of freedom, and a step has three coefficients and a moment."""
+    step = effect_named("bias_step").shaped({"at": 6 * HOLD_S})
+    rng = np.random.default_rng(3)
+    ups = twenty_six[rng.permutation(26)[:13]]
+    loop = diagnose(
+        moving(paper_unit, ups, rng, ((step, np.array([2e-3, -3e-3, 1.5e-3])),)), signs=MINUS, catalogue=[step]
+    )
+    assert loop.unexplained.significant
+    assert "these poses are too few to test bias_step" in loop.unexplained.lead

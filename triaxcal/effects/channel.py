@@ -12,6 +12,7 @@ from triaxcal.effects.contract import (
     Coefficient,
     Effect,
     condition_of,
+    held_within,
     no_slope,
     on_each_axis,
     per_axis,
@@ -44,6 +45,9 @@ class ChannelBias(Effect):
     def remedy(self) -> str:
         return f"Hold {self.channel} steadier, or correct the bias by it, in the host."
 
+    def advice(self, largest: float, floor: float) -> str:
+        return held_within(self.remedy, largest, floor, f"[{self.channel}]")
+
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return on_each_axis(conditions[condition_of(self.channel)])
 
@@ -72,6 +76,9 @@ class ChannelScaleFactor(Effect):
     @property
     def remedy(self) -> str:
         return f"Hold {self.channel} steadier, or correct the scale factor by it, in the host."
+
+    def advice(self, largest: float, floor: float) -> str:
+        return held_within(self.remedy, largest, floor, f"[{self.channel}]")
 
     def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return per_axis(s * conditions[condition_of(self.channel)][:, None])

@@ -14,6 +14,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.figures import plain
 
 TIME = "t_s"
 """The name under which time stands among the conditions, in seconds."""
@@ -94,8 +95,8 @@ class Effect(Protocol):
         ...
 
     def advice(self, largest: float, floor: float) -> str:
-        """Its remedy, with numbers where it can: for the ``largest`` of its coefficients, where errors up to ``floor``
-        [g] do not matter. `remedy`, unless said otherwise."""
+        """Its remedy, with numbers where it can: for the ``largest`` of its coefficients, where what it makes up to
+        ``floor``, in the same unit but for the conditions, does not matter. `remedy`, unless said otherwise."""
         return self.remedy
 
     @property
@@ -154,3 +155,10 @@ def no_slope(s: Floats, coefficients: int = 3) -> Floats:
 
 def xyz(unit: str, name: str = "{}") -> tuple[Coefficient, ...]:
     return tuple(Coefficient(name.format(axis), unit, axis) for axis in "xyz")
+
+
+def held_within(remedy: str, largest: float, floor: float, unit: str) -> str:
+    """A remedy that says how steady is steady enough, for an effect that goes with a condition in ``unit``."""
+    if not 0 < floor < np.inf or not largest:
+        return remedy
+    return f"{remedy} Within ±{plain(floor / abs(largest), 2)} {unit} what it does is below the noise floor."

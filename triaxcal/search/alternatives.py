@@ -41,7 +41,8 @@ def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]
         # So few poses would have shown one effect or another whatever it was: also one that they cannot test.
         for other in search.untestable():
             name = other.effects[0].name
-            if name not in {e.name for e in now.effects} and other.trends < now.trends + NEAR:
+            near = search.against_trends(other) < search.against_trends(now) + NEAR
+            if near and name not in {e.name for e in now.effects}:
                 out.setdefault(name, other)
     return out
 

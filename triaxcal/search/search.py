@@ -46,8 +46,8 @@ PARTNERS = 60
 
 @dataclass(frozen=True)
 class Model:
-    """Effects in the model, fitted: ``chi2`` of the residuals, the price of the effects, and the deviance of the
-    ``trends`` inside the poses from those that it foretells."""
+    """Effects in the model, fitted: ``chi2`` of the residuals, the price of the effects, and the sum of squares of the
+    ``trends`` inside the poses beside those that it foretells."""
 
     effects: tuple[Effect, ...]
     state: State
@@ -114,8 +114,7 @@ class Search:
         found = Model(effects, state, float(np.sum((r / s) ** 2)), price)
         if self.trends is None:
             return found
-        trends = np.array(self.trends.chi2(state, J / s[:, None]))
-        return replace(found, trends=float(deviance(trends, len(self.poses))))
+        return replace(found, trends=self.trends.chi2(state, J / s[:, None]))
 
     def model(self, effects: Sequence[Effect]) -> Model | None:
         """Fitted; None where the poses cannot carry it."""
@@ -162,11 +161,21 @@ class Search:
 
     def score(self, m: Model) -> float:
         """Deviance, more than the linear model has inside the poses, and price; the lower the better."""
-        return self.score_of_means(m) + m.trends - self.linear.trends
+        return self.score_of_means(m) + self.against_trends(m)
 
     def score_of_means(self, m: Model) -> float:
         """The same as far as the means of the poses tell it."""
         return float(deviance(np.array(m.chi2), self.left(m.effects))) + m.price
+
+    def against_trends(self, m: Model) -> float:
+        """By how much worse than the linear model it foretells the trends inside the poses, in deviance."""
+        own, linear = deviance(np.array([m.trends, self.linear.trends]), len(self.poses))
+        return float(own - linear)
+
+    def trends_p(self) -> float:
+        """Probability of trends as far as these from those that the model found foretells; 1 where none are known."""
+        n = len(self.poses)
+        return float(f_sf(self.found.trends / n, n, self.pure))
 
     def left_over(self, m: Model) -> bool:
         """Whether the residuals are more than noise."""
