@@ -48,7 +48,8 @@ class Counts:
     @classmethod
     def of(cls, seeds: int) -> Counts:
         """``seeds`` recordings of 26 poses with one large effect, the others in proportion."""
-        return cls(seeds, max(seeds // 3, 15), seeds, max(seeds // 4, 15), max(seeds // 3, 15), max(seeds // 3, 20))
+        many = max(2 * seeds // 3, 20)
+        return cls(seeds, max(seeds // 3, 15), seeds, max(seeds // 4, 15), many, many)
 
 
 def cases(counts: Counts, section: str) -> list[Case]:

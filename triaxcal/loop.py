@@ -34,7 +34,7 @@ from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start, with_history
 from triaxcal.unexplained import Unexplained, hints_of, unexplained_of
 
-ANYTHING = 4
+ANYTHING = 5
 """An effect beside others, with so many alternatives, is none."""
 ROUNDS_MOST = 3
 """Effects and spoiled poses are sought in turn so often."""
