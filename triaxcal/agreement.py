@@ -20,7 +20,8 @@ from triaxcal.errors import InvalidData
 from triaxcal.loop import Loop
 from triaxcal.search.alternatives import NEAR
 from triaxcal.search.candidates import Ground
-from triaxcal.search.search import Model, Search, deviance
+from triaxcal.search.search import Search
+from triaxcal.search.worth import Model, deviance
 
 LOOKED_AT = 2
 """Of each effect so many variants, the best for all units together in linear reckoning, are fitted in earnest."""

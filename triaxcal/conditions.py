@@ -29,6 +29,7 @@ from triaxcal.effects.contract import (
     rate_of,
 )
 from triaxcal.errors import InvalidData
+from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose
 
 
@@ -119,10 +120,10 @@ def _held_at(name: str, value: float, several: bool) -> str:
         return "at the middle of each recording's poses"
     if name in DERIVED:
         unit = {TIME: " s", HELD: " s"}.get(name, "")
-        return f"at {name} = {value:g}{unit}"
+        return f"at {name} = {plain(value, 6)}{unit}"
     if is_derived(name):
         return f"while {channel_of(name.removesuffix(rate_of('')))} does not change"
-    return f"at {channel_of(name)} = {value:g}{' °C' if name == TEMPERATURE else ''}"
+    return f"at {channel_of(name)} = {plain(value, 6)}{' °C' if name == TEMPERATURE else ''}"
 
 
 def at_reference(names: Iterable[str], n: int) -> dict[str, Floats]:

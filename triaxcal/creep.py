@@ -14,7 +14,8 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import conditions_elsewhere
-from triaxcal.effects.contract import SINCE_START, TIME, channel_of, is_derived
+from triaxcal.effects.contract import HELD, SINCE_START, TIME, channel_of, is_derived
+from triaxcal.effects.plugins import EffectFault
 from triaxcal.poses.pose import Pose
 
 
@@ -29,7 +30,10 @@ def with_creep_left(poses: Sequence[Pose], model: Calibration, *, elsewhere: boo
     """
     if not any(p.creep.any() for p in poses) or not model.sensor.effects:
         return list(poses)
-    change = _change(poses, model, elsewhere)
+    try:
+        change = _change(poses, model, elsewhere)
+    except EffectFault:  # known in the middle of the poses alone
+        return list(poses)
     left = [p.creep - c for p, c in zip(poses, change, strict=True)]
     return [
         _with(p, rest) if p.creep.any() and rest @ rest < p.creep @ p.creep else p
@@ -48,6 +52,8 @@ def _change(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> Float
     ends = []
     for half in (-length / 2, length / 2):
         at = dict(held)
+        if HELD in held:
+            at[HELD] = np.zeros(len(poses))  # moments, not means
         for name in held:
             if name in (TIME, SINCE_START):
                 at[name] = held[name] if elsewhere else held[name] + half

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import SINCE_START, TIME, channel_of, is_derived, rate_of
+from triaxcal.effects.contract import HELD, SINCE_START, TIME, channel_of, is_derived, rate_of
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise
 
@@ -46,7 +46,9 @@ class Trends:
             middle,
             u=_moved(problem.u, np.array([p.trend for p in poses])),
             covariance=np.concatenate([middle.covariance] * len(PLACES)),
-            channels={n: _moved(v, change[n]) for n, v in problem.channels.items()},
+            # A moment is asked for, not a mean over the pose.
+            channels={n: _moved(v, change[n]) for n, v in problem.channels.items()}
+            | {HELD: np.zeros(len(PLACES) * len(poses))},
         )
         return cls(inside, middle, errors)
 

@@ -171,3 +171,14 @@ def test_the_noise_floor_of_held_out_poses_has_only_the_creep_that_the_model_doe
     assert loop.held_out is not None
     assert loop.held_out.noise_floor_g == pytest.approx(SIGMA_G, rel=0.1)
     assert loop.held_out.after_rms_g < 2 * SIGMA_G
+
+
+def test_a_step_between_two_poses_explains_no_creep_inside_them(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    step = effect_named("bias_step").shaped({"at": 10 * HOLD_S})
+    sensor = replace(paper_unit, effects=((step, np.array([2e-3, -1e-3, 3e-3])),))
+    poses = noisy_poses(sensor, twenty_six, SIGMA_G, np.random.default_rng(0), hold_s=HOLD_S)
+    turned = [replace(p, start_s=p.start_s + 1.0, end_s=p.end_s - 1.0) for p in poses]
+    creep = 0.5 * paper_unit.scale_factor * np.array([2e-3, -1e-3, 3e-3])
+    creeps = [replace(p, creep=creep, covariance=p.covariance + np.outer(creep, creep) / 12) for p in turned]
+    model = fit(turned, signs=MINUS, effects=[step])
+    assert [p.creep.tolist() for p in with_creep_left(creeps, model)] == [creep.tolist()] * 26

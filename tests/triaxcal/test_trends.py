@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from triaxcal.conditions import held_at
 from triaxcal.effects import effect_named
-from triaxcal.effects.contract import Effect
+from triaxcal.effects.contract import TIME, Coefficient, Effect, no_slope, on_each_axis, per_axis, per_axis_slope, xyz
+from triaxcal.effects.plugins import Foreign
 from triaxcal.loop import diagnose
-from triaxcal.poses.pose import Pose
+from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.problem import State, linearise, solve
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start
-from triaxcal.synthetic import noisy_poses
+from triaxcal.stillness.detector import StillnessDetector
+from triaxcal.synthetic import Tumble, noisy_poses
 from triaxcal.trends import Trends
 
 MINUS = (-1.0, -1.0, -1.0)
@@ -150,13 +154,86 @@ def test_what_is_left_and_moves_inside_the_poses_is_said_to_go_with_the_time(
     assert [moves in loop.unexplained.lead for loop in loops] == [True, False]
 
 
+def test_a_step_between_two_poses_is_no_slope_inside_them(paper_unit: Sensor, fourteen: np.ndarray) -> None:
+    """Hundreds of times what noise does, while the unit is turned from the eighth pose to the ninth."""
+    path = Tumble(fourteen, hold_s=10.0, move_s=1.5)
+    t_s = np.arange(int(100 * path.round_s)) / 100
+    at_s = 8 * path.step_s - 0.75
+    step, size = effect_named("bias_step").shaped({"at": at_s}), np.array([3e-3, -2e-3, 1.5e-3])
+    total = 0.0
+    for seed in range(10):
+        noise = 1e-4 * np.random.default_rng(seed).standard_normal((len(t_s), 3))
+        u = paper_unit.output(path.specific_force(t_s), {}) + noise
+        detector = StillnessDetector()
+        detector.feed((t_s * 1e9).astype(np.int64), u + np.outer(t_s >= at_s, size * paper_unit.scale_factor), {})
+        detector.finish()
+        total += misfit(poses_of(detector.windows(), detector.spans()), (step,))
+    assert total / 140 == pytest.approx(1, abs=0.35)
+
+
+@dataclass(frozen=True)
+class Bowl(Effect):
+    """Four coefficients that come together: the square of each axis, and a drift of the first."""
+
+    name: str = "bowl"
+    coefficients: tuple[Coefficient, ...] = (*xyz("1/g"), Coefficient("drift", "g/s"))
+    needs: tuple[str, ...] = (TIME,)
+    remedy: str = "None."
+
+    def basis(self, s: np.ndarray, conditions: Mapping[str, np.ndarray]) -> np.ndarray:
+        return np.concatenate([per_axis(s**2), on_each_axis(conditions[TIME])[:, :, :1]], axis=2)
+
+    def slope(self, s: np.ndarray, conditions: Mapping[str, np.ndarray]) -> np.ndarray:
+        return np.concatenate([per_axis_slope(2 * s), no_slope(s, 1)], axis=3)
+
+
 def test_of_poses_too_few_for_an_effect_its_name_is_in_the_lead(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    """Thirteen leave four degrees of freedom, and a step has three coefficients and a moment."""
-    step = effect_named("bias_step").shaped({"at": 6 * HOLD_S})
+    """Thirteen leave four degrees of freedom: anything of four coefficients explains them."""
     rng = np.random.default_rng(3)
-    ups = twenty_six[rng.permutation(26)[:13]]
-    loop = diagnose(
-        moving(paper_unit, ups, rng, ((step, np.array([2e-3, -3e-3, 1.5e-3])),)), signs=MINUS, catalogue=[step]
-    )
+    poses = moving(paper_unit, twenty_six[rng.permutation(26)[:13]], rng, ((SQUARE, np.array([2e-3, -1e-3, 3e-3])),))
+    loop = diagnose(poses, signs=MINUS, catalogue=[Bowl()])
+    assert loop.findings == ()
     assert loop.unexplained.significant
-    assert "these poses are too few to test bias_step" in loop.unexplained.lead
+    assert "these poses are too few to test bowl" in loop.unexplained.lead
+
+
+@dataclass(frozen=True)
+class Table(Effect):
+    """What temperature does to the bias, by a table that ends where the means of these poses end."""
+
+    name: str = "table"
+    coefficients: tuple[Coefficient, ...] = xyz("g/K")
+    needs: tuple[str, ...] = ("temp_c",)
+    remedy: str = "Make the table longer."
+    end_k: float = 2.0
+
+    def basis(self, s: np.ndarray, conditions: Mapping[str, np.ndarray]) -> np.ndarray:
+        if np.abs(conditions["temp_c"]).max() > self.end_k:
+            raise ValueError("outside the table")
+        return on_each_axis(conditions["temp_c"])
+
+    def slope(self, s: np.ndarray, conditions: Mapping[str, np.ndarray]) -> np.ndarray:
+        return no_slope(s)
+
+    def advice(self, largest: float, floor: float) -> str:
+        raise NotImplementedError
+
+    @property
+    def absent(self) -> str:
+        raise NotImplementedError
+
+
+def test_an_effect_of_another_package_that_is_known_at_the_means_alone_is_judged_by_them(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = moving(paper_unit, twenty_six, np.random.default_rng(4), ((TEMPERATURE, SENSITIVITY),))
+    means = np.array([p.channels["temp_c"] for p in poses])
+    table = Table(end_k=float(np.abs(means - round(float(means.mean()), 1)).max()) + 0.01)
+    # They creep, too.
+    creeping = [replace(p, creep=p.trend, covariance=p.covariance + np.outer(p.trend, p.trend) / 12) for p in poses]
+    for seen in (poses, creeping):
+        loop = diagnose(seen, signs=MINUS, catalogue=[Foreign(table, "the package of a table")])
+        (finding,) = loop.findings
+        assert (finding.effect, finding.remedy) == ("table", table.remedy)
+        effects = [effect for effect, _ in loop.after.sensor.effects]
+        assert held_at(effects, loop.after.channel_reference)[0].startswith("at temp_c = ")

@@ -57,11 +57,17 @@ class Foreign(Wrapped):
         return tuple(self.whole.needs)
 
     def advice(self, largest: float, floor: float) -> str:
-        return str(self._asked(lambda: self.whole.advice(largest, floor)))
+        try:
+            return str(self._asked(lambda: self.whole.advice(largest, floor)))
+        except EffectFault:  # words only
+            return self.remedy
 
     @property
     def absent(self) -> str:
-        return str(self._asked(lambda: self.whole.absent))
+        try:
+            return str(self._asked(lambda: self.whole.absent))
+        except EffectFault:
+            return ""
 
     @property
     def lasting(self) -> bool:

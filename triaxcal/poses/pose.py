@@ -217,7 +217,7 @@ def _logged(w: Windows, s: Span) -> dict[str, _Logged]:
         values = channel[first:last] - channel[first:last].mean()
         middle, rate, bend = gain @ values
         scatter = float(np.sqrt(np.sum((values - powers @ [middle, rate, bend]) ** 2) / max(len(t_s) - 3, 1)))
-        # A step of a coarse thermometer in the middle of what is looked at makes a slope of three quarters of it.
+        # Of the order of the slope that a step of a coarse thermometer makes.
         step = _step(channel)
         out[name] = _Logged(
             error=scatter / np.sqrt(len(s.used)),
@@ -230,7 +230,8 @@ def _logged(w: Windows, s: Span) -> dict[str, _Logged]:
 
 
 def _step(channel: Floats) -> float:
-    """By how much a channel moves where it stands still between its moves; zero where it is always on the move."""
+    """By how much a channel moves where it stands still between its moves; zero where it is always on the move. A step
+    that falls inside a window makes two moves, so it is more than half a step."""
     moves = np.abs(np.diff(channel))
     return float(np.median(moves[moves > 0])) if 0 < np.count_nonzero(moves) < len(moves) / 2 else 0.0
 

@@ -2,6 +2,7 @@
 
 from triaxcal.search.alternatives import NEAR, alternatives
 from triaxcal.search.apart import telling_apart
-from triaxcal.search.search import FAMILYWISE, Model, Nearest, Search
+from triaxcal.search.search import Nearest, Search
+from triaxcal.search.worth import FAMILYWISE, Model
 
 __all__ = ["FAMILYWISE", "NEAR", "Model", "Nearest", "Search", "alternatives", "telling_apart"]

@@ -9,7 +9,8 @@ import numpy as np
 
 from triaxcal.effects.contract import Effect
 from triaxcal.search.candidates import Candidate, Ground
-from triaxcal.search.search import FAMILYWISE, Model, Search
+from triaxcal.search.search import Search
+from triaxcal.search.worth import FAMILYWISE, Model
 
 NEAR = 10.0
 """An alternative is out where it is worse by so much in deviance and price. Of two effects that differ by δ standard

@@ -23,7 +23,8 @@ from triaxcal.effects.contract import (
 )
 from triaxcal.figures import plain
 from triaxcal.plan.directions import directions, spiral
-from triaxcal.search.search import Model, Search
+from triaxcal.search.search import Search
+from triaxcal.search.worth import Model
 
 SPHERE = 400
 APART_DEG = 40.0

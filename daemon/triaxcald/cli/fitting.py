@@ -180,12 +180,12 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
 def _write(a: argparse.Namespace, measured: Measured, document: documents.Document) -> None:
     if measured.unit:
         document["unit"] = dict(measured.unit)  # so that it cannot be written to another
+    if a.report:  # before anything is written
+        from triaxcald.report.page import render_report  # matplotlib, which nothing else needs
+        from triaxcald.report.stream import overview_of
     if a.output:
         write_text(a.output, documents.to_text(document))
     if a.report:
-        from triaxcald.report.page import render_report  # matplotlib, which nothing else needs
-        from triaxcald.report.stream import overview_of
-
         limits = {"limits": {"rms_g": a.limit}} if a.limit else None
         unit = chosen(a, measured).output_unit
         overview = overview_of(measured.windows, measured.poses, unit) if measured.windows is not None else None

@@ -76,7 +76,7 @@ def guide(
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
     if found >= wanted and not due:
         hint = "done"
-    elif 0 < still_s < hold_s:
+    elif 0 < still_s < hold_s and not enough[-1]:
         hint = f"hold still, {still_s:.1f} of {hold_s:.1f} s"
     elif due:
         hint = f"next: {_nearest(targets, distinct[0])}once more, as at first"

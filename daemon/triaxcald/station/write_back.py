@@ -92,9 +92,10 @@ class WriteBack:
             raw_sha256=check.digest.hexdigest(),
         )
         self.writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
-        if found.poses and found.rms_g is None:
+        if found.rms_g is None:
             faults = ", ".join(dict.fromkeys(p.fault for p in found.untrusted))
-            raise Refused(f"no check pose can be trusted: {len(found.poses)} left out ({faults})")
+            why = f"no check pose can be trusted: {len(found.poses)} left out ({faults})"
+            raise Refused(why if found.poses else "there is no check pose")
         verdict = str(document["verdict"])
         self.state = {WITHIN: NEW_VERIFIED, UNJUDGED: NEW_UNJUDGED}.get(verdict, self.state)
         return verdict

@@ -111,7 +111,11 @@ async def _no_pose(check: Collection) -> None:
     """Check poses that nobody judges."""
 
 
-async def test_what_no_limit_judges_stays_and_is_not_said_to_be_verified(open_bench: OpenBench) -> None:
+async def test_what_no_limit_judges_stays_and_is_not_said_to_be_verified(
+    open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = Pose(0.0, 2.0, 200, np.array([1.0, 0.0, 0.0]), 1e-10 * np.eye(3), 50.0)
+    monkeypatch.setattr("triaxcald.station.write_back.corrected", lambda *_: verify([good], 1.0))
     async with open_bench() as bench:
         back = bench.write_back(_no_pose)
         assert back.state is None
@@ -176,15 +180,22 @@ async def test_no_number_of_cancellations_stops_the_old_calibration_from_coming_
         _holds_old(bench.served)
 
 
-async def test_check_poses_none_of_which_can_be_trusted_bring_the_old_calibration_back(
-    open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("faults", "why"),
+    [
+        (["stuck_output"], r"no check pose can be trusted: 1 left out \(stuck_output\)"),
+        ([], "there is no check pose"),
+    ],
+)
+async def test_without_a_check_pose_that_can_be_trusted_the_old_calibration_is_back(
+    open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch, faults: list[str], why: str
 ) -> None:
     """Whether the station has a limit or not."""
-    stuck = Pose(0.0, 2.0, 200, np.array([1.0, 0.0, 0.0]), 1e-10 * np.eye(3), 50.0, fault="stuck_output")
-    monkeypatch.setattr("triaxcald.station.write_back.corrected", lambda *_: verify([stuck], 1.0))
+    poses = [Pose(0.0, 2.0, 200, np.array([1.0, 0, 0]), 1e-10 * np.eye(3), 50.0, fault=fault) for fault in faults]
+    monkeypatch.setattr("triaxcald.station.write_back.corrected", lambda *_: verify(poses, 1.0))
     async with open_bench() as bench:
         back = bench.write_back(_no_pose)
-        with pytest.raises(StationError, match=r"no check pose can be trusted: 1 left out \(stuck_output\)"):
+        with pytest.raises(StationError, match=why):
             await bench.run(back)
         assert back.state == RESTORED
         _holds_old(bench.served)
