@@ -110,8 +110,7 @@ def lead(
 
 def _is_hint(why: str) -> bool:
     """Whether the reason why an effect was passed over is any other than that it may well be chance."""
-    said, _, p = why.partition("p = ")
-    return bool(said) or not p or float(p) < HINT
+    return not why.startswith("p ") or float(why.removeprefix("p ").removeprefix("< ")) < HINT
 
 
 def _clear_patterns(after: Calibration, used: Sequence[PoseResult], patterns: Sequence[_Pattern]) -> list[str]:

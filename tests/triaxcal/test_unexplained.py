@@ -185,8 +185,8 @@ def test_beside_effects_in_the_model_nothing_is_made_up(
 def test_effects_that_came_near_are_told_with_their_reasons(fitted: Fitted, ups: np.ndarray) -> None:
     rng = np.random.default_rng(1000)
     c = fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)))
-    text = lead(c, {"warm_up": "p = 0.02", "hysteresis": "the poses cannot carry it", "bias_step": "p = 0.03"})
-    assert "the nearest effect is warm_up, not adopted: p = 0.02" in text
+    text = lead(c, {"warm_up": "p 0.02", "hysteresis": "the poses cannot carry it", "bias_step": "p 0.03"})
+    assert "the nearest effect is warm_up, not adopted: p 0.02" in text
     assert "hysteresis, not adopted: the poses cannot carry it" in text
     assert "bias_step" not in text
 
@@ -194,9 +194,9 @@ def test_effects_that_came_near_are_told_with_their_reasons(fitted: Fitted, ups:
 def test_what_chance_may_well_have_done_is_no_lead(fitted: Fitted, ups: np.ndarray) -> None:
     rng = np.random.default_rng(1000)
     c = fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)))
-    text = lead(c, {"warm_up": "p = 1", "hysteresis": "p = 0.2", "bias_step": "p = 0.04"})
-    assert text == "the nearest effect is bias_step, not adopted: p = 0.04"
-    assert lead(c, {"warm_up": "p = 1"}) == "no candidate comes near, and no pose, pattern or channel stands out"
+    text = lead(c, {"warm_up": "p 1", "hysteresis": "p 0.2", "bias_step": "p 0.04"})
+    assert text == "the nearest effect is bias_step, not adopted: p 0.04"
+    assert lead(c, {"warm_up": "p 1"}) == "no candidate comes near, and no pose, pattern or channel stands out"
 
 
 def test_numbers_of_a_lead_have_no_exponent(fitted: Fitted, ups: np.ndarray) -> None:

@@ -12,6 +12,7 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration
 from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import Effect
+from triaxcal.figures import probability
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State
 from triaxcal.search.candidates import Candidate, Ground, candidates_of
@@ -201,7 +202,7 @@ class Search(Worth):
         name = _named(trial, now)
         p = max(self.earned(e, [o for o in trial.effects if o is not e], trial) for e in new)
         if p >= FAMILYWISE:
-            why = f"p = {min(1.0, p):.2g}"
+            why = f"p {probability(min(1.0, p))}"
         elif self.left_over(trial) and now.chi2 - trial.chi2 < MOST * (trial.chi2 - self.left(trial.effects)):
             # Something else, part of which looks like this: a name is earned by explaining most of what is there.
             why = "it explains less than nine tenths of what is there"

@@ -112,7 +112,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
             ["device's own output", micro(v["before_rms_g"]), micro(v["after_rms_g"]), micro(v["noise_floor_g"])]
         )
     table(
-        f"unit {o.unit}, serial {o.certified.document['unit']['serial']}: error of the magnitude, µg rms",
+        f"unit {o.unit}, serial {o.certified.document['unit']['serial'] or 'unknown'}: error of the magnitude, µg rms",
         ["", "before", "after", "noise floor"],
         [*rows, *extra],
     )
