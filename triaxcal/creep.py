@@ -18,6 +18,9 @@ from triaxcal.effects.contract import HELD, SINCE_START, TIME, channel_of, is_de
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.poses.pose import Pose
 
+ASLANT = 0.05
+"""How far the direction of the measured vector that poses know of themselves is off, at most."""
+
 
 def without_creep(poses: Sequence[Pose]) -> list[Pose]:
     """The same poses with the scatter about their creep alone in their covariance."""
@@ -34,20 +37,37 @@ def with_creep_left(poses: Sequence[Pose], model: Calibration, *, elsewhere: boo
         change = _change(poses, model, elsewhere)
     except EffectFault:  # known in the middle of the poses alone
         return list(poses)
-    left = [p.creep - c for p, c in zip(poses, change, strict=True)]
+    left = [_beside(p.creep, c, g) for p, c, g in zip(poses, change, _outward(poses, model, elsewhere), strict=True)]
     return [
         _with(p, rest) if p.creep.any() and rest @ rest < p.creep @ p.creep else p
         for p, rest in zip(poses, left, strict=True)
     ]
 
 
-def _change(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> Floats:
-    """(n,3) by how much the model's effects change the outputs from the beginning of each pose to its end."""
+def _beside(creep: Floats, change: Floats, outward: Floats) -> Floats:
+    """What ``change`` leaves of a pose's creep. Of a pose that only turns, whose |a| stays within its noise, only the
+    turn was taken for creep (`triaxcal.poses.pose`), and so is what is left."""
+    left = creep - change
+    turns = abs(creep @ outward) <= ASLANT * np.linalg.norm(creep)
+    return np.asarray(left - (left @ outward) * outward if turns else left)
+
+
+def _outward(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> Floats:
+    """(n,3) unit gradients of |a| by the outputs."""
+    _, by_u = model.sensor.magnitude(np.array([p.mean for p in poses]), _held(poses, model, elsewhere))
+    return np.asarray(by_u / np.linalg.norm(by_u, axis=1, keepdims=True))
+
+
+def _held(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> dict[str, Floats]:
     sensor = model.sensor
     if elsewhere:
-        held = conditions_elsewhere(poses, model.channel_reference, sensor.scale_factor, sensor.bias)
-    else:
-        held = model.conditions_of(poses)
+        return conditions_elsewhere(poses, model.channel_reference, sensor.scale_factor, sensor.bias)
+    return dict(model.conditions_of(poses))
+
+
+def _change(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> Floats:
+    """(n,3) by how much the model's effects change the outputs from the beginning of each pose to its end."""
+    sensor, held = model.sensor, _held(poses, model, elsewhere)
     length = np.array([p.end_s - p.start_s for p in poses])
     ends = []
     for half in (-length / 2, length / 2):

@@ -72,7 +72,7 @@ def finding_of(
         reason=reason,
         remedy=effect.advice(_largest(after, effect), floor),
         step=step,
-        apart=tuple(telling_apart(search, effect, found)),
+        apart=tuple(dict.fromkeys(telling_apart(search, effect, found))),
     )
 
 
@@ -145,7 +145,10 @@ def advice_of(
         if f.verdict == "confounded":
             out.append(f"{f.effect} cannot be told from {', '.join(f.alternatives)} here: {'; '.join(f.apart)}")
     if unexplained.significant:
-        out.append("something is left that no candidate explains: look at the lead, and record more poses")
+        out.append(
+            "something is left that no candidate explains: look at the lead; take some directions again at another "
+            "azimuth and at another time, and log what else changes (temperature, supply, what stands nearby)"
+        )
     if undescribed:
         out.append(f"empirical: {undescribed}")
     for why in dict.fromkeys(blind.values()):

@@ -18,6 +18,7 @@ from triaxcal.conditions import at_reference
 from triaxcal.distributions import t_ppf
 from triaxcal.effects import CATALOGUE, Effect
 from triaxcal.errors import InvalidData
+from triaxcal.figures import micro_g
 from triaxcal.gravity import local_gravity_g
 from triaxcal.plan.directions import directions
 from triaxcal.problem import Problem, State, by_shape, linearise, parameters_by_theta
@@ -30,6 +31,10 @@ SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
 """Standard deviation, before any data, of a coefficient that the fit has not taken up: in references per kelvin, and
 per kelvin. Typical of a mass-market MEMS accelerometer's data sheet; a navigation unit is ten times better."""
 SPHERE = 200
+
+
+UNEXPLAINED = 0.01
+"""p of the lack of fit below which more than noise is left in single readings."""
 
 
 @dataclass(frozen=True)
@@ -141,8 +146,8 @@ def budget(calibration: Calibration, stated: Stated | None = None, level: float 
     found.sort(key=lambda c: -c.magnitude)
     return Budget(
         tuple(found),
-        _combined([(c, c.parameters) for c in found], calibration.dof, level),
-        _combined([(c, np.asarray(c.magnitude)) for c in found], calibration.dof, level),
+        _combined([(c, c.parameters) for c in found], calibration.dof, level, calibration.standard_errors),
+        _combined([(c, np.asarray(c.magnitude)) for c in found], calibration.dof, level, np.zeros(())),
         tuple(_not_evaluated(calibration, ground, stated)),
     )
 
@@ -318,11 +323,13 @@ def _rounding(calibration: Calibration, ground: _Ground, stated: Stated) -> list
     return [ground.component("register_rounding", "B", np.inf, np.diag(steps**2 / 12), how, by)]
 
 
-def _combined(lines: list[tuple[Component, Floats]], dof: float, level: float) -> Combined:
+def _combined(lines: list[tuple[Component, Floats]], dof: float, level: float, least: Floats) -> Combined:
     """Root sum of squares, and degrees of freedom by annex G.4. Noise and what residuals add to it are one source, of
-    the ``dof`` that the fit gives them, since the one is judged by the other.
+    the ``dof`` that the fit gives them, since the one is judged by the other. Never below what the fit by itself states
+    (``least``), though thermal effects may be why its residuals are so large.
     """
     variance = sum((u**2 for _, u in lines), start=np.zeros_like(lines[0][1]))
+    variance = np.maximum(variance, least**2)
     scatter = sum((u**2 for c, u in lines if c.evaluation == "A"), start=np.zeros_like(lines[0][1]))
     effective = variance**2 / np.maximum(scatter**2 / dof, 1e-300)
     return Combined(np.sqrt(variance), np.where(variance > 0, np.minimum(effective, DOF_MOST), DOF_MOST), level)
@@ -336,6 +343,12 @@ def _not_evaluated(calibration: Calibration, ground: _Ground, stated: Stated) ->
         out.append(f"temperature: there is no channel {TEMPERATURE}")
     elif stated.thermometer_k is None and _needs_temperature(ground.effects):
         out.append("thermometer: its uncertainty was not stated")
+    p, crossed = calibration.residual.lack_of_fit_p, calibration.residual.cross_validated_rms_g
+    if p is not None and p < UNEXPLAINED and crossed is not None:
+        out.append(
+            f"lack of fit of a single reading: {micro_g(crossed)} cross-validated, of which only what it does to the "
+            "parameters is above"
+        )
     if any(p.pose.dof <= 0 for p in calibration.poses):
         out.append("noise: some poses have no scatter inside to tell it from")
     return out

@@ -220,6 +220,35 @@ def test_what_nobody_stated_is_said_not_to_be_evaluated(paper_unit: Sensor, twen
     assert not [x for x in budget(c, Stated(reference=0.0)).not_evaluated if x.startswith("reference")]
 
 
+def test_no_expanded_uncertainty_is_below_the_standard_error_that_the_fit_states(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """A temperature that explains all that is beyond noise, and is not in the model."""
+    truth = replace(paper_unit, effects=((effect_named("temperature_bias"), np.array([3e-4, -2e-4, 1e-4])),))
+    channels = {"temp_c": 25 + 2 * np.sin(np.arange(26) * 1.7)}
+    rng = np.random.default_rng(5)
+    poses = noisy_poses(truth, twenty_six, NOISE, rng, channels=channels, channel_reference={"temp_c": 25.0})
+    c = fit(poses, signs=SIGNS, aside=())
+    assert c.inflation > 5
+    b = budget(c)
+    assert np.all(b.parameters.standard >= c.standard_errors)
+    assert np.all(b.parameters.expanded > c.standard_errors)
+
+
+def test_what_a_single_reading_lacks_is_said_to_be_in_no_line(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    rng = np.random.default_rng(2)
+    poses = noisy_poses(paper_unit, twenty_six, NOISE, rng)
+    told = [replace(p, covariance=p.covariance / 25) for p in poses]
+    said = [
+        [x for x in budget(fit(ps, signs=SIGNS, aside=())).not_evaluated if "single reading" in x]
+        for ps in (poses, told)
+    ]
+    assert said[0] == []
+    crossed = fit(told, signs=SIGNS, aside=()).residual.cross_validated_rms_g
+    assert crossed is not None
+    assert said[1][0].startswith(f"lack of fit of a single reading: {crossed * 1e6:.1f} µg cross-validated")
+
+
 @pytest.mark.parametrize("value", [-1e-6, float("nan"), float("inf")])
 def test_uncertainties_that_are_none_are_refused(value: float) -> None:
     with pytest.raises(InvalidData, match="reference"):

@@ -116,3 +116,23 @@ def writable(path: Path | None) -> None:
     """Fail before the work, not after it, where a result could not be written. Raises InputError."""
     if path is not None and not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
+
+
+def keep_apart(chosen: argparse.Namespace) -> None:
+    """Raises InputError, before anything is read or written, where a file is to be written over one that is read, or
+    two files over each other."""
+    written = {
+        f"--{name}": path for name in ("output", "report") if isinstance(path := getattr(chosen, name, None), Path)
+    }
+    read = [v for name, value in vars(chosen).items() if f"--{name}" not in written for v in _paths(value)]
+    for option, path in written.items():
+        if path.is_file() and any(v.is_file() and v.samefile(path) for v in read):
+            raise InputError(f"{option}: {path}: it would overwrite what is read; write to another file")
+    if len(written) > len({path.absolute() for path in written.values()}):
+        raise InputError(f"--output, --report: {path}: one would overwrite the other; write to two files")
+
+
+def _paths(value: object) -> list[Path]:
+    if isinstance(value, list):
+        return [p for v in value for p in _paths(v)]
+    return [Path(value)] if isinstance(value, (str, Path)) and "\0" not in str(value) else []

@@ -11,7 +11,7 @@ from importlib.metadata import version
 
 from triaxcal.errors import InvalidData, Refused
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
-from triaxcald.cli.arguments import OneLineParser
+from triaxcald.cli.arguments import OneLineParser, keep_apart
 from triaxcald.cli.console import say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import DaemonError
@@ -53,6 +53,7 @@ def main(arguments: Sequence[str]) -> int:
         return int(e.code or 0)
     code: int = DONE
     try:
+        keep_apart(chosen)
         code = chosen.run(chosen)
         sys.stdout.flush()
         return code

@@ -65,7 +65,7 @@ def show_budget(b: Budget, choice: Choice) -> None:
     by = small.in_words(b.dominant.halved_by)
     print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
     for line in b.not_evaluated:
-        print(f"not evaluated: {line}")
+        print(f"not evaluated: {small.in_words(line)}")
 
 
 def show_loop(loop: Loop, choice: Choice) -> None:

@@ -262,3 +262,23 @@ def test_a_reader_that_has_gone_is_no_error(arguments: list[str]) -> None:
     done = subprocess.run([PROGRAM, *arguments], stdout=writing, stderr=subprocess.PIPE, text=True, timeout=60)
     os.close(writing)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["fit", "a.csv", "-o", "a.csv"], "--output: a.csv: it would overwrite what is read"),
+        (["fit", "a.csv", "--report", "./a.csv"], "--report: a.csv: it would overwrite what is read"),
+        (["diagnose", "a.csv", "--check", "b.csv", "--report", "b.csv"], "--report: b.csv: it would overwrite what is"),
+        (["diagnose", "a.csv", "b.csv", "-o", "b.csv"], "--output: b.csv: it would overwrite what is read"),
+        (["fit", "a.csv", "-o", "same", "--report", "same"], "--output, --report: same: one would overwrite the other"),
+    ],
+)
+def test_nothing_is_written_over_what_is_read(
+    tmp_path: Path, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.csv", "b.csv"):
+        Path(name).write_text(HEADER + ROWS)
+    triaxcal(*arguments).failed(2, words)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == dict.fromkeys(("a.csv", "b.csv"), HEADER + ROWS)
