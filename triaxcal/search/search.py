@@ -94,7 +94,7 @@ class Search(Worth):
         """The best model with one or two effects more, where each of them earns its place."""
         trials = self._trials(now)
         for trial in sorted(trials, key=self.score):
-            if self.score(trial) >= self.score(now) or not self._earned(trial, now):
+            if not self._better(trial, now) or not self._earned(trial, now):
                 continue
             fitted = self.fitted(trial.effects)
             why = "the poses cannot carry it" if fitted is None else _no_better(fitted, self.best)
@@ -104,6 +104,10 @@ class Search(Worth):
             self.best = fitted
             return trial
         return None
+
+    def _better(self, trial: Model, now: Model) -> bool:
+        """By the means alone too: trends tell effects apart, and make none."""
+        return self.score(trial) < self.score(now) and self.score_of_means(trial) < self.score_of_means(now)
 
     def beside(self, now: Model) -> Beside:
         """What may come beside a model, in linear reckoning; the best of every effect with its shape refined."""
