@@ -108,3 +108,15 @@ def searched() -> Callable[..., Search]:
         return Search(problem, poses, MINUS, 1.0, catalogue, fit(poses, signs=MINUS, aside=()), linear)
 
     return make
+
+
+@pytest.fixture(scope="module")
+def poses(with_effects: Callable[..., Sensor], recorded: Callable[..., list[Pose]]) -> list[Pose]:
+    """With a square term on every axis inside."""
+    return recorded(with_effects(second_order_nonlinearity=[4e-4, -5e-4, 6e-4]), 0)
+
+
+@pytest.fixture(scope="module")
+def search(poses: list[Pose], searched: Callable[..., Search]) -> Search:
+    """Of these poses, before its first step."""
+    return searched(poses)

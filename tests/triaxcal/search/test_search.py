@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy import stats
 
 from triaxcal.effects import TIME, effect_named
@@ -16,20 +15,9 @@ from triaxcal.poses.pose import Pose
 from triaxcal.search import Search
 from triaxcal.sensor import Sensor
 
-Make = Callable[..., Sensor]
 Recorded = Callable[..., list[Pose]]
 Searched = Callable[..., Search]
 SECOND, WARMTH = effect_named("second_order_nonlinearity"), effect_named("temperature_bias")
-
-
-@pytest.fixture(scope="module")
-def poses(with_effects: Make, recorded: Recorded) -> list[Pose]:
-    return recorded(with_effects(second_order_nonlinearity=[4e-4, -5e-4, 6e-4]), 0)
-
-
-@pytest.fixture(scope="module")
-def search(poses: list[Pose], searched: Searched) -> Search:
-    return searched(poses)
 
 
 def test_what_is_there_is_found_and_no_more(search: Search) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -16,22 +14,8 @@ from triaxcal.effects.part import Part
 from triaxcal.poses.pose import Pose
 from triaxcal.search import Search
 from triaxcal.search.worth import deviance
-from triaxcal.sensor import Sensor
 
-Make = Callable[..., Sensor]
-Recorded = Callable[..., list[Pose]]
-Searched = Callable[..., Search]
 SECOND, WARMTH = effect_named("second_order_nonlinearity"), effect_named("temperature_bias")
-
-
-@pytest.fixture(scope="module")
-def poses(with_effects: Make, recorded: Recorded) -> list[Pose]:
-    return recorded(with_effects(second_order_nonlinearity=[4e-4, -5e-4, 6e-4]), 0)
-
-
-@pytest.fixture(scope="module")
-def search(poses: list[Pose], searched: Searched) -> Search:
-    return searched(poses)
 
 
 def chi2_by_scipy(poses: list[Pose], squared: bool) -> float:
