@@ -6,7 +6,7 @@ follows them is not disturbed by their moving inside the pose; a model that lack
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -33,11 +33,12 @@ def with_creep_left(poses: Sequence[Pose], model: Calibration, *, elsewhere: boo
     """
     if not any(p.creep.any() for p in poses) or not model.sensor.effects:
         return list(poses)
+    held = _held(poses, model, elsewhere)
     try:
-        change = _change(poses, model, elsewhere)
+        change = _change(poses, model, held, elsewhere)
     except EffectFault:  # known in the middle of the poses alone
         return list(poses)
-    left = [_beside(p.creep, c, g) for p, c, g in zip(poses, change, _outward(poses, model, elsewhere), strict=True)]
+    left = [_beside(p.creep, c, g) for p, c, g in zip(poses, change, _outward(poses, model, held), strict=True)]
     return [
         _with(p, rest) if p.creep.any() and rest @ rest < p.creep @ p.creep else p
         for p, rest in zip(poses, left, strict=True)
@@ -52,9 +53,9 @@ def _beside(creep: Floats, change: Floats, outward: Floats) -> Floats:
     return np.asarray(left - (left @ outward) * outward if turns else left)
 
 
-def _outward(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> Floats:
+def _outward(poses: Sequence[Pose], model: Calibration, held: Mapping[str, Floats]) -> Floats:
     """(n,3) unit gradients of |a| by the outputs."""
-    _, by_u = model.sensor.magnitude(np.array([p.mean for p in poses]), _held(poses, model, elsewhere))
+    _, by_u = model.sensor.magnitude(np.array([p.mean for p in poses]), held)
     return np.asarray(by_u / np.linalg.norm(by_u, axis=1, keepdims=True))
 
 
@@ -65,9 +66,9 @@ def _held(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> dict[st
     return dict(model.conditions_of(poses))
 
 
-def _change(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> Floats:
+def _change(poses: Sequence[Pose], model: Calibration, held: Mapping[str, Floats], elsewhere: bool) -> Floats:
     """(n,3) by how much the model's effects change the outputs from the beginning of each pose to its end."""
-    sensor, held = model.sensor, _held(poses, model, elsewhere)
+    sensor = model.sensor
     length = np.array([p.end_s - p.start_s for p in poses])
     ends = []
     for half in (-length / 2, length / 2):

@@ -62,7 +62,8 @@ class Trends:
         J = np.tensordot(slope, by_theta.reshape(len(slope), *weighted.shape), 1)
         here, _, error = linearise(self.middle, state)
         variance = error**2
-        for name in {n for e in state.effects for n in e.needs} & self.errors.keys():
+        # In one order whatever the process, or audits would differ in the last digits.
+        for name in sorted({n for e in state.effects for n in e.needs} & self.errors.keys()):
             channels = dict(self.middle.channels) | {name: self.middle.channels[name] + self.errors[name]}
             there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
             variance = variance + (there - here) ** 2

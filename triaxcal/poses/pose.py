@@ -163,7 +163,8 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
         radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
         creep = creep - radial[:, None] * out
     covariance = covariance + np.diag(_rounding(w, spans))
-    logged = [_logged(w, s) for s in spans]
+    steps = {name: _step(channel) for name, channel in w.channels.items()}
+    logged = [_logged(w, s, steps) for s in spans]
     return [
         Pose(
             start_s=held[i].start_s,
@@ -200,7 +201,7 @@ class _Logged(NamedTuple):
     bend_error: float
 
 
-def _logged(w: Windows, s: Span) -> dict[str, _Logged]:
+def _logged(w: Windows, s: Span, steps: Mapping[str, float]) -> dict[str, _Logged]:
     """By a parabola through the span and half its length on either side: a thermometer's steps and noise are spread
     over what is around the pose as well.
     """
@@ -218,7 +219,7 @@ def _logged(w: Windows, s: Span) -> dict[str, _Logged]:
         middle, rate, bend = gain @ values
         scatter = float(np.sqrt(np.sum((values - powers @ [middle, rate, bend]) ** 2) / max(len(t_s) - 3, 1)))
         # Of the order of the slope that a step of a coarse thermometer makes.
-        step = _step(channel)
+        step = steps[name]
         out[name] = _Logged(
             error=scatter / np.sqrt(len(s.used)),
             rate=float(rate) / scale,
