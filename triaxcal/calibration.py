@@ -54,7 +54,8 @@ class Calibration:
     conditions are counted; ``inflation`` is the factor on the standard errors by which residuals exceed the noise:
     at least 1, unless no pose knows its noise (then the residuals alone set it). ``dof`` are the effective degrees of
     freedom behind the standard errors. ``shape_errors`` are standard errors of the effects' shapes, by "effect.name";
-    ``shared`` are coefficients, named so, that only a combination of them is known of.
+    ``shared`` are coefficients, named so, that only a combination of them is known of. ``trends``: how |a| goes inside
+    the poses was fitted along with their means.
     """
 
     sensor: Sensor
@@ -69,6 +70,7 @@ class Calibration:
     dof: float
     shape_errors: Mapping[str, float] = field(default_factory=dict)
     shared: frozenset[str] = frozenset()
+    trends: bool = False
     blind_to: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 

@@ -10,19 +10,23 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration, PoseResult, Residual
 from triaxcal.effects.contract import Effect
+from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.outliers import Spoiled, spoiled
 from triaxcal.plan.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
-from triaxcal.problem import NOT_STILL, Problem, State, by_shape, linearise, parameters_by_theta, solve
+from triaxcal.problem import NOT_STILL, Problem, State, by_shape, everything, linearise, parameters_by_theta, solve
 from triaxcal.pure_error import lack_of_fit_p, pose_dof, pure_error_dof, raised
 from triaxcal.start import DILUTION_LIMIT, problem_of, start, with_history
+from triaxcal.trends import left_by_means, trends_p, with_trends
 
 DILUTION_WARNING = 10.0
 SPREAD_WARNING = 15.0
 """Dilution times the root of the number of poses: about 5 where they are all over the sphere, 25 over half of it."""
 SPOILED_ROUNDS = 4
 SIGNIFICANT = 0.05
+CONTRADICTED = 0.01
+"""p of the trends inside the poses below which the coefficients are left to the means."""
 STRAIGHT = 1e-4
 """Steps of the scaled parameters up to which the fit is straight, to about this share of the step."""
 
@@ -54,9 +58,8 @@ def fit(
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
     verdict = Spoiled(tuple(sorted(aside))) if aside is not None else Spoiled()
-    state = solve(everything, begin, tuple(effects)) if not verdict.rows else begin
-    if aside is None:
-        verdict = _spoiled(everything, state, poses)
+    if aside is None and len(poses) > 9 + sum(len(e.coefficients) for e in effects):
+        verdict = _spoiled(everything, solve(everything, begin, tuple(effects)), poses)
     found = verdict.rows
     kept, problem = list(poses), everything
     if found:
@@ -64,8 +67,7 @@ def fit(
         problem = problem_of(kept, signs=signs, reference=reference)
         begin = start(problem, kept, signs)
         problem = with_history(problem, kept, begin.sensor(problem))
-        state = solve(problem, begin, tuple(effects))
-    calibration = _conclude(problem, kept, state, verdict)
+    calibration = _conclude(*_solved(problem, kept, begin, effects), kept, verdict)
     if found:
         calibration = _with_aside(calibration, poses, verdict)
     if verdict.rivals:
@@ -73,6 +75,22 @@ def fit(
         warning = f"some poses were spoiled, and these cannot be told from each other, so none is left out: {sets}"
         calibration = replace(calibration, warnings=(warning, *calibration.warnings))
     return calibration
+
+
+def _solved(problem: Problem, poses: Sequence[Pose], begin: State, effects: Sequence[Effect]) -> tuple[Problem, State]:
+    """What was fitted, and the fit: to the means, and to the trends inside the poses as far as these agree with them.
+
+    Trends that do not agree go with something else, or the effect acts later than its channel says.
+    """
+    both = with_trends(problem, poses, effects)
+    if both is not None:
+        try:
+            state = solve(both, begin, tuple(effects))
+        except (Refused, EffectFault):  # an effect may be known at the means alone
+            state = None
+        if state is not None and trends_p(both, state, pure_error_dof(poses)) >= CONTRADICTED:
+            return both, state
+    return problem, solve(problem, begin, tuple(effects))
 
 
 def _spoiled(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
@@ -134,19 +152,22 @@ def _with_aside(calibration: Calibration, poses: Sequence[Pose], verdict: Spoile
     return replace(calibration, poses=results, warnings=(warning, *calibration.warnings))
 
 
-def _conclude(problem: Problem, poses: Sequence[Pose], state: State, verdict: Spoiled) -> Calibration:
-    r, J, s = linearise(problem, state)
-    n, p = J.shape
-    q, _ = np.linalg.qr(J / s[:, None])
-    leverage = np.clip((q**2).sum(axis=1), 0.0, 1.0)
+def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
+    r, _, s = linearise(problem, state)
+    every_r, J, every_s = everything(problem, state)
+    weighted = J / every_s[:, None]
+    n, p = len(r), J.shape[1]
+    q, _ = np.linalg.qr(weighted)
+    leverage = np.clip((q**2).sum(axis=1), 0.0, 1.0)[:n]
     free = np.sqrt(np.maximum(1 - leverage, 0.0))
     studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
-    chi2 = float(np.sum((r / s) ** 2))
     # What the shape of an effect was chosen by is spent, though no column of the Jacobian stands for it.
-    left = n - p - sum(len(e.shape) for e in state.effects)
+    spent = p + sum(len(e.shape) for e in state.effects)
+    chi2, left = float(np.sum((every_r / every_s) ** 2)), len(every_r) - spent
+    if problem.further is not None and n > spent:
+        chi2, left = left_by_means(problem, state), n - spent
     doubtful = len(verdict.rows) if verdict.doubtful else 0
-    inflation, dof = raised(chi2 + verdict.doubtful, left + doubtful, pure_error_dof(poses, leverage / p))
-    crossed = cross_validated(problem, state, leverage)
+    inflation, dof = raised(chi2 + verdict.doubtful, left + doubtful, pure_error_dof(poses, leverage / leverage.sum()))
     sensor = state.sensor(problem)
     direction = sensor.specific_force(problem.u, problem.conditions)
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
@@ -155,13 +176,13 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State, verdict: Sp
     if not spread < DILUTION_LIMIT:
         # No scale factor and a bias of one reference fit anything: |a| is right everywhere and means nothing.
         raise Refused(f"the fit ran away, to a dilution of {spread:.3g}; {NOT_STILL}")
-    norms = np.linalg.norm(J / s[:, None], axis=0)
+    norms = np.linalg.norm(weighted, axis=0)
     shapes = by_shape(problem, state)
-    covariance = _covariance(problem, state, np.concatenate([J, shapes], axis=1) / s[:, None]) * inflation**2
+    covariance = _covariance(problem, state, np.concatenate([J, shapes], axis=1) / every_s[:, None]) * inflation**2
     residual = Residual(
         rms_g=float(np.sqrt(np.mean(r**2))),
         max_abs_g=float(np.max(np.abs(r))),
-        cross_validated_rms_g=crossed,
+        cross_validated_rms_g=cross_validated(problem, state),
         noise_floor_g=float(np.sqrt(np.mean(s**2))),
         lack_of_fit_p=lack_of_fit_p(chi2, left, pure_error_dof(poses)),
     )
@@ -175,11 +196,12 @@ def _conclude(problem: Problem, poses: Sequence[Pose], state: State, verdict: Sp
             PoseResult(pose, direction[i], float(r[i]), float(s[i]), float(studentized[i]), float(leverage[i]))
             for i, pose in enumerate(poses)
         ),
-        condition=float(np.linalg.cond(J / s[:, None] / np.maximum(norms, 1e-300))),
+        condition=float(np.linalg.cond(weighted / np.maximum(norms, 1e-300))),
         dilution=spread,
         inflation=inflation,
         dof=dof,
         shape_errors=_shape_errors(state, shapes, np.sqrt(np.diag(covariance)[p:])),
+        trends=problem.further is not None,
     )
     return replace(calibration, warnings=tuple(_warnings(calibration)))
 
@@ -207,20 +229,28 @@ def _shape_errors(state: State, columns: Floats, thousandths: Floats) -> dict[st
     }
 
 
-def cross_validated(problem: Problem, state: State, leverage: Floats) -> float | None:
+def cross_validated(problem: Problem, state: State) -> float | None:
     """rms of each pose's |a| − reference under a fit to all the others; None where a pose alone carries a parameter.
 
     ``state`` is at the minimum. What leaving a pose out moves is exact for a linear problem; where that is so far that
     the curvature could show, the rest is fitted again from there.
     """
+    r, J, s = everything(problem, state)
     n = len(problem.u)
-    if n <= len(state.theta) or np.max(leverage) > 1 - 1e-6:
+    if len(r) <= len(state.theta):
         return None
-    r, J, s = linearise(problem, state)
     norms = np.maximum(np.linalg.norm(J / s[:, None], axis=0), 1e-300)
-    gain = np.linalg.pinv(J / s[:, None] / norms, rcond=1e-14) / norms[:, None]
-    moved = (gain * (r / s / (1 - leverage))).T
-    misses = r / (1 - leverage)
+    weighted = J / s[:, None] / norms
+    gain = np.linalg.pinv(weighted, rcond=1e-14)
+    # By pose (n,k): its mean, and what else it tells, which is left out with it.
+    of_pose = np.arange(len(r)).reshape(-1, n).T
+    hat = np.einsum("nkp,pnl->nkl", weighted[of_pose], gain[:, of_pose])
+    free = np.eye(of_pose.shape[1]) - hat
+    if np.linalg.eigvalsh(free).min() < 1e-6:
+        return None
+    misses = np.linalg.solve(free, (r / s)[of_pose][..., None])[..., 0]
+    moved = np.einsum("pnk,nk->np", gain[:, of_pose] / norms[:, None, None], misses)
+    misses = misses[:, 0] * s[:n]
     for i in np.flatnonzero(np.abs(moved).max(axis=1) > STRAIGHT):
         rest: Ints = np.delete(np.arange(n), i)
         without = solve(problem.only(rest), State(state.theta + moved[i], state.effects), state.effects, steps=3)

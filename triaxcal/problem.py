@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.sensor import Sensor
 
+Linearised = tuple[Floats, Floats, Floats]
+"""Residuals (n,), their derivatives by theta (n, 9+p), their standard errors (n,)."""
 NOT_STILL = "the poses do not look like those of one still triad"
 STEPS_MOST = 60
 NEARBY = 1e-6
@@ -30,9 +33,20 @@ CONVERGED = 1e-12
 """Relative step at which the search ends; the noise of any real pose is a million times larger."""
 
 
+class Further(Protocol):
+    """What poses tell beside their means: a residual of each, which the model should make zero."""
+
+    def linearise(self, state: State, jacobian: bool = True) -> Linearised:
+        """As `linearise` has it for the means."""
+        ...
+
+    def only(self, rows: Ints | slice) -> Self: ...
+
+
 @dataclass(frozen=True)
 class Problem:
-    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each."""
+    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each. ``further`` is
+    fitted along with the means."""
 
     u: Floats
     covariance: Floats
@@ -42,6 +56,7 @@ class Problem:
     half: Floats
     signs: Floats
     reference: float
+    further: Further | None = None
 
     @cached_property
     def conditions(self) -> dict[str, Floats]:
@@ -54,7 +69,8 @@ class Problem:
     def only(self, rows: Ints | slice) -> Problem:
         """The same problem with some of its poses."""
         channels = {n: v[rows] for n, v in self.channels.items()}
-        return replace(self, u=self.u[rows], covariance=self.covariance[rows], channels=channels)
+        further = self.further and self.further.only(rows)
+        return replace(self, u=self.u[rows], covariance=self.covariance[rows], channels=channels, further=further)
 
 
 @dataclass(frozen=True)
@@ -100,7 +116,7 @@ def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: in
 
 def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps: int) -> State:
     for _ in range(steps):
-        r, J, s = linearise(problem, State(theta, effects))
+        r, J, s = everything(problem, State(theta, effects))
         if not (np.isfinite(J).all() and np.isfinite(r).all()):
             raise Refused(f"the fit ran away; {NOT_STILL}")
         norm = np.linalg.norm(J / s[:, None], axis=0)
@@ -109,7 +125,7 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
         cost = float(np.sum((r / s) ** 2))
         scale = 1.0
         for _ in range(12):
-            trial, _, _ = linearise(problem, State(theta + scale * step, effects), jacobian=False)
+            trial, _, _ = everything(problem, State(theta + scale * step, effects), jacobian=False)
             if np.sum((trial / s) ** 2) <= cost * (1 + 1e-9) + 1e-12:
                 break
             scale /= 2
@@ -122,7 +138,16 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
     return State(theta, effects)
 
 
-def linearise(problem: Problem, state: State, jacobian: bool = True) -> tuple[Floats, Floats, Floats]:
+def everything(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
+    """`linearise`, and where the problem has something further the same of that, after the means of all poses."""
+    means = linearise(problem, state, jacobian)
+    if problem.further is None:
+        return means
+    r, J, s = (np.concatenate(both) for both in zip(means, problem.further.linearise(state, jacobian), strict=True))
+    return r, J, s
+
+
+def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
     """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise (n,)."""
     sensor = state.sensor(problem)
     held = problem.conditions
@@ -141,21 +166,20 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> tuple[Fl
 
 
 def by_shape(problem: Problem, state: State) -> Floats:
-    """(n,m) derivatives of the residuals by the shapes of the effects (`Effect.shape`), in thousandths of each."""
-    sensor = state.sensor(problem)
+    """Derivatives of all residuals (`everything`) by the shapes of the effects (`Effect.shape`), (n,m), in thousandths
+    of each."""
     columns = []
-    for i, (effect, q) in enumerate(sensor.effects):
+    for i, effect in enumerate(state.effects):
         for name, (value, _) in effect.shape.items():
             sides = []
             for sign in (1, -1):
                 other = effect.shaped(
                     {k: v for k, (v, _) in effect.shape.items()} | {name: value * (1 + sign * NEARBY)}
                 )
-                pairs = [(other, q) if j == i else pair for j, pair in enumerate(sensor.effects)]
-                moved = replace(sensor, effects=tuple(pairs))
-                sides.append(np.linalg.norm(moved.specific_force(problem.u, problem.conditions), axis=1))
+                effects = (*state.effects[:i], other, *state.effects[i + 1 :])
+                sides.append(everything(problem, State(state.theta, effects), jacobian=False)[0])
             columns.append((sides[0] - sides[1]) / (2000 * NEARBY))
-    return np.array(columns).T if columns else np.empty((len(problem.u), 0))
+    return np.array(columns).T if columns else np.empty((len(everything(problem, state, jacobian=False)[0]), 0))
 
 
 def parameters_by_theta(problem: Problem, state: State) -> Floats:

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-from triaxcal.effects.contract import HELD, SINCE_START, TIME, channel_of, is_derived, rate_of
+from triaxcal.arrays import Floats, Ints
+from triaxcal.distributions import f_sf
+from triaxcal.effects.contract import HELD, SINCE_START, TIME, Effect, channel_of, is_derived, rate_of
 from triaxcal.poses.pose import Pose
-from triaxcal.problem import Problem, State, linearise
+from triaxcal.problem import Linearised, Problem, State, everything, linearise
 
 PLACES = np.linspace(-0.5, 0.5, 6)
 """Where in a pose the model is asked, from its beginning to its end: enough to follow a step or a steep decay."""
@@ -26,11 +27,12 @@ PLACES = np.linspace(-0.5, 0.5, 6)
 class Trends:
     """``inside`` are the poses at all `PLACES`, one place after the other, ``middle`` as they are in the middle, both
     with the covariance of the trends; ``errors`` (n,) by condition those of the changes that the conditions are said to
-    have gone through."""
+    have gone through, and ``moving`` the conditions that go through any."""
 
     inside: Problem
     middle: Problem
     errors: Mapping[str, Floats]
+    moving: frozenset[str]
 
     @classmethod
     def of(cls, problem: Problem, poses: Sequence[Pose]) -> Trends | None:
@@ -40,6 +42,7 @@ class Trends:
             return None
         length = np.array([p.end_s - p.start_s for p in poses])
         change, errors = _changes(problem, poses, length)
+        moving = frozenset(change)
         change |= {n: np.zeros(len(poses)) for n in problem.channels.keys() - change.keys()}
         middle = replace(problem, covariance=error[:, None, None] ** 2 * np.eye(3))
         inside = replace(
@@ -50,29 +53,78 @@ class Trends:
             channels={n: _moved(v, change[n]) for n, v in problem.channels.items()}
             | {HELD: np.zeros(len(PLACES) * len(poses))},
         )
-        return cls(inside, middle, errors)
+        return cls(inside, middle, errors, moving)
+
+    def linearise(self, state: State, jacobian: bool = True) -> Linearised:
+        """By how much |a| goes along each pose where it should stay, as `triaxcal.problem.linearise` has it."""
+        slope = PLACES / (PLACES @ PLACES)
+        everywhere, by_theta, _ = linearise(self.inside, state, jacobian)
+        n = len(self.middle.u)
+        r = slope @ everywhere.reshape(len(slope), n)
+        if not jacobian:
+            return r, by_theta, np.empty(0)
+        J = np.tensordot(slope, by_theta.reshape(len(slope), n, -1), 1)
+        here, _, error = linearise(self.middle, state)
+        variance = error**2
+        # In one order whatever the process, or audits would differ in the last digits.
+        for name in sorted({c for e in state.effects for c in e.needs} & self.errors.keys()):
+            channels = dict(self.middle.channels) | {name: self.middle.channels[name] + self.errors[name]}
+            there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
+            variance = variance + (there - here) ** 2
+        return r, J, np.sqrt(variance)
+
+    def only(self, rows: Ints | slice) -> Trends:
+        """Those of some of the poses."""
+        n = len(self.middle.u)
+        kept = np.arange(n)[rows]
+        inside = self.inside.only(np.concatenate([kept + n * k for k in range(len(PLACES))]))
+        return Trends(
+            inside, self.middle.only(rows), {name: error[rows] for name, error in self.errors.items()}, self.moving
+        )
 
     def chi2(self, state: State, weighted: Floats) -> float:
         """How far the trends are from those that a model foretells, as a sum of squares of n; as near as the means,
         whose weighted derivatives by theta (n, 9+p) are given, let the model come.
         """
-        everywhere, by_theta, _ = linearise(self.inside, state)
-        slope = PLACES / (PLACES @ PLACES)
-        r = slope @ everywhere.reshape(len(slope), -1)
-        J = np.tensordot(slope, by_theta.reshape(len(slope), *weighted.shape), 1)
-        here, _, error = linearise(self.middle, state)
-        variance = error**2
-        # In one order whatever the process, or audits would differ in the last digits.
-        for name in sorted({n for e in state.effects for n in e.needs} & self.errors.keys()):
-            channels = dict(self.middle.channels) | {name: self.middle.channels[name] + self.errors[name]}
-            there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
-            variance = variance + (there - here) ** 2
-        error = np.sqrt(variance)
+        r, J, error = self.linearise(state)
         stacked = np.concatenate([weighted, J / error[:, None]])
-        misses = np.concatenate([np.zeros(len(weighted)), r / error])
-        size = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
-        step = np.linalg.lstsq(stacked / size, misses, rcond=1e-13)[0]
-        return float(np.sum((misses - stacked / size @ step) ** 2))
+        return _unabsorbed(stacked, np.concatenate([np.zeros(len(weighted)), r / error]))
+
+    def touch(self, effects: Sequence[Effect]) -> bool:
+        """Whether any of the effects goes with something that moves inside the poses."""
+        return any(n in self.moving for e in effects for n in e.needs)
+
+
+def with_trends(problem: Problem, poses: Sequence[Pose], effects: Sequence[Effect]) -> Problem | None:
+    """The problem with the trends beside the means; None where they tell nothing of the effects."""
+    trends = Trends.of(problem, poses) if effects else None
+    return replace(problem, further=trends) if trends is not None and trends.touch(effects) else None
+
+
+def trends_p(problem: Problem, state: State, pure: float) -> float:
+    """Probability of trends as far as these from those that the model foretells, by the noise inside the poses, of
+    which ``pure`` degrees of freedom are known; ``state`` is that of a fit to everything."""
+    left = len(problem.u) - max(len(state.theta) - len(problem.u), 0)
+    return float(f_sf(left_by_trends(problem, state) / left, left, max(pure, 1.0)))
+
+
+def left_by_trends(problem: Problem, state: State) -> float:
+    """By how much the sum of squares of a fit to everything is larger than that of a fit to the means alone."""
+    r, _, s = everything(problem, state)
+    return max(float(np.sum((r / s) ** 2)) - left_by_means(problem, state), 0.0)
+
+
+def left_by_means(problem: Problem, state: State) -> float:
+    """The sum of squares that a fit to the means alone leaves; ``state`` is that of a fit to everything."""
+    r, J, s = linearise(problem, state)
+    return _unabsorbed(J / s[:, None], r / s)
+
+
+def _unabsorbed(columns: Floats, misses: Floats) -> float:
+    """Sum of squares of what is left of misses (n,) beside columns (n,p), however different these are in size."""
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    step = np.linalg.lstsq(columns / size, misses, rcond=1e-13)[0]
+    return float(np.sum((misses - columns / size @ step) ** 2))
 
 
 def _moved(values: Floats, change: Floats) -> Floats:

@@ -21,9 +21,10 @@ from triaxcal.errors import InvalidData
 from triaxcal.figures import micro_g
 from triaxcal.gravity import local_gravity_g
 from triaxcal.plan.directions import directions
-from triaxcal.problem import Problem, State, by_shape, linearise, parameters_by_theta
+from triaxcal.problem import Problem, State, by_shape, everything, linearise, parameters_by_theta
 from triaxcal.pure_error import DOF_MOST, pure_error_dof
 from triaxcal.start import problem_of, with_history
+from triaxcal.trends import with_trends
 
 LEVEL = 0.95
 TEMPERATURE = "temp_c"
@@ -166,13 +167,15 @@ class _Ground:
         self.problem = replace(problem, channel_reference=means | dict(calibration.channel_reference))
         self.state = State.of(self.problem, sensor)
         self.effects = self.state.effects
-        _, J, self.error = linearise(self.problem, self.state)
+        if calibration.trends:
+            self.problem = with_trends(self.problem, poses, self.effects) or self.problem
+        _, J, self.error = everything(self.problem, self.state)
         # What the shapes of effects were chosen by blurs the parameters too.
         self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
         self.gain = _pinv(self.weighted)
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
-        """(p,n): shift of the parameters for an error of each pose's residual."""
+        """(p,n): shift of the parameters for an error of each residual (`triaxcal.problem.everything`)."""
         self.sphere = self._sphere(calibration, {})
         _, J, _ = linearise(self.sphere, self.state)
         self.by_parameters = J @ np.linalg.inv(self.G)
@@ -186,8 +189,7 @@ class _Ground:
         u = calibration.sensor.output(up, held)
         channels = {n: held[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
         none = np.zeros((len(u), 3, 3))
-        problem = self.problem
-        return Problem(u, none, channels, reference, problem.middle, problem.half, problem.signs, problem.reference)
+        return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, further=None)
 
     def magnitude(self, covariance: Floats) -> float:
         """rms over the sphere of the uncertainty of |a| that a covariance (p,p) of the parameters makes."""
@@ -221,9 +223,10 @@ def _statistical(calibration: Calibration, ground: _Ground, beyond: float) -> li
     poses = [p.pose for p in calibration.poses if p.used]
     _, by_u = calibration.sensor.magnitude(ground.problem.u, ground.problem.conditions)
     creeping = np.array([p.creep_covariance for p in poses])
-    creep = np.einsum("ni,nij,nj->n", by_u, creeping, by_u)
-    noise = np.maximum(ground.error**2 - creep, 0.0)
     S = ground.by_residual
+    creep = np.zeros(S.shape[1])
+    creep[: len(poses)] = np.einsum("ni,nij,nj->n", by_u, creeping, by_u)
+    noise = np.maximum(ground.error**2 - creep, 0.0)
     held_s = float(np.median([p.end_s - p.start_s for p in poses]))
     out = [
         ground.component(
@@ -250,7 +253,8 @@ def _statistical(calibration: Calibration, ground: _Ground, beyond: float) -> li
 def _reference(ground: _Ground, stated: Stated) -> list[Component]:
     if not stated.reference:
         return []
-    shift = ground.by_residual.sum(axis=1) * stated.reference
+    # What |a| does inside the poses should be nothing, whatever the reference.
+    shift = ground.by_residual[:, : len(ground.problem.u)].sum(axis=1) * stated.reference
     by = f"know the reference to {stated.reference / 2 * 1e6:.2g} µg"
     return [ground.component("reference", "B", np.inf, np.outer(shift, shift), stated.reference_source, by)]
 
@@ -266,7 +270,7 @@ def _temperature(calibration: Calibration, ground: _Ground) -> tuple[list[Compon
     if TEMPERATURE not in ground.problem.channel_reference or not missing:
         return [], 1.0
     extra = sum(len(e.coefficients) for e in missing)
-    r, J, s = linearise(ground.problem, ground.state.extended(missing))
+    r, J, s = everything(ground.problem, ground.state.extended(missing))
     spread = np.concatenate([[_sensitivity(e, calibration.reference)] * len(e.coefficients) for e in missing])
     p = len(ground.state.theta)
     Z = J[:, p:] * spread / s[:, None]

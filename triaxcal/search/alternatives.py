@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection
 
 import numpy as np
 
@@ -26,15 +26,17 @@ def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]
     if without is None:
         return {}
     found: list[tuple[str, Model]] = []
-    for candidate in _near(search, without, [e.name for e in now.effects], search.score_of_means(now)):
-        other = search.model([*rest, candidate.effect])
-        if other is None or search.score(other) > search.score(now) + NEAR:
+    taken = {e.name for e in now.effects}
+    near = _near(search, without, taken, search.score_of_means(now))
+    others = [m for c in near if (m := search.model([*rest, c.effect])) is not None]
+    for other in [*others, *search.by_trends(without, taken)]:
+        if search.score(other) > search.score(now) + NEAR:
             continue
         ground = Ground.at(search.problem, other.state)
         contained = not ground.shown(ground.columns(effect), CONTAINED)[0].shape[1]
         if contained and search.left(other.effects) < search.left(now.effects):
             continue  # it contains the finding, and has more to it: the simpler of the two is the name
-        found.append((candidate.name, other))
+        found.append((other.effects[-1].name, other))
     out: dict[str, Model] = {}
     for name, other in sorted([*found, *_jointly(search, effect, now)], key=lambda f: search.score(f[1])):
         out.setdefault(name, other)
@@ -42,13 +44,12 @@ def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]
         # So few poses would have shown one effect or another whatever it was: also one that they cannot test.
         for other in search.untestable():
             name = other.effects[0].name
-            near = search.against_trends(other) < search.against_trends(now) + NEAR
-            if near and name not in {e.name for e in now.effects}:
+            if name not in taken and search.against_trends(other) < search.against_trends(now) + NEAR:
                 out.setdefault(name, other)
     return out
 
 
-def _near(search: Search, without: Model, taken: Sequence[str], best: float) -> list[Candidate]:
+def _near(search: Search, without: Model, taken: Collection[str], best: float) -> list[Candidate]:
     """The best variants of every other effect, as far as linear reckoning puts them near."""
     beside = search.beside(without)
     scores = beside.scores + without.price

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -146,7 +146,18 @@ class Search(Worth):
         """The best models with one effect more, each fitted."""
         beside = self.beside(now)
         order = np.argsort(beside.scores, kind="stable")[:SECOND_LOOK]
-        return self._models(now, [(beside.candidates[i].effect,) for i in order])
+        return self._models(now, [(beside.candidates[i].effect,) for i in order]) + self.by_trends(
+            now, {e.name for e in now.effects}
+        )
+
+    def by_trends(self, now: Model, taken: Collection[str]) -> list[Model]:
+        """The models with one effect more, none of those ``taken``, that is too much for the means, as far as the
+        trends inside the poses put them to the test, each fitted."""
+        if self.trends is None or not self.left_over(now):
+            return []
+        others = [e for e in self.catalogue if e.name in self.names and e.name not in taken and self.trends.touch([e])]
+        variants = [v for e in others for v in e.variants(self.problem.conditions)]
+        return self._models(now, [(v,) for v in variants if self.left((*now.effects, v)) < self.kept])
 
     def pairs_from(self, now: Model) -> list[Model]:
         """The best models with two effects more, each fitted."""
@@ -248,7 +259,7 @@ class Search(Worth):
 
     def _cost(self, effects: Sequence[Effect]) -> float:
         model = self.model(effects)
-        return np.inf if model is None else model.chi2
+        return np.inf if model is None else model.chi2 + (model.trends if model.tested is not None else 0.0)
 
     # What was found.
 

@@ -20,7 +20,7 @@ from triaxcal.pure_error import lack_of_fit_p, pure_error_dof
 from triaxcal.search.candidates import Ground, candidates_of, still_conditions
 from triaxcal.search.familywise import familywise, independent_tests
 from triaxcal.search.gains import Gains
-from triaxcal.trends import Trends
+from triaxcal.trends import Trends, left_by_means, left_by_trends, trends_p
 
 FAMILYWISE = 0.01
 """Probability of any false finding on data with nothing inside."""
@@ -32,13 +32,15 @@ KEPT = 2.6
 @dataclass(frozen=True)
 class Model:
     """Effects in the model, fitted: ``chi2`` of the residuals, the price of the effects, and the sum of squares of the
-    ``trends`` inside the poses beside those that it foretells."""
+    ``trends`` inside the poses beside those that it foretells. ``tested`` is given where the trends alone put it to the
+    test: the familywise probability that chance brings so much of them about."""
 
     effects: tuple[Effect, ...]
     state: State
     chi2: float
     price: float
     trends: float = 0.0
+    tested: float | None = None
 
 
 class Worth:
@@ -81,8 +83,9 @@ class Worth:
         """Fitted; None where the poses cannot carry it."""
         key = tuple(map(id, effects))
         if key not in self._known:
-            carried = self.left(effects) >= self.kept
-            self._known[key] = tuple(effects), self._solved(tuple(effects)) if carried else None
+            by_means = self.left(effects) >= self.kept
+            found = self._solved(tuple(effects)) if by_means else self._by_trends(tuple(effects))
+            self._known[key] = tuple(effects), found
         return self._known[key][1]
 
     def _solved(self, effects: tuple[Effect, ...]) -> Model | None:
@@ -92,9 +95,28 @@ class Worth:
             return None
         return self._model(effects, state, sum(self.price(e) for e in effects))
 
+    def _by_trends(self, effects: tuple[Effect, ...]) -> Model | None:
+        """A model that is too much for the means alone, where the trends inside the poses put it to the test: they are
+        as it foretells, and were far from nothing."""
+        if self.trends is None or not self.trends.touch(effects):
+            return None
+        both = replace(self.problem, further=self.trends)
+        try:
+            state = solve(both, self.linear.state, effects)
+        except (Refused, EffectFault):
+            return None
+        trends, n, rank = left_by_trends(both, state), len(self.poses), parameters(effects)
+        tested = familywise(self.p_value(self.linear.trends, trends, rank, n - rank), self.tests)
+        if trends_p(both, state, self.pure) < FAMILYWISE or tested >= FAMILYWISE:
+            return None
+        price = sum(self.price(e) for e in effects)
+        return Model(effects, state, left_by_means(both, state), price, trends, tested)
+
     def coincidence(self, m: Model) -> float:
         """Probability that the best of all candidates would explain as much of residuals as large as these, did they
         lie in any direction: small where a model has been put to the test."""
+        if m.tested is not None:
+            return m.tested
         left, dof = self.left(m.effects), self.left(())
         rest = min(max(m.chi2, left) / max(self.linear.chi2, 1e-300), 1.0)
         return familywise(float(beta_cdf(rest, left / 2, (dof - left) / 2)), self.tests) if m.effects else 1.0
