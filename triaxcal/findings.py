@@ -22,7 +22,8 @@ OTHERS = ("", "the other effect", "the other two effects", "the other three effe
 class Finding:
     """An effect that the data show. ``coefficients`` name → (value, standard error, unit).
 
-    ``verdict`` is "adopted" where the name is earned, "confounded" where ``alternatives`` fit as well.
+    ``verdict`` is "adopted" where the name is earned, "confounded" where ``alternatives``, or poses that something
+    ``spoiled``, fit as well.
     """
 
     effect: str
@@ -36,6 +37,8 @@ class Finding:
     """The model with this effect and those before it."""
     apart: tuple[str, ...] = ()
     """What to record so as to tell it from its alternatives."""
+    spoiled: tuple[str, ...] = ()
+    """When poses began that would do as well as any effect, were they spoiled."""
 
 
 def finding_of(
@@ -45,9 +48,11 @@ def finding_of(
     after: Calibration,
     step: Calibration,
     rivals: Sequence[Sequence[Effect]],
+    spoiled: Sequence[str],
 ) -> Finding:
     """``compared`` are the model that lacks this effect alone (None where the poses cannot carry it), and that with all
-    effects found; ``after`` is what is handed on. ``rivals`` explain as much with other poses left out."""
+    effects found; ``after`` is what is handed on. ``rivals`` explain as much with other poses left out, the poses
+    ``spoiled`` without any effect."""
     found = alternatives(search, effect, search.found)
     taken = {e.name for e in search.found.effects}
     for rival in rivals:
@@ -60,20 +65,29 @@ def finding_of(
         reason += f"; of its coefficients these poses show only {effect.formula}, which they share in that proportion"
     if found:
         reason += f"; {', '.join(found)} would do as well on these poses"
+    if spoiled:
+        reason += f"; that something spoiled {the_poses(spoiled)} would {'also ' * bool(found)}do as well"
+    apart = dict.fromkeys(telling_apart(search, effect, found)) if found else ()
     floor = compared[1].residual.noise_floor_g
     if not effect.coefficients[0].unit.startswith("g"):
         floor /= after.reference  # the effect is a share of the magnitude
     return Finding(
         effect=effect.name,
-        verdict="confounded" if found else "adopted",
+        verdict="confounded" if found or spoiled else "adopted",
         p_value=p,
         coefficients=after.coefficients_of(effect.name),
         alternatives=tuple(found),
         reason=reason,
         remedy=effect.advice(_largest(after, effect), floor),
         step=step,
-        apart=tuple(dict.fromkeys(telling_apart(search, effect, found))),
+        apart=(*([f"take {the_poses(spoiled)} again"] if spoiled else []), *apart),
+        spoiled=tuple(spoiled),
     )
+
+
+def the_poses(at: Sequence[str]) -> str:
+    """In words, by when they began."""
+    return " and ".join(f"the pose at {a}" for a in at)
 
 
 def _largest(c: Calibration, effect: Effect) -> float:
@@ -143,7 +157,8 @@ def advice_of(
     out = [f"{f.effect}: {f.remedy}" for f in findings if f.verdict == "adopted"]
     for f in findings:
         if f.verdict == "confounded":
-            out.append(f"{f.effect} cannot be told from {', '.join(f.alternatives)} here: {'; '.join(f.apart)}")
+            others = [*f.alternatives, *(["spoiled poses"] if f.spoiled else [])]
+            out.append(f"{f.effect} cannot be told from {', '.join(others)} here: {'; '.join(f.apart)}")
     if unexplained.significant:
         out.append(
             "something is left that no candidate explains: look at the lead; take some directions again at another "

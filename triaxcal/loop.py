@@ -23,7 +23,7 @@ from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.findings import Finding, advice_of, description_of, finding_of, why_not_shown
+from triaxcal.findings import Finding, advice_of, description_of, finding_of, the_poses, why_not_shown
 from triaxcal.fit import fit, with_faulty
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
@@ -114,8 +114,8 @@ def diagnose(
     for effect, step in zip(found.adopted, steps, strict=False):
         others = [e for e in found.adopted if e is not effect]
         without = given.tried(others) if others else before
-        rivals = () if findings else found.rivals
-        findings.append(finding_of(search, effect, (without, steps[-1]), after, step, rivals))
+        rivals, spoiled = ((), ()) if findings else (found.rivals, tuple(poses[i].at for i in found.spoiled))
+        findings.append(finding_of(search, effect, (without, steps[-1]), after, step, rivals, spoiled))
     if smooth is not None:
         findings.append(description_of(smooth, steps[-1]))
         unexplained = unexplained_of(smooth, search.passed_over)
@@ -129,7 +129,7 @@ def diagnose(
         findings=tuple(findings),
         unexplained=unexplained,
         held_out=_held_out(before, after, check) if check is not None else None,
-        advice=tuple(advice_of(findings, unexplained, undescribed, blind, faulty)),
+        advice=(*_again(found, poses), *advice_of(findings, unexplained, undescribed, blind, faulty)),
         search=search,
     )
 
@@ -163,6 +163,19 @@ class _Found:
     aside: tuple[int, ...]
     rivals: tuple[tuple[Effect, ...], ...] = ()
     """Effects that explain as much with other poses left out."""
+    spoiled: tuple[int, ...] = ()
+    """Poses that explain as much without any effect, were they spoiled."""
+    instead: tuple[Effect, ...] = ()
+    """Effects that explain as much as the poses left out do."""
+
+
+def _again(found: _Found, poses: Sequence[Pose]) -> list[str]:
+    """What to take again where an effect would explain as much as the poses that were left out as spoiled."""
+    if not found.instead:
+        return []
+    names = " or ".join(dict.fromkeys(e.name for e in found.instead))
+    left_out = the_poses([poses[i].at for i in found.aside])
+    return [f"take again {left_out}: left out as spoiled, but {names} would explain as much"]
 
 
 def _aside(c: Calibration) -> tuple[int, ...]:
@@ -198,13 +211,17 @@ def _explained(
         trials.append(other)
         found = other
     near = _criterion(found, len(poses)) + NEAR
+    others = [t for t in trials if t.aside != found.aside]
     rivals: list[tuple[Effect, ...]] = []
-    for t in trials:
-        if t.aside != found.aside:
-            models = [t.search.found, *t.search.singles_from(t.search.linear)]
-            price = _criterion(t, len(poses)) - t.search.score(t.search.found)
-            rivals += [m.effects for m in models if m.effects and t.search.score(m) + price < near]
-    return replace(found, rivals=tuple(rivals))
+    for t in others:
+        models = [t.search.found, *t.search.singles_from(t.search.linear)]
+        price = _criterion(t, len(poses)) - t.search.score(t.search.found)
+        rivals += [m.effects for m in models if m.effects and t.search.score(m) + price < near]
+    alike = sorted((t for t in others if _criterion(t, len(poses)) < near), key=lambda t: _criterion(t, len(poses)))
+    if found.adopted:
+        spoiled = next((t.aside for t in alike if not t.adopted), ())
+        return replace(found, rivals=tuple(rivals), spoiled=spoiled)
+    return replace(found, instead=tuple(e for t in alike for e in t.adopted))
 
 
 def _tried(

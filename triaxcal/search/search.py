@@ -258,8 +258,8 @@ class Search(Worth):
         return None if fitted is None else (m, fitted)
 
     def _cost(self, effects: Sequence[Effect]) -> float:
-        model = self.model(effects)
-        return np.inf if model is None else model.chi2 + (model.trends if model.tested is not None else 0.0)
+        model = self.model(effects) or self.linear
+        return model.chi2 + self.against_trends(model)
 
     # What was found.
 
