@@ -165,15 +165,13 @@ class _Found:
     """Effects that explain as much with other poses left out."""
     spoiled: tuple[int, ...] = ()
     """Poses that explain as much without any effect, were they spoiled."""
-    instead: tuple[Effect, ...] = ()
-    """Effects that explain as much as the poses left out do."""
 
 
 def _again(found: _Found, poses: Sequence[Pose]) -> list[str]:
     """What to take again where an effect would explain as much as the poses that were left out as spoiled."""
-    if not found.instead:
+    if found.adopted or not found.rivals or not found.aside:
         return []
-    names = " or ".join(dict.fromkeys(e.name for e in found.instead))
+    names = " or ".join(dict.fromkeys(e.name for effects in found.rivals for e in effects))
     left_out = the_poses([poses[i].at for i in found.aside])
     return [f"take again {left_out}: left out as spoiled, but {names} would explain as much"]
 
@@ -217,11 +215,9 @@ def _explained(
         models = [t.search.found, *t.search.singles_from(t.search.linear)]
         price = _criterion(t, len(poses)) - t.search.score(t.search.found)
         rivals += [m.effects for m in models if m.effects and t.search.score(m) + price < near]
-    alike = sorted((t for t in others if _criterion(t, len(poses)) < near), key=lambda t: _criterion(t, len(poses)))
-    if found.adopted:
-        spoiled = next((t.aside for t in alike if not t.adopted), ())
-        return replace(found, rivals=tuple(rivals), spoiled=spoiled)
-    return replace(found, instead=tuple(e for t in alike for e in t.adopted))
+    without = [t for t in others if found.adopted and not t.adopted and _criterion(t, len(poses)) < near]
+    spoiled = min(without, key=lambda t: _criterion(t, len(poses))).aside if without else ()
+    return replace(found, rivals=tuple(rivals), spoiled=spoiled)
 
 
 def _tried(

@@ -111,6 +111,31 @@ def test_an_effect_is_not_taken_for_spoiled_poses(
             assert "second_order_nonlinearity" in (found.effect, *found.alternatives)
 
 
+def test_poses_left_out_where_an_effect_would_do_as_well_are_to_be_taken_again(
+    with_effects: Callable[..., Sensor], fourteen: np.ndarray
+) -> None:
+    """Of 14 poses two that are left out explain nearly anything. With an effect inside, nothing is never the answer."""
+    swallowed = doubted = 0
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        off = fourteen + 0.05 * rng.standard_normal((14, 3))
+        ups = (off / np.linalg.norm(off, axis=1, keepdims=True))[rng.permutation(14)]
+        unit = with_effects(third_order_nonlinearity=list(rng.normal(size=3) * 4e-3))
+        loop = diagnose(noisy_poses(unit, ups, SIGMA, rng), signs=SIGNS)
+        if not loop.findings:
+            swallowed += 1
+            first, second = (f"the pose at {10 * i:.1f} s" for i in left_out(loop.after))
+            assert loop.advice[0].startswith(f"take again {first} and {second}: left out as spoiled, but ")
+            assert "third_order_nonlinearity" in loop.advice[0]
+        elif loop.findings[0].spoiled:
+            doubted += 1
+            assert loop.findings[0].verdict == "confounded"
+            assert "spoiled poses here: take the pose at " in loop.advice[0]
+            assert "that something spoiled the pose at " in loop.findings[0].reason
+    assert swallowed >= 1
+    assert doubted >= 1
+
+
 def test_a_spoiled_pose_shows_beside_an_effect_once_the_effect_is_in_the_model(
     with_effects: Callable[..., Sensor], twenty_six: np.ndarray
 ) -> None:

@@ -13,6 +13,7 @@ from triaxcal.conditions import held_at
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import TIME, Coefficient, Effect, no_slope, on_each_axis, per_axis, per_axis_slope, xyz
 from triaxcal.effects.plugins import Foreign
+from triaxcal.fit import cross_validated, fit
 from triaxcal.loop import diagnose
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.problem import State, linearise, solve
@@ -20,7 +21,8 @@ from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start
 from triaxcal.stillness.detector import StillnessDetector
 from triaxcal.synthetic import Tumble, noisy_poses
-from triaxcal.trends import Trends
+from triaxcal.trends import Trends, with_trends
+from triaxcal.uncertainty import Stated, budget
 
 MINUS = (-1.0, -1.0, -1.0)
 SIGMA_G = 1.5e-5
@@ -46,7 +48,7 @@ def moving(
     sensor = replace(unit, effects=effects)
     channels, reference = {"temp_c": temp_c}, {"temp_c": 25.0}
     poses = noisy_poses(sensor, ups, SIGMA_G, rng, channels=channels, channel_reference=reference, hold_s=HOLD_S)
-    by_kelvin = sum((q for e, q in effects if e.name == TEMPERATURE.name), np.zeros(3))
+    begin, end = (sensor.output(ups, {"temp_c": temp_c - 25 + x * rate * HOLD_S}) for x in (-0.5, 0.5))
     scale = float(np.abs(unit.scale_factor).mean())
     return [
         replace(
@@ -55,7 +57,7 @@ def moving(
             rate_errors={"temp_c": 0.0},
             bends={"temp_c": 0.0},
             bend_errors={"temp_c": 0.0},
-            trend=unit.scale_factor * (by_kelvin * rate[i] * HOLD_S) + scale * TREND_G * rng.standard_normal(3),
+            trend=end[i] - begin[i] + scale * TREND_G * rng.standard_normal(3),
             trend_error=scale * TREND_G,
         )
         for i, p in enumerate(poses)
@@ -237,3 +239,99 @@ def test_an_effect_of_another_package_that_is_known_at_the_means_alone_is_judged
         assert (finding.effect, finding.remedy) == ("table", table.remedy)
         effects = [effect for effect, _ in loop.after.sensor.effects]
         assert held_at(effects, loop.after.channel_reference)[0].startswith("at temp_c = ")
+
+
+QUADRATIC = effect_named("temperature_bias_quadratic")
+CURVED = np.array([4e-4, -3e-4, 5e-4, 6e-5, 8e-5, -7e-5])  # g/K and g/K²
+
+
+def blind(poses: list[Pose]) -> list[Pose]:
+    """The same poses without their trends."""
+    return [replace(p, trend_error=np.inf) for p in poses]
+
+
+def test_trends_fitted_along_with_the_means_narrow_the_intervals_and_these_hold_the_truth(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    """But for one recording of a hundred, whose trends look by chance as if they contradicted the means."""
+    rng, inside, narrower, seeds = np.random.default_rng(6), 0, [], 150
+    for _ in range(seeds):
+        poses = moving(paper_unit, fourteen[rng.permutation(14)], rng, ((TEMPERATURE, SENSITIVITY),))
+        c, means = (fit(p, signs=MINUS, effects=[TEMPERATURE], aside=()) for p in (poses, blind(poses)))
+        assert not means.trends
+        low, high = (side[9:] for side in c.interval())
+        inside += int(np.count_nonzero((low < SENSITIVITY) & (high > SENSITIVITY)))
+        if c.trends:
+            narrower.append(c.standard_errors[9:] / c.inflation / (means.standard_errors[9:] / means.inflation))
+    assert len(narrower) > 0.96 * seeds
+    assert np.max(narrower) < 1
+    assert np.mean(narrower) < 0.95
+    assert 0.93 < inside / (3 * seeds) < 0.985
+
+
+def test_trends_that_contradict_the_means_have_no_part_in_the_fit(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    """A unit that follows its thermometer late, so that inside the poses it goes the other way."""
+    poses = moving(paper_unit, twenty_six, np.random.default_rng(7), ((TEMPERATURE, SENSITIVITY),))
+    late = [replace(p, trend=-p.trend) for p in poses]
+    c, means = (fit(p, signs=MINUS, effects=[TEMPERATURE], aside=()) for p in (late, blind(poses)))
+    assert not c.trends
+    assert np.array_equal(c.values, means.values)
+
+
+def test_trends_have_no_part_in_a_model_that_nothing_moves_inside_the_poses(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = moving(paper_unit, twenty_six, np.random.default_rng(8), ((SQUARE, np.array([2e-3, -1e-3, 3e-3])),))
+    for effects in ([], [SQUARE]):
+        c, means = (fit(p, signs=MINUS, effects=effects, aside=()) for p in (poses, blind(poses)))
+        assert not c.trends
+        assert np.array_equal(c.values, means.values)
+
+
+def test_fourteen_poses_carry_six_coefficients_by_what_moves_inside_them(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    """Six coefficients and nine parameters are more than fourteen means, by which alone nothing can be said."""
+    named, pulls = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        poses = moving(paper_unit, fourteen[rng.permutation(14)], rng, ((QUADRATIC, CURVED),))
+        loop = diagnose(poses, signs=MINUS)
+        named.append([(f.effect, f.verdict) for f in loop.findings])
+        if len(loop.after.values) == 15:
+            elsewhere = loop.after.channel_reference["temp_c"] - 25
+            there = CURVED + np.concatenate([2 * elsewhere * CURVED[3:], np.zeros(3)])
+            pulls.append((loop.after.values[9:] - there) / loop.after.standard_errors[9:])
+        alone = diagnose(blind(poses), signs=MINUS)
+        assert [(f.effect, f.verdict) for f in alone.findings] != [(QUADRATIC.name, "adopted")]
+    assert named.count([(QUADRATIC.name, "adopted")]) >= 7
+    assert len(pulls) >= 7
+    assert np.sqrt(np.mean(np.square(pulls))) == pytest.approx(1, abs=0.4)
+
+
+def test_a_pose_left_out_for_cross_validation_leaves_with_its_trend(paper_unit: Sensor, fourteen: np.ndarray) -> None:
+    """Against as many fits from the beginning."""
+    poses = moving(paper_unit, fourteen, np.random.default_rng(9), ((TEMPERATURE, SENSITIVITY),))
+    problem = with_trends(problem_of(poses, signs=MINUS), poses, [TEMPERATURE])
+    assert problem
+    begin = start(problem, poses, MINUS)
+    state = solve(problem, begin, (TEMPERATURE,))
+    misses = []
+    for i in range(len(poses)):
+        rest = solve(problem.only(np.delete(np.arange(len(poses)), i)), begin, (TEMPERATURE,))
+        misses.append(linearise(problem.only(slice(i, i + 1)), rest, jacobian=False)[0][0])
+    assert cross_validated(problem, state) == pytest.approx(np.sqrt(np.mean(np.square(misses))), rel=1e-3)
+
+
+def test_the_budget_of_a_fit_to_means_and_trends_has_the_errors_of_the_fit(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    poses = moving(paper_unit, fourteen, np.random.default_rng(10), ((TEMPERATURE, SENSITIVITY),))
+    c = fit(poses, signs=MINUS, effects=[TEMPERATURE], aside=())
+    assert c.trends
+    scatter = [part.parameters for part in budget(c).components if part.evaluation == "A"]
+    assert np.sqrt(np.sum(np.square(scatter), axis=0)) == pytest.approx(c.standard_errors, rel=1e-6)
+    # An error of the reference is one of the scale factors, and nothing of the temperature's.
+    (reference,) = [p for p in budget(c, Stated(reference=1e-4)).components if p.source == "reference"]
+    assert reference.parameters[:3] == pytest.approx(1e-4 * np.abs(c.sensor.scale_factor), rel=0.01)
+    assert np.all(reference.parameters[9:] < 1e-3 * np.abs(SENSITIVITY))
