@@ -51,17 +51,17 @@ def fit(
         among = None if aside is None else [k for k, i in enumerate(sound) if i in aside]
         kept = [poses[i] for i in sound]
         return with_faulty(fit(kept, signs=signs, reference=reference, effects=effects, aside=among), poses)
-    everything = problem_of(poses, signs=signs, reference=reference)
-    begin = start(everything, poses, signs)
-    everything = with_history(everything, poses, begin.sensor(everything))
-    missing = {n for e in effects for n in e.needs if n not in everything.channel_reference}
+    whole = problem_of(poses, signs=signs, reference=reference)
+    begin = start(whole, poses, signs)
+    whole = with_history(whole, poses, begin.sensor(whole))
+    missing = {n for e in effects for n in e.needs if n not in whole.channel_reference}
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
     verdict = Spoiled(tuple(sorted(aside))) if aside is not None else Spoiled()
     if aside is None and len(poses) > 9 + sum(len(e.coefficients) for e in effects):
-        verdict = _spoiled(everything, solve(everything, begin, tuple(effects)), poses)
+        verdict = _spoiled(whole, solve(whole, begin, tuple(effects)), poses)
     found = verdict.rows
-    kept, problem = list(poses), everything
+    kept, problem = list(poses), whole
     if found:
         kept = [p for i, p in enumerate(poses) if i not in found]
         problem = problem_of(kept, signs=signs, reference=reference)

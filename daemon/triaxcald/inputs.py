@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from triaxcal.errors import InvalidData
+from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.quality import QualityDetector, untrusted_poses
 from triaxcal.stillness.detector import StillnessDetector, Windows
@@ -27,6 +31,9 @@ PROFILE = "profile.toml"
 STATION_FILE = "station.toml"
 CALIBRATION: Phase = "calibration"
 VERIFICATION: Phase = "verification"
+HELD_MOST_S, TURNED_MOST_S, TURNED_SAMPLES, PERIOD_MOST_S = 2000.0, 500.0, 30, 0.5
+"""Times are in milliseconds, say, where all of these are exceeded: how long a pose is held, from one to the next in
+seconds and in samples, and from sample to sample."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,23 @@ def measure(
     poses = poses_of(windows, spans, untrusted_poses(seen))
     counted = [f"duplicate_samples: {samples.duplicates}"] if samples.duplicates else []
     quality = together(counted, seen)
-    return Measured(name, poses, windows, quality + creeping(poses))
+    return Measured(name, poses, windows, quality + creeping(poses) + _not_seconds(poses))
+
+
+def _not_seconds(poses: Sequence[Pose]) -> list[str]:
+    """A line where the times of a text can hardly be seconds. A real recording may be sampled that slowly, or its poses
+    held that long, but then it takes few samples to turn the unit from one to the next."""
+    if len(poses) < 2:
+        return []
+    held = float(np.median([p.end_s - p.start_s for p in poses]))
+    period = float(np.median([(p.end_s - p.start_s) / max(p.samples - 1, 1) for p in poses]))
+    turned = float(np.median([b.start_s - a.end_s for a, b in pairwise(poses)]))
+    if held < HELD_MOST_S or period < PERIOD_MOST_S or turned < max(TURNED_MOST_S, TURNED_SAMPLES * period):
+        return []
+    return [
+        f"time_unit: a sample every {plain(period)} s, poses of {plain(held)} s, {plain(turned)} s from one to the "
+        "next: is t_s in seconds?"
+    ]
 
 
 def _measure_recording(recording: Recording, phase: Phase, stream: str, moments: Moments | None) -> Measured:

@@ -10,6 +10,8 @@ from triaxcal.figures import plain
 
 SMALLEST = 1e-250
 """Of references: beyond it powers of ten end."""
+UNNAMED = "reference unit"
+"""What stands in documents where nobody named the unit of the reference."""
 _MICRO_G = re.compile(r"(?<![\w.])([+-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?) µg(?!\w)")
 _CHANNEL = re.compile(r"(\[.*\])")
 _G = re.compile(r"(?<![A-Za-zµ_])g(?![A-Za-z_])")
@@ -18,30 +20,39 @@ _G = re.compile(r"(?<![A-Za-zµ_])g(?![A-Za-z_])")
 @dataclass(frozen=True)
 class ErrorUnit:
     """The unit in which errors of the magnitude are told to people: ``unit``, that of the reference vector, times ten
-    to the ``exponent``. µg as it is."""
+    to the ``exponent``. µg as it is; where nobody named the unit, ppm of the reference, whose magnitude is ``whole``.
+    """
 
     unit: str = "g"
     exponent: int = -6
+    whole: float = 1.0
 
     @classmethod
     def of(cls, reference_unit: str, reference: float) -> ErrorUnit:
         """About a millionth of the reference, by a power of a thousand: 1e-6 µT of 50 µT, 1e-12 T of 5e-5 T."""
         if reference_unit == "g" or not 0 < reference < math.inf:
             return cls(reference_unit)
+        if reference_unit == UNNAMED:
+            return cls(reference_unit, whole=max(reference, SMALLEST))
         return cls(reference_unit, 3 * math.floor((math.log10(max(reference, SMALLEST)) + 0.5) / 3) - 6)
 
+    @property
+    def name(self) -> str:
+        """Empty where it has none of its own."""
+        return {"g": "µg", UNNAMED: "ppm of the reference"}.get(self.unit, "")
+
     def __str__(self) -> str:
-        return "µg" if self.unit == "g" else f"1e{self.exponent} {self.unit}"
+        return self.name or f"1e{self.exponent} {self.unit}"
 
     def count(self, value: float) -> float:
         """A ``value`` in the reference's unit as a number of these."""
-        return value * 10.0**-self.exponent
+        return value / self.whole * 10.0**-self.exponent
 
     def told(self, value: float | None) -> str:
         return "—" if value is None else f"{self.count(value):.1f}"
 
     def in_full(self, value: float | None) -> str:
-        return f"{self.told(value)} {self}"
+        return self._behind(self.told(value))
 
     def in_words(self, text: str) -> str:
         """What the metrology says in words, where it writes µg for a millionth of the reference's unit."""
@@ -49,9 +60,14 @@ class ErrorUnit:
 
     def _instead(self, found: re.Match[str]) -> str:
         number = found[1]
-        if self.exponent != -6:
+        if self.exponent != -6 or self.whole != 1.0 or "e" in number:
             number = plain(self.count(float(number) * 1e-6), sign="+" if number[0] == "+" else "")
-        return f"{number} {self}"
+        return self._behind(number)
+
+    def _behind(self, number: str) -> str:
+        """`20.1e-6 m/s^2`, not `20.1 1e-6 m/s^2`; a number that has an exponent keeps it."""
+        joined = not self.name and number[-1].isdecimal() and "e" not in number
+        return f"{number}e{self.exponent} {self.unit}" if joined else f"{number} {self}"
 
 
 def in_units_of(unit: str, reference_unit: str) -> str:
@@ -70,4 +86,4 @@ def grouped(unit: str) -> str:
 
 def reference_unit_of(reference: float) -> str:
     """g where the magnitude can be gravity in units of g, else what the caller did not name."""
-    return "g" if 0.9 <= reference <= 1.1 else "reference unit"
+    return "g" if 0.9 <= reference <= 1.1 else UNNAMED

@@ -14,12 +14,16 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import f_sf
+from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose
 from triaxcald.documents import Document, error, number, uncertainty
 from triaxcald.pipeline import Pipeline, creeping
 
 WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"
 BY_CHANCE = 0.01
+UNLIKE = 0.05
+"""rms error of the magnitude, as a share of the reference, above which another unit is likelier than a change of this
+one: 60 K away, the sensitivities of mass-market data sheets (`triaxcal.uncertainty`) make 0.035."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,16 @@ def verified(pipeline: Pipeline, reference: float) -> Verification:
 
 def _rms(values: Floats) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
+def unlike(name: str, rms_g: float, reference: float) -> list[str]:
+    """A line where the poses of the recording ``name`` can hardly be of the unit of the calibration."""
+    if not rms_g > UNLIKE * reference:
+        return []
+    return [
+        f"{name} does not look like this unit: |a| is off by {plain(rms_g / reference, 2)} of the reference; is it "
+        "another unit, or are signs, order or unit of its outputs others?"
+    ]
 
 
 def trust(pose: Pose) -> dict[str, Any]:

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcal.plan.directions import spiral
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import SyntheticUnit, Tumble
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.inputs import VERIFICATION, bundle_of, measure, read_document
 from triaxcald.recording.reader import Recording
@@ -134,3 +137,31 @@ def test_a_document_that_is_not_there_is_named(tmp_path: Path) -> None:
         read_document(str(tmp_path / "cal.json"))
     with pytest.raises(InputError, match="Is a directory"):
         read_document(str(tmp_path))
+
+
+def _tumbled(path: Path, rate_hz: float, hold_s: float, move_s: float, times: float = 1.0) -> str:
+    """Poses as text, its times multiplied by ``times``."""
+    unit = SyntheticUnit(
+        Sensor(np.full(3, 2.0), np.zeros(3), np.zeros(3)), Tumble(spiral(6), hold_s, move_s), np.full(3, 2e-4), seed=1
+    )
+    t_s = np.arange(int(6 * (hold_s + move_s) * rate_hz)) / rate_hz
+    rows = (f"{t * times:.6f},{x:.6f},{y:.6f},{z:.6f}\n" for t, (x, y, z) in zip(t_s, unit.sample(t_s)[0], strict=True))
+    path.write_text("t_s,ux,uy,uz\n" + "".join(rows), "utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize(("rate_hz", "hold_s", "move_s"), [(25.0, 6.0, 1.0), (200.0, 3.0, 0.8)])
+def test_times_in_milliseconds_are_asked_about(tmp_path: Path, rate_hz: float, hold_s: float, move_s: float) -> None:
+    asked = measure(_tumbled(tmp_path / "ms.csv", rate_hz, hold_s, move_s, times=1000.0)).data_quality
+    assert asked[-1].startswith(f"time_unit: a sample every {1000 / rate_hz:g} s, poses of ")
+    assert asked[-1].endswith(" s from one to the next: is t_s in seconds?")
+    assert measure(_tumbled(tmp_path / "s.csv", rate_hz, hold_s, move_s)).data_quality == asked[:-1]
+
+
+@pytest.mark.parametrize(("rate_hz", "hold_s", "move_s"), [(1 / 60, 7200.0, 5.0), (0.1, 2400.0, 60.0), (1, 3600.0, 60)])
+def test_a_recording_that_is_really_so_slow_is_asked_nothing(
+    tmp_path: Path, rate_hz: float, hold_s: float, move_s: float
+) -> None:
+    measured = measure(_tumbled(tmp_path / "slow.csv", rate_hz, hold_s, move_s))
+    assert len(measured.poses) == 6
+    assert measured.data_quality == []

@@ -34,7 +34,9 @@ def test_a_unit_with_a_fraction_stands_in_brackets() -> None:
     ("unit", "reference", "text", "number"),
     [
         ("g", 0.998, "µg", "2.0"),
-        ("reference unit", 9.80665, "1e-6 reference unit", "2.0"),
+        ("reference unit", 9.80665, "ppm of the reference", "0.2"),
+        ("reference unit", 5e-5, "ppm of the reference", "40000.0"),
+        ("reference unit", 1e-320, "ppm of the reference", None),
         ("µT", 48.0, "1e-6 µT", "2.0"),
         ("nT", 48_000.0, "1e-3 nT", "0.0"),
         ("T", 5e-5, "1e-12 T", "2000000.0"),
@@ -55,6 +57,15 @@ def test_a_sentence_has_the_unit_of_the_reference_behind_numbers_alone() -> None
     assert ErrorUnit.of("g", 1.0).in_words(said) == said
     assert (
         ErrorUnit.of("µT", 48.0).in_words(said)
-        == "channel_bias:dust_µg: from 1.53e+04 1e-6 µT to 12 1e-6 µT, one pose (-3.2 1e-6 µT, +4 1e-6 µT)"
+        == "channel_bias:dust_µg: from 15300e-6 µT to 12e-6 µT, one pose (-3.2e-6 µT, +4e-6 µT)"
     )
-    assert ErrorUnit.of("T", 5e-5).in_words("from 0.00153 µg to +1.2e-05 µg") == "from 1530 1e-12 T to +12 1e-12 T"
+    assert ErrorUnit.of("T", 5e-5).in_words("from 0.00153 µg to +1.2e-05 µg") == "from 1530e-12 T to +12e-12 T"
+    unnamed = ErrorUnit.of("reference unit", 9.80665)
+    assert unnamed.in_words("from 98.0665 µg to +9.81 µg") == "from 10 ppm of the reference to +1 ppm of the reference"
+
+
+def test_a_power_of_ten_is_written_on_to_its_number() -> None:
+    small = ErrorUnit.of("m/s^2", 9.80665)
+    assert [small.in_full(v) for v in (20.06e-6, 0.0, None)] == ["20.1e-6 m/s^2", "0.0e-6 m/s^2", "— 1e-6 m/s^2"]
+    assert ErrorUnit.of("g", 1.0).in_full(20.06e-6) == "20.1 µg"
+    assert ErrorUnit.of("reference unit", 9.80665).in_full(98.0665e-6) == "10.0 ppm of the reference"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -20,6 +21,17 @@ class OneLineParser(argparse.ArgumentParser):
                 message += f"; write it with an equals sign: {option}={example}"
         sys.stderr.write(f"{self.prog}: {message}\n")
         sys.exit(2)
+
+
+def parsed(parser: OneLineParser, arguments: Sequence[str]) -> argparse.Namespace:
+    """As `parse_args`, and options may stand between recordings, where there may be several."""
+    chosen, left = parser.parse_known_args(arguments)
+    several = next((v for n in ("recording", "recordings") if isinstance(v := getattr(chosen, n, None), list)), None)
+    if several is not None and not any(word.startswith("-") and word != "-" for word in left):
+        several += map(type(several[0]), left)
+    elif left:
+        parser.error(f"unrecognized arguments: {' '.join(left)}")
+    return chosen
 
 
 def signs(text: str) -> tuple[int, int, int]:

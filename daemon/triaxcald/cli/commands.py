@@ -11,7 +11,7 @@ from importlib.metadata import version
 
 from triaxcal.errors import InvalidData, Refused
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
-from triaxcald.cli.arguments import OneLineParser, keep_apart
+from triaxcald.cli.arguments import OneLineParser, keep_apart, parsed
 from triaxcald.cli.console import say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import DaemonError
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal that knows no µ shall not end the work
     try:
-        chosen = parser(*arguments[:1]).parse_args(arguments)
+        chosen = parsed(parser(*arguments[:1]), arguments)
     except SystemExit as e:
         return int(e.code or 0)
     code: int = DONE

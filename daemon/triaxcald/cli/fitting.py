@@ -32,6 +32,7 @@ from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, measure
 from triaxcald.several import agreement_document, with_recordings
+from triaxcald.verification import unlike
 
 
 def register(commands: Any) -> None:
@@ -106,11 +107,11 @@ def diagnose_command(a: argparse.Namespace) -> int:
     check = measured_check(measured, a)
     choice = chosen(a, measured)
     loop = _loop(a, measured, choice, check.poses if check else None)
-    if len(names) > 1:
-        warnings = (*loop.after.warnings, *channels_of_some(recordings))
-        loop = replace(loop, after=replace(loop.after, warnings=warnings))
-    if check:
+    warnings = channels_of_some(recordings)
+    if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
+        warnings += unlike(check.name, loop.held_out.before_rms_g, choice.reference)
+    loop = replace(loop, after=replace(loop.after, warnings=(*loop.after.warnings, *warnings)))
     document = _loop_document(loop, measured, choice)
     if len(names) > 1:
         document = with_recordings(document, loop, names)

@@ -20,7 +20,7 @@ from triaxcald.errors import InputError
 from triaxcald.held_sensor import model_of, reference_unit_in, sensor_of
 from triaxcald.inputs import Measured, measure, read_document
 from triaxcald.units import ErrorUnit
-from triaxcald.verification import Verification, pose_rows, trust
+from triaxcald.verification import Verification, pose_rows, trust, unlike
 
 
 def register(commands: Any) -> None:
@@ -74,6 +74,8 @@ def verify_command(a: argparse.Namespace) -> int:
     with telling_data_quality(measured):
         _require_trusted(measured)
     found = _verified(measured, model_of(sensor, channel_reference, reference), where=a.calibration)
+    assert found.rms_g is not None
+    warnings = unlike(measured.name, found.rms_g, reference)
     result = {
         "format": "triaxcal.verify/1",
         "rms_g": documents.error(found.rms_g, reference),
@@ -81,14 +83,14 @@ def verify_command(a: argparse.Namespace) -> int:
         "noise_floor_g": documents.error(found.noise_floor_g, reference),
         "poses": pose_rows(found, reference),
         "data_quality": measured.data_quality,
+        "warnings": warnings,
     }
     unit = a.reference_unit or reference_unit_in(document, where=a.calibration, magnitude=reference)
     if a.json:
         emit(result)
     else:
         _show_verified(found, f"|a| − {reference:g} {unit} under {a.calibration}", ErrorUnit.of(unit, reference))
-        warn(measured.data_quality)
-    assert found.rms_g is not None
+        warn([*warnings, *measured.data_quality])
     return judge(a.limit, found.rms_g)
 
 

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
+
 from triaxcal.calibration import Calibration
+from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import probability
 from triaxcal.loop import Loop
 from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, counted
 from triaxcald.documents import holds_of
+from triaxcald.remarks import assumption, overlap
 from triaxcald.units import grouped, in_units_of
 
 
 def show_calibration(c: Calibration, choice: Choice) -> None:
     b = budget(c, choice.stated)
     show_coefficients(c, choice, b.parameters)
+    if said := _temperature_of(c):
+        print(said)
     r, small = c.residual, choice.small
     poses = counted(len(c.poses), sum(not p.used for p in c.poses))
     print(
@@ -23,6 +29,17 @@ def show_calibration(c: Calibration, choice: Choice) -> None:
         f"lack of fit p {probability(r.lack_of_fit_p)}"
     )
     show_budget(b, choice)
+
+
+def _temperature_of(c: Calibration) -> str:
+    """Where the values of a model without temperature are known to hold; empty for any other."""
+    of_poses = [p.pose.channels.get(TEMPERATURE, math.nan) for p in c.poses if p.used]
+    modelled = any(TEMPERATURE in effect.needs for effect, _ in c.sensor.effects)
+    if modelled or not all(map(math.isfinite, of_poses)):
+        return ""
+    low, mean, high = (f"{v:.4g}" for v in (min(of_poses), sum(of_poses) / len(of_poses), max(of_poses)))
+    spread = "" if low == high else f", the mean of the poses ({low} to {high} °C)"
+    return f"scale factor, misalignment and bias are those at {TEMPERATURE} = {mean} °C{spread}"
 
 
 def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = None) -> None:
@@ -64,6 +81,8 @@ def show_budget(b: Budget, choice: Choice) -> None:
     table(f"uncertainty of the magnitude, {small}", ["source", "type", "standard", "share"], rows)
     by = small.in_words(b.dominant.halved_by)
     print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
+    if assumed := assumption(b.dominant.source, b.dominant.how, choice.reference_unit):
+        print(f"{b.dominant.source}: {assumed}")
     for line in b.not_evaluated:
         print(f"not evaluated: {small.in_words(line)}")
 
@@ -85,5 +104,7 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     if loop.unexplained.significant:
         lead = small.in_words(loop.unexplained.lead)
         print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")
+        if said := overlap(lead):
+            print(f"shares of what is unexplained: {said}")
     for line in loop.advice:
         print(f"advice: {small.in_words(line)}")

@@ -170,8 +170,8 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
     r = c.residual
     print(
         f"{len(c.poses)} poses: |a| off by {small.in_full(r.rms_g)} rms, cross-validated "
-        f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.told(r.noise_floor_g)} "
-        f"{small}, lack of fit p {probability(r.lack_of_fit_p)}"
+        f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.in_full(r.noise_floor_g)}, "
+        f"lack of fit p {probability(r.lack_of_fit_p)}"
     )
 
 

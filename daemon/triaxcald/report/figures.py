@@ -66,12 +66,12 @@ def micro(value_g: float | None, unit: ErrorUnit = MICRO_G) -> str:
 def micro_g(value_g: float | None, unit: ErrorUnit = MICRO_G) -> str:
     if value_g is None:
         return MISSING
-    return f"{micro(value_g, unit)}{' ' if unit.unit == 'g' else ' × '}{unit_label(unit)}"
+    return f"{micro(value_g, unit)}{' ' if unit.name else ' × '}{unit_label(unit)}"
 
 
 def unit_label(unit: ErrorUnit) -> str:
     """As it stands beside an axis or over a column."""
-    return "µg" if unit.unit == "g" else f"{power(unit.exponent)} {clean(unit.unit)}"
+    return unit.name or f"{power(unit.exponent)} {clean(unit.unit)}"
 
 
 def in_full(value: float | None) -> str:

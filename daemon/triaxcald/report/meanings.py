@@ -169,6 +169,7 @@ QUALITY = {
     "mains_pickup": "Mains hum",
     "coarse_quantization": "Steps of the output too coarse",
     "creeping_pose": "Outputs creep while the pose is held",
+    "time_unit": "Times that can hardly be seconds",
 }
 _NAME = re.compile(
     r"\b(?:(?:channel_bias|channel_scale_factor):[^\s,;]+?(?=[:,;.]?(?:\s|$))|"
@@ -176,7 +177,7 @@ _NAME = re.compile(
     + r")(?!\w)"
 )
 _RUN = re.compile(r"(.+)_run([1-9]\d{0,3})(_alone)?")
-_TIMES = re.compile(r"(?<=\d) 1e([+-]\d{1,3})(?= \S)")
+_TIMES = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)(?: 1)?e([+-]\d{1,3})(?= \S)")
 _EXPONENT = re.compile(r"(?<![\w.])(?<!\d )(\d(?:\.\d{1,8})?)e[+-]\d{1,2}(?![\w.])")
 
 
@@ -229,7 +230,7 @@ def _factor(factors: Mapping[str, str], coefficient: str) -> tuple[str, str]:
 def in_plain(text: str, *, begins: bool = True) -> str:
     """A sentence of a document with names and powers of ten as people write them; ``begins``: with a capital."""
     said = _EXPONENT.sub(lambda found: _written_out(found[0], found[1]), text)
-    said = _TIMES.sub(lambda found: f" × {power(int(found[1]))}", said)
+    said = _TIMES.sub(lambda found: f"{found[1]} × {power(int(found[2]))}", said)
     said = _NAME.sub(lambda found: _plain(found[0]), said)
     return said[:1].upper() + said[1:] if begins else said
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from triaxcald.remarks import assumption, overlap
 from triaxcald.report import figures
 from triaxcald.report.budget import read_uncertainty
 from triaxcald.report.charts import bars_picture, stream_picture
@@ -49,12 +50,16 @@ def render_report(
     limits = {name: figures.number(value) for name, value in mapping(papers.get("limits")).items()}
     floor_g = outcome.final.noise_floor_g
     uncertainty = read_uncertainty(mapping(document.get("calibration")) or document)
+    dominant = uncertainty.lines[0] if uncertainty else None
+    assumed = assumption(dominant.source, dominant.how, outcome.reference_unit) if dominant else ""
     return _ENVIRONMENT.get_template("report.html").render(
         title=title,
         outcome=outcome,
         unit=unit,
         verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None),
         uncertainty=uncertainty,
+        assumed=assumed,
+        overlap=overlap("; ".join(outcome.unexplained.leads if outcome.unexplained else ())),
         bars=bars_picture(outcome.stages, outcome.held_out, unit),
         sphere=sphere_picture(outcome.poses, outcome.stages, floor_g, unit),
         over_time=time_pictures(

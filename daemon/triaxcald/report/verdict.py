@@ -63,10 +63,11 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
     if open_checks or not (checks or _tested(outcome)):
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
-    if checks:
-        return Verdict("within", _WITHIN, errors, reservations, checks)
-    return Verdict("unexplained" if _uncertain(outcome) else "within", _without_limits(outcome), errors,
-                   reservations, checks)  # fmt: skip
+    headline = _WITHIN if checks else _without_limits(outcome)
+    uncertain = not checks and _uncertain(outcome)
+    if _spoiled(outcome) or _rejected(outcome):
+        headline, uncertain = f"{headline}; poses to take again", True
+    return Verdict("unexplained" if uncertain else "within", headline, errors, reservations, checks)
 
 
 def _without_limits(outcome: Outcome) -> str:
@@ -76,6 +77,15 @@ def _without_limits(outcome: Outcome) -> str:
         return "Nothing found beyond noise"
     what = "Effect" if len(outcome.findings) == 1 else f"{len(outcome.findings)} effects"
     return f"{what} found, cause uncertain" if _uncertain(outcome) else f"{what} found and corrected"
+
+
+def _spoiled(outcome: Outcome) -> bool:
+    return any(fault.spoils for fault in faults_of(outcome.data_quality))
+
+
+def _rejected(outcome: Outcome) -> int:
+    """How many poses the fit left out."""
+    return len(outcome.poses) - outcome.poses_used
 
 
 def _uncertain(outcome: Outcome) -> bool:
@@ -155,10 +165,9 @@ def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None, uni
 
 
 def _reservations(outcome: Outcome, checks: tuple[LimitCheck, ...]) -> list[str]:
-    spoiled = sum(fault.spoils for fault in faults_of(outcome.data_quality))
-    rejected = len(outcome.poses) - outcome.poses_used
+    rejected = _rejected(outcome)
     found = []
-    if spoiled:
+    if _spoiled(outcome):
         found.append("Faults in the recording spoil poses, which have to be taken again: see below.")
     if rejected:
         found.append(f"{rejected} of {len(outcome.poses)} poses not used.")

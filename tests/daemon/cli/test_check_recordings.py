@@ -19,10 +19,10 @@ RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
 REPEATED = "duplicate_samples: 1"
 
 
-def write(path: Path, seed: int, *, count: int = 14, repeated: bool = False) -> Path:
-    """A recording as text; ``repeated``: with a sample that came twice."""
+def write(path: Path, seed: int, *, count: int = 14, repeated: bool = False, k: float = 2.0) -> Path:
+    """A recording as text, of scale factors ``k``; ``repeated``: with a sample that came twice."""
     up = np.array([v for _, v in directions(14)])[np.random.default_rng(seed).permutation(14)][:count]
-    sensor = Sensor(np.full(3, 2.0), np.array([2e-3, -1e-3, 1e-3]), np.array([1e-3, 2e-3, -1e-3]))
+    sensor = Sensor(np.full(3, k), np.array([2e-3, -1e-3, 1e-3]), np.array([1e-3, 2e-3, -1e-3]))
     unit = SyntheticUnit(sensor, Tumble(up, HOLD_S, MOVE_S), np.full(3, 2e-4), Environment(), seed=seed)
     t_s = np.arange(int(count * (HOLD_S + MOVE_S) * RATE_HZ)) / RATE_HZ
     rows = [f"{t:.3f},{x:.9f},{y:.9f},{z:.9f}\n" for t, (x, y, z) in zip(t_s, unit.sample(t_s)[0], strict=True)]
@@ -39,6 +39,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write(folder / "later.csv", 2)
     write(folder / "check.csv", 3, repeated=True)
     write(folder / "few.csv", 4, count=5, repeated=True)
+    write(folder / "strange.csv", 5, k=3.2)
+    write(folder / "aged.csv", 6, k=2.02)
     return folder
 
 
@@ -70,6 +72,29 @@ def test_what_spoils_the_check_recording_stands_behind_its_name(folder: Path, tr
     assert document["held_out"]["poses"] == 14
     assert f"warning: {check}: {REPEATED}\n" in triaxcal("diagnose", main, "--check", check).err
     assert triaxcal("diagnose", main, "--json").json["data_quality"] == []
+
+
+def test_a_check_recording_that_cannot_be_of_this_unit_is_told_from_one_whose_unit_has_aged(
+    folder: Path, triaxcal: Run
+) -> None:
+    main, strange, aged = (folder / f"{name}.csv" for name in ("main", "strange", "aged"))
+    remark = f"{strange} does not look like this unit: |a| is off by 0.6 of the reference"
+    (said,) = triaxcal("diagnose", main, "--check", strange, "--json").json["calibration"]["warnings"]
+    assert said.startswith(remark)
+    done = triaxcal("diagnose", main, "--check", strange)
+    assert (done.code, done.err) == (0, f"warning: {said}\n")
+    assert triaxcal("diagnose", main, "--check", aged).err == ""
+
+
+def test_verify_says_when_a_recording_cannot_be_of_the_unit_of_the_calibration(folder: Path, triaxcal: Run) -> None:
+    cal, strange, aged = folder / "main.json", folder / "strange.csv", folder / "aged.csv"
+    assert triaxcal("fit", folder / "main.csv", "-o", cal).code == 0
+    (said,) = triaxcal("verify", cal, strange, "--json").json["warnings"]
+    assert said.startswith(f"{strange} does not look like this unit: |a| is off by 0.6 of the reference")
+    done = triaxcal("verify", cal, strange)
+    assert (done.code, done.err) == (0, f"warning: {said}\n")
+    assert triaxcal("verify", cal, strange, "--limit", "1e-3").code == 1
+    assert triaxcal("verify", cal, aged, "--json").json["warnings"] == []
 
 
 @pytest.mark.parametrize("command", [["fit"], ["fit", "--turning"], ["diagnose"]])

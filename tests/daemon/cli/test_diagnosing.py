@@ -14,6 +14,7 @@ from triaxcal.plan.directions import spiral
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcald.cli.several import COLUMNS
+from triaxcald.remarks import SHARE, overlap
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
@@ -21,9 +22,10 @@ K = 2.0
 
 
 def write(path: Path, seed: int, *, settling_g: float = 0.0, step_g: float = 0.0, swell: float = 0.0,
-          ripple: float = 0.0) -> Path:  # fmt: skip
-    """A recording as text at a steady temperature. Biases settle within 40 s each, or step at 87.5 s; |a| is off by a
-    ``swell`` of degree 4 over the sphere; the outputs are off by a ``ripple`` along their range."""
+          ripple: float = 0.0, warms_k: float = 0.0) -> Path:  # fmt: skip
+    """A recording as text at 25 °C, or at so much more in the end, which does nothing. Biases settle within 40 s each,
+    or step at 87.5 s; |a| is off by a ``swell`` of degree 4 over the sphere; the outputs are off by a ``ripple`` along
+    their range."""
     rng = np.random.default_rng(seed)
     up = spiral(30)[rng.permutation(30)]
     sensor = Sensor(np.full(3, K), np.array([2e-3, -1e-3, 1e-3]), np.array([1e-3, 2e-3, -1e-3]))
@@ -34,7 +36,8 @@ def write(path: Path, seed: int, *, settling_g: float = 0.0, step_g: float = 0.0
     u = u * (1 + swell * (s[:, :1] ** 3 * s[:, 1:2] - s[:, :1] * s[:, 1:2] ** 3)) + K * ripple * np.sin(25 * s)
     moves = settling_g * np.exp(-t_s / 40.0) + step_g * (t_s > 87.5)
     u = u + K * moves[:, None] * np.array([1.0, -0.8, 1.0])
-    rows = "\n".join(f"{t:.3f},{x:.9f},{y:.9f},{z:.9f},25.0" for t, (x, y, z) in zip(t_s, u, strict=True))
+    temp_c = 25.0 + warms_k * t_s / t_s[-1]
+    rows = "\n".join(f"{t:.3f},{x:.9f},{y:.9f},{z:.9f},{c:.6f}" for t, (x, y, z), c in zip(t_s, u, temp_c, strict=True))
     path.write_text(f"t_s,ux,uy,uz,temp_c\n{rows}\n", "utf-8")
     return path
 
@@ -99,6 +102,33 @@ def test_values_that_hold_always_are_not_said_to_hold_anywhere(rippled: Path, tr
     assert triaxcal("fit", rippled, "--json").json["holds"] == []
 
 
+def test_values_without_an_effect_of_temperature_are_said_to_be_those_at_the_mean_of_the_poses(
+    folder: Path, rippled: Path, triaxcal: Run
+) -> None:
+    said = "scale factor, misalignment and bias are those at temp_c = "
+    assert f"{said}25 °C\n" in triaxcal("fit", rippled).out
+    warm = folder / "warm.csv"
+    shown = triaxcal("fit", write(warm, 5, settling_g=5e-3, warms_k=1.0)).out
+    poses = triaxcal("fit", warm, "--json").json["poses"]
+    temp_c = [pose["channels"]["temp_c"] for pose in poses if pose["used"]]
+    mean, low, high = (f"{v:.4g}" for v in (np.mean(temp_c), min(temp_c), max(temp_c)))
+    assert f"{said}{mean} °C, the mean of the poses ({low} to {high} °C)\n" in shown
+
+
+def test_a_budget_that_temperature_dominates_says_what_of_it_is_assumed(
+    folder: Path, rippled: Path, triaxcal: Run
+) -> None:
+    warm = write(folder / "assumed.csv", 6, settling_g=5e-3, warms_k=1.0)
+    said = "temperature: where the poses do not tell, this is an assumption, typical of data sheets: bias 500 "
+    assert f"{said}µg/K and scale factor 300 ppm/K; " in triaxcal("fit", warm).out
+    assert f"{said}ppm of the reference per K and scale" in triaxcal("fit", warm, "--reference", "9.80665").out
+    page = folder / "assumed.html"
+    triaxcal("fit", warm, "--report", page)
+    assert "Where the poses do not tell, this is an assumption, typical of data sheets: bias 500" in page.read_text()
+    assert "assumption" not in triaxcal("fit", rippled, "--report", page).out
+    assert "this is an assumption" not in page.read_text("utf-8")
+
+
 def test_no_probability_is_said_to_be_nothing_and_no_error_has_an_exponent(
     rippled: Path, settling: Path, triaxcal: Run
 ) -> None:
@@ -120,12 +150,22 @@ def test_what_no_effect_explains_is_described_only_where_that_is_asked_for(folde
     assert not empirical_lines("\n".join(plainly["advice"]))
     assert "empirical" not in plainly["calibration"]["terms"]
     assert plainly["unexplained"]["significant"]
+    assert plainly["unexplained"]["lead"].count(SHARE) == 1
+    assert overlap(plainly["unexplained"]["lead"]) == ""
     described = triaxcal("diagnose", recording, "--empirical", "--json").json
     assert described["calibration"]["terms"][-1] == described["findings"][-1]["effect"] == "empirical"
     errors = [d["after"]["cross_validated_rms_g"] for d in (plainly, described)]
     assert errors[1] < errors[0] / 1.4
     assert f"from {errors[0] * 1e6:.1f} µg to {errors[1] * 1e6:.1f} µg" in described["findings"][-1]["reason"]
     assert not described["unexplained"]["significant"]
+
+
+def test_the_console_explains_the_shares_of_what_is_left(
+    rippled: Path, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("triaxcald.cli.results.overlap", lambda lead: f"of {lead}")
+    said = triaxcal("diagnose", rippled).out
+    assert re.search(r"unexplained: \S+ µg rms; (.+)\nshares of what is unexplained: of \1\n", said)
 
 
 def test_one_line_says_why_the_empirical_term_is_not_in_the_model(rippled: Path, settling: Path, triaxcal: Run) -> None:

@@ -199,7 +199,7 @@ def test_verify_judges_a_recording_by_a_calibration(finished_run: Any, tmp_path:
     triaxcal("diagnose", finished_run.can, "-o", closed)
     done = triaxcal("verify", linear, finished_run.can, "--json")
     assert (done.code, done.err) == (0, "")
-    assert set(done.json) == {"format", "rms_g", "max_abs_g", "noise_floor_g", "poses", "data_quality"}
+    assert set(done.json) == {"format", "rms_g", "max_abs_g", "noise_floor_g", "poses", "data_quality", "warnings"}
     _all_finite(done.json)
     assert done.json["rms_g"] == pytest.approx(fitted["residual"]["rms_g"], rel=0.05)
     assert len(done.json["poses"]) == len(fitted["poses"])
@@ -337,7 +337,7 @@ def test_the_unit_of_another_reference_is_that_of_every_coefficient(
     assert document["calibration"]["units"] == units
     (finding,) = document["findings"]
     assert finding["effect"] == "second_order_nonlinearity"
-    assert re.search(r"error \w+ from \S+ 1e-6 µT to \S+ 1e-6 µT \(noise floor", finding["reason"])
+    assert re.search(r"error \w+ from [\d.]+e-6 µT to [\d.]+e-6 µT \(noise floor", finding["reason"])
     (held,) = document["calibration"]["effects"].values()
     assert {c["unit"] for c in (*finding["coefficients"].values(), *held.values())} == {"µT/µT²"}
     fitted = triaxcal("fit", exported, SIGNS, *field, "--json").json
@@ -349,6 +349,9 @@ def test_the_unit_of_another_reference_is_that_of_every_coefficient(
     assert "µg" not in shown
     unnamed = triaxcal("fit", exported, SIGNS, "--reference", "50", "--json").json
     assert unnamed["units"]["bias"] == "reference unit"
+    said = triaxcal("fit", exported, SIGNS, "--reference", "50").out
+    assert f"residual rms {unnamed['residual']['rms_g'] / 50 * 1e6:.1f} ppm of the reference, " in said
+    assert "1e-6" not in said
 
 
 def test_what_is_no_number_is_within_no_limit(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,8 @@ import pytest
 from triaxcal.plan.directions import directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+from triaxcald.cli.arguments import parsed
+from triaxcald.cli.commands import parser
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
@@ -64,6 +66,24 @@ def test_the_document_says_which_pose_is_of_which_recording(runs: list[Path], tr
         assert name.endswith("_run2")
         assert value["value"] == pytest.approx(1.5e-3, abs=5 * value["standard_error"])
     assert document["calibration"]["channel_reference"] == {"run_index": 0.0}
+
+
+def test_options_may_stand_between_recordings(runs: list[Path], triaxcal: Run) -> None:
+    one, two = runs
+    between = triaxcal("diagnose", one, "--sign=+,+,+", two, "--json", "--output-unit", "V")
+    assert between.json == triaxcal("diagnose", one, two, "--sign=+,+,+", "--output-unit", "V", "--json").json
+    audits = parsed(parser("audit"), ["audit", str(one), "--json", str(two)])
+    assert (audits.recordings, audits.json) == (runs, True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "left"),
+    [(["diagnose", "a.csv", "--odd", "b.csv"], "--odd b.csv"), (["fit", "a.csv", "--json", "b.csv"], "b.csv")],
+)
+def test_what_no_command_knows_is_told(triaxcal: Run, arguments: list[str], left: str) -> None:
+    done = triaxcal(*arguments)
+    done.failed(2)
+    assert done.err == f"triaxcal: unrecognized arguments: {left}\n"
 
 
 def test_the_calibration_of_two_runs_serves_another(runs: list[Path], triaxcal: Run, tmp_path: Path) -> None:

@@ -168,6 +168,14 @@ def test_the_leads_of_what_is_unexplained_are_a_list(words: dict[str, Any]) -> N
     assert text.count(HOSTILE) == 1
 
 
+def test_shares_that_overlap_are_said_to_be_no_parts_of_a_whole(words: dict[str, Any]) -> None:
+    said = "Each share is of the squares of all that is left, by that pattern alone; patterns overlap"
+    one, other = "93% of it goes with an odd pattern", "60% of it goes with a wave along the output of axis x, 1 g long"
+    for lead, told in ((f"{one}; {other}", True), (one, False)):
+        words["unexplained"] = {"significant": True, "p_value": 1e-9, "rms_g": 2e-4, "lead": lead}
+        assert (said in page(words)[1]) == told
+
+
 def test_how_much_is_left_is_told_only_where_it_is_significant(words: dict[str, Any]) -> None:
     words["unexplained"] = {"significant": False, "p_value": 0.4, "rms_g": 2.81e-6, "lead": ""}
     _, text = page(words)
@@ -207,6 +215,24 @@ def test_poses_left_out_are_named_above_all_figures(loop: dict[str, Any]) -> Non
     assert "Pose 5, at 166.0 s: off by 3062 µg" in text
     assert text.index("Poses to take again") < text.index("Residual, rms")
     assert "pose 5, not used" in html
+
+
+@pytest.mark.parametrize("limits", [{}, {"limits": {"rms_g": 1e-3}}])
+@pytest.mark.parametrize("fault", ["saturation", "stuck_output", ""])
+def test_the_headline_is_not_that_all_is_well_while_poses_have_to_be_taken_again(
+    loop: dict[str, Any], limits: dict[str, Any], fault: str
+) -> None:
+    good = "Within limits" if limits else "Nothing found beyond noise"
+    html, text = page(loop, limits)
+    assert 'class="verdict within"' in html
+    assert f"{good}; poses" not in text
+    if fault:
+        loop["data_quality"] = [f"{fault}: x at 2.1 in 687 samples, in the pose that begins at 171.6 s: take again"]
+    else:
+        loop["calibration"]["poses"][4]["used"] = False
+    html, text = page(loop, limits)
+    assert 'class="verdict unexplained"' in html
+    assert f"{good}; poses to take again" in text
 
 
 def test_faults_that_spoil_poses_come_first_and_the_rest_stay_remarks(words: dict[str, Any]) -> None:

@@ -132,7 +132,8 @@ def test_an_effect_of_somebody_else_is_shown_by_its_name() -> None:
         ("warm_up cannot be told from bias_drift here", "Warm up cannot be told from bias drift here"),
         ("record while temp_c moves", "Record while temp_c moves"),
         ("from 1.53e+04 µg, p below 1e-12", "From 15300 µg, p below 10⁻¹²"),
-        ("15300 1e-6 µT", "15300 × 10⁻⁶ µT"),
+        ("from 15300 1e-6 µT to 3e-6 µT", "From 15300 × 10⁻⁶ µT to 3 × 10⁻⁶ µT"),
+        ("from 15300e-6 µT to 27.6e-6 µT", "From 15300 × 10⁻⁶ µT to 27.6 × 10⁻⁶ µT"),
         ("temperature_bias_quadratic with warm_upper", "Temperature bias quadratic with warm_upper"),
     ],
 )  # fmt: skip

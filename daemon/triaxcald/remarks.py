@@ -1,0 +1,33 @@
+"""Sentences that console and report add to what the metrology says: what it assumes, what its shares are shares of."""
+
+from __future__ import annotations
+
+from triaxcal.uncertainty import SENSITIVITY_PER_K
+
+SHARE = "% of it goes with "
+"""How the lead of what is unexplained tells a share."""
+
+
+def assumption(source: str, how: str, reference_unit: str = "g") -> str:
+    """On a line of the budget (`triaxcal.uncertainty.Component`), empty where it assumes nothing."""
+    said = {
+        "temperature_bias": f"bias {{:g}} {'µg/K' if reference_unit == 'g' else 'ppm of the reference per K'}",
+        "temperature_scale_factor": "scale factor {:g} ppm/K",
+    }
+    assumed = " and ".join(text.format(1e6 * SENSITIVITY_PER_K[e]) for e, text in said.items() if e in how)
+    if source != "temperature" or not assumed:
+        return ""
+    return (
+        f"where the poses do not tell, this is an assumption, typical of data sheets: {assumed}; diagnose of a "
+        "recording in which the temperature swings would tell"
+    )
+
+
+def overlap(lead: str) -> str:
+    """On the shares of a lead (`triaxcal.unexplained`), empty where there are not several."""
+    if lead.count(SHARE) < 2:
+        return ""
+    return (
+        "each share is of the squares of all that is left, by that pattern alone; patterns overlap, so the shares do "
+        "not sum to 100%"
+    )

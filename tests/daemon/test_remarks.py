@@ -1,0 +1,31 @@
+"""Sentences that are added to what the metrology says."""
+
+from __future__ import annotations
+
+import pytest
+
+from triaxcald.remarks import SHARE, assumption, overlap
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ("temperature_bias and temperature_scale_factor not in the model", "bias 500 µg/K and scale factor 300 ppm/K;"),
+        ("temperature_scale_factor not in the model", "data sheets: scale factor 300 ppm/K;"),
+        ("temperature_bias not in the model", "data sheets: bias 500 µg/K;"),
+    ],
+)
+def test_what_is_assumed_of_temperature_is_what_the_model_has_no_effect_for(how: str, said: str) -> None:
+    assert said in assumption("temperature", how)
+    assert assumption("noise", how) == ""
+    assert "µg" not in assumption("temperature", how, "m/s^2")
+
+
+def test_nothing_is_said_of_an_assumption_that_nobody_made() -> None:
+    assert assumption("temperature", "measured") == ""
+
+
+def test_shares_are_explained_where_there_are_several() -> None:
+    one, other = f"93{SHARE}the time", f"60{SHARE}temp_c"
+    assert overlap(f"{one}; {other}").startswith("each share is of the squares of all that is left")
+    assert overlap(f"{one}; inside the poses |a| moves too") == ""
