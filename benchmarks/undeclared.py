@@ -24,6 +24,8 @@ from tests.undeclared import physics, uncatalogued
 from tests.undeclared.examine import Case, Outcome, describe, examine
 
 SIZES = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0)
+ASKED, TIMES = 5.0, 4
+"""Of the size for which a figure is asked there are so many times as many."""
 LARGE = (20.0, 200.0)
 PAIR = (20.0, 40.0)
 NOISES = ("white", "first_order", "mixed")
@@ -69,7 +71,7 @@ def cases(counts: Counts, section: str) -> list[Case]:
         return [
             Case(*_turn(physics.KINDS, i), (s, s), 26, _noise(physics.KINDS, i))
             for s in SIZES
-            for i in range(ELSEWHERE, ELSEWHERE + counts.power)
+            for i in range(ELSEWHERE, ELSEWHERE + counts.power * (TIMES if s == ASKED else 1))
         ]
     if section == "two":
         return [Case("two", i, PAIR, 26, NOISES[i % 3]) for i in range(counts.two)]
@@ -181,7 +183,7 @@ def _power(found: Sequence[Outcome]) -> Iterable[Table]:
         row = [f"{s:g}", str(n), f"{told:.1f}", f"{detected:.1f}", f"{detected / told:.2f}"]
         rows.append([*row, percent(sum(o.listed for o in group), n), percent(sum(o.wrong for o in group), n)])
     yield Table("Power, 26 poses; told: the test that was told the effect, at 1 % false alarms", head, rows)
-    five = [o for o in found if o.case.size[0] == 5.0]
+    five = [o for o in found if o.case.size[0] == ASKED]
     rows = []
     for kind in physics.KINDS:
         group = [o for o in five if o.case.kind == kind]

@@ -12,7 +12,7 @@ from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, r
 from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import package_of
 from triaxcal.figures import micro_g, probability
-from triaxcal.search import Search, alternatives, telling_apart
+from triaxcal.search import Search, alternatives, compared, telling_apart
 from triaxcal.unexplained import Unexplained
 
 OTHERS = ("", "the other effect", "the other two effects", "the other three effects", "the other four effects")
@@ -44,13 +44,13 @@ class Finding:
 def finding_of(
     search: Search,
     effect: Effect,
-    compared: tuple[Calibration | None, Calibration],
+    pair: tuple[Calibration | None, Calibration],
     after: Calibration,
     step: Calibration,
     rivals: Sequence[Sequence[Effect]],
     spoiled: Sequence[str],
 ) -> Finding:
-    """``compared`` are the model that lacks this effect alone (None where the poses cannot carry it), and that with all
+    """The ``pair`` are the model that lacks this effect alone (None where the poses cannot carry it), and that with all
     effects found; ``after`` is what is handed on. ``rivals`` explain as much with other poses left out, the poses
     ``spoiled`` without any effect."""
     found = alternatives(search, effect, search.found)
@@ -60,7 +60,7 @@ def finding_of(
         found |= {e.name: model for e in rival if model and e.name not in taken | found.keys()}
     others = [e for e in search.found.effects if e is not effect]
     p = search.earned(effect, others)
-    reason = f"{_fall(*compared, len(others))}familywise p {probability(p)}"
+    reason = f"{_fall(*pair, len(others))}familywise p {probability(p)}"
     if isinstance(effect, Part) and not effect.selects:
         reason += f"; of its coefficients these poses show only {effect.formula}, which they share in that proportion"
     if found:
@@ -68,7 +68,7 @@ def finding_of(
     if spoiled:
         reason += f"; that something spoiled {the_poses(spoiled)} would {'also ' * bool(found)}do as well"
     apart = dict.fromkeys(telling_apart(search, effect, found)) if found else ()
-    floor = compared[1].residual.noise_floor_g
+    floor = pair[1].residual.noise_floor_g
     if not effect.coefficients[0].unit.startswith("g"):
         floor /= after.reference  # the effect is a share of the magnitude
     return Finding(
@@ -97,14 +97,17 @@ def _largest(c: Calibration, effect: Effect) -> float:
 
 def _fall(without: Calibration | None, complete: Calibration, others: int) -> str:
     """What an effect does to the cross-validated error; empty where that is not known."""
-    old = None if without is None else without.residual.cross_validated_rms_g
-    new = complete.residual.cross_validated_rms_g
-    if old is None or new is None:
+    found = None if without is None else compared(complete, without)
+    if found is None or found.old_g is None or found.new_g is None:
         return ""
     beside = f", beside {OTHERS[others]}," if others else ""
+    which = "which" if len(found.but) == 1 else "each of which"
+    but = f", but for {the_poses([p.pose.at for p in found.but])}, {which} alone carries a coefficient," * bool(
+        found.but
+    )
     return (
-        f"with it{beside} the cross-validated error {'falls' if new < old else 'goes'} from {micro_g(old)} to "
-        f"{micro_g(new)} (noise floor {micro_g(complete.residual.noise_floor_g)}); "
+        f"with it{beside} the cross-validated error{but} {'falls' if found.new_g < found.old_g else 'goes'} from "
+        f"{micro_g(found.old_g)} to {micro_g(found.new_g)} (noise floor {micro_g(complete.residual.noise_floor_g)}); "
     )
 
 

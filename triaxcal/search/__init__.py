@@ -2,7 +2,8 @@
 
 from triaxcal.search.alternatives import NEAR, alternatives
 from triaxcal.search.apart import telling_apart
+from triaxcal.search.comparison import compared
 from triaxcal.search.search import Nearest, Search
 from triaxcal.search.worth import FAMILYWISE, Model
 
-__all__ = ["FAMILYWISE", "NEAR", "Model", "Nearest", "Search", "alternatives", "telling_apart"]
+__all__ = ["FAMILYWISE", "NEAR", "Model", "Nearest", "Search", "alternatives", "compared", "telling_apart"]

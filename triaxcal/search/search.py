@@ -16,6 +16,7 @@ from triaxcal.figures import probability
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State
 from triaxcal.search.candidates import Candidate, Ground, candidates_of
+from triaxcal.search.comparison import CARRIES, compared
 from triaxcal.search.gains import Gains
 from triaxcal.search.shape import refined, sharpened
 from triaxcal.search.worth import FAMILYWISE, Model, Worth, deviance, parameters
@@ -28,8 +29,6 @@ LIKE_NOISE, MUCH_BETTER = 2.0, 10.0
 or else the model only bends to the poses."""
 MOST = 9.0
 """Where something is left beside it, an effect is named that explains so many times as much."""
-CARRIES = 0.05
-"""A pose of which the model leaves less than this share carries a parameter, and cannot be left out."""
 FORMS, REACH = 3, 1000
 """Of pairs with the same two names so many are fitted, from so many of the best pairs."""
 PARTNERS = 60
@@ -110,7 +109,8 @@ class Search(Worth):
         return self.score(trial) < self.score(now) and self.score_of_means(trial) < self.score_of_means(now)
 
     def beside(self, now: Model) -> Beside:
-        """What may come beside a model, in linear reckoning; the best of every effect with its shape refined."""
+        """What may come beside a model, in linear reckoning; of every form of an effect the best with its shape
+        refined."""
         key = tuple(map(id, now.effects))
         if key not in self._reckonings:
             self._reckonings[key] = now, self._reckoned(now)
@@ -122,10 +122,11 @@ class Search(Worth):
             found, _ = candidates_of(ground, [e for e in self.catalogue if e.name in self.names], self.still)
         candidates = [c for c in found if c.name not in {e.name for e in now.effects}]
         rough = self._scored(now, ground, candidates)
-        shaped: dict[str, Candidate] = {}
+        shaped: dict[tuple[str, ...], Candidate] = {}
         for i in np.argsort(rough.scores, kind="stable"):
-            if candidates[i].effect.shape and np.isfinite(rough.scores[i]):
-                shaped.setdefault(candidates[i].name, candidates[i])
+            c = candidates[i]
+            if c.effect.shape and np.isfinite(rough.scores[i]):
+                shaped.setdefault((c.name, *(k.name for k in c.effect.coefficients)), c)
         better = [finer for c in shaped.values() if (finer := sharpened(ground, c)) is not None]
         return self._scored(now, ground, [*candidates, *better]) if better else rough
 
@@ -303,10 +304,10 @@ def _named(trial: Model, now: Model) -> str:
 
 def _no_better(trial: Calibration, best: Calibration) -> str:
     """Why poses that the fit did not see speak against a model; nothing where they do not."""
-    new, old = trial.residual.cross_validated_rms_g, best.residual.cross_validated_rms_g
+    found = compared(trial, best)
+    new, old = found.new_g, found.old_g
     if new is None or (old is not None and new >= old):
         return "it does not lower the cross-validated error"
-    noise = np.sqrt(np.mean([p.standard_error_g**2 / max(1 - p.leverage, 1e-9) for p in trial.poses if p.used]))
-    if new > LIKE_NOISE * noise and (old is None or new > old / MUCH_BETTER):
-        return f"the cross-validated error stays {new / noise:.1f} times what noise makes it"
+    if new > LIKE_NOISE * found.noise_g and (old is None or new > old / MUCH_BETTER):
+        return f"the cross-validated error stays {new / found.noise_g:.1f} times what noise makes it"
     return ""
