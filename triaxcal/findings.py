@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,6 +39,8 @@ class Finding:
     """What to record so as to tell it from its alternatives."""
     spoiled: tuple[str, ...] = ()
     """When poses began that would do as well as any effect, were they spoiled."""
+    instead: Mapping[str, tuple[Effect, ...]] = field(default_factory=dict, repr=False)
+    """The effects of the model with each alternative in its place, by name."""
 
 
 def finding_of(
@@ -82,6 +84,7 @@ def finding_of(
         step=step,
         apart=(*([f"take {the_poses(spoiled)} again"] if spoiled else []), *apart),
         spoiled=tuple(spoiled),
+        instead={name: model.effects for name, model in found.items()},
     )
 
 

@@ -7,30 +7,29 @@ tested against the noise inside the poses (pure error).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import special
 
-from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
-from triaxcal.conditions import channels_of, conditions_elsewhere
+from triaxcal.conditions import channels_of
 from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.description import described
 from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import plugins
-from triaxcal.errors import InvalidData, Refused
+from triaxcal.errors import Refused
 from triaxcal.findings import Finding, advice_of, description_of, finding_of, the_poses, why_not_shown
 from triaxcal.fit import fit, with_faulty
+from triaxcal.held_out import HeldOut, better_of, held_out
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.runs import by_run, expected_of
 from triaxcal.search import NEAR, Search, alternatives
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
-from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start, with_history
 from triaxcal.unexplained import Unexplained, hints_of, unexplained_of
 
@@ -38,17 +37,6 @@ ANYTHING = 5
 """An effect beside others, with so many alternatives, is none."""
 ROUNDS_MOST = 3
 """Effects and spoiled poses are sought in turn so often."""
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Errors of the magnitude in poses that no fit saw, in g."""
-
-    before_rms_g: float
-    after_rms_g: float
-    noise_floor_g: float
-    """What the noise of these poses leaves, with so much of their creep as the extended model does not explain."""
-    poses: int
 
 
 @dataclass(frozen=True)
@@ -123,13 +111,17 @@ def diagnose(
     blind = {e.name: why_not_shown(search, e) for e in effects if e.name not in search.full and e.name not in faulty}
     if catalogue is None:
         faulty = dict(plugins()[1]) | faulty
+    held = None
+    if check is not None:
+        instead = {n: given.tried(effects) for f in findings for n, effects in f.instead.items()}
+        held = held_out(before, after, check, {n: c for n, c in instead.items() if c is not None})
     return Loop(
         before=before.with_blind_to(tuple(blind)),
         after=after.with_blind_to(tuple(blind)),
         findings=tuple(findings),
         unexplained=unexplained,
-        held_out=_held_out(before, after, check) if check is not None else None,
-        advice=(*_again(found, poses), *advice_of(findings, unexplained, undescribed, blind, faulty)),
+        held_out=held,
+        advice=(*_again(found, poses), *advice_of(findings, unexplained, undescribed, blind, faulty), *better_of(held)),
         search=search,
     )
 
@@ -276,36 +268,3 @@ def _criterion(found: _Found, n: int) -> float:
     aside = len(found.aside)
     choice = float(special.gammaln(n + 1) - special.gammaln(aside + 1) - special.gammaln(n - aside + 1))
     return found.search.score(found.search.found) + aside * float(np.log(n)) + 2 * choice
-
-
-def _held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HeldOut:
-    """Raises InvalidData where the check poses lack a channel that the effects need."""
-    if not check:
-        raise InvalidData("the check recording has no still pose")
-    try:
-        errors = [
-            magnitude_errors(c.sensor, held, channel_reference=c.channel_reference, reference=c.reference)
-            for c, held in ((before, check), (after, with_creep_left(check, after, elsewhere=True)))
-        ]
-    except InvalidData as e:
-        raise InvalidData(f"the check recording: {e}") from e
-    return HeldOut(_rms(errors[0][0]), _rms(errors[1][0]), _rms(errors[1][1]), len(check))
-
-
-def magnitude_errors(
-    sensor: Sensor, poses: Sequence[Pose], *, channel_reference: Mapping[str, float], reference: float
-) -> tuple[Floats, Floats]:
-    """|a| − reference (n,) of poses under a sensor's model, and its standard error (n,) from their noise.
-
-    The poses are of another recording than the model's, whose clock is its own: effects of time count as at their
-    reference. Raises InvalidData where a channel that the effects need is missing.
-    """
-    u = np.array([p.mean for p in poses])
-    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias)
-    length, by_u = sensor.magnitude(u, held)
-    covariance = np.array([p.covariance for p in poses])
-    return length - reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))

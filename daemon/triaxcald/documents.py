@@ -260,6 +260,7 @@ def loop_document(
                     "after_rms_g": error(held.after_rms_g, reference),
                     "noise_floor_g": error(held.noise_floor_g, reference),
                     "poses": held.poses,
+                    "alternatives": {name: error(rms, reference) for name, rms in held.instead.items()},
                 }
             }
             if held

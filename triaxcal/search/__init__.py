@@ -4,6 +4,6 @@ from triaxcal.search.alternatives import NEAR, alternatives
 from triaxcal.search.apart import telling_apart
 from triaxcal.search.comparison import compared
 from triaxcal.search.search import Nearest, Search
-from triaxcal.search.worth import FAMILYWISE, Model
+from triaxcal.search.worth import FAMILYWISE, Model, deviance
 
-__all__ = ["FAMILYWISE", "NEAR", "Model", "Nearest", "Search", "alternatives", "compared", "telling_apart"]
+__all__ = ["FAMILYWISE", "NEAR", "Model", "Nearest", "Search", "alternatives", "compared", "deviance", "telling_apart"]

@@ -11,7 +11,7 @@ import numpy as np
 from triaxcal.calibration import Calibration
 from triaxcal.creep import with_creep_left
 from triaxcal.errors import Refused
-from triaxcal.loop import magnitude_errors
+from triaxcal.held_out import magnitude_errors
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, positive
 from triaxcald.cli.console import emit

@@ -95,6 +95,8 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     ]
     if loop.held_out:
         rows.append(["held-out rms", small.told(loop.held_out.before_rms_g), small.told(loop.held_out.after_rms_g)])
+        for name, rms in loop.held_out.instead.items():
+            rows.append([f"  with {name} instead", "", small.told(rms)])
     rows.append(["noise floor", small.told(b.noise_floor_g), small.told(f.noise_floor_g)])
     table(f"error of the magnitude, {small}", ["", "before", "after"], rows)
     for finding in loop.findings:
