@@ -330,7 +330,9 @@ def keys_of(value: object, named: frozenset[str]) -> set[str]:
     return found
 
 
-NAMED = frozenset({"channels", "channel_reference", "effects", "coefficients", "sees", "levels", "promised", "moves"})
+NAMED = frozenset(
+    {"alternatives", "channels", "channel_reference", "effects", "coefficients", "sees", "levels", "promised", "moves"}
+)
 EFFECT_LEAVES = {"x", "y", "z"}
 
 

@@ -273,6 +273,7 @@ def loop_document(
                 "p_value": probability(f.p_value),
                 "coefficients": coefficients_document(f.coefficients, reference_unit),
                 "alternatives": list(f.alternatives),
+                "spoiled": list(f.spoiled),
                 "reason": small.in_words(f.reason),
                 "remedy": f.remedy,
                 "apart": [small.in_words(line) for line in f.apart],

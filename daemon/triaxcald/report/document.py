@@ -67,6 +67,8 @@ class Finding:
     remedy: str | None
     apart: tuple[str, ...] = ()
     """What to record so as to tell it from its alternatives."""
+    spoiled: tuple[str, ...] = ()
+    """When poses began that, were they spoiled, would do as well."""
 
     def shape(self, name: str) -> float | None:
         """The value of a coefficient, such as the moment of a step."""
@@ -226,6 +228,7 @@ def _findings(value: object, terms: set[str]) -> Iterator[Finding]:
             reason=None if reason is None else words(reason),
             remedy=None if remedy is None else words(remedy),
             apart=texts(known.get("apart")),
+            spoiled=texts(known.get("spoiled")),
         )
 
 

@@ -109,7 +109,8 @@ def _named(finding: Finding, outcome: Outcome) -> str:
         title = known.title.lower()
         clauses.append(known.clause if known.clause == title else f"{known.clause} ({title})")
     clauses += ["others"] if len(names) > _MOST_NAMED else []
-    doubt = "" if len(names) == 1 else " – these poses cannot tell which"
+    clauses += ["spoiled poses"] if finding.spoiled else []
+    doubt = "" if len(clauses) == 1 else " – these poses cannot tell which"
     return " or ".join(clauses) + doubt
 
 

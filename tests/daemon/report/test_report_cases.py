@@ -74,7 +74,7 @@ def add(document: dict[str, Any], effect: str, coefficients: dict[str, Any], **m
     document["findings"].append(
         {
             "effect": effect,
-            "verdict": "confounded" if more.get("alternatives") else "adopted",
+            "verdict": "confounded" if more.get("alternatives") or more.get("spoiled") else "adopted",
             "p_value": 1e-9,
             "coefficients": known,
             "alternatives": [],
@@ -135,6 +135,25 @@ def test_confounded_effects_are_all_told_in_words_with_what_would_tell_them_apar
         assert said in text
     assert "Would tell them apart Record again while temp_c moves by itself" in text
     assert "elsewhere it holds only if the name is right" in text
+
+
+def test_a_check_recording_has_its_error_beside_every_name_that_fits_as_well(words: dict[str, Any]) -> None:
+    words["held_out"] = {"before_rms_g": 1.31e-4, "after_rms_g": 1.62e-5, "noise_floor_g": 1.49e-5, "poses": 9}
+    words["held_out"]["alternatives"] = {"warm_up": 3.45e-4}
+    add(words, "bias_drift", {"x": (8.27e-4, 1.5e-5, "g/s")}, alternatives=["warm_up", "bias_step"])
+    _, text = page(words)
+    assert text.count("in the check recording)") == 1
+    assert re.search(r"Warm up: [^()]*\(345 µg in the check recording\)", text)
+
+
+def test_poses_that_would_do_as_well_as_the_effect_are_named_beside_it(words: dict[str, Any]) -> None:
+    apart = ["take the pose at 10.7 s and the pose at 82.9 s again"]
+    add(words, "bias_drift", {"x": (8.27e-4, 1.5e-5, "g/s")}, spoiled=["10.7 s", "82.9 s"], apart=apart)
+    _, text = page(words)
+    assert "or spoiled poses – these poses cannot tell which" in text
+    assert "No effect, had something spoiled the poses at 10.7 s and 82.9 s" in text
+    assert "Would tell them apart take the pose at 10.7 s and the pose at 82.9 s again".lower() in text.lower()
+    assert "The name: the correction is good for these poses" in text
 
 
 def test_a_confounded_effect_within_its_limits_is_within_limits(words: dict[str, Any]) -> None:
