@@ -58,8 +58,11 @@ def finding_of(
     found = alternatives(search, effect, search.found)
     taken = {e.name for e in search.found.effects}
     for rival in rivals:
-        model = search.model(rival)
-        found |= {e.name: model for e in rival if model and e.name not in taken | found.keys()}
+        names = {e.name for e in rival}
+        # What stands beside one of the effects stands for the other; what shares none of them, for the first.
+        stands = effect.name not in names and (names & taken or effect is search.found.effects[0])
+        model = search.model(rival) if stands else None
+        found |= {name: model for name in sorted(names) if model and name not in taken | found.keys()}
     others = [e for e in search.found.effects if e is not effect]
     p = search.earned(effect, others)
     reason = f"{_fall(*pair, len(others))}familywise p {probability(p)}"

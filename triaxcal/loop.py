@@ -28,7 +28,7 @@ from triaxcal.held_out import HeldOut, better_of, held_out
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.runs import by_run, expected_of
-from triaxcal.search import NEAR, Search, alternatives
+from triaxcal.search import NEAR, NO_LOWER, Search, alternatives, compared
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
 from triaxcal.start import problem_of, start, with_history
 from triaxcal.unexplained import Unexplained, hints_of, unexplained_of
@@ -88,13 +88,18 @@ def diagnose(
     search, given = found.search, _Given(poses, signs, reference, found.aside)
     before, steps = linear, [linear]
     # Poses in which |a| itself creeps are something that is left, not an excuse for it.
-    if not found.adopted:
-        model = fit(quiet, signs=signs, reference=reference)
-    else:
-        before = given.fit(())
+    nothing = fit(quiet, signs=signs, reference=reference)
+    model = nothing
+    if found.adopted:
         model = replace(given, poses=quiet).fit(found.adopted)
+        before = given.fit(())
         given = replace(given, poses=with_creep_left(poses, model))
         steps = [given.fit(found.adopted[:count]) for count in range(1, len(found.adopted) + 1)]
+        # The search has asked this of poses without their creep.
+        if not compared(steps[-1], before).lower:
+            search.passed_over[" with ".join(e.name for e in found.adopted)] = NO_LOWER
+            found = replace(found, adopted=search.settle_on(search.linear))
+            given, before, steps, model = replace(given, poses=poses), linear, [linear], nothing
     unexplained = unexplained_of(model, search.passed_over, search.nearest(), hints_of(search))
     smooth, undescribed = described(steps[-1], unexplained, signs) if empirical else (None, "")
     after = smooth or steps[-1]
@@ -102,8 +107,8 @@ def diagnose(
     for effect, step in zip(found.adopted, steps, strict=False):
         others = [e for e in found.adopted if e is not effect]
         without = given.tried(others) if others else before
-        rivals, spoiled = ((), ()) if findings else (found.rivals, tuple(poses[i].at for i in found.spoiled))
-        findings.append(finding_of(search, effect, (without, steps[-1]), after, step, rivals, spoiled))
+        spoiled = () if findings else tuple(poses[i].at for i in found.spoiled)
+        findings.append(finding_of(search, effect, (without, steps[-1]), after, step, found.rivals, spoiled))
     if smooth is not None:
         findings.append(description_of(smooth, steps[-1]))
         unexplained = unexplained_of(smooth, search.passed_over)
@@ -115,13 +120,14 @@ def diagnose(
     if check is not None:
         instead = {n: given.tried(effects) for f in findings for n, effects in f.instead.items()}
         held = held_out(before, after, check, {n: c for n, c in instead.items() if c is not None})
+    advice = advice_of(findings, unexplained, undescribed, blind, faulty)
     return Loop(
         before=before.with_blind_to(tuple(blind)),
         after=after.with_blind_to(tuple(blind)),
         findings=tuple(findings),
         unexplained=unexplained,
         held_out=held,
-        advice=(*_again(found, poses), *advice_of(findings, unexplained, undescribed, blind, faulty), *better_of(held)),
+        advice=tuple(_again(found, before) + advice + better_of(held)),
         search=search,
     )
 
@@ -159,13 +165,13 @@ class _Found:
     """Poses that explain as much without any effect, were they spoiled."""
 
 
-def _again(found: _Found, poses: Sequence[Pose]) -> list[str]:
+def _again(found: _Found, before: Calibration) -> list[str]:
     """What to take again where an effect would explain as much as the poses that were left out as spoiled."""
-    if found.adopted or not found.rivals or not found.aside:
+    aside = [p.pose.at for p in before.poses if not p.used]
+    if found.adopted or not found.rivals or not aside:
         return []
     names = " or ".join(dict.fromkeys(e.name for effects in found.rivals for e in effects))
-    left_out = the_poses([poses[i].at for i in found.aside])
-    return [f"take again {left_out}: left out as spoiled, but {names} would explain as much"]
+    return [f"take again {the_poses(aside)}: left out as spoiled, but {names} would explain as much"]
 
 
 def _aside(c: Calibration) -> tuple[int, ...]:
@@ -257,7 +263,7 @@ def _without_fillers(search: Search) -> list[Effect]:
         filler = next((e for e in reversed(now.effects) if len(alternatives(search, e, now)) >= ANYTHING), None)
         if filler is None:
             break
-        search.passed_over[filler.name] = "beside the others almost any effect would do as well"
+        search.passed_over[filler.name] = "almost any effect would do as well"
         rest = search.model([e for e in now.effects if e is not filler])
         now = rest if rest is not None and search.earned_all(rest) else search.linear
     return list(now.effects) if now is search.found else search.settle_on(now)

@@ -32,6 +32,8 @@ SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
 """Standard deviation, before any data, of a coefficient that the fit has not taken up: in references per kelvin, and
 per kelvin. Typical of a mass-market MEMS accelerometer's data sheet; a navigation unit is ten times better."""
 SPHERE = 200
+NOTHING = 1e-12
+"""Share of a variance that is none."""
 
 
 UNEXPLAINED = 0.01
@@ -226,6 +228,8 @@ def _statistical(calibration: Calibration, ground: _Ground, beyond: float) -> li
     S = ground.by_residual
     creep = np.zeros(S.shape[1])
     creep[: len(poses)] = np.einsum("ni,nij,nj->n", by_u, creeping, by_u)
+    # Creep across the measured vector, of which a processor's rounding leaves something, is none.
+    creep = np.where(creep > NOTHING * ground.error**2, creep, 0.0)
     noise = np.maximum(ground.error**2 - creep, 0.0)
     held_s = float(np.median([p.end_s - p.start_s for p in poses]))
     out = [

@@ -66,17 +66,19 @@ def _near(search: Search, without: Model, taken: Collection[str], best: float) -
 
 def _jointly(search: Search, effect: Effect, now: Model) -> list[tuple[str, Model]]:
     """Where two effects were found: the names in other pairs that explain as much. Of a pair that has one of the two,
-    in whatever form, its other name stands for the other; of a pair of two others, both stand for the first.
+    in whatever form, its other name stands for the other; of a pair of two others, none of which stands beside one of
+    the two as well, both stand for the first.
     """
     if len(now.effects) != 2:
         return []
     taken = [e.name for e in now.effects]
     mine = effect.name
+    near = [m for m in search.pairs_from(search.linear) if search.score(m) < search.score(now) + NEAR]
+    named = [{e.name for e in m.effects} for m in near]
+    beside = {name for names in named if names & set(taken) for name in names}
     out = []
-    for m in search.pairs_from(search.linear):
-        names = {e.name for e in m.effects}
+    for m, names in zip(near, named, strict=True):
         kept = names & set(taken)
-        stands = mine not in names and (kept or mine == taken[0])
-        if stands and search.score(m) < search.score(now) + NEAR:
+        if mine not in names and (kept or (mine == taken[0] and not names & beside)):
             out += [(name, m) for name in sorted(names - kept)]
     return out

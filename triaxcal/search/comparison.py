@@ -13,6 +13,7 @@ from triaxcal.calibration import Calibration, PoseResult
 CARRIES = 0.05
 """A pose of which the model leaves less than this share carries a parameter, and cannot be left out."""
 ALMOST_ALL = 0.9
+NO_LOWER = "it does not lower the cross-validated error"
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,11 @@ class Comparison:
     old_g: float | None
     noise_g: float
     but: tuple[PoseResult, ...] = ()
+
+    @property
+    def lower(self) -> bool:
+        """Whether it speaks for the model, or does not know."""
+        return self.new_g is not None and (self.old_g is None or self.new_g < self.old_g)
 
 
 def compared(new: Calibration, old: Calibration) -> Comparison:

@@ -16,7 +16,7 @@ from triaxcal.figures import probability
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State
 from triaxcal.search.candidates import Candidate, Ground, candidates_of
-from triaxcal.search.comparison import CARRIES, compared
+from triaxcal.search.comparison import CARRIES, NO_LOWER, compared
 from triaxcal.search.gains import Gains
 from triaxcal.search.shape import refined, sharpened
 from triaxcal.search.worth import FAMILYWISE, Model, Worth, deviance, parameters
@@ -306,8 +306,8 @@ def _no_better(trial: Calibration, best: Calibration) -> str:
     """Why poses that the fit did not see speak against a model; nothing where they do not."""
     found = compared(trial, best)
     new, old = found.new_g, found.old_g
-    if new is None or (old is not None and new >= old):
-        return "it does not lower the cross-validated error"
+    if new is None or not found.lower:
+        return NO_LOWER
     if new > LIKE_NOISE * found.noise_g and (old is None or new > old / MUCH_BETTER):
         return f"the cross-validated error stays {new / found.noise_g:.1f} times what noise makes it"
     return ""

@@ -117,7 +117,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         [*rows, *extra],
     )
     for finding in loop.findings:
-        print(f"  {finding.verdict}: {finding.effect}")
+        others = "".join(f" or {name}" for name in finding.alternatives)
+        print(f"  {finding.verdict}: {finding.effect}{others}")
         for name, (value, error, unit) in finding.coefficients.items():
             print(f"    {name} {value:+.4g} ± {error:.1g} {unit}")
     if not loop.findings:
