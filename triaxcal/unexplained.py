@@ -162,22 +162,30 @@ def _patterns(after: Calibration, used: Sequence[PoseResult]) -> list[_Pattern]:
             said = NAMES.get(name, channel_of(name))
             out.append(_Pattern(scaled[:, None], said, name))
             out.append(_Pattern(scaled[:, None] * direction, f"{said}, as a bias", name))
-    out += _waves(held[TIME], np.ones((len(poses), 1)), "a swing in time with a period of {} s", 2.0, digits=3)
-    for i, axis in enumerate("xyz"):
-        s = direction[:, i]
-        out += _waves(s, direction[:, i : i + 1], f"a wave along the output of axis {axis}, {{}} g long", 5.0, digits=2)
+    t, n = held[TIME], len(poses)
+    finest = max(n / 2.5, 2.0)
+    axes = [(axis, direction[:, i : i + 1]) for i, axis in enumerate("xyz")]
+    swing, wave = "a swing in time with a period of {} s", "a wave along the output of {}, {{}} g long"
+    out += _waves([(t, np.ones((n, 1)))], "time", swing, finest, digits=3)
+    out += _waves([(t, direction)], "time", f"{swing}, as a bias", finest, digits=3)
+    for axis, own in axes:
+        out += _waves([(t, own)], "time", f"{swing}, as a bias of axis {axis}", finest, digits=3)
+        out += _waves([(own[:, 0], own)], axis, wave.format(f"axis {axis}"), 10.0, digits=2)
+    out += _waves([(own[:, 0], own) for _, own in axes], "axes", wave.format("every axis"), 10.0, digits=2)
     return out
 
 
-def _waves(x: Floats, size: Floats, text: str, most: float, digits: int) -> list[_Pattern]:
-    """Sines of many periods, from a few poses apart to the whole range; each counts as chosen among them."""
-    whole = float(np.ptp(x)) or 1.0
-    finest = max(len(x) / 2.5, 2.0) if most < 3 else 2 * most
+def _waves(
+    parts: Sequence[tuple[Floats, Floats]], family: str, text: str, finest: float, digits: int
+) -> list[_Pattern]:
+    """Sines of many periods, up to ``finest`` in the whole range, together of all ``parts``: along x (n,), of the sizes
+    (n,m). Each counts as chosen among them."""
+    whole = max(float(np.ptp(x)) for x, _ in parts) or 1.0
     out = []
     for cycles in np.geomspace(0.8, finest, PERIODS):
-        angle = 2 * np.pi * cycles * x / whole
-        columns = np.concatenate([np.sin(angle)[:, None] * size, np.cos(angle)[:, None] * size], axis=1)
-        out.append(_Pattern(columns, text.format(plain(whole / cycles, digits)), text))
+        angles = [(2 * np.pi * cycles * x[:, None] / whole, size) for x, size in parts]
+        columns = np.concatenate([turn(angle) * size for angle, size in angles for turn in (np.sin, np.cos)], axis=1)
+        out.append(_Pattern(columns, text.format(plain(whole / cycles, digits)), family))
     return out
 
 
