@@ -163,29 +163,30 @@ def _patterns(after: Calibration, used: Sequence[PoseResult]) -> list[_Pattern]:
             out.append(_Pattern(scaled[:, None], said, name))
             out.append(_Pattern(scaled[:, None] * direction, f"{said}, as a bias", name))
     t, n = held[TIME], len(poses)
-    finest = max(n / 2.5, 2.0)
+    slow, long, short = (0.8, max(n / 2.5, 2.0)), (0.8, 10.0), (2.0, 10.0)
     axes = [(axis, direction[:, i : i + 1]) for i, axis in enumerate("xyz")]
     swing, wave = "a swing in time with a period of {} s", "a wave along the output of {}, {{}} g long"
-    out += _waves([(t, np.ones((n, 1)))], "time", swing, finest, digits=3)
-    out += _waves([(t, direction)], "time", f"{swing}, as a bias", finest, digits=3)
+    out += _waves([(t, np.ones((n, 1)))], "time", swing, slow, digits=3)
+    out += _waves([(t, direction)], "time", f"{swing}, as a bias", slow, digits=3)
     for axis, own in axes:
-        out += _waves([(t, own)], "time", f"{swing}, as a bias of axis {axis}", finest, digits=3)
-        out += _waves([(own[:, 0], own)], axis, wave.format(f"axis {axis}"), 10.0, digits=2)
-    out += _waves([(own[:, 0], own) for _, own in axes], "axes", wave.format("every axis"), 10.0, digits=2)
+        out += _waves([(t, own)], "time", f"{swing}, as a bias of axis {axis}", slow, digits=3)
+        out += _waves([(own[:, 0], own)], "wave", wave.format(f"axis {axis}"), long, digits=2)
+    # Longer ones along all axes make any even pattern.
+    out += _waves([(own[:, 0], own) for _, own in axes], "wave", wave.format("every axis"), short, digits=2)
     return out
 
 
 def _waves(
-    parts: Sequence[tuple[Floats, Floats]], family: str, text: str, finest: float, digits: int
+    parts: Sequence[tuple[Floats, Floats]], family: str, text: str, cycles: tuple[float, float], digits: int
 ) -> list[_Pattern]:
-    """Sines of many periods, up to ``finest`` in the whole range, together of all ``parts``: along x (n,), of the sizes
-    (n,m). Each counts as chosen among them."""
+    """Sines of many periods, from the first number of ``cycles`` in the whole range to the last, together of all
+    ``parts``: along x (n,), of the sizes (n,m). Each counts as chosen among them."""
     whole = max(float(np.ptp(x)) for x, _ in parts) or 1.0
     out = []
-    for cycles in np.geomspace(0.8, finest, PERIODS):
-        angles = [(2 * np.pi * cycles * x[:, None] / whole, size) for x, size in parts]
+    for count in np.geomspace(*cycles, PERIODS):
+        angles = [(2 * np.pi * count * x[:, None] / whole, size) for x, size in parts]
         columns = np.concatenate([turn(angle) * size for angle, size in angles for turn in (np.sin, np.cos)], axis=1)
-        out.append(_Pattern(columns, text.format(plain(whole / cycles, digits)), family))
+        out.append(_Pattern(columns, text.format(plain(whole / count, digits)), family))
     return out
 
 

@@ -86,6 +86,12 @@ def swing(ups: np.ndarray) -> np.ndarray:
     return radial(ups, np.sin(2 * np.pi * TIME / 95.0 + 0.4))
 
 
+def bias_swing(ups: np.ndarray) -> np.ndarray:
+    """On each axis with a phase of its own."""
+    angle = 2 * np.pi * TIME[:, None] / 95.0 + np.array([0.4, 2.0, 4.0])
+    return np.asarray(1.5 * SIGMA_G * np.sin(angle) * np.array([1.0, -1.2, 0.8]))
+
+
 def by_channel(ups: np.ndarray) -> np.ndarray:
     return radial(ups, CHANNEL)
 
@@ -99,12 +105,19 @@ def wave(ups: np.ndarray) -> np.ndarray:
     return np.asarray(1.5 * SIGMA_G * np.sin(2 * np.pi * ups[:, 1:2] / 0.33 + 0.7) * [0.0, 1.0, 0.0])
 
 
+def waves(ups: np.ndarray) -> np.ndarray:
+    """The same of all three."""
+    return np.asarray(1.5 * SIGMA_G * np.sin(2 * np.pi * ups / 0.43 + np.array([0.7, 1.5, 3.0])))
+
+
 @pytest.mark.parametrize(
     ("pattern", "words"),
     [
         (odd, "an odd pattern on the sphere"),
         (even, "an even pattern on the sphere"),
         (swing, "a swing in time with a period of "),
+        (bias_swing, " s, as a bias"),
+        (waves, "a wave along the output of every axis, 0.4"),
         (by_channel, "supply_v"),
         (bias_by_channel, "supply_v, as a bias"),
         (wave, "a wave along the output of axis y, "),
