@@ -82,12 +82,12 @@ def _rms(values: Floats) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
-def unlike(name: str, rms_g: float, reference: float) -> list[str]:
+def unlike(name: str, rms_g: float, reference: float, said: str = "does not look like this unit") -> list[str]:
     """A line where the poses of the recording ``name`` can hardly be of the unit of the calibration."""
     if not rms_g > UNLIKE * reference:
         return []
     return [
-        f"{name} does not look like this unit: |a| is off by {plain(rms_g / reference, 2)} of the reference; is it "
+        f"{name} {said}: |a| is off by {plain(rms_g / reference, 2)} of the reference; is it "
         "another unit, or are signs, order or unit of its outputs others?"
     ]
 

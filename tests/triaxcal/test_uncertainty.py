@@ -52,6 +52,19 @@ def test_noise_alone_is_what_the_fit_itself_says(paper_unit: Sensor, twenty_six:
     assert b.dominant.magnitude == float(b.magnitude.standard)
 
 
+def test_creep_that_only_turns_the_unit_is_no_line_of_the_budget(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    """Across the measured vector it is nothing but rounding, which is another from processor to processor."""
+    poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(1))
+    _, outward = fit(poses, signs=SIGNS, aside=()).sensor.magnitude(np.array([p.mean for p in poses]), {})
+    turns = np.cross(outward, [0.3, -0.5, 0.8])
+    turns *= 1e-3 / np.linalg.norm(turns, axis=1, keepdims=True)
+    for share, sources in ((0.0, {"noise"}), (1e-3, {"noise", "creep"})):
+        creep = turns + share * 1e-3 * outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        creeping = [replace(p, creep=c) for p, c in zip(poses, creep, strict=True)]
+        moved = [replace(p, covariance=p.covariance + p.creep_covariance) for p in creeping]
+        assert {line.source for line in budget(fit(moved, signs=SIGNS, aside=())).components} == sources
+
+
 def test_fourteen_poses_leave_0_80_of_a_poses_noise_in_the_magnitude(paper_unit: Sensor, fourteen: np.ndarray) -> None:
     poses = noisy_poses(paper_unit, fourteen, 1.5e-5, np.random.default_rng(3))
     noise = next(line for line in budget(fit(poses, signs=SIGNS, aside=())).components if line.source == "noise")

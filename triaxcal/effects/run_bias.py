@@ -32,6 +32,11 @@ class RunBias(Effect):
         "The bias comes back anew at every start: allow for its spread, or correct it after each start by a few poses."
     )
 
+    def advice(self, largest: float, floor: float) -> str:
+        if self.alone is None:
+            return self.remedy
+        return f"Look for what was different in recording {self.alone + 1}: a knock, a pause, another temperature."
+
     def named(self, coefficients: Iterable[str]) -> Self:
         """That which coefficients of these names are of."""
         names = list(coefficients)

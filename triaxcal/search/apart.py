@@ -55,11 +55,13 @@ def telling_apart(search: Search, effect: Effect, others: Mapping[str, Model]) -
         elif SHAKING in (mine, theirs):
             out["record again with what shakes the stand switched off"] = None
         else:
-            channels = [c for c in (mine, theirs) if c not in (DIRECTION, CLOCK)]
-            rest = "the other stands still" if len(set(channels)) > 1 else "direction and time go on as they were"
-            if len(set(channels)) == 1 and mine == theirs:
-                rest = "it rises, falls and stands still while the poses change"
-            out[f"record again while {channels[0]} moves by itself, and {rest}"] = None
+            one, *another = dict.fromkeys(c for c in (mine, theirs) if c not in (DIRECTION, CLOCK))
+            if another:
+                out[f"record again while {one} changes and {another[0]} stands still"] = None
+            elif mine == theirs:
+                out[f"record again while {one} rises, falls and stands still, from pose to pose"] = None
+            else:
+                out[f"record the same poses again in the same order, while {one} goes another way"] = None
     return list(out)
 
 

@@ -108,6 +108,9 @@ def diagnose_command(a: argparse.Namespace) -> int:
     choice = chosen(a, measured)
     loop = _loop(a, measured, choice, check.poses if check else None)
     warnings = channels_of_some(recordings)
+    if len(names) > 1:
+        together = "do not look like one unit"
+        warnings += unlike(" and ".join(names), loop.before.residual.rms_g, choice.reference, together)
     if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
         warnings += unlike(check.name, loop.held_out.before_rms_g, choice.reference)

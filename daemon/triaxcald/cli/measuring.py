@@ -10,6 +10,7 @@ import numpy as np
 
 from triaxcal.calibration import Calibration
 from triaxcal.creep import with_creep_left
+from triaxcal.effects.contract import RUN, SINCE_START, TIME
 from triaxcal.errors import Refused
 from triaxcal.held_out import magnitude_errors
 from triaxcald import documents
@@ -76,6 +77,10 @@ def verify_command(a: argparse.Namespace) -> int:
     found = _verified(measured, model_of(sensor, channel_reference, reference), where=a.calibration)
     assert found.rms_g is not None
     warnings = unlike(measured.name, found.rms_g, reference)
+    if own := [e.name for e, _ in sensor.effects if {TIME, SINCE_START, RUN} & set(e.needs)]:
+        warnings.append(
+            f"{', '.join(own)} in {a.calibration} belongs to the recording that it was made from, and counts as zero"
+        )
     result = {
         "format": "triaxcal.verify/1",
         "rms_g": documents.error(found.rms_g, reference),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -116,3 +117,16 @@ def test_a_report_is_headed_by_the_name_of_the_file_alone(folder: Path, triaxcal
     assert triaxcal("fit", folder / "main.csv", "--report", page).code == 0
     assert "<h1>main.csv</h1>" in page.read_text("utf-8")
     assert str(folder) not in page.read_text("utf-8")
+
+
+def test_verify_says_which_effects_of_the_calibration_stayed_behind_with_its_recording(
+    folder: Path, triaxcal: Run, tmp_path: Path
+) -> None:
+    cal = tmp_path / "drifting.json"
+    assert triaxcal("fit", folder / "main.csv", "-o", cal).code == 0
+    document = json.loads(cal.read_text("utf-8"))
+    document["effects"] = {"bias_drift": {axis: {"value": 1e-6, "unit": "g/s"} for axis in "xyz"}}
+    document["channel_reference"] = {"t_s": 50.0}
+    cal.write_text(json.dumps(document), "utf-8")
+    warnings = triaxcal("verify", cal, folder / "main.csv", "--json").json["warnings"]
+    assert warnings == [f"bias_drift in {cal} belongs to the recording that it was made from, and counts as zero"]

@@ -50,6 +50,15 @@ def settling(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     ]
 
 
+def test_recordings_of_different_units_given_as_one_are_remarked_on(
+    settling: list[Path], runs: list[Path], triaxcal: Run
+) -> None:
+    one, other = settling
+    remark = f"{one} and {other} do not look like one unit: |a| is off by 0."
+    assert any(w.startswith(remark) for w in triaxcal("diagnose", *settling, "--json").json["calibration"]["warnings"])
+    assert "do not look like" not in triaxcal("diagnose", *runs).err
+
+
 def test_the_document_says_which_pose_is_of_which_recording(runs: list[Path], triaxcal: Run) -> None:
     document = triaxcal("diagnose", *runs, "--json").json
     assert document["format"] == "triaxcal.loop/1"
