@@ -44,6 +44,8 @@ class PoseResult:
     studentized: float
     leverage: float
     used: bool = True
+    carries: float = 0.0
+    """0…1: how much of some combination of its mean and its trend the pose determines by itself."""
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,10 @@ def _solved(problem: Problem, poses: Sequence[Pose], begin: State, effects: Sequ
             state = None
         if state is not None and trends_p(both, state, pure_error_dof(poses)) >= CONTRADICTED:
             return both, state
-    return problem, solve(problem, begin, tuple(effects))
+    state = solve(problem, begin, tuple(effects))
+    if len(state.theta) > len(poses):
+        raise Refused(f"{len(poses)} poses cannot carry {len(state.theta)} parameters")
+    return problem, state
 
 
 def _spoiled(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
@@ -159,6 +162,8 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Sp
     n, p = len(r), J.shape[1]
     q, _ = np.linalg.qr(weighted)
     leverage = np.clip((q**2).sum(axis=1), 0.0, 1.0)[:n]
+    own = q.reshape(-1, n, p).transpose(1, 0, 2)
+    carries = np.linalg.eigvalsh(own @ own.transpose(0, 2, 1))[:, -1]
     free = np.sqrt(np.maximum(1 - leverage, 0.0))
     studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
     # What the shape of an effect was chosen by is spent, though no column of the Jacobian stands for it.
@@ -193,7 +198,15 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Sp
         channel_reference={c: problem.channel_reference[c] for e in state.effects for c in e.needs},
         residual=residual,
         poses=tuple(
-            PoseResult(pose, direction[i], float(r[i]), float(s[i]), float(studentized[i]), float(leverage[i]))
+            PoseResult(
+                pose,
+                direction[i],
+                float(r[i]),
+                float(s[i]),
+                float(studentized[i]),
+                float(leverage[i]),
+                carries=float(carries[i]),
+            )
             for i, pose in enumerate(poses)
         ),
         condition=float(np.linalg.cond(weighted / np.maximum(norms, 1e-300))),

@@ -20,6 +20,7 @@ from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.description import described
 from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
+from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
 from triaxcal.findings import Finding, advice_of, description_of, finding_of, the_poses, why_not_shown
@@ -113,7 +114,8 @@ def diagnose(
         findings.append(description_of(smooth, steps[-1]))
         unexplained = unexplained_of(smooth, search.passed_over)
     faulty = faults_of(Ground.at(search.problem, search.linear.state), effects)
-    blind = {e.name: why_not_shown(search, e) for e in effects if e.name not in search.full and e.name not in faulty}
+    shown = search.full | faulty.keys() | {e.name for e in found.adopted if not isinstance(e, Part)}
+    blind = {e.name: why_not_shown(search, e) for e in effects if e.name not in shown}
     if catalogue is None:
         faulty = dict(plugins()[1]) | faulty
     held = None

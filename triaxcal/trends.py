@@ -38,7 +38,7 @@ class Trends:
     def of(cls, problem: Problem, poses: Sequence[Pose]) -> Trends | None:
         """None where the poses do not know theirs."""
         error = np.array([p.trend_error for p in poses])
-        if not np.isfinite(error).all():
+        if not np.isfinite(error).all() or not np.isfinite([p.trend for p in poses]).all():
             return None
         length = np.array([p.end_s - p.start_s for p in poses])
         change, errors = _changes(problem, poses, length)
@@ -105,6 +105,8 @@ def trends_p(problem: Problem, state: State, pure: float) -> float:
     """Probability of trends as far as these from those that the model foretells, by the noise inside the poses, of
     which ``pure`` degrees of freedom are known; ``state`` is that of a fit to everything."""
     left = len(problem.u) - max(len(state.theta) - len(problem.u), 0)
+    if left <= 0:
+        return 0.0
     return float(f_sf(left_by_trends(problem, state) / left, left, max(pure, 1.0)))
 
 
@@ -139,6 +141,9 @@ def _changes(problem: Problem, poses: Sequence[Pose], length: Floats) -> tuple[d
     for name in problem.channels:
         channel = channel_of(name)
         if is_derived(name) or any(channel not in p.bends for p in poses):
+            continue
+        told = [(p.rates[channel], p.rate_errors[channel], p.bends[channel], p.bend_errors[channel]) for p in poses]
+        if not np.isfinite(told).all():
             continue
         change[name] = length * np.array([p.rates[channel] for p in poses])
         errors[name] = length * np.array([p.rate_errors[channel] for p in poses])

@@ -281,8 +281,10 @@ def _temperature(calibration: Calibration, ground: _Ground) -> tuple[list[Compon
     absorbed = ground.gain @ Z
     rest = Z - ground.weighted @ absorbed
     # With the prior's width as unit: what the poses do not show stays as wide as it was.
-    left = np.linalg.inv(np.eye(extra) + rest.T @ rest)
-    mean = -left @ rest.T @ (r / s)
+    # By the means alone: trends know nothing of an effect whose coefficients, and so its conditions' errors, are zero.
+    told = rest[: len(ground.problem.u)]
+    left = np.linalg.inv(np.eye(extra) + told.T @ told)
+    mean = -left @ told.T @ (r / s)[: len(told)]
     through = ground.G @ absorbed[:p]
     after = r / s + rest @ mean
     taken = extra - float(np.trace(left))  # degrees of freedom, fewer than coefficients where the data say little

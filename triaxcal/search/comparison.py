@@ -28,7 +28,7 @@ class Comparison:
 
     @property
     def lower(self) -> bool:
-        """Whether it speaks for the model, or does not know."""
+        """Whether it speaks for the model."""
         return self.new_g is not None and (self.old_g is None or self.new_g < self.old_g)
 
 
@@ -36,7 +36,7 @@ def compared(new: Calibration, old: Calibration) -> Comparison:
     """Two models of the same poses. Of a pose that alone carries a coefficient the others say nothing, be the model
     right or not: it has no part in the comparison, if there are no more than one of ten."""
     used, before = ([p for p in c.poses if p.used] for c in (new, old))
-    told = [p.leverage < 1 - CARRIES for p in used]
+    told = [p.carries < 1 - CARRIES for p in used]
     if all(told) or sum(told) < ALMOST_ALL * len(told):
         return Comparison(new.residual.cross_validated_rms_g, old.residual.cross_validated_rms_g, _by_noise(used))
     kept = list(itertools.compress(used, told))

@@ -12,6 +12,7 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration
 from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import Effect
+from triaxcal.effects.in_run import of_clocks
 from triaxcal.figures import probability
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State
@@ -144,20 +145,24 @@ class Search(Worth):
         return [m for g in groups if (m := self.model([*now.effects, *g])) is not None]
 
     def singles_from(self, now: Model) -> list[Model]:
-        """The best models with one effect more, each fitted."""
+        """The best models with one effect more, each fitted.
+
+        What is too much for the means is among them where the trends test it, but for effects of the clocks: a
+        polynomial of the time goes along with any two others.
+        """
         beside = self.beside(now)
-        order = np.argsort(beside.scores, kind="stable")[:SECOND_LOOK]
-        return self._models(now, [(beside.candidates[i].effect,) for i in order]) + self.by_trends(
-            now, {e.name for e in now.effects}
-        )
+        order = [i for i in np.argsort(beside.scores, kind="stable")[:SECOND_LOOK] if np.isfinite(beside.scores[i])]
+        found = self._models(now, [(beside.candidates[i].effect,) for i in order])
+        clocks = {e.name for e in self.catalogue if of_clocks(e)}
+        return found + self.by_trends(now, clocks | {e.name for e in now.effects})
 
     def by_trends(self, now: Model, taken: Collection[str]) -> list[Model]:
-        """The models with one effect more, none of those ``taken``, that is too much for the means, as far as the
-        trends inside the poses put them to the test, each fitted."""
+        """The models with one effect more, of no shape and none of those ``taken``, that is too much for the means, as
+        far as the trends inside the poses put them to the test, each fitted."""
         if self.trends is None or not self.left_over(now):
             return []
         others = [e for e in self.catalogue if e.name in self.names and e.name not in taken and self.trends.touch([e])]
-        variants = [v for e in others for v in e.variants(self.problem.conditions)]
+        variants = [v for e in others for v in e.variants(self.problem.conditions) if not v.shape]
         return self._models(now, [(v,) for v in variants if self.left((*now.effects, v)) < self.kept])
 
     def pairs_from(self, now: Model) -> list[Model]:
