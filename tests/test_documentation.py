@@ -331,7 +331,17 @@ def keys_of(value: object, named: frozenset[str]) -> set[str]:
 
 
 NAMED = frozenset(
-    {"alternatives", "channels", "channel_reference", "effects", "coefficients", "sees", "levels", "promised", "moves"}
+    {
+        "held_out_rms_g",
+        "channels",
+        "channel_reference",
+        "effects",
+        "coefficients",
+        "sees",
+        "levels",
+        "promised",
+        "moves",
+    }
 )
 EFFECT_LEAVES = {"x", "y", "z"}
 

@@ -118,7 +118,8 @@ class _Unit:
         return self.search.model(effects) if effects else self.search.linear
 
     def deviance(self, m: Model) -> float:
-        return float(deviance(np.array(m.chi2), self.search.left(m.effects)))
+        """Of the means, and by how much worse than the linear model it foretells the trends inside the poses."""
+        return float(deviance(np.array(m.chi2), self.search.left(m.effects))) + self.search.against_trends(m)
 
     def score(self, m: Model, choices: int = 1) -> float:
         """Deviance, and Schwarz's price; the last effect was chosen among so many parts of it."""
@@ -166,7 +167,7 @@ def _near(unit: _Unit, without: Model, variants: Sequence[Effect]) -> list[tuple
     """For each variant: score in linear reckoning, the part that has it, and among how many parts."""
     search = unit.search
     ground = Ground.at(search.problem, without.state)
-    chi2 = float(ground.y @ ground.y)
+    chi2, trends = float(ground.y @ ground.y), search.against_trends(without)
     out: list[tuple[float, Effect | None, int]] = []
     for variant in variants:
         found = []
@@ -174,7 +175,11 @@ def _near(unit: _Unit, without: Model, variants: Sequence[Effect]) -> list[tuple
             left = search.left([*without.effects, part])
             if left >= search.kept:
                 price = len(part.coefficients) * float(np.log(len(search.poses)))
-                found.append((float(deviance(np.array(chi2 - gain), left)) + price, part))
+                found.append((float(deviance(np.array(chi2 - gain), left)) + price + trends, part))
+        # What is too much for the means of few poses, their trends may carry.
+        if not variant.shape and search.left([*without.effects, variant]) < search.kept:
+            both = search.model([*without.effects, variant])
+            found += [(unit.score(both), variant)] if both is not None else []
         score, best = min(found, key=lambda f: f[0], default=(unit.deviance(without), None))
         out.append((score, best, max(len(found), 1)))
     return out

@@ -260,7 +260,6 @@ def loop_document(
                     "after_rms_g": error(held.after_rms_g, reference),
                     "noise_floor_g": error(held.noise_floor_g, reference),
                     "poses": held.poses,
-                    "alternatives": {name: error(rms, reference) for name, rms in held.instead.items()},
                 }
             }
             if held
@@ -274,6 +273,9 @@ def loop_document(
                 "coefficients": coefficients_document(f.coefficients, reference_unit),
                 "alternatives": list(f.alternatives),
                 "spoiled": list(f.spoiled),
+                "held_out_rms_g": {n: error(held.instead[n], reference) for n in f.alternatives if n in held.instead}
+                if held
+                else {},
                 "reason": small.in_words(f.reason),
                 "remedy": f.remedy,
                 "apart": [small.in_words(line) for line in f.apart],

@@ -69,6 +69,8 @@ class Finding:
     """What to record so as to tell it from its alternatives."""
     spoiled: tuple[str, ...] = ()
     """When poses began that, were they spoiled, would do as well."""
+    held_out_g: Mapping[str, float | None] = field(default_factory=dict)
+    """The error in the check recording with an alternative in its place, by name."""
 
     def shape(self, name: str) -> float | None:
         """The value of a coefficient, such as the moment of a step."""
@@ -229,6 +231,7 @@ def _findings(value: object, terms: set[str]) -> Iterator[Finding]:
             remedy=None if remedy is None else words(remedy),
             apart=texts(known.get("apart")),
             spoiled=texts(known.get("spoiled")),
+            held_out_g=numbers(known.get("held_out_rms_g")),
         )
 
 

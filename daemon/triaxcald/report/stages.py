@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcald.report.figures import clean, effect_title, number
-from triaxcald.report.untrusted import mapping, numbers
+from triaxcald.report.untrusted import mapping
 
 AFTER = "After"
 
@@ -51,8 +51,6 @@ class HeldOut:
     after_rms_g: float | None
     noise_floor_g: float | None
     poses: int | None
-    alternatives_g: Mapping[str, float | None]
-    """Its error after, by the effect that stands in the place of the finding of which it is an alternative."""
 
 
 def residual_of(value: object) -> Residual | None:
@@ -70,7 +68,6 @@ def held_out_of(document: Mapping[str, object]) -> HeldOut | None:
         number(known.get("after_rms_g")),
         number(known.get("noise_floor_g")),
         None if poses is None else int(poses),
-        numbers(known.get("alternatives")),
     )
 
 

@@ -28,8 +28,8 @@ CALIBRATION = {
 }  # fmt: skip
 LOOP = {"format", "before", "after", "findings", "choices", "unexplained", "data_quality", "advice", "calibration"}
 FINDING = {
-    "effect", "verdict", "p_value", "coefficients", "alternatives", "apart", "reason", "remedy", "residual",
-    "pose_residual_g",
+    "effect", "verdict", "p_value", "coefficients", "alternatives", "apart", "spoiled", "held_out_rms_g",
+    "reason", "remedy", "residual", "pose_residual_g",
 }  # fmt: skip
 SIGNS = "--sign=-,-,-"
 

@@ -138,9 +138,8 @@ def test_confounded_effects_are_all_told_in_words_with_what_would_tell_them_apar
 
 
 def test_a_check_recording_has_its_error_beside_every_name_that_fits_as_well(words: dict[str, Any]) -> None:
-    words["held_out"] = {"before_rms_g": 1.31e-4, "after_rms_g": 1.62e-5, "noise_floor_g": 1.49e-5, "poses": 9}
-    words["held_out"]["alternatives"] = {"warm_up": 3.45e-4}
-    add(words, "bias_drift", {"x": (8.27e-4, 1.5e-5, "g/s")}, alternatives=["warm_up", "bias_step"])
+    others = {"alternatives": ["warm_up", "bias_step"], "held_out_rms_g": {"warm_up": 3.45e-4}}
+    add(words, "bias_drift", {"x": (8.27e-4, 1.5e-5, "g/s")}, **others)
     _, text = page(words)
     assert text.count("in the check recording)") == 1
     assert re.search(r"Warm up: [^()]*\(345 µg in the check recording\)", text)
