@@ -254,7 +254,7 @@ def test_trends_fitted_along_with_the_means_narrow_the_intervals_and_these_hold_
     paper_unit: Sensor, fourteen: np.ndarray
 ) -> None:
     """But for one recording of a hundred, whose trends look by chance as if they contradicted the means."""
-    rng, inside, narrower, seeds = np.random.default_rng(6), 0, [], 150
+    rng, inside, narrower, seeds = np.random.default_rng(6), 0, [], 60
     for _ in range(seeds):
         poses = moving(paper_unit, fourteen[rng.permutation(14)], rng, ((TEMPERATURE, SENSITIVITY),))
         c, means = (fit(p, signs=MINUS, effects=[TEMPERATURE], aside=()) for p in (poses, blind(poses)))
