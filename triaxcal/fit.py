@@ -58,8 +58,10 @@ def fit(
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
     verdict = Spoiled(tuple(sorted(aside))) if aside is not None else Spoiled()
+    by_means = None
     if aside is None and len(poses) > 9 + sum(len(e.coefficients) for e in effects):
-        verdict = _spoiled(whole, solve(whole, begin, tuple(effects)), poses)
+        by_means = solve(whole, begin, tuple(effects))
+        verdict = _spoiled(whole, by_means, poses)
     found = verdict.rows
     kept, problem = list(poses), whole
     if found:
@@ -67,7 +69,8 @@ def fit(
         problem = problem_of(kept, signs=signs, reference=reference)
         begin = start(problem, kept, signs)
         problem = with_history(problem, kept, begin.sensor(problem))
-    calibration = _conclude(*_solved(problem, kept, begin, effects), kept, verdict)
+        by_means = None
+    calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, verdict)
     if found:
         calibration = _with_aside(calibration, poses, verdict)
     if verdict.rivals:
@@ -77,8 +80,11 @@ def fit(
     return calibration
 
 
-def _solved(problem: Problem, poses: Sequence[Pose], begin: State, effects: Sequence[Effect]) -> tuple[Problem, State]:
-    """What was fitted, and the fit: to the means, and to the trends inside the poses as far as these agree with them.
+def _solved(
+    problem: Problem, poses: Sequence[Pose], begin: State, effects: Sequence[Effect], by_means: State | None
+) -> tuple[Problem, State]:
+    """What was fitted, and the fit: to the means (``by_means``, where that is known already), and to the trends inside
+    the poses as far as these agree with them.
 
     Trends that do not agree go with something else, or the effect acts later than its channel says.
     """
@@ -90,7 +96,7 @@ def _solved(problem: Problem, poses: Sequence[Pose], begin: State, effects: Sequ
             state = None
         if state is not None and trends_p(both, state, pure_error_dof(poses)) >= CONTRADICTED:
             return both, state
-    state = solve(problem, begin, tuple(effects))
+    state = by_means or solve(problem, begin, tuple(effects))
     if len(state.theta) > len(poses):
         raise Refused(f"{len(poses)} poses cannot carry {len(state.theta)} parameters")
     return problem, state

@@ -89,8 +89,6 @@ def diagnose(
     search, given = found.search, _Given(poses, signs, reference, found.aside)
     before, steps = linear, [linear]
     # Poses in which |a| itself creeps are something that is left, not an excuse for it.
-    nothing = fit(quiet, signs=signs, reference=reference)
-    model = nothing
     if found.adopted:
         model = replace(given, poses=quiet).fit(found.adopted)
         before = given.fit(())
@@ -100,7 +98,9 @@ def diagnose(
         if not compared(steps[-1], before).lower:
             search.passed_over[" with ".join(e.name for e in found.adopted)] = NO_LOWER
             found = replace(found, adopted=search.settle_on(search.linear))
-            given, before, steps, model = replace(given, poses=poses), linear, [linear], nothing
+            given, before, steps = replace(given, poses=poses), linear, [linear]
+    if not found.adopted:
+        model = fit(quiet, signs=signs, reference=reference)
     unexplained = unexplained_of(model, search.passed_over, search.nearest(), hints_of(search))
     smooth, undescribed = described(steps[-1], unexplained, signs) if empirical else (None, "")
     after = smooth or steps[-1]
