@@ -34,9 +34,12 @@ class Gains:
 
     def of_noise(self, y: Floats) -> Floats:
         """(c,m) for m vectors (n,m) of residuals."""
-        c, n, q = self.bases.shape
-        parts = self.bases.transpose(0, 2, 1).reshape(c * q, n) @ y
-        return np.asarray((parts.reshape(c, q, -1) ** 2).sum(axis=1))
+        out = np.empty((len(self.ranks), y.shape[1]))
+        for rank in np.unique(self.ranks):
+            bases = self.bases[self.ranks == rank, :, :rank].transpose(0, 2, 1)
+            parts = bases.reshape(-1, len(y)) @ y
+            out[self.ranks == rank] = (parts.reshape(-1, rank, y.shape[1]) ** 2).sum(axis=1)
+        return out
 
     def pairs(self, first: Ints) -> Floats:
         """(f,c) of the candidates ``first`` (f,) with every candidate together.
