@@ -89,15 +89,18 @@ def _solved(
     Trends that do not agree go with something else, or the effect acts later than its channel says.
     """
     both = with_trends(problem, poses, effects)
+    contradicted = False
     if both is not None:
         try:
             state = solve(both, begin, tuple(effects))
         except (Refused, EffectFault):  # an effect may be known at the means alone
             state = None
-        if state is not None and trends_p(both, state, pure_error_dof(poses)) >= CONTRADICTED:
+        contradicted = state is not None and trends_p(both, state, pure_error_dof(poses)) < CONTRADICTED
+        if state is not None and not contradicted:
             return both, state
     state = by_means or solve(problem, begin, tuple(effects))
-    if len(state.theta) > len(poses):
+    # Means that leave nothing agree with any model: what speaks against it is all that there is to judge it by.
+    if len(state.theta) > len(poses) - contradicted:
         raise Refused(f"{len(poses)} poses cannot carry {len(state.theta)} parameters")
     return problem, state
 

@@ -13,6 +13,7 @@ from triaxcal.conditions import held_at
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import TIME, Coefficient, Effect, no_slope, on_each_axis, per_axis, per_axis_slope, xyz
 from triaxcal.effects.plugins import Foreign
+from triaxcal.errors import Refused
 from triaxcal.fit import cross_validated, fit
 from triaxcal.loop import diagnose
 from triaxcal.poses.pose import Pose, poses_of
@@ -276,6 +277,17 @@ def test_trends_that_contradict_the_means_have_no_part_in_the_fit(paper_unit: Se
     c, means = (fit(p, signs=MINUS, effects=[TEMPERATURE], aside=()) for p in (late, blind(poses)))
     assert not c.trends
     assert np.array_equal(c.values, means.values)
+
+
+def test_means_that_leave_nothing_are_not_believed_against_the_trends(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """Twelve poses fit twelve parameters whatever they are."""
+    ups = twenty_six[np.random.default_rng(3).permutation(26)[:12]]
+    poses = moving(paper_unit, ups, np.random.default_rng(7), ((TEMPERATURE, SENSITIVITY),))
+    assert fit(poses, signs=MINUS, effects=[TEMPERATURE], aside=()).trends
+    with pytest.raises(Refused, match="12 poses cannot carry 12 parameters"):
+        fit([replace(p, trend=-p.trend) for p in poses], signs=MINUS, effects=[TEMPERATURE], aside=())
 
 
 def test_trends_have_no_part_in_a_model_that_nothing_moves_inside_the_poses(
