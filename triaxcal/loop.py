@@ -32,7 +32,7 @@ from triaxcal.runs import by_run, expected_of
 from triaxcal.search import NEAR, NO_LOWER, Search, alternatives, compared
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
 from triaxcal.start import problem_of, start, with_history
-from triaxcal.unexplained import Unexplained, hints_of, unexplained_of
+from triaxcal.unexplained import Unexplained, hints_of, spoiled_or, unexplained_of
 
 ANYTHING = 5
 """An effect beside others, with so many alternatives, is none."""
@@ -101,7 +101,8 @@ def diagnose(
             given, before, steps = replace(given, poses=poses), linear, [linear]
     if not found.adopted:
         model = fit(quiet, signs=signs, reference=reference)
-    unexplained = unexplained_of(model, search.passed_over, search.nearest(), hints_of(search))
+    p = search.anything_p(search.found)
+    unexplained = unexplained_of(model, search.passed_over, p, search.nearest(), hints_of(search))
     smooth, undescribed = described(steps[-1], unexplained, signs) if empirical else (None, "")
     after = smooth or steps[-1]
     findings: list[Finding] = []
@@ -123,13 +124,17 @@ def diagnose(
         instead = {n: given.tried(effects) for f in findings for n, effects in f.instead.items()}
         held = held_out(before, after, check, {n: c for n, c in instead.items() if c is not None})
     advice = advice_of(findings, unexplained, undescribed, blind, faulty)
+    if (again := _again(found, before)) and not unexplained.significant and found.whole_p is not None:
+        whole = fit(quiet, signs=signs, reference=reference, aside=())
+        aside = [p for p in before.poses if not p.used]
+        unexplained = spoiled_or(whole, found.whole_p, aside, _names(found.rivals))
     return Loop(
         before=before.with_blind_to(tuple(blind)),
         after=after.with_blind_to(tuple(blind)),
         findings=tuple(findings),
         unexplained=unexplained,
         held_out=held,
-        advice=tuple(_again(found, before) + advice + better_of(held)),
+        advice=tuple(again + advice + better_of(held)),
         search=search,
     )
 
@@ -165,6 +170,8 @@ class _Found:
     """Effects that explain as much with other poses left out."""
     spoiled: tuple[int, ...] = ()
     """Poses that explain as much without any effect, were they spoiled."""
+    whole_p: float | None = None
+    """Where poses were left out: the probability of what the linear model leaves of all of them."""
 
 
 def _again(found: _Found, before: Calibration) -> list[str]:
@@ -172,8 +179,12 @@ def _again(found: _Found, before: Calibration) -> list[str]:
     aside = [p.pose.at for p in before.poses if not p.used]
     if found.adopted or not found.rivals or not aside:
         return []
-    names = " or ".join(dict.fromkeys(e.name for effects in found.rivals for e in effects))
+    names = " or ".join(_names(found.rivals))
     return [f"take again {the_poses(aside)}: left out as spoiled, but {names} would explain as much"]
+
+
+def _names(rivals: Sequence[Sequence[Effect]]) -> list[str]:
+    return list(dict.fromkeys(e.name for effects in rivals for e in effects))
 
 
 def _aside(c: Calibration) -> tuple[int, ...]:
@@ -217,7 +228,8 @@ def _explained(
         rivals += [m.effects for m in models if m.effects and t.search.score(m) + price < near]
     without = [t for t in others if found.adopted and not t.adopted and _criterion(t, len(poses)) < near]
     spoiled = min(without, key=lambda t: _criterion(t, len(poses))).aside if without else ()
-    return replace(found, rivals=tuple(rivals), spoiled=spoiled)
+    whole_p = first.anything_p(first.linear) if found.aside and not trials[0].aside else None
+    return replace(found, rivals=tuple(rivals), spoiled=spoiled, whole_p=whole_p)
 
 
 def _tried(

@@ -17,9 +17,6 @@ from triaxcal.plan.directions import linear_design
 from triaxcal.search import NEAR, Nearest, Search
 
 SIGNIFICANT = 0.01
-EITHER = 1.5
-"""How much more often one of two tests that mostly agree tells by chance than one alone: of 800 recordings with nothing
-inside 1.0 % are significant with it."""
 LEAD = 0.01
 """Probability of a pattern as clear as this by chance, the choice among all patterns allowed for, up to which it is a
 lead."""
@@ -55,24 +52,42 @@ class _Pattern:
 
 
 def unexplained_of(
-    after: Calibration, passed_over: Mapping[str, str], nearest: Nearest | None = None, hints: Sequence[str] = ()
+    after: Calibration,
+    passed_over: Mapping[str, str],
+    p: float | None = None,
+    nearest: Nearest | None = None,
+    hints: Sequence[str] = (),
 ) -> Unexplained:
-    """``passed_over`` are the effects that came near, each with the reason why it was not adopted; ``hints`` what else
-    is known of what is left.
+    """``passed_over`` are the effects that came near, each with the reason why it was not adopted, and ``nearest`` the
+    one that came nearest; ``hints`` what else is known of what is left.
 
-    Two tests, of which either tells: that of everything that is left, and that of the ``nearest`` single effect, which
-    sees what is too little to be named.
+    ``p`` is the probability of what is left by chance (`triaxcal.search.omnibus`): that of its sum of squares where it
+    is None.
     """
     residual = after.residual
-    p = residual.lack_of_fit_p
-    if p is not None and nearest is not None:
-        p = min(EITHER * min(p, nearest.p_value), 1.0)
+    # Where the noise is not known, nothing is more than it.
+    p = residual.lack_of_fit_p if p is None or residual.lack_of_fit_p is None else p
     significant = p is not None and p < SIGNIFICANT
+    return Unexplained(
+        significant, p, _beyond(after, significant), lead(after, passed_over, nearest, hints) if significant else ""
+    )
+
+
+def spoiled_or(whole: Calibration, p: float, spoiled: Sequence[PoseResult], names: Sequence[str]) -> Unexplained:
+    """What the poses leave where those that are ``spoiled`` explain it no better than the effects of these ``names``
+    would. ``whole`` is the fit to all poses, ``p`` the probability of what it leaves."""
+    off = " and ".join(f"the pose at {s.pose.at} ({micro_g(s.residual_g, '+')})" for s in spoiled)
+    lead = f"most of it is {off}: spoiled, or it is {' or '.join(names)}, which would explain as much"
+    return Unexplained(p < SIGNIFICANT, p, _beyond(whole, p < SIGNIFICANT), lead if p < SIGNIFICANT else "")
+
+
+def _beyond(after: Calibration, significant: bool) -> float:
+    """rms of the residuals beyond noise, in g."""
+    residual = after.residual
     beyond = float(np.sqrt(max(residual.rms_g**2 - residual.noise_floor_g**2, 0.0)))
-    if significant:
-        # One loud pose may hide in the plain rms what the others show, each by its own noise.
-        beyond = max(beyond, residual.noise_floor_g * float(np.sqrt(max(after.inflation**2 - 1, 0.0))))
-    return Unexplained(significant, p, beyond, lead(after, passed_over, nearest, hints) if significant else "")
+    # One loud pose may hide in the plain rms what the others show, each by its own noise.
+    raised = residual.noise_floor_g * float(np.sqrt(max(after.inflation**2 - 1, 0.0)))
+    return max(beyond, raised) if significant else beyond
 
 
 def hints_of(search: Search) -> list[str]:

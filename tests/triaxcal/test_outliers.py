@@ -127,6 +127,9 @@ def test_poses_left_out_where_an_effect_would_do_as_well_are_to_be_taken_again(
             first, second = (f"the pose at {10 * i:.1f} s" for i in left_out(loop.after))
             assert loop.advice[0].startswith(f"take again {first} and {second}: left out as spoiled, but ")
             assert "third_order_nonlinearity" in loop.advice[0]
+            assert loop.unexplained.significant
+            assert loop.unexplained.lead.startswith(f"most of it is {first} (")
+            assert "third_order_nonlinearity" in loop.unexplained.lead
         elif loop.findings[0].spoiled:
             doubted += 1
             assert loop.findings[0].verdict == "confounded"

@@ -19,6 +19,7 @@ from triaxcal.problem import Problem, State
 from triaxcal.search.candidates import Candidate, Ground, candidates_of
 from triaxcal.search.comparison import CARRIES, NO_LOWER, compared
 from triaxcal.search.gains import Gains
+from triaxcal.search.omnibus import anything_p
 from triaxcal.search.shape import refined, sharpened
 from triaxcal.search.worth import FAMILYWISE, Model, Worth, deviance, parameters
 
@@ -117,11 +118,15 @@ class Search(Worth):
             self._reckonings[key] = now, self._reckoned(now)
         return self._reckonings[key][1]
 
-    def _reckoned(self, now: Model) -> Beside:
+    def _of_catalogue(self, now: Model) -> tuple[Ground, list[Candidate]]:
+        """The candidates beside a model."""
         ground, found = Ground.at(self.problem, now.state), self.candidates
         if now.effects:
             found, _ = candidates_of(ground, [e for e in self.catalogue if e.name in self.names], self.still)
-        candidates = [c for c in found if c.name not in {e.name for e in now.effects}]
+        return ground, [c for c in found if c.name not in {e.name for e in now.effects}]
+
+    def _reckoned(self, now: Model) -> Beside:
+        ground, candidates = self._of_catalogue(now)
         rough = self._scored(now, ground, candidates)
         shaped: dict[tuple[str, ...], Candidate] = {}
         for i in np.argsort(rough.scores, kind="stable"):
@@ -287,6 +292,13 @@ class Search(Worth):
     def earned_all(self, m: Model) -> bool:
         """Whether the effects of a model earn their places, from nothing."""
         return self._earned(m, self.linear)
+
+    def anything_p(self, now: Model) -> float | None:
+        """Probability of what a model leaves by chance; None where nothing can be left."""
+        if self.left(now.effects) <= 0:
+            return None
+        ground, candidates = self._of_catalogue(now)
+        return anything_p(Gains.of(candidates, ground.y), [c.name for c in candidates], ground.model, self.pure)
 
     def nearest(self) -> Nearest | None:
         """Of single effects beside those found the one that is least likely to be chance; None where none is left."""

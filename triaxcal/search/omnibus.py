@@ -1,0 +1,47 @@
+"""Whether anything is left: one test of all candidates together.
+
+The best of many candidates has to outdo what chance makes of the best, and the sum of squares spreads over directions
+in which no effect acts. The likelihood ratio averaged over all that there may be tells more often than either: of the
+tests of one level it has the most power on that average (Andrews and Ploberger 1994, Econometrica 62:1383).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import special
+
+from triaxcal.arrays import Floats
+from triaxcal.search.gains import Gains
+
+DRAWS = 2000
+SIZE = 5.0
+"""The effects averaged over have this size s (rms): larger ones are seen in any case, smaller ones in none."""
+
+
+def anything_p(gains: Gains, names: Sequence[str], model: Floats, pure_dof: float) -> float:
+    """Probability that noise alone looks as much like one of the candidates, or like something that is none of them.
+
+    ``names`` (c,) of the candidates: each has the same weight, and so has what has no name. ``model`` (n,k) is the
+    orthonormal basis of what was fitted; ``pure_dof`` are the degrees of freedom behind the poses' noise. Simulated, as
+    candidates are alike.
+    """
+    n, k = model.shape
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((n, DRAWS))
+    noise = (noise - model @ (model.T @ noise)) / np.sqrt(rng.chisquare(pure_dof, DRAWS) / pure_dof)
+    y = np.column_stack([gains.y, noise])
+    total = np.sum(y**2, axis=0)
+    tries = Counter(names)
+    weights = np.array([*(1 / tries[name] for name in names), 1.0])
+    rank = np.append(gains.ranks, n - k)[:, None]
+    taken = np.vstack([gains.of_noise(y), total])
+    # By effects whose coefficients are normal; the size of the noise is told by the poses' own and by the residuals.
+    share = SIZE**2 / (SIZE**2 + rank)
+    likelier = 0.5 * (rank * np.log1p(-share) - (pure_dof + n - k) * np.log1p(-share * taken / (pure_dof + total)))
+    log_mean = special.logsumexp(likelier, axis=0, b=weights[:, None] / weights.sum())
+    as_large = float(np.mean(np.append(log_mean[1:] >= log_mean[0], True)))
+    # Under noise its mean is 1, so that a large one is rarer than its inverse (Markov), which draws cannot show.
+    return float(min(as_large, np.exp(-log_mean[0])))
