@@ -275,7 +275,7 @@ def cross_validated(problem: Problem, state: State) -> float | None:
     misses = misses[:, 0] * s[:n]
     for i in np.flatnonzero(np.abs(moved).max(axis=1) > STRAIGHT):
         rest: Ints = np.delete(np.arange(n), i)
-        without = solve(problem.only(rest), State(state.theta + moved[i], state.effects), state.effects, steps=3)
+        without = solve(problem.only(rest), State(state.theta + moved[i], state.effects), state.effects, steps=2)
         misses[i] = linearise(problem.only(slice(i, i + 1)), without, jacobian=False)[0][0]
     return float(np.sqrt(np.mean(misses**2)))
 

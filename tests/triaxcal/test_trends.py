@@ -305,7 +305,7 @@ def test_fourteen_poses_carry_six_coefficients_by_what_moves_inside_them(
 ) -> None:
     """Six coefficients and nine parameters are more than fourteen means, by which alone nothing can be said."""
     named, pulls = [], []
-    for seed in range(8):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         poses = moving(paper_unit, fourteen[rng.permutation(14)], rng, ((QUADRATIC, CURVED),))
         loop = diagnose(poses, signs=MINUS)
@@ -316,8 +316,8 @@ def test_fourteen_poses_carry_six_coefficients_by_what_moves_inside_them(
             pulls.append((loop.after.values[9:] - there) / loop.after.standard_errors[9:])
         alone = diagnose(blind(poses), signs=MINUS)
         assert [(f.effect, f.verdict) for f in alone.findings] != [(QUADRATIC.name, "adopted")]
-    assert named.count([(QUADRATIC.name, "adopted")]) >= 7
-    assert len(pulls) >= 7
+    assert named.count([(QUADRATIC.name, "adopted")]) >= 4
+    assert len(pulls) >= 4
     assert np.sqrt(np.mean(np.square(pulls))) == pytest.approx(1, abs=0.4)
 
 

@@ -154,13 +154,13 @@ def test_one_pose_that_was_not_still_is_named_by_its_time(fitted: Fitted, ups: n
 
 def test_where_nothing_stands_out_nothing_is_made_up(fitted: Fitted, ups: np.ndarray) -> None:
     """Every pose off by an amount of its own: of 100 a lead is declared for one, by chance."""
-    runs, leads = 40, 0
+    runs, leads = 30, 0
     for seed in range(runs):
         rng = np.random.default_rng(1000 + seed)
         text = lead(fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)), seed), {})
         leads += text != "no candidate comes near, and no pose, pattern or channel stands out"
     # binom.isf(1e-3, 40, 0.01)
-    assert leads <= 4
+    assert leads <= 3
 
 
 MANY: list[Sequence[Effect]] = [[BiasDrift(3)], [Empirical("even")], [BiasDrift(3), Empirical("even")]]

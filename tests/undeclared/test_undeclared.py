@@ -1,7 +1,7 @@
 """What the loop makes of effects that nobody declared: the claims of docs/explanation/undeclared-effects.md.
 
-At a size that runs in seconds; a claim fails where a share as it is, or worse, has a probability below `RARE` if the
-claim holds. The whole of it: ``python -m benchmarks.undeclared``.
+At a size that runs in seconds, of recordings that are always the same: a claim fails where a share as it is, or worse,
+has a probability below `RARE` if the claim holds. The whole of it: ``python -m benchmarks.undeclared``.
 """
 
 from __future__ import annotations
@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pytest
 from scipy import stats
 
 from tests.undeclared import physics, uncatalogued
 from tests.undeclared.examine import Case, Outcome, examine
 from tests.undeclared.noise import KINDS as NOISES
 
-RARE = 1e-3
+RARE = 0.1
 LARGE = (20.0, 200.0)
 
 
@@ -34,13 +33,6 @@ def examined(cases: Sequence[Case]) -> list[Outcome]:
     return outcomes
 
 
-@pytest.fixture(scope="module")
-def large() -> list[Outcome]:
-    """One large effect each: with 26 poses every third kind, with 14 two."""
-    every = [Case(k, 500 + i, LARGE, 26, NOISES[i % 3]) for i, k in enumerate(physics.KINDS[::3])]
-    return examined([*every, *(Case(k, 520, LARGE, 14, "white") for k in physics.KINDS[4::7])])
-
-
 def test_nothing_is_found_where_nothing_is() -> None:
     cases = [Case("none", 540 + i, (1.0, 1.0), 26 if i % 3 else 14, noise) for noise in NOISES[:2] for i in range(2)]
     outcomes = examined(cases)
@@ -48,18 +40,20 @@ def test_nothing_is_found_where_nothing_is() -> None:
     assert at_most(0.01, [o.unexplained for o in outcomes])
 
 
-def test_a_large_effect_is_named_or_listed(large: list[Outcome]) -> None:
-    assert at_least(0.95, [o.verdict in ("adopted", "confounded") for o in large]), "\n".join(o.line for o in large)
-
-
-def test_a_unique_name_is_seldom_wrong(large: list[Outcome]) -> None:
-    assert at_most(0.02, [o.wrong for o in large]), "\n".join(o.line for o in large)
+def test_a_large_effect_is_named_or_listed_and_a_unique_name_is_not_wrong() -> None:
+    """With 26 poses every third kind, with 14 two."""
+    cases = [Case(k, 500 + i, LARGE, 26, NOISES[i % 3]) for i, k in enumerate(physics.KINDS[::3])]
+    outcomes = examined([*cases, *(Case(k, 520, LARGE, 14, "white") for k in physics.KINDS[4::7])])
+    told = "\n".join(o.line for o in outcomes)
+    assert at_least(0.95, [o.verdict in ("adopted", "confounded") for o in outcomes]), told
+    assert at_most(0.02, [o.wrong for o in outcomes]), told
 
 
 def test_a_small_effect_is_seen_nearly_as_often_as_by_the_test_that_was_told() -> None:
-    outcomes = examined([Case(k, 560 + i, (5.0, 5.0), 26, NOISES[i % 3]) for i, k in enumerate(physics.KINDS[1::4])])
+    kinds = list(enumerate(physics.KINDS))[1::2]
+    outcomes = examined([Case(k, 560 + i, (5.0, 5.0), 26, NOISES[i % 3]) for i, k in kinds])
     told = float(np.mean([o.told_power for o in outcomes]))
-    assert at_least(0.8 * told, [o.detected for o in outcomes]), "\n".join(o.line for o in outcomes)
+    assert at_least(0.75 * told, [o.detected for o in outcomes]), "\n".join(o.line for o in outcomes)
 
 
 def test_what_no_catalogue_has_stays_unexplained() -> None:
