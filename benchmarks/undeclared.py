@@ -24,7 +24,7 @@ from tests.undeclared import physics, uncatalogued
 from tests.undeclared.examine import Case, Outcome, describe, examine
 
 SIZES = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0)
-ASKED, TIMES = 5.0, 4
+ASKED, TIMES = 5.0, 12
 """Of the size for which a figure is asked there are so many times as many."""
 LARGE = (20.0, 200.0)
 PAIR = (20.0, 40.0)

@@ -17,6 +17,8 @@ DESCRIBES = 1.4
 
 def described(after: Calibration, unexplained: Unexplained, signs: Sequence[float]) -> tuple[Calibration | None, str]:
     """The model with the smooth term that lowers the cross-validated error most; or None, and why there is none."""
+    if unexplained.or_spoiled:
+        return None, "not tried, as it is open whether poses were spoiled"
     if not unexplained.significant:
         return None, f"not tried, as what is left is no more than noise explains (p {probability(unexplained.p_value)})"
     old = after.residual.cross_validated_rms_g

@@ -168,9 +168,9 @@ def advice_of(
         if f.verdict == "confounded":
             others = [*f.alternatives, *(["spoiled poses"] if f.spoiled else [])]
             out.append(f"{f.effect} cannot be told from {', '.join(others)} here: {'; '.join(f.apart)}")
-    if unexplained.significant:
+    if unexplained.significant and not unexplained.or_spoiled:
         out.append(
-            "something is left that no candidate explains: look at the lead; take some directions again at another "
+            "something is left that no candidate explains: take some directions again at another "
             "azimuth and at another time, and log what else changes (temperature, supply, what stands nearby)"
         )
     if undescribed:

@@ -12,9 +12,8 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import special
 
-from triaxcal.calibration import Calibration
+from triaxcal.calibration import Calibration, PoseResult
 from triaxcal.conditions import channels_of
 from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.description import described
@@ -32,10 +31,14 @@ from triaxcal.runs import by_run, expected_of
 from triaxcal.search import NEAR, NO_LOWER, Search, alternatives, compared
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
 from triaxcal.start import problem_of, start, with_history
-from triaxcal.unexplained import Unexplained, hints_of, spoiled_or, unexplained_of
+from triaxcal.unexplained import SIGNIFICANT, Unexplained, hints_of, spoiled_or, unexplained_of
 
 ANYTHING = 5
 """An effect beside others, with so many alternatives, is none."""
+SPOILED = 0.02
+"""Of so many poses something spoils one, as far as nothing is known of them."""
+OPEN = 6.0
+"""Poses are left out as spoiled for certain where every effect is worse by so much, in deviance: odds of 20 to 1."""
 ROUNDS_MOST = 3
 """Effects and spoiled poses are sought in turn so often."""
 
@@ -96,13 +99,21 @@ def diagnose(
         steps = [given.fit(found.adopted[:count]) for count in range(1, len(found.adopted) + 1)]
         # The search has asked this of poses without their creep.
         if not compared(steps[-1], before).lower:
-            search.passed_over[" with ".join(e.name for e in found.adopted)] = NO_LOWER
-            found = replace(found, adopted=search.settle_on(search.linear))
+            found.linear.passed_over[" with ".join(e.name for e in found.adopted)] = NO_LOWER
+            found = replace(found, adopted=[])
             given, before, steps = replace(given, poses=poses), linear, [linear]
     if not found.adopted:
-        model = fit(quiet, signs=signs, reference=reference)
+        # What is left is asked of the poses that the calibration is of.
+        model = fit(quiet, signs=signs, reference=reference, aside=_aside(linear))
+        search = found.linear
+        search.settle_on(search.linear)
     p = search.anything_p(search.found)
     unexplained = unexplained_of(model, search.passed_over, p, search.nearest(), hints_of(search))
+    aside = [p for p in before.poses if not p.used]
+    rivals = _names(found.rivals) if not found.adopted else []
+    if aside and rivals and not unexplained.significant and found.whole_p is not None and found.whole_p < SIGNIFICANT:
+        whole = fit(quiet, signs=signs, reference=reference, aside=())
+        unexplained = spoiled_or(whole, found.whole_p, aside, rivals)
     smooth, undescribed = described(steps[-1], unexplained, signs) if empirical else (None, "")
     after = smooth or steps[-1]
     findings: list[Finding] = []
@@ -124,17 +135,13 @@ def diagnose(
         instead = {n: given.tried(effects) for f in findings for n, effects in f.instead.items()}
         held = held_out(before, after, check, {n: c for n, c in instead.items() if c is not None})
     advice = advice_of(findings, unexplained, undescribed, blind, faulty)
-    if (again := _again(found, before)) and not unexplained.significant and found.whole_p is not None:
-        whole = fit(quiet, signs=signs, reference=reference, aside=())
-        aside = [p for p in before.poses if not p.used]
-        unexplained = spoiled_or(whole, found.whole_p, aside, _names(found.rivals))
     return Loop(
         before=before.with_blind_to(tuple(blind)),
         after=after.with_blind_to(tuple(blind)),
         findings=tuple(findings),
         unexplained=unexplained,
         held_out=held,
-        advice=tuple(again + advice + better_of(held)),
+        advice=tuple(_again(aside, rivals) + advice + better_of(held)),
         search=search,
     )
 
@@ -166,6 +173,8 @@ class _Found:
     search: Search
     adopted: list[Effect]
     aside: tuple[int, ...]
+    linear: Search
+    """That with those poses left out which the linear fit leaves out."""
     rivals: tuple[tuple[Effect, ...], ...] = ()
     """Effects that explain as much with other poses left out."""
     spoiled: tuple[int, ...] = ()
@@ -174,13 +183,14 @@ class _Found:
     """Where poses were left out: the probability of what the linear model leaves of all of them."""
 
 
-def _again(found: _Found, before: Calibration) -> list[str]:
-    """What to take again where an effect would explain as much as the poses that were left out as spoiled."""
-    aside = [p.pose.at for p in before.poses if not p.used]
-    if found.adopted or not found.rivals or not aside:
+def _again(aside: Sequence[PoseResult], rivals: Sequence[str]) -> list[str]:
+    """What to take again: poses left out as spoiled, and what would explain as much without that."""
+    if not aside:
         return []
-    names = " or ".join(_names(found.rivals))
-    return [f"take again {the_poses(aside)}: left out as spoiled, but {names} would explain as much"]
+    advice = f"take again {the_poses([p.pose.at for p in aside])}: left out as spoiled"
+    if rivals:
+        advice += f", but {' or '.join(rivals)} would explain as much; if it comes out the same, nothing spoiled it"
+    return [advice]
 
 
 def _names(rivals: Sequence[Sequence[Effect]]) -> list[str]:
@@ -219,7 +229,7 @@ def _explained(
             break
         trials.append(other)
         found = other
-    near = _criterion(found, len(poses)) + NEAR
+    near = _criterion(found, len(poses)) + (NEAR if found.adopted else OPEN)
     others = [t for t in trials if t.aside != found.aside]
     rivals: list[tuple[Effect, ...]] = []
     for t in others:
@@ -228,8 +238,9 @@ def _explained(
         rivals += [m.effects for m in models if m.effects and t.search.score(m) + price < near]
     without = [t for t in others if found.adopted and not t.adopted and _criterion(t, len(poses)) < near]
     spoiled = min(without, key=lambda t: _criterion(t, len(poses))).aside if without else ()
-    whole_p = first.anything_p(first.linear) if found.aside and not trials[0].aside else None
-    return replace(found, rivals=tuple(rivals), spoiled=spoiled, whole_p=whole_p)
+    linear = next((t.search for t in trials if t.aside == aside), found.search)
+    whole_p = first.anything_p(first.linear) if aside and not trials[0].aside else None
+    return replace(found, linear=linear, rivals=tuple(rivals), spoiled=spoiled, whole_p=whole_p)
 
 
 def _tried(
@@ -266,7 +277,7 @@ def _searched(
     # What is nearly always there: beside it others show that neither alone nor in pairs would have.
     if expected and len(other.run(expected)) > 1 and other.score(other.found) < search.score(search.found):
         search, adopted = other, list(other.found.effects)
-    return _Found(search, adopted if expected else _without_fillers(search), aside)
+    return _Found(search, adopted if expected else _without_fillers(search), aside, search)
 
 
 def _without_fillers(search: Search) -> list[Effect]:
@@ -284,7 +295,5 @@ def _without_fillers(search: Search) -> list[Effect]:
 
 
 def _criterion(found: _Found, n: int) -> float:
-    """The score of a model, where a pose left out costs a parameter, and the choice of those left out as effects do."""
-    aside = len(found.aside)
-    choice = float(special.gammaln(n + 1) - special.gammaln(aside + 1) - special.gammaln(n - aside + 1))
-    return found.search.score(found.search.found) + aside * float(np.log(n)) + 2 * choice
+    """The score of a model, where a pose left out costs a parameter and how seldom one is spoiled."""
+    return found.search.score(found.search.found) + len(found.aside) * float(np.log(n) + 2 * np.log(1 / SPOILED - 1))

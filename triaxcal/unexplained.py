@@ -33,13 +33,14 @@ NAMES |= {s: f"the scatter of axis {s[-1]}" for s in SCATTER}
 @dataclass(frozen=True)
 class Unexplained:
     """What is left. ``p_value`` is the probability of as much by chance; ``rms_g`` its size beyond noise; ``lead`` the
-    best hint at what it may be.
+    best hint at what it may be. ``or_spoiled``: it is poses that were left out as spoiled, or an effect.
     """
 
     significant: bool
     p_value: float | None
     rms_g: float
     lead: str
+    or_spoiled: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,10 +76,10 @@ def unexplained_of(
 
 def spoiled_or(whole: Calibration, p: float, spoiled: Sequence[PoseResult], names: Sequence[str]) -> Unexplained:
     """What the poses leave where those that are ``spoiled`` explain it no better than the effects of these ``names``
-    would. ``whole`` is the fit to all poses, ``p`` the probability of what it leaves."""
+    would. ``whole`` is the fit to all poses, ``p`` the probability of what it leaves, which is significant."""
     off = " and ".join(f"the pose at {s.pose.at} ({micro_g(s.residual_g, '+')})" for s in spoiled)
     lead = f"most of it is {off}: spoiled, or it is {' or '.join(names)}, which would explain as much"
-    return Unexplained(p < SIGNIFICANT, p, _beyond(whole, p < SIGNIFICANT), lead if p < SIGNIFICANT else "")
+    return Unexplained(True, p, _beyond(whole, True), lead, or_spoiled=True)
 
 
 def _beyond(after: Calibration, significant: bool) -> float:
@@ -115,12 +116,14 @@ def lead(
     if worst.studentized**2 > 0.5 * sum(p.studentized**2 for p in used):
         parts.append(f"most of it is one pose, at {worst.pose.at} ({micro_g(worst.residual_g, '+')}): was it still?")
     parts += [*_clear_patterns(after, used, _patterns(after, used)), *hints]
-    near = {name: why for name, why in passed_over.items() if _is_hint(why)}
+    inside = {effect.name for effect, _ in after.sensor.effects}
+    near = {name: why for name, why in passed_over.items() if _is_hint(why) and name not in inside}
     if nearest is not None and nearest.p_value < SIGNIFICANT:
         why = f"p {probability(nearest.p_value)}, but it explains too little for what it adds"
         near.setdefault(nearest.effect, why)
     parts += [f"the nearest effect is {name}, not adopted: {why}" for name, why in list(near.items())[:2]]
-    return "; ".join(parts) or "no candidate comes near, and no pose, pattern or channel stands out"
+    others = "" if len(used) == len(after.poses) else "but for the poses that were left out, "
+    return "; ".join(parts) or f"{others}no candidate comes near, and no pose, pattern or channel stands out"
 
 
 def _is_hint(why: str) -> bool:

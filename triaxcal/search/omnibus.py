@@ -18,15 +18,17 @@ from triaxcal.search.gains import Gains
 
 DRAWS = 2000
 SIZE = 5.0
-"""The effects averaged over have this size s (rms): larger ones are seen in any case, smaller ones in none."""
+"""The effects averaged over have this size s (rms): much larger ones are seen in any case, smaller ones by nobody."""
+FREE_LEAST = 1e-3
+"""A pose of which the model leaves less than this share carries a parameter, and is never off."""
 
 
 def anything_p(gains: Gains, names: Sequence[str], model: Floats, pure_dof: float) -> float:
     """Probability that noise alone looks as much like one of the candidates, or like something that is none of them.
 
-    ``names`` (c,) of the candidates: each has the same weight, and so has what has no name. ``model`` (n,k) is the
-    orthonormal basis of what was fitted; ``pure_dof`` are the degrees of freedom behind the poses' noise. Simulated, as
-    candidates are alike.
+    ``names`` (c,) of the candidates: each has the same weight, and so have one pose that is off, whichever it is, and
+    what has no name. ``model`` (n,k) is the orthonormal basis of what was fitted; ``pure_dof`` are the degrees of
+    freedom behind the poses' noise. Simulated, as candidates are alike.
     """
     n, k = model.shape
     rng = np.random.default_rng(0)
@@ -34,10 +36,12 @@ def anything_p(gains: Gains, names: Sequence[str], model: Floats, pure_dof: floa
     noise = (noise - model @ (model.T @ noise)) / np.sqrt(rng.chisquare(pure_dof, DRAWS) / pure_dof)
     y = np.column_stack([gains.y, noise])
     total = np.sum(y**2, axis=0)
+    free = 1 - np.sum(model**2, axis=1)
+    shows = free > FREE_LEAST
     tries = Counter(names)
-    weights = np.array([*(1 / tries[name] for name in names), 1.0])
-    rank = np.append(gains.ranks, n - k)[:, None]
-    taken = np.vstack([gains.of_noise(y), total])
+    weights = np.array([*(1 / tries[name] for name in names), *np.full(n, 1 / n)[shows], 1.0])
+    rank = np.concatenate([gains.ranks, np.ones(shows.sum()), [n - k]])[:, None]
+    taken = np.vstack([gains.of_noise(y), y[shows] ** 2 / free[shows, None], total])
     # By effects whose coefficients are normal; the size of the noise is told by the poses' own and by the residuals.
     share = SIZE**2 / (SIZE**2 + rank)
     likelier = 0.5 * (rank * np.log1p(-share) - (pure_dof + n - k) * np.log1p(-share * taken / (pure_dof + total)))

@@ -16,6 +16,7 @@ from triaxcal.effects.in_run import of_clocks
 from triaxcal.figures import probability
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State
+from triaxcal.pure_error import pure_error_dof
 from triaxcal.search.candidates import Candidate, Ground, candidates_of
 from triaxcal.search.comparison import CARRIES, NO_LOWER, compared
 from triaxcal.search.gains import Gains
@@ -294,8 +295,8 @@ class Search(Worth):
         return self._earned(m, self.linear)
 
     def anything_p(self, now: Model) -> float | None:
-        """Probability of what a model leaves by chance; None where nothing can be left."""
-        if self.left(now.effects) <= 0:
+        """Probability of what a model leaves by chance; None where nothing can be left, or the noise is not known."""
+        if self.left(now.effects) <= 0 or pure_error_dof(self.poses) < 1:
             return None
         ground, candidates = self._of_catalogue(now)
         return anything_p(Gains.of(candidates, ground.y), [c.name for c in candidates], ground.model, self.pure)

@@ -59,12 +59,17 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
     if _unexplained(outcome):
         kept = "Every declared limit is kept, but more" if checks and not open_checks else "More"
         sentence = f"{kept} is left than the noise of the poses accounts for. {errors}"
+        if _rejected(outcome) and not outcome.findings and not _lacks_fit(outcome):
+            sentence = f"Something spoiled poses, which were left out, or an effect acts: this is open. {errors}"
+            return Verdict(
+                "unexplained", "Spoiled poses or an effect; poses to take again", sentence, reservations, checks
+            )
         return Verdict("unexplained", _UNEXPLAINED, sentence, reservations, checks)
     if open_checks or not (checks or _tested(outcome)):
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
     headline = _WITHIN if checks else _without_limits(outcome)
-    uncertain = not checks and _uncertain(outcome)
+    uncertain = not checks and (_uncertain(outcome) or (not outcome.findings and _lacks_fit(outcome)))
     if _spoiled(outcome) or _rejected(outcome):
         headline, uncertain = f"{headline}; poses to take again", True
     return Verdict("unexplained" if uncertain else "within", headline, errors, reservations, checks)
@@ -74,7 +79,7 @@ def _without_limits(outcome: Outcome) -> str:
     if not outcome.searched:
         return "No lack of fit shows"
     if not outcome.findings:
-        return "Nothing found beyond noise"
+        return "Nothing found beyond noise" if not _lacks_fit(outcome) else "Nothing certain found beyond noise"
     what = "Effect" if len(outcome.findings) == 1 else f"{len(outcome.findings)} effects"
     return f"{what} found, cause uncertain" if _uncertain(outcome) else f"{what} found and corrected"
 
@@ -132,6 +137,10 @@ def _tested(outcome: Outcome) -> bool:
 def _unexplained(outcome: Outcome) -> bool:
     if outcome.unexplained is not None:
         return outcome.unexplained.significant
+    return _lacks_fit(outcome)
+
+
+def _lacks_fit(outcome: Outcome) -> bool:
     p = outcome.final.lack_of_fit_p
     return p is not None and p < _SIGNIFICANT_P
 

@@ -253,6 +253,26 @@ def test_the_headline_is_not_that_all_is_well_while_poses_have_to_be_taken_again
     assert f"{good}; poses to take again" in text
 
 
+def test_poses_left_out_or_an_effect_is_said_to_be_open(loop: dict[str, Any]) -> None:
+    loop["unexplained"] |= {"significant": True, "p_value": 2e-4, "lead": "most of it is the pose at 166.0 s"}
+    _, text = page(loop)
+    assert "Unexplained error left" in text
+    loop["calibration"]["poses"][4]["used"] = False
+    _, text = page(loop)
+    assert "Spoiled poses or an effect; poses to take again" in text
+    assert "Unexplained error left" not in text
+
+
+def test_nothing_found_is_not_certain_where_the_fit_is_worse_than_noise(loop: dict[str, Any]) -> None:
+    _, text = page(loop)
+    assert "Nothing found beyond noise" in text
+    for block in (loop["after"], loop["calibration"]["residual"]):
+        block["lack_of_fit_p"] = 0.003
+    html, text = page(loop)
+    assert 'class="verdict unexplained"' in html
+    assert "Nothing certain found beyond noise" in text
+
+
 def test_faults_that_spoil_poses_come_first_and_the_rest_stay_remarks(words: dict[str, Any]) -> None:
     words["data_quality"] = [
         "mains_pickup: 50.0 Hz, amplitude y 0.0014",

@@ -15,7 +15,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.search.candidates import Candidate, Ground, candidates_of, still_conditions
 from triaxcal.search.familywise import familywise, independent_tests
 from triaxcal.search.gains import Gains
-from triaxcal.search.omnibus import DRAWS, anything_p
+from triaxcal.search.omnibus import anything_p
 
 CERTAIN = 1e6
 N, FITTED = 26, 9
@@ -66,13 +66,16 @@ def at_most(share: float, of: int) -> int:
     return int(stats.binom.ppf(1 - 1e-3, of, share))
 
 
-def test_where_nothing_is_known_it_is_the_test_of_the_sum_of_squares() -> None:
-    for seed in range(5):
-        y = np.random.default_rng(seed).standard_normal(N) * 1.2
-        rest = y - MODEL @ (MODEL.T @ y)
-        expected = float(stats.f.sf(rest @ rest / (N - FITTED), N - FITTED, 30.0))
-        spread = 4 * np.sqrt(expected * (1 - expected) / DRAWS) + 1 / DRAWS
-        assert p_of(y, [], [], 30.0) == pytest.approx(expected, abs=spread)
+def test_one_pose_that_is_off_is_seen_more_often_than_by_the_sum_of_squares(known: Known) -> None:
+    seen = np.zeros(2)
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        y = rng.standard_normal(N)
+        row = int(rng.integers(N))
+        y[row] += 4.5 / np.sqrt(1 - np.sum(known.model[row] ** 2))
+        rest = y - known.model @ (known.model.T @ y)
+        seen += [known.p(y, CERTAIN) < 0.01, stats.chi2.sf(rest @ rest, N - FITTED) < 0.01]
+    assert seen[0] > 1.1 * seen[1]
 
 
 @pytest.mark.parametrize("pure_dof", [12.0, 200.0])
