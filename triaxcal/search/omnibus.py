@@ -19,6 +19,9 @@ from triaxcal.search.gains import Gains
 DRAWS = 2000
 SIZE = 5.0
 """The effects averaged over have this size s (rms): much larger ones are seen in any case, smaller ones by nobody."""
+LARGE = 50.0
+"""Half of what has no name has this size: spread over many directions, in noise that is hardly known, even a large
+departure is not beyond all that chance could do if only small ones were thought of."""
 FREE_LEAST = 1e-3
 """A pose of which the model leaves less than this share carries a parameter, and is never off."""
 
@@ -39,11 +42,12 @@ def anything_p(gains: Gains, names: Sequence[str], model: Floats, pure_dof: floa
     free = 1 - np.sum(model**2, axis=1)
     shows = free > FREE_LEAST
     tries = Counter(names)
-    weights = np.array([*(1 / tries[name] for name in names), *np.full(n, 1 / n)[shows], 1.0])
-    rank = np.concatenate([gains.ranks, np.ones(shows.sum()), [n - k]])[:, None]
-    taken = np.vstack([gains.of_noise(y), y[shows] ** 2 / free[shows, None], total])
+    weights = np.array([*(1 / tries[name] for name in names), *np.full(n, 1 / n)[shows], 0.5, 0.5])
+    rank = np.concatenate([gains.ranks, np.ones(shows.sum()), [n - k, n - k]])[:, None]
+    taken = np.vstack([gains.of_noise(y), y[shows] ** 2 / free[shows, None], total, total])
+    size = np.append(np.full(len(rank) - 1, SIZE), LARGE)[:, None]
     # By effects whose coefficients are normal; the size of the noise is told by the poses' own and by the residuals.
-    share = SIZE**2 / (SIZE**2 + rank)
+    share = size**2 / (size**2 + rank)
     likelier = 0.5 * (rank * np.log1p(-share) - (pure_dof + n - k) * np.log1p(-share * taken / (pure_dof + total)))
     log_mean = special.logsumexp(likelier, axis=0, b=weights[:, None] / weights.sum())
     as_large = float(np.mean(np.append(log_mean[1:] >= log_mean[0], True)))
