@@ -122,7 +122,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         for name, (value, error, unit) in finding.coefficients.items():
             print(f"    {name} {value:+.4g} ± {error:.1g} {unit}")
     if not loop.findings:
-        print("  no effect of the catalogue shows")
+        print(f"  no effect of the catalogue shows{' for certain' if loop.unexplained.or_spoiled else ''}")
     if loop.unexplained.significant:
         print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms; {loop.unexplained.lead}")
     if o.provisioned:

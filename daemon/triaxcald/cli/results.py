@@ -102,7 +102,7 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     for finding in loop.findings:
         print(f"{finding.verdict}: {finding.effect} ({small.in_words(finding.reason)})")
     if not loop.findings:
-        print("no effect of the catalogue shows")
+        print(f"no effect of the catalogue shows{' for certain' if loop.unexplained.or_spoiled else ''}")
     if loop.unexplained.significant:
         lead = small.in_words(loop.unexplained.lead)
         print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")

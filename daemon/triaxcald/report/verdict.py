@@ -60,7 +60,7 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
         kept = "Every declared limit is kept, but more" if checks and not open_checks else "More"
         sentence = f"{kept} is left than the noise of the poses accounts for. {errors}"
         if _rejected(outcome) and not outcome.findings and not _lacks_fit(outcome):
-            sentence = f"Something spoiled poses, which were left out, or an effect acts: this is open. {errors}"
+            sentence = f"Something spoiled poses, which were left out, or an effect acts. {_errors(outcome)}"
             return Verdict(
                 "unexplained", "Spoiled poses or an effect; poses to take again", sentence, reservations, checks
             )
