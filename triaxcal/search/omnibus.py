@@ -19,9 +19,11 @@ from triaxcal.search.gains import Gains
 DRAWS = 2000
 SIZE = 5.0
 """The effects averaged over have this size s (rms): much larger ones are seen in any case, smaller ones by nobody."""
-LARGE = 50.0
+LARGE = 20.0
 """Half of what has no name has this size: spread over many directions, in noise that is hardly known, even a large
 departure is not beyond all that chance could do if only small ones were thought of."""
+NAMELESS = 0.2
+"""Share of what has no name."""
 FREE_LEAST = 1e-3
 """A pose of which the model leaves less than this share carries a parameter, and is never off."""
 
@@ -29,9 +31,9 @@ FREE_LEAST = 1e-3
 def anything_p(gains: Gains, names: Sequence[str], model: Floats, pure_dof: float) -> float:
     """Probability that noise alone looks as much like one of the candidates, or like something that is none of them.
 
-    ``names`` (c,) of the candidates: each has the same weight, and so have one pose that is off, whichever it is, and
-    what has no name. ``model`` (n,k) is the orthonormal basis of what was fitted; ``pure_dof`` are the degrees of
-    freedom behind the poses' noise. Simulated, as candidates are alike.
+    ``names`` (c,) of the candidates: each has the same weight, and so has one pose that is off, whichever it is.
+    ``model`` (n,k) is the orthonormal basis of what was fitted; ``pure_dof`` are the degrees of freedom behind the
+    poses' noise. Simulated, as candidates are alike.
     """
     n, k = model.shape
     rng = np.random.default_rng(0)
@@ -42,14 +44,15 @@ def anything_p(gains: Gains, names: Sequence[str], model: Floats, pure_dof: floa
     free = 1 - np.sum(model**2, axis=1)
     shows = free > FREE_LEAST
     tries = Counter(names)
-    weights = np.array([*(1 / tries[name] for name in names), *np.full(n, 1 / n)[shows], 0.5, 0.5])
+    named = np.array([*(1 / tries[name] for name in names), *np.full(n, 1 / n)[shows]])
+    weights = np.append((1 - NAMELESS) / named.sum() * named, [NAMELESS / 2, NAMELESS / 2])
     rank = np.concatenate([gains.ranks, np.ones(shows.sum()), [n - k, n - k]])[:, None]
     taken = np.vstack([gains.of_noise(y), y[shows] ** 2 / free[shows, None], total, total])
     size = np.append(np.full(len(rank) - 1, SIZE), LARGE)[:, None]
     # By effects whose coefficients are normal; the size of the noise is told by the poses' own and by the residuals.
     share = size**2 / (size**2 + rank)
     likelier = 0.5 * (rank * np.log1p(-share) - (pure_dof + n - k) * np.log1p(-share * taken / (pure_dof + total)))
-    log_mean = special.logsumexp(likelier, axis=0, b=weights[:, None] / weights.sum())
+    log_mean = special.logsumexp(likelier, axis=0, b=weights[:, None])
     as_large = float(np.mean(np.append(log_mean[1:] >= log_mean[0], True)))
     # Under noise its mean is 1, so that a large one is rarer than its inverse (Markov), which draws cannot show.
     return float(min(as_large, np.exp(-log_mean[0])))
