@@ -80,7 +80,7 @@ def test_one_pose_that_is_off_is_seen_more_often_than_by_the_sum_of_squares(know
 
 @pytest.mark.parametrize("pure_dof", [12.0, 200.0])
 def test_noise_alone_is_called_something_as_seldom_as_claimed(known: Known, pure_dof: float) -> None:
-    rng, runs = np.random.default_rng(3), 150
+    rng, runs = np.random.default_rng(3), 100
     p = np.array([known.p(rng.standard_normal(N) / np.sqrt(rng.chisquare(pure_dof) / pure_dof), pure_dof)
                   for _ in range(runs)])  # fmt: skip
     for level in (0.01, 0.05, 0.2, 0.5):
@@ -89,7 +89,7 @@ def test_noise_alone_is_called_something_as_seldom_as_claimed(known: Known, pure
 
 
 def test_it_sees_as_much_as_the_best_candidate_at_the_same_level_and_more_than_the_sum_of_squares(known: Known) -> None:
-    rng, runs = np.random.default_rng(4), 150
+    rng, runs = np.random.default_rng(4), 100
     seen = np.zeros(3)
     names = sorted(set(known.names))
     for k in range(runs):
