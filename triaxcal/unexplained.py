@@ -66,8 +66,7 @@ def unexplained_of(
     is None.
     """
     residual = after.residual
-    # Where the noise is not known, nothing is more than it.
-    p = residual.lack_of_fit_p if p is None or residual.lack_of_fit_p is None else p
+    p = residual.lack_of_fit_p if p is None else p
     significant = p is not None and p < SIGNIFICANT
     return Unexplained(
         significant, p, _beyond(after, significant), lead(after, passed_over, nearest, hints) if significant else ""

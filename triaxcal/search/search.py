@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,9 +40,12 @@ PARTNERS = 60
 
 @dataclass(frozen=True)
 class Beside:
-    """Candidates beside a model: what each gains and costs, the degrees of freedom ``left`` and the ``scores`` (c,) of
-    the model with it."""
+    """Candidates beside a model, whose orthonormal basis is ``ground.model``: what each gains and costs, the degrees of
+    freedom ``left`` and the ``scores`` (c,) of the model with it. The first ``tried`` are as the catalogue has them;
+    the shapes of the others were chosen by the residuals."""
 
+    ground: Ground
+    tried: int
     candidates: Sequence[Candidate]
     gains: Gains
     prices: Floats
@@ -119,15 +122,11 @@ class Search(Worth):
             self._reckonings[key] = now, self._reckoned(now)
         return self._reckonings[key][1]
 
-    def _of_catalogue(self, now: Model) -> tuple[Ground, list[Candidate]]:
-        """The candidates beside a model."""
+    def _reckoned(self, now: Model) -> Beside:
         ground, found = Ground.at(self.problem, now.state), self.candidates
         if now.effects:
             found, _ = candidates_of(ground, [e for e in self.catalogue if e.name in self.names], self.still)
-        return ground, [c for c in found if c.name not in {e.name for e in now.effects}]
-
-    def _reckoned(self, now: Model) -> Beside:
-        ground, candidates = self._of_catalogue(now)
+        candidates = [c for c in found if c.name not in {e.name for e in now.effects}]
         rough = self._scored(now, ground, candidates)
         shaped: dict[tuple[str, ...], Candidate] = {}
         for i in np.argsort(rough.scores, kind="stable"):
@@ -135,7 +134,7 @@ class Search(Worth):
             if c.effect.shape and np.isfinite(rough.scores[i]):
                 shaped.setdefault((c.name, *(k.name for k in c.effect.coefficients)), c)
         better = [finer for c in shaped.values() if (finer := sharpened(ground, c)) is not None]
-        return self._scored(now, ground, [*candidates, *better]) if better else rough
+        return replace(self._scored(now, ground, [*candidates, *better]), tried=len(candidates)) if better else rough
 
     def _scored(self, now: Model, ground: Ground, candidates: Sequence[Candidate]) -> Beside:
         prices = np.array([self.price_of(c.rank, c.tries) for c in candidates])
@@ -145,7 +144,7 @@ class Search(Worth):
         if candidates:
             scores = deviance(float(ground.y @ ground.y) - gains.single(), left) + prices
             scores[left < self.kept] = np.inf
-        return Beside(candidates, gains, prices, left, scores)
+        return Beside(ground, len(candidates), candidates, gains, prices, left, scores)
 
     def _models(self, now: Model, groups: Iterable[tuple[Effect, ...]]) -> list[Model]:
         return [m for g in groups if (m := self.model([*now.effects, *g])) is not None]
@@ -298,8 +297,10 @@ class Search(Worth):
         """Probability of what a model leaves by chance; None where nothing can be left, or the noise is not known."""
         if self.left(now.effects) <= 0 or pure_error_dof(self.poses) < 1:
             return None
-        ground, candidates = self._of_catalogue(now)
-        return anything_p(Gains.of(candidates, ground.y), [c.name for c in candidates], ground.model, self.pure)
+        beside = self.beside(now)
+        tried = beside.candidates[: beside.tried]
+        gains = Gains(beside.gains.bases[: len(tried)], beside.gains.ranks[: len(tried)], beside.gains.y)
+        return anything_p(gains, [c.name for c in tried], beside.ground.model, self.pure)
 
     def nearest(self) -> Nearest | None:
         """Of single effects beside those found the one that is least likely to be chance; None where none is left."""
