@@ -280,7 +280,7 @@ def _rewrite(
         header = make_reader(file).get_header()
     with open(source, "rb") as file, open(out, "wb") as sink:
         writer = Writer(sink, enable_data_crcs=True)
-        writer.start(profile=header.profile, library=header.library)
+        writer.start(profile=header.profile)
         for record in StreamReader(file).records:
             if isinstance(record, Attachment) and (data := attachment(record.name, record.data)) is not None:
                 writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, data)

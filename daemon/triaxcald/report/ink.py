@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable
+from typing import Literal
 
 import matplotlib
 import matplotlib.style
@@ -67,8 +68,8 @@ def draw(name: str, alt: str, size_in: tuple[float, float], paint: Callable[[Fig
     return _inline(sheet.getvalue(), name, alt)
 
 
-def hang_grid(axes: Axes, axis: str = "y") -> None:
-    axes.grid(True, axis=axis)  # type: ignore[arg-type]
+def hang_grid(axes: Axes, axis: Literal["x", "y"] = "y") -> None:
+    axes.grid(True, axis=axis)
     axes.tick_params(length=2.5, width=0.6)
 
 

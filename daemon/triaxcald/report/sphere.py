@@ -71,7 +71,7 @@ def equal_area(direction: NDArray[np.float64], side: int) -> NDArray[np.float64]
 
 def _doubling_classes(stages: Sequence[Stage], noise_floor_g: float | None) -> BoundaryNorm:
     """Classes of ±1, ±2, ±4 … noise floors, so that errors before and after both show on one scale."""
-    largest = max(float(np.nanmax(np.abs(stage.pose_residual_g))) for stage in stages)  # type: ignore[arg-type]
+    largest = max(float(np.nanmax(np.abs(r))) for stage in stages if (r := stage.pose_residual_g) is not None)
     unit = noise_floor_g if noise_floor_g is not None and noise_floor_g > 0 else (largest / 8 or 1e-6)
     doublings = int(np.clip(np.ceil(np.log2(max(largest / unit, 1.0))), 2, _MOST_DOUBLINGS))
     edges = unit * 2.0 ** np.arange(doublings + 1)
