@@ -13,6 +13,8 @@ from scipy import special
 
 from triaxcal.arrays import Bools, Floats
 
+DOF_MOST = 1e6
+"""So many degrees of freedom are as good as more."""
 Given = float | np.floating[Any] | np.integer[Any] | Floats
 
 

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.distributions import f_sf
+from triaxcal.distributions import DOF_MOST, f_sf
+from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.pose import Pose
 
-DOF_MOST = 1e6
 BEYOND_DOUBT = 0.2
 """Where residuals like these have less than this probability, the residuals alone say how large the noise is."""
 
@@ -37,6 +37,17 @@ def pure_error_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
     common = np.array([1 / p.shared_dof for p in poses])
     own = np.maximum(1 / dof - common, 0.0)
     return min(float(1 / (np.sum(w**2 * own) + (w @ np.sqrt(common)) ** 2 + 1e-300)), DOF_MOST)
+
+
+def noise_levels(poses: Sequence[Pose]) -> NoiseLevels:
+    """How large the noise of the poses, of which none is known better than the others, may be: by the degrees of
+    freedom alone where they are of several recordings."""
+    first = poses[0]
+    common = first.noise_levels
+    if common is None or any(p.noise_levels is not common for p in poses):
+        return NoiseLevels.known_by(max(pure_error_dof(poses), 1.0))
+    own = np.maximum(1 / np.maximum(pose_dof(poses), 1.0) - 1 / first.shared_dof, 0.0)
+    return common.blurred(float(own.sum()) / len(poses) ** 2)
 
 
 def lack_of_fit_p(chi2: float, left: int, pure_dof: float) -> float | None:

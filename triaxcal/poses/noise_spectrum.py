@@ -15,10 +15,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, special
+from scipy import fft
 
 from triaxcal.arrays import Bools, Floats, Ints
-from triaxcal.distributions import chi2_isf, t_isf
+from triaxcal.distributions import chi2_isf
+from triaxcal.poses.noise_levels import NoiseLevels
 
 BANDS = 1.25
 """Ordinates of a periodogram are gathered in bands whose edges rise by this factor."""
@@ -26,8 +27,6 @@ TIME_CONSTANTS = 12
 LENGTHS = 12
 SLOWEST = 0.40
 """exp(3/2 − γ) / 2π: ∫(1 − sinc²(πx)) dx/x from 0 to X tends to ln X + ln 2π + γ − 3/2."""
-DOF_LEVEL = 0.99
-DOF_GRID = np.geomspace(1.0, 1e5, 200)
 STEPS = 12
 FLICKER = 0.3
 """Odds, before the data, of 1/f noise strong enough to matter (decision 0022)."""
@@ -159,12 +158,13 @@ def periodogram(tracks: Sequence[Track], components: Components, lowest: int = 1
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Autocovariance (q, lags) of window means, up to the scale of each pose, and the degrees of freedom (q,) behind
-    the variance of a mean of the usual length, doubt between the models included. ``highest`` is the frequency up to
-    which it was fitted.
+    """Autocovariance (q, lags) of window means, up to the scale of each pose; for each quantity the ``levels`` that the
+    variance of a mean of the usual length may have, and the degrees of freedom (q,) that intervals take for it.
+    ``highest`` is the frequency up to which it was fitted.
     """
 
     autocovariance: Floats
+    levels: tuple[NoiseLevels, ...]
     dof: Floats
     highest: float
 
@@ -188,11 +188,12 @@ def fitted(p: Periodogram, components: Components, typical: int) -> tuple[Spectr
     highest = 0.5
     while True:
         part = p.only(p.frequency <= highest)
-        amplitude, dof = _averaged(part, components, typical)
+        amplitude, levels = _averaged(part, components, typical)
         if highest / 2 * typical < 5 or _fits(part, part.expected @ amplitude.T):
             break
         highest /= 2
-    return Spectrum(amplitude @ components.autocovariance, dof, highest), p.expected @ amplitude.T
+    dof = np.array([level.students_dof for level in levels])
+    return Spectrum(amplitude @ components.autocovariance, levels, dof, highest), p.expected @ amplitude.T
 
 
 def _fits(p: Periodogram, expected: Floats) -> bool:
@@ -208,10 +209,8 @@ def _fits(p: Periodogram, expected: Floats) -> bool:
     return misfit < float(chi2_isf(MISFIT, np.size(off)))
 
 
-def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Floats, Floats]:
-    """Amplitudes (q,c) averaged over the models by their weights, and the degrees of freedom (q,) of the variance of a
-    mean.
-    """
+def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Floats, tuple[NoiseLevels, ...]]:
+    """Amplitudes (q,c) averaged over the models by their weights, and what the variance of a mean may be (q)."""
     models, n = components.models, components.variance_of_mean(typical)
     fits = [_amplitudes(p.expected[:, models], column, p.weight) for column in p.power.T]
     # The models of one kind with different time constants share one weight: a mean over a prior, not a sum.
@@ -222,34 +221,14 @@ def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Flo
     loss = np.sum([f[1] for f in fits], axis=0) + free * np.log(max(len(fits) * p.weight.sum(), 2.0)) / 2
     share = prior * np.exp(loss.min() - loss)
     share /= share.sum()
-    out, dof = np.zeros((len(fits), len(n))), np.zeros(len(fits))
+    out, levels = np.zeros((len(fits), len(n))), []
     for i, (amplitude, _, information) in enumerate(fits):
         np.add.at(out[i], models, share[:, None] * amplitude)
         each = (n[models] * amplitude).sum(axis=1)
         gradient = np.where(amplitude > 0, n[models], 0.0)
         spread = np.einsum("mi,mij,mj->m", gradient, np.linalg.pinv(information, hermitian=True), gradient)
-        dof[i] = _mixed_dof(share, each, 2 * each**2 / np.maximum(spread, 1e-12 * each**2 + 1e-300))
-    return out, dof
-
-
-def _mixed_dof(share: Floats, variance: Floats, dof: Floats) -> float:
-    """Degrees of freedom of Student's t that reaches as far as a mixture of such, (m,) each, at `DOF_LEVEL`, when both
-    are told in units of the mixture's own standard deviation.
-
-    By moments a model of small share and large variance would count as much as if every interval had to allow for it.
-    """
-    kept = (share > 1e-6) & (variance > 0)
-    share, variance, dof = share[kept] / max(share[kept].sum(), 1e-300), variance[kept], np.maximum(dof[kept], 1.0)
-    if not len(share):
-        return 1.0
-    mean = float(share @ variance)
-    low, high = 0.0, 100.0 * float(np.sqrt(variance.max() / mean))
-    for _ in range(40):
-        middle = (low + high) / 2
-        beyond = float(share @ (2 * special.stdtr(dof, -middle * np.sqrt(mean / variance))))
-        low, high = (middle, high) if beyond > 1 - DOF_LEVEL else (low, middle)
-    reach = t_isf((1 - DOF_LEVEL) / 2, DOF_GRID)
-    return float(np.interp(-low, -reach, DOF_GRID))
+        levels.append(NoiseLevels.of(share, each, 2 * each**2 / np.maximum(spread, 1e-12 * each**2 + 1e-300)))
+    return out, tuple(levels)
 
 
 SUBSETS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]], dtype=bool)

@@ -10,6 +10,7 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.errors import InvalidData
+from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose_noise import PoseNoise, pose_noise
 from triaxcal.stillness.detector import Span
@@ -34,7 +35,8 @@ class Run:
 class Pose:
     """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean, output units. ``dof`` are the
     degrees of freedom behind the covariance (along the measured vector, where there are six poses or more), and
-    ``shared_dof`` those behind what the covariances of all poses have in common, infinite where that is nothing.
+    ``shared_dof`` those behind what the covariances of all poses have in common, infinite where that is nothing;
+    ``noise_levels`` say the same in full, where all poses of a recording have it in common.
 
     ``channels`` are means over the span; ``t_s`` is the middle of the span, like ``start_s`` and ``end_s`` in seconds
     from the first sample. ``creep`` (3,) is the change of the outputs along the span, output units, where it is more
@@ -66,6 +68,7 @@ class Pose:
     before: Floats | None = None
     scatter: Floats = field(default_factory=lambda: np.zeros(3))
     shared_dof: float = float("inf")
+    noise_levels: NoiseLevels | None = field(default=None, repr=False, compare=False)
     run: Run = field(default_factory=Run)
     fault: str = ""
 
@@ -151,13 +154,13 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
     covariance = np.array(
         [_correlation(w, s) * np.outer(e, e) for s, e in zip(spans, np.sqrt(noise.variance), strict=True)]
     )
-    dof, shared_dof = noise.dof.min(axis=1), noise.common_dof
+    dof, shared_dof, levels = noise.dof.min(axis=1), noise.common_dof, noise.levels
     trend, trend_error = noise.slope * (length + 1), np.full(len(spans), np.inf)
     out = outward(mean)
     if out is not None:
         along, predicted = _along(w, spans, tracks, out, recording, creeping)
         covariance = _mended(covariance, out, along.variance[:, 0] * predicted**2)
-        dof, shared_dof = along.dof[:, 0], along.common_dof
+        dof, shared_dof, levels = along.dof[:, 0], along.common_dof, along.levels
         # A unit that turns creeps across the measured vector; along it only where that shows by itself.
         trend_error = along.slope_error[:, 0] * predicted * (length[:, 0] + 1)
         radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
@@ -174,6 +177,7 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
             covariance=covariance[i] + np.outer(creep[i], creep[i]) / 12,
             dof=float(dof[i]),
             shared_dof=shared_dof,
+            noise_levels=levels,
             channels={name: float(values[s.used].mean()) for name, values in w.channels.items()},
             creep=creep[i],
             trend=trend[i],

@@ -15,6 +15,7 @@ from scipy import special
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.distributions import normal_isf
+from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.noise_spectrum import Components, Spectrum, Track, fitted, periodogram
 from triaxcal.poses.tones import without_tones
 
@@ -26,8 +27,8 @@ FALSE_CREEP = 0.01
 class PoseNoise:
     """For k poses and q quantities, (k,q) each: variance of the mean, degrees of freedom behind it, least-squares slope
     a window, its standard error, and its significance in standard deviations. ``limit`` is where the latter is more
-    than chance; ``common_dof`` the degrees of freedom of what the variances of all poses have in common, the shape of
-    the spectrum.
+    than chance. What the variances of all poses have in common is the shape of the spectrum: ``levels`` say what it may
+    make them, of the quantity that is known least, and ``common_dof`` the same as degrees of freedom.
     """
 
     variance: Floats
@@ -36,6 +37,7 @@ class PoseNoise:
     slope_error: Floats
     significance: Floats
     limit: float
+    levels: NoiseLevels
     common_dof: float
 
     @property
@@ -65,7 +67,7 @@ def pose_noise(tracks: Sequence[Track], recording: float, creeping: Bools | None
     significance = model.significance(tracks, slope)
     variance = model.mean_variance(tracks) + np.array([c.variance for c in cleaned])
     error = model.slope_error(tracks) + model.vibration_slope(tracks)
-    return PoseNoise(variance, model.dof(), slope, error, significance, limit, model.common_dof)
+    return PoseNoise(variance, model.dof(), slope, error, significance, limit, model.levels, model.common_dof)
 
 
 def _mixed(tracks: Sequence[Track], straight: Sequence[Track], creeping: Bools) -> list[Track]:
@@ -127,6 +129,10 @@ class _Model:
             return np.zeros_like(self.scale)
         size = np.array([np.sqrt(2 * (t.deviation**2).mean(axis=0)) / t.length**2 for t in tracks])
         return np.asarray(6 * size / np.sin(np.pi * self.spectrum.highest))
+
+    @property
+    def levels(self) -> NoiseLevels:
+        return self.spectrum.levels[int(np.argmin(self.spectrum.dof))]
 
     @property
     def common_dof(self) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import special
 
 from triaxcal.arrays import Floats
+from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.search.gains import Gains
 
 DRAWS = 2000
@@ -28,18 +29,18 @@ FREE_LEAST = 1e-3
 """A pose of which the model leaves less than this share carries a parameter, and is never off."""
 
 
-def anything_p(gains: Gains, names: Sequence[str], model: Floats, pure_dof: float) -> float:
+def anything_p(gains: Gains, names: Sequence[str], model: Floats, noise: NoiseLevels) -> float:
     """Probability that noise alone looks as much like one of the candidates, or like something that is none of them.
 
     ``names`` (c,) of the candidates: each has the same weight, and so has one pose that is off, whichever it is.
-    ``model`` (n,k) is the orthonormal basis of what was fitted; ``pure_dof`` are the degrees of freedom behind the
-    poses' noise. Simulated, as candidates are alike.
+    ``model`` (n,k) is the orthonormal basis of what was fitted; ``noise`` how large the poses' noise may be. Simulated,
+    as candidates are alike.
     """
     n, k = model.shape
     rng = np.random.default_rng(0)
-    noise = rng.standard_normal((n, DRAWS))
-    noise = (noise - model @ (model.T @ noise)) / np.sqrt(rng.chisquare(pure_dof, DRAWS) / pure_dof)
-    y = np.column_stack([gains.y, noise])
+    drawn = rng.standard_normal((n, DRAWS))
+    drawn = (drawn - model @ (model.T @ drawn)) * np.sqrt(noise.drawn(DRAWS, rng))
+    y = np.column_stack([gains.y, drawn])
     total = np.sum(y**2, axis=0)
     free = 1 - np.sum(model**2, axis=1)
     shows = free > FREE_LEAST
@@ -51,7 +52,8 @@ def anything_p(gains: Gains, names: Sequence[str], model: Floats, pure_dof: floa
     size = np.append(np.full(len(rank) - 1, SIZE), LARGE)[:, None]
     # By effects whose coefficients are normal; the size of the noise is told by the poses' own and by the residuals.
     share = size**2 / (size**2 + rank)
-    likelier = 0.5 * (rank * np.log1p(-share) - (pure_dof + n - k) * np.log1p(-share * taken / (pure_dof + total)))
+    by_noise = noise.log_likelihood(np.vstack([total - share * taken, total]), n - k)
+    likelier = 0.5 * rank * np.log1p(-share) + by_noise[:-1] - by_noise[-1]
     log_mean = special.logsumexp(likelier, axis=0, b=weights[:, None])
     as_large = float(np.mean(np.append(log_mean[1:] >= log_mean[0], True)))
     # Under noise its mean is 1, so that a large one is rarer than its inverse (Markov), which draws cannot show.

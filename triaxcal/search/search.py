@@ -16,7 +16,7 @@ from triaxcal.effects.in_run import of_clocks
 from triaxcal.figures import probability
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State
-from triaxcal.pure_error import pure_error_dof
+from triaxcal.pure_error import noise_levels, pure_error_dof
 from triaxcal.search.candidates import Candidate, Ground, candidates_of
 from triaxcal.search.comparison import CARRIES, NO_LOWER, compared
 from triaxcal.search.gains import Gains
@@ -300,7 +300,7 @@ class Search(Worth):
         beside = self.beside(now)
         tried = beside.candidates[: beside.tried]
         gains = Gains(beside.gains.bases[: len(tried)], beside.gains.ranks[: len(tried)], beside.gains.y)
-        return anything_p(gains, [c.name for c in tried], beside.ground.model, self.pure)
+        return anything_p(gains, [c.name for c in tried], beside.ground.model, noise_levels(self.poses))
 
     def nearest(self) -> Nearest | None:
         """Of single effects beside those found the one that is least likely to be chance; None where none is left."""

@@ -11,13 +11,14 @@ import pytest
 from scipy import stats
 
 from triaxcal.effects import CATALOGUE, effect_named
+from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.pose import Pose
 from triaxcal.search.candidates import Candidate, Ground, candidates_of, still_conditions
 from triaxcal.search.familywise import familywise, independent_tests
 from triaxcal.search.gains import Gains
 from triaxcal.search.omnibus import anything_p
 
-CERTAIN = 1e6
+CERTAIN = NoiseLevels.known_by(1e6)
 N, FITTED = 26, 9
 MODEL = np.linalg.qr(np.random.default_rng(1).standard_normal((N, FITTED)))[0]
 EFFECT = effect_named("bias_drift")
@@ -36,11 +37,11 @@ class Known:
 
     @cached_property
     def tests(self) -> float:
-        return independent_tests(Gains.of(self.candidates, np.zeros(N)), CERTAIN)
+        return independent_tests(Gains.of(self.candidates, np.zeros(N)), 1e6)
 
-    def p(self, y: np.ndarray, pure_dof: float) -> float:
+    def p(self, y: np.ndarray, noise: NoiseLevels) -> float:
         rest = y - self.model @ (self.model.T @ y)
-        return anything_p(Gains.of(self.candidates, rest), self.names, self.model, pure_dof)
+        return anything_p(Gains.of(self.candidates, rest), self.names, self.model, noise)
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +57,9 @@ def bases_beside_the_model(count: int, rank: int, seed: int = 0) -> list[np.ndar
     return [np.linalg.qr(c - MODEL @ (MODEL.T @ c))[0] for c in columns]
 
 
-def p_of(y: np.ndarray, bases: Sequence[np.ndarray], names: Sequence[str], pure_dof: float = CERTAIN) -> float:
+def p_of(y: np.ndarray, bases: Sequence[np.ndarray], names: Sequence[str], noise: NoiseLevels = CERTAIN) -> float:
     rest = y - MODEL @ (MODEL.T @ y)
-    return anything_p(Gains.of([Candidate(EFFECT, b, 1) for b in bases], rest), names, MODEL, pure_dof)
+    return anything_p(Gains.of([Candidate(EFFECT, b, 1) for b in bases], rest), names, MODEL, noise)
 
 
 def at_most(share: float, of: int) -> int:
@@ -80,9 +81,9 @@ def test_one_pose_that_is_off_is_seen_more_often_than_by_the_sum_of_squares(know
 
 @pytest.mark.parametrize("pure_dof", [12.0, 200.0])
 def test_noise_alone_is_called_something_as_seldom_as_claimed(known: Known, pure_dof: float) -> None:
-    rng, runs = np.random.default_rng(3), 100
-    p = np.array([known.p(rng.standard_normal(N) / np.sqrt(rng.chisquare(pure_dof) / pure_dof), pure_dof)
-                  for _ in range(runs)])  # fmt: skip
+    rng, runs, noise = np.random.default_rng(3), 100, NoiseLevels.known_by(pure_dof)
+    truth = np.sqrt(noise.drawn(runs, rng))
+    p = np.array([known.p(rng.standard_normal(N) * scale, noise) for scale in truth])
     for level in (0.01, 0.05, 0.2, 0.5):
         assert np.sum(p < level) <= at_most(level, runs)
     assert np.sum(p < 0.5) >= runs - at_most(0.5, runs)
@@ -132,4 +133,33 @@ def test_what_has_no_name_is_seen_where_there_is_much_of_it() -> None:
 def test_what_has_no_name_and_is_large_is_seen_though_the_noise_is_hardly_known(known: Known, pure_dof: float) -> None:
     for seed in range(5):
         y = 30 * np.random.default_rng(seed).standard_normal(N)
-        assert known.p(y, pure_dof) < 0.01
+        assert known.p(y, NoiseLevels.known_by(pure_dof)) < 0.01
+
+
+SLOW_OR_NOT = NoiseLevels.of(np.array([0.9, 0.1]), np.array([1.0, 6.0]), np.array([500.0, 30.0]))
+"""Slow noise below what the poses show is not ruled out."""
+
+
+def test_noise_that_may_be_slow_is_called_something_as_seldom_as_claimed(known: Known) -> None:
+    rng, runs = np.random.default_rng(5), 200
+    truth = np.sqrt(SLOW_OR_NOT.drawn(runs, rng))
+    p = np.array([known.p(rng.standard_normal(N) * scale, SLOW_OR_NOT) for scale in truth])
+    for level in (0.01, 0.05, 0.2):
+        assert np.sum(p < level) <= at_most(level, runs)
+
+
+def test_an_effect_is_seen_though_slow_noise_is_not_ruled_out(known: Known) -> None:
+    quiet, of_t = float(SLOW_OR_NOT.variance[0]), NoiseLevels.known_by(SLOW_OR_NOT.students_dof)
+    seen = np.zeros(2)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        one = known.candidates[rng.integers(len(known.candidates))].basis[:, 0]
+        y = np.sqrt(quiet) * (rng.standard_normal(N) + 6 * one)
+        seen += [known.p(y, SLOW_OR_NOT) < 0.01, known.p(y, of_t) < 0.01]
+    assert seen[0] > 1.3 * seen[1]
+
+
+def test_what_is_huge_is_no_noise_though_some_level_is_hardly_known(known: Known) -> None:
+    noise = NoiseLevels.of(np.array([0.98, 0.02]), np.array([1.0, 1.01]), np.array([1000.0, 1.4]))
+    y = 12 * np.random.default_rng(0).standard_normal(N)
+    assert known.p(y, noise) < 1e-6
