@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from scipy import stats
 
 from triaxcal.calibration import Calibration
 from triaxcal.effects import effect_named
-from triaxcal.errors import InvalidData
 from triaxcal.fit import fit
 from triaxcal.plan.directions import directions
 from triaxcal.poses.pose import Pose
@@ -52,25 +50,6 @@ def test_noise_alone_is_what_the_fit_itself_says(paper_unit: Sensor, twenty_six:
     assert b.dominant.magnitude == float(b.magnitude.standard)
 
 
-def test_creep_that_only_turns_the_unit_is_no_line_of_the_budget(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    """Across the measured vector it is nothing but rounding, which is another from processor to processor."""
-    poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(1))
-    _, outward = fit(poses, signs=SIGNS, aside=()).sensor.magnitude(np.array([p.mean for p in poses]), {})
-    turns = np.cross(outward, [0.3, -0.5, 0.8])
-    turns *= 1e-3 / np.linalg.norm(turns, axis=1, keepdims=True)
-    for share, sources in ((0.0, {"noise"}), (1e-3, {"noise", "creep"})):
-        creep = turns + share * 1e-3 * outward / np.linalg.norm(outward, axis=1, keepdims=True)
-        creeping = [replace(p, creep=c) for p, c in zip(poses, creep, strict=True)]
-        moved = [replace(p, covariance=p.covariance + p.creep_covariance) for p in creeping]
-        assert {line.source for line in budget(fit(moved, signs=SIGNS, aside=())).components} == sources
-
-
-def test_fourteen_poses_leave_0_80_of_a_poses_noise_in_the_magnitude(paper_unit: Sensor, fourteen: np.ndarray) -> None:
-    poses = noisy_poses(paper_unit, fourteen, 1.5e-5, np.random.default_rng(3))
-    noise = next(line for line in budget(fit(poses, signs=SIGNS, aside=())).components if line.source == "noise")
-    assert noise.magnitude / 1.5e-5 == pytest.approx(0.80, abs=0.01)  # METHOD, section 5
-
-
 def test_all_sources_together_scatter_as_the_budget_says(
     monkeypatch: pytest.MonkeyPatch, paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
@@ -78,7 +57,7 @@ def test_all_sources_together_scatter_as_the_budget_says(
     rng = np.random.default_rng(7)
     reference, thermal_share = 15e-6, 0.04
     monkeypatch.setattr(
-        "triaxcal.uncertainty.SENSITIVITY_PER_K", {n: v * thermal_share for n, v in SENSITIVITY_PER_K.items()}
+        "triaxcal.uncertainty.thermal.SENSITIVITY_PER_K", {n: v * thermal_share for n, v in SENSITIVITY_PER_K.items()}
     )
     creep = np.zeros((26, 3))
     creep[::4] = rng.uniform(-1, 1, (7, 3)) * 4e-4
@@ -112,55 +91,6 @@ def _creeping(pose: Pose, change: np.ndarray, rng: np.random.Generator) -> Pose:
     return replace(moved, covariance=pose.covariance + moved.creep_covariance)
 
 
-def test_an_error_of_the_reference_moves_scale_factors_alike(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2))
-    c = fit(poses, signs=SIGNS, aside=())
-    other = fit(poses, signs=SIGNS, reference=1 + 1e-5, aside=())
-    line = next(x for x in budget(c, Stated(reference=1e-5)).components if x.source == "reference")
-    np.testing.assert_allclose(line.parameters, np.abs(other.values - c.values), rtol=1e-3, atol=1e-12)
-    assert line.magnitude == pytest.approx(1e-5, rel=1e-3)
-
-
-def test_a_thermometer_matters_once_thermal_effects_are_in_the_model(
-    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
-) -> None:
-    unit = with_effects(temperature_bias=[3e-4, -2e-4, 1e-4])
-    swing = {"temp_c": 25 + 6 * np.sin(np.arange(26) * 1.7)}
-    poses = noisy_poses(unit, twenty_six, NOISE, np.random.default_rng(5), channels=swing)
-    c = fit(poses, signs=SIGNS, effects=[effect_named("temperature_bias")], aside=())
-    line = next(x for x in budget(c, Stated(thermometer_k=0.4)).components if x.source == "thermometer")
-    coefficients = c.values[9:12]
-    np.testing.assert_allclose(line.parameters[6:9], np.abs(coefficients) * 0.4, rtol=0.02)
-    assert "thermometer" in " ".join(budget(c).not_evaluated)
-    sources = [x.source for x in budget(fit(poses, signs=SIGNS, aside=()), Stated(thermometer_k=0.4)).components]
-    assert "thermometer" not in sources
-    assert "temperature" in sources
-
-
-def test_what_temperature_may_have_done_grows_with_how_far_it_moved(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    def share(swing_k: float) -> float:
-        moved = {"temp_c": 25 + swing_k * np.sin(np.arange(26) * 1.7)}
-        poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=moved)
-        found = budget(fit(poses, signs=SIGNS, aside=())).components
-        return next(x.magnitude for x in found if x.source == "temperature")
-
-    steady, moving, wild = share(0.001), share(0.05), share(20.0)
-    assert steady < 0.05 * NOISE
-    assert steady < moving < wild
-    # However far it moves, it cannot cost more than letting the coefficients free.
-    assert wild < 1.5 * NOISE
-
-
-@pytest.mark.parametrize("steady_c", [22.45, -3.49, 1 / 3])
-def test_a_steady_temperature_costs_nothing_whatever_it_is(
-    paper_unit: Sensor, twenty_six: np.ndarray, steady_c: float
-) -> None:
-    held = {"temp_c": np.full(26, steady_c)}
-    poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=held)
-    line = next(x for x in budget(fit(poses, signs=SIGNS, aside=())).components if x.source == "temperature")
-    assert line.magnitude < 1e-3 * NOISE
-
-
 @pytest.mark.parametrize("moved_k", [0.1, 2.0])
 def test_a_thermal_effect_that_shows_in_the_residuals_counts_once(
     paper_unit: Sensor, twenty_six: np.ndarray, moved_k: float
@@ -179,15 +109,6 @@ def test_a_thermal_effect_that_shows_in_the_residuals_counts_once(
     assert abs(np.mean(ratios) - 1) < 4 * np.std(ratios) / np.sqrt(len(ratios))
 
 
-def test_steps_of_registers_are_rectangular(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, aside=())
-    line = next(x for x in budget(c, Stated(rounding={"bias.y": 6e-5})).components if x.source == "register_rounding")
-    assert line.parameters[c.parameters.index("bias.y")] == pytest.approx(6e-5 / np.sqrt(12))
-    assert np.count_nonzero(line.parameters) == 1
-    # |a| feels the bias of one axis by its direction cosine, whose mean square over the sphere is a third.
-    assert line.magnitude == pytest.approx(6e-5 / np.sqrt(12) / np.sqrt(3), rel=0.02)
-
-
 @pytest.mark.parametrize(
     ("noise", "reference", "dominant"), [(1e-6, 4e-5, "reference"), (1e-3, 4e-5, "noise"), (1e-6, 1e-9, "noise")]
 )
@@ -201,36 +122,6 @@ def test_the_largest_term_dominates_and_halving_it_is_worth_what_it_says(
     assert sum(b.share(x) for x in b.components) == pytest.approx(1)
     halved = sum((x.magnitude / (2 if x is b.dominant else 1)) ** 2 for x in b.components)
     assert b.magnitude_if_halved == pytest.approx(np.sqrt(halved))
-
-
-def test_residuals_beyond_noise_are_a_line_of_their_own(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    rng = np.random.default_rng(2)
-    poses = noisy_poses(paper_unit, twenty_six, NOISE, rng)
-    told = [replace(p, covariance=p.covariance / 25) for p in poses]
-    c = fit(told, signs=SIGNS, aside=())
-    b = budget(c)
-    assert b.dominant.source == "lack_of_fit"
-    np.testing.assert_allclose(b.parameters.standard, c.standard_errors, rtol=1e-9)
-    # 17 degrees of freedom behind it, so Student's factor is not the normal one.
-    np.testing.assert_allclose(b.parameters.coverage, stats.t.ppf(0.975, 17), rtol=0.02)
-
-
-def test_a_time_constant_that_had_to_be_found_belongs_to_the_noise(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    """Nothing is lacking in a model whose residuals are noise, however uncertain a shape of it makes its values."""
-    warming = effect_named("warm_up").shaped({"time_constant": 400.0})
-    truth = replace(paper_unit, effects=((warming, np.array([3e-3, -2e-3, 1e-3])),))
-    c = fit(noisy_poses(truth, twenty_six, NOISE, np.random.default_rng(5)), signs=SIGNS, effects=[warming], aside=())
-    assert c.inflation == 1
-    assert c.shape_errors["warm_up.time_constant"] > 0
-    b = budget(c)
-    assert [line.source for line in b.components] == ["noise"]
-    np.testing.assert_allclose(b.parameters.standard, c.standard_errors, rtol=1e-6)
-
-
-def test_what_nobody_stated_is_said_not_to_be_evaluated(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, aside=())
-    assert [line.split(":")[0] for line in budget(c).not_evaluated] == ["reference", "temperature"]
-    assert not [x for x in budget(c, Stated(reference=0.0)).not_evaluated if x.startswith("reference")]
 
 
 def test_no_expanded_uncertainty_is_below_the_standard_error_that_the_fit_states(
@@ -248,6 +139,12 @@ def test_no_expanded_uncertainty_is_below_the_standard_error_that_the_fit_states
     assert np.all(b.parameters.expanded > c.standard_errors)
 
 
+def test_what_nobody_stated_is_said_not_to_be_evaluated(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, aside=())
+    assert [line.split(":")[0] for line in budget(c).not_evaluated] == ["reference", "temperature"]
+    assert not [x for x in budget(c, Stated(reference=0.0)).not_evaluated if x.startswith("reference")]
+
+
 def test_what_a_single_reading_lacks_is_said_to_be_in_no_line(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     rng = np.random.default_rng(2)
     poses = noisy_poses(paper_unit, twenty_six, NOISE, rng)
@@ -260,17 +157,3 @@ def test_what_a_single_reading_lacks_is_said_to_be_in_no_line(paper_unit: Sensor
     crossed = fit(told, signs=SIGNS, aside=()).residual.cross_validated_rms_g
     assert crossed is not None
     assert said[1][0].startswith(f"lack of fit of a single reading: {crossed * 1e6:.1f} µg cross-validated")
-
-
-@pytest.mark.parametrize("value", [-1e-6, float("nan"), float("inf")])
-def test_uncertainties_that_are_none_are_refused(value: float) -> None:
-    with pytest.raises(InvalidData, match="reference"):
-        Stated(reference=value)
-    with pytest.raises(InvalidData, match="thermometer"):
-        Stated(thermometer_k=value)
-
-
-def test_a_place_gives_the_uncertainty_of_gravity_there_unless_it_was_measured() -> None:
-    assert Stated.at(50.0, 200.0).reference == pytest.approx(43.2e-6, rel=1e-3)
-    assert Stated.at(50.0, 200.0, 2e-8).reference == 2e-8
-    assert Stated.at(None, None).reference is None

@@ -1,0 +1,115 @@
+"""What the temperature may have done, and what to do about it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from triaxcal.effects import effect_named
+from triaxcal.fit import fit
+from triaxcal.poses.pose import Pose
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import noisy_poses
+from triaxcal.uncertainty import Component, Stated, budget
+
+NOISE = 2e-5
+SIGNS = (-1, -1, -1)
+
+
+def test_a_thermometer_matters_once_thermal_effects_are_in_the_model(
+    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+) -> None:
+    unit = with_effects(temperature_bias=[3e-4, -2e-4, 1e-4])
+    swing = {"temp_c": 25 + 6 * np.sin(np.arange(26) * 1.7)}
+    poses = noisy_poses(unit, twenty_six, NOISE, np.random.default_rng(5), channels=swing)
+    c = fit(poses, signs=SIGNS, effects=[effect_named("temperature_bias")], aside=())
+    line = next(x for x in budget(c, Stated(thermometer_k=0.4)).components if x.source == "thermometer")
+    coefficients = c.values[9:12]
+    np.testing.assert_allclose(line.parameters[6:9], np.abs(coefficients) * 0.4, rtol=0.02)
+    assert "thermometer" in " ".join(budget(c).not_evaluated)
+    sources = [x.source for x in budget(fit(poses, signs=SIGNS, aside=()), Stated(thermometer_k=0.4)).components]
+    assert "thermometer" not in sources
+    assert "temperature" in sources
+
+
+def test_what_temperature_may_have_done_grows_with_how_far_it_moved(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    def share(swing_k: float) -> float:
+        moved = {"temp_c": 25 + swing_k * np.sin(np.arange(26) * 1.7)}
+        poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=moved)
+        found = budget(fit(poses, signs=SIGNS, aside=())).components
+        return next(x.magnitude for x in found if x.source == "temperature")
+
+    steady, moving, wild = share(0.001), share(0.05), share(20.0)
+    assert steady < 0.05 * NOISE
+    assert steady < moving < wild
+    # However far it moves, it cannot cost more than letting the coefficients free.
+    assert wild < 1.5 * NOISE
+
+
+@pytest.mark.parametrize("steady_c", [22.45, -3.49, 1 / 3])
+def test_a_steady_temperature_costs_nothing_whatever_it_is(
+    paper_unit: Sensor, twenty_six: np.ndarray, steady_c: float
+) -> None:
+    held = {"temp_c": np.full(26, steady_c)}
+    poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=held)
+    line = next(x for x in budget(fit(poses, signs=SIGNS, aside=())).components if x.source == "temperature")
+    assert line.magnitude < 1e-3 * NOISE
+
+
+def _line(poses: Sequence[Pose], *effects: str) -> Component:
+    c = fit(poses, signs=SIGNS, effects=[effect_named(n) for n in effects], aside=())
+    return next(x for x in budget(c).components if x.source == "temperature")
+
+
+def _warming(unit: Sensor, up: np.ndarray, temperatures_c: np.ndarray, noise: float = NOISE) -> list[Pose]:
+    channels, reference = {"temp_c": temperatures_c}, {"temp_c": 25.0}
+    return noisy_poses(unit, up, noise, np.random.default_rng(5), channels=channels, channel_reference=reference)
+
+
+def test_poses_that_cannot_tell_what_a_wide_swing_did_are_to_be_more_not_steadier(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    rising = np.linspace(18, 32, 14)
+    line = _line(_warming(paper_unit, fourteen, rising))
+    assert "moved by 14 K from pose to pose, but these poses cannot tell" in line.how
+    assert line.halved_by.startswith("record more poses, or the same ones again in another order, while the temp")
+    wider = _line(_warming(paper_unit, fourteen, 25 + 2 * (rising - 25)))
+    assert wider.magnitude > line.magnitude / 2
+    again = np.random.default_rng(1).permutation(fourteen)
+    both = _line(_warming(paper_unit, np.concatenate([fourteen, again]), np.r_[rising, rising + 3]))
+    assert both.magnitude < line.magnitude / 20
+
+
+def test_a_temperature_that_hardly_moved_is_to_be_steadier(paper_unit: Sensor, fourteen: np.ndarray) -> None:
+    """The same poses and the same rise, but within what noise hides."""
+    rising = np.linspace(-0.005, 0.005, 14)
+    line, steadier = (_line(_warming(paper_unit, fourteen, 25 + share * rising)) for share in (1, 0.5))
+    assert line.halved_by.startswith("hold the temperature twice as steady")
+    assert "cannot tell" not in line.how
+    assert steadier.magnitude == pytest.approx(line.magnitude / 2, rel=0.1)
+
+
+def test_a_thermal_effect_that_shows_is_to_be_in_the_model(
+    with_effects: Callable[..., Sensor], twenty_six: np.ndarray
+) -> None:
+    unit = with_effects(temperature_bias=[3e-4, -2e-4, 1e-4])
+    poses = _warming(unit, twenty_six, 25 + 6 * np.sin(np.arange(26) * 1.7))
+    line = _line(poses)
+    assert line.halved_by.startswith("take into the model what the residuals come from: temperature_bias and ")
+    assert _line(poses, "temperature_bias").magnitude < line.magnitude / 2
+
+
+def test_what_noise_leaves_of_thermal_effects_is_to_be_halved_as_noise_is(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    swing = 25 + 6 * np.sin(np.arange(26) * 1.7)
+    line, quieter, steadier = (
+        _line(_warming(paper_unit, twenty_six, 25 + share * (swing - 25), noise))
+        for share, noise in ((1, NOISE), (1, NOISE / 2), (0.5, NOISE))
+    )
+    assert re.fullmatch(r"hold each pose for .* s, or record 104 poses .*", line.halved_by)
+    assert quieter.magnitude == pytest.approx(line.magnitude / 2, rel=0.1)
+    assert steadier.magnitude == pytest.approx(line.magnitude, rel=0.1)

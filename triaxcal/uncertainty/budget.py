@@ -1,0 +1,111 @@
+"""The components combined: root sum of squares, degrees of freedom by Welch and Satterthwaite, and which dominates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration
+from triaxcal.distributions import DOF_MOST, t_ppf
+from triaxcal.effects import TEMPERATURE
+from triaxcal.figures import micro_g
+from triaxcal.uncertainty.components import Component, reference, rounding, statistical
+from triaxcal.uncertainty.linearised import Linearised
+from triaxcal.uncertainty.stated import Stated
+from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
+
+LEVEL = 0.95
+UNEXPLAINED = 0.01
+"""p of the lack of fit below which more than noise is left in single readings."""
+
+
+@dataclass(frozen=True)
+class Combined:
+    """``standard`` uncertainty, Welch–Satterthwaite ``dof``, Student's ``coverage`` factor; arrays of one shape."""
+
+    standard: Floats
+    dof: Floats
+    level: float
+
+    @property
+    def coverage(self) -> Floats:
+        return np.asarray(t_ppf((1 + self.level) / 2, self.dof))
+
+    @property
+    def expanded(self) -> Floats:
+        return self.standard * self.coverage
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Components, largest first; ``not_evaluated`` are sources that nothing is known of, in words."""
+
+    components: tuple[Component, ...]
+    parameters: Combined
+    magnitude: Combined
+    not_evaluated: tuple[str, ...]
+
+    @property
+    def dominant(self) -> Component:
+        return self.components[0]
+
+    @property
+    def magnitude_if_halved(self) -> float:
+        """Standard uncertainty of the magnitude if the dominant component were half as large."""
+        least = float(self.magnitude.standard**2) - 0.75 * self.dominant.magnitude**2
+        return float(np.sqrt(max(least, 0.0)))
+
+    def share(self, component: Component) -> float:
+        """Of the variance of the magnitude, 0…1."""
+        whole = float(self.magnitude.standard**2)
+        return component.magnitude**2 / whole if whole > 0 else 0.0
+
+
+def budget(calibration: Calibration, stated: Stated | None = None, level: float = LEVEL) -> Budget:
+    """The budget of a calibration fitted to still poses (`triaxcal.fit.fit`)."""
+    stated = stated or Stated()
+    linearised = Linearised(calibration)
+    thermal, beyond = temperature(calibration, linearised)
+    found = [*statistical(calibration, linearised, beyond), *reference(linearised, stated), *thermal]
+    found += thermometer(calibration, linearised, stated)
+    found += rounding(calibration, linearised, stated)
+    found.sort(key=lambda c: -c.magnitude)
+    return Budget(
+        tuple(found),
+        _combined([(c, c.parameters) for c in found], calibration.dof, level, calibration.standard_errors),
+        _combined([(c, np.asarray(c.magnitude)) for c in found], calibration.dof, level, np.zeros(())),
+        tuple(_not_evaluated(calibration, linearised, stated)),
+    )
+
+
+def _combined(lines: list[tuple[Component, Floats]], dof: float, level: float, least: Floats) -> Combined:
+    """Root sum of squares, and degrees of freedom by annex G.4. Noise and what residuals add to it are one source, of
+    the ``dof`` that the fit gives them, since the one is judged by the other. Never below what the fit by itself states
+    (``least``), though thermal effects may be why its residuals are so large.
+    """
+    variance = sum((u**2 for _, u in lines), start=np.zeros_like(lines[0][1]))
+    variance = np.maximum(variance, least**2)
+    scatter = sum((u**2 for c, u in lines if c.evaluation == "A"), start=np.zeros_like(lines[0][1]))
+    effective = variance**2 / np.maximum(scatter**2 / dof, 1e-300)
+    return Combined(np.sqrt(variance), np.where(variance > 0, np.minimum(effective, DOF_MOST), DOF_MOST), level)
+
+
+def _not_evaluated(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[str]:
+    out = []
+    if stated.reference is None:
+        out.append("reference: taken as exact; state its uncertainty, or a latitude and height")
+    if TEMPERATURE not in linearised.problem.channel_reference:
+        out.append(f"temperature: there is no channel {TEMPERATURE}")
+    elif stated.thermometer_k is None and needs_temperature(linearised.effects):
+        out.append("thermometer: its uncertainty was not stated")
+    p, crossed = calibration.residual.lack_of_fit_p, calibration.residual.cross_validated_rms_g
+    if p is not None and p < UNEXPLAINED and crossed is not None:
+        out.append(
+            f"lack of fit of a single reading: {micro_g(crossed)} cross-validated, of which only what it does to the "
+            "parameters is above"
+        )
+    if any(p.pose.dof <= 0 for p in calibration.poses):
+        out.append("noise: some poses have no scatter inside to tell it from")
+    return out

@@ -1,0 +1,107 @@
+"""The sources of the budget, each evaluated from the linearised fit; those of the temperature have their own file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration
+from triaxcal.poses.pose import Pose
+from triaxcal.pure_error import pure_error_dof
+from triaxcal.uncertainty.linearised import Linearised
+from triaxcal.uncertainty.stated import Stated
+
+NOTHING = 1e-12
+"""Share of a variance that is none."""
+
+
+@dataclass(frozen=True)
+class Component:
+    """One line of the budget.
+
+    ``evaluation`` is A (from scatter) or B (otherwise); ``dof`` degrees of freedom behind it. ``parameters`` (p,)
+    standard uncertainties of `Calibration.parameters`; ``magnitude`` of |a|, rms over the sphere. ``how`` it was found
+    and what would halve it, in words.
+    """
+
+    source: str
+    evaluation: str
+    dof: float
+    parameters: Floats
+    magnitude: float
+    how: str
+    halved_by: str
+
+    @classmethod
+    def of(
+        cls, linearised: Linearised, source: str, evaluation: str, dof: float, covariance: Floats, how: str, by: str
+    ) -> Component:
+        """Of a source by the ``covariance`` (p,p) of the parameters that it makes; ``by`` what would halve it."""
+        parameters = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        return cls(source, evaluation, dof, parameters, linearised.magnitude(covariance), how, by)
+
+
+def statistical(calibration: Calibration, linearised: Linearised, beyond: float) -> list[Component]:
+    """What the scatter inside the poses, their creep, and residuals beyond both say, of which thermal effects leave the
+    share ``beyond``."""
+    poses = [p.pose for p in calibration.poses if p.used]
+    _, by_u = calibration.sensor.magnitude(linearised.problem.u, linearised.problem.conditions)
+    creeping = np.array([p.creep_covariance for p in poses])
+    S = linearised.by_residual
+    creep = np.zeros(S.shape[1])
+    creep[: len(poses)] = np.einsum("ni,nij,nj->n", by_u, creeping, by_u)
+    # Creep across the measured vector, of which a processor's rounding leaves something, is none.
+    creep = np.where(creep > NOTHING * linearised.error**2, creep, 0.0)
+    noise = np.maximum(linearised.error**2 - creep, 0.0)
+    out = [
+        Component.of(
+            linearised,
+            "noise",
+            "A",
+            pure_error_dof(poses),
+            (S * noise) @ S.T,
+            f"scatter inside {len(poses)} poses of {_held_s(poses):.3g} s, with its autocorrelation",
+            half_the_noise(poses),
+        )
+    ]
+    if creep.any():
+        how = f"{np.count_nonzero(creep)} poses creep; rectangular over the change in each"
+        by = "wait before each pose until the outputs creep by half as much"
+        out.append(Component.of(linearised, "creep", "B", np.inf, (S * creep) @ S.T, how, by))
+    excess = beyond * (calibration.covariance - (S * linearised.error**2) @ S.T)
+    if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
+        how = f"residuals are {calibration.inflation:.2f} times what noise explains"
+        by = "find what the model lacks: diagnose; more poses, some of them repeated"
+        out.append(Component.of(linearised, "lack_of_fit", "A", calibration.dof, excess, how, by))
+    return out
+
+
+def half_the_noise(poses: Sequence[Pose]) -> str:
+    """What would halve a component that is the noise of the poses, in words."""
+    longer = f"hold each pose for {4 * _held_s(poses):.2g} s"
+    return f"{longer}, or record {4 * len(poses)} poses (against 1/f noise the latter)"
+
+
+def _held_s(poses: Sequence[Pose]) -> float:
+    return float(np.median([p.end_s - p.start_s for p in poses]))
+
+
+def reference(linearised: Linearised, stated: Stated) -> list[Component]:
+    if not stated.reference:
+        return []
+    # What |a| does inside the poses should be nothing, whatever the reference.
+    shift = linearised.by_residual[:, : len(linearised.problem.u)].sum(axis=1) * stated.reference
+    by = f"know the reference to {stated.reference / 2 * 1e6:.2g} µg"
+    return [Component.of(linearised, "reference", "B", np.inf, np.outer(shift, shift), stated.reference_source, by)]
+
+
+def rounding(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[Component]:
+    if not stated.rounding:
+        return []
+    steps = np.array([stated.rounding.get(name, 0.0) for name in calibration.parameters])
+    how = f"steps of {np.count_nonzero(steps)} registers; rectangular"
+    by = "registers with one bit more"
+    return [Component.of(linearised, "register_rounding", "B", np.inf, np.diag(steps**2 / 12), how, by)]

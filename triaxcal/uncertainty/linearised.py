@@ -1,0 +1,76 @@
+"""The fit linearised at its solution: from errors of the poses' residuals to parameters, and from these to |a|."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration
+from triaxcal.conditions import at_reference
+from triaxcal.plan.directions import directions
+from triaxcal.problem import Problem, State, by_shape, everything, linearise, parameters_by_theta
+from triaxcal.start import problem_of, with_history
+from triaxcal.trends import with_trends
+
+SPHERE = 200
+
+
+class Linearised:
+    """The fit linearised at its solution, and the sphere that its parameters are judged on."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        sensor = calibration.sensor
+        poses = [p.pose for p in calibration.poses if p.used]
+        signs = tuple(np.sign(sensor.scale_factor))
+        problem = with_history(problem_of(poses, signs=signs, reference=calibration.reference), poses, sensor)
+        # A model without a channel holds at its mean; the reference of one that has it is rounded to read well. To a
+        # millionth, since processors differ in the last digits, and a steady channel should not seem to move.
+        means = {n: round(float(np.mean(problem.channels[n])), 6) for n in problem.channel_reference}
+        self.problem = replace(problem, channel_reference=means | dict(calibration.channel_reference))
+        self.state = State.of(self.problem, sensor)
+        self.effects = self.state.effects
+        if calibration.trends:
+            self.problem = with_trends(self.problem, poses, self.effects) or self.problem
+        _, J, self.error = everything(self.problem, self.state)
+        # What the shapes of effects were chosen by blurs the parameters too.
+        self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
+        self.gain = _pinv(self.weighted)
+        self.G = parameters_by_theta(self.problem, self.state)
+        self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
+        """(p,n): shift of the parameters for an error of each residual (`triaxcal.problem.everything`)."""
+        self.sphere = self._sphere(calibration, {})
+        _, J, _ = linearise(self.sphere, self.state)
+        self.by_parameters = J @ np.linalg.inv(self.G)
+        """(m,p): change of |a| over the sphere by the parameters."""
+
+    def _sphere(self, calibration: Calibration, shift: Mapping[str, float]) -> Problem:
+        """Outputs of the unit all over the sphere, at the reference conditions but for ``shift``."""
+        up = np.array([v for _, v in directions(SPHERE)]) * calibration.reference
+        reference = self.problem.channel_reference
+        held = at_reference(reference, len(up))
+        u = calibration.sensor.output(up, held)
+        channels = {n: held[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
+        none = np.zeros((len(u), 3, 3))
+        return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, further=None)
+
+    def magnitude(self, covariance: Floats) -> float:
+        """rms over the sphere of the uncertainty of |a| that a covariance (p,p) of the parameters makes."""
+        return float(
+            np.sqrt(max(np.einsum("mi,ij,mj->", *[self.by_parameters, covariance, self.by_parameters]), 0.0) / SPHERE)
+        )
+
+    def when_shifted(self, calibration: Calibration, channel: str, by: float) -> Floats:
+        """(p,) what the parameters would have to be for |a| to stay right were a channel off by so much."""
+        shifted = self._sphere(calibration, {channel: by})
+        r, _, _ = linearise(shifted, self.state, jacobian=False)
+        nine = self.by_parameters[:, :9]
+        return np.concatenate([-np.linalg.lstsq(nine, r, rcond=None)[0], np.zeros(len(self.G) - 9)])
+
+
+def _pinv(matrix: Floats) -> Floats:
+    """Columns are scaled first: those of a temperature and of a cube are decades apart."""
+    norms = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    return np.asarray(np.linalg.pinv(matrix / norms, rcond=1e-13) / norms[:, None])

@@ -1,0 +1,49 @@
+"""What no recording can tell, and somebody has to state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from triaxcal.errors import InvalidData
+from triaxcal.gravity import local_gravity_g
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What no recording can tell, as standard uncertainties; None where nobody stated it.
+
+    ``reference`` in the reference's unit, with words on where it comes from; ``thermometer_k``; ``rounding`` the steps
+    of the registers that take the result, by parameter (`Calibration.parameters`), in its unit.
+    """
+
+    reference: float | None = None
+    reference_source: str = "as stated"
+    thermometer_k: float | None = None
+    rounding: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def at(
+        cls,
+        latitude_deg: float | None,
+        height_m: float | None,
+        reference: float | None = None,
+        *,
+        thermometer_k: float | None = None,
+    ) -> Stated:
+        """Where the reference is gravity by `triaxcal.gravity`: a stated uncertainty, in g, comes before that of the
+        formula. Without a place, what is stated."""
+        source = "as stated"
+        if latitude_deg is not None and height_m is not None:
+            source = f"normal gravity at latitude {latitude_deg:g}°, height {height_m:g} m; its uncertainty "
+            source += "as stated" if reference is not None else "that of gravity anomalies over the Earth"
+            if reference is None:
+                reference = local_gravity_g(latitude_deg, height_m)[1]
+        return cls(reference, source, thermometer_k)
+
+    def __post_init__(self) -> None:
+        for name, value in (("reference", self.reference), ("thermometer", self.thermometer_k)):
+            if value is not None and not 0 <= value < np.inf:
+                raise InvalidData(f"the uncertainty of the {name} must be a number of at least 0, not {value}")

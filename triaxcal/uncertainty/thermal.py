@@ -1,0 +1,103 @@
+"""What temperature does to the parameters: by effects that the model lacks, and by the thermometer of those it has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration
+from triaxcal.effects import CATALOGUE, TEMPERATURE, Effect
+from triaxcal.problem import everything
+from triaxcal.uncertainty.components import Component, half_the_noise
+from triaxcal.uncertainty.linearised import Linearised
+from triaxcal.uncertainty.stated import Stated
+
+SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
+"""Standard deviation, before any data, of a coefficient that the fit has not taken up: in references per kelvin, and
+per kelvin. Typical of a mass-market MEMS accelerometer's data sheet; a navigation unit is ten times better."""
+
+
+def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[Component], float]:
+    """What thermal effects that the fit has not taken up may have done to its parameters; and the share of the
+    residuals' variance beyond noise that they do not explain, 0…1, lest it count twice.
+
+    A coefficient that did not show is not zero: it is what the data leave of `SENSITIVITY_PER_K`, a mean and a spread
+    by Bayes' rule, and the parameters of a fit without it are off by what it does to them.
+    """
+    missing = _thermal_but(linearised.effects)
+    if TEMPERATURE not in linearised.problem.channel_reference or not missing:
+        return [], 1.0
+    extra = sum(len(e.coefficients) for e in missing)
+    r, J, s = everything(linearised.problem, linearised.state.extended(missing))
+    spread = np.concatenate([[_sensitivity(e, calibration.reference)] * len(e.coefficients) for e in missing])
+    p = len(linearised.state.theta)
+    Z = J[:, p:] * spread / s[:, None]
+    absorbed = linearised.gain @ Z
+    rest = Z - linearised.weighted @ absorbed
+    # With the prior's width as unit: what the poses do not show stays as wide as it was.
+    # By the means alone: trends know nothing of an effect whose coefficients, and so its conditions' errors, are zero.
+    n = len(linearised.problem.u)
+    left = _posterior(rest[:n])
+    mean = -left @ rest[:n].T @ (r / s)[:n]
+    through = linearised.G @ absorbed[:p]
+    after = r / s + rest @ mean
+    taken = extra - float(np.trace(left))  # degrees of freedom, fewer than coefficients where the data say little
+    before_ratio, after_ratio = (
+        float(v @ v) / max(len(r) - linearised.weighted.shape[1] - dof, 1e-9)
+        for v, dof in ((r / s, 0.0), (after, taken))
+    )
+    beyond = min(max(after_ratio - 1, 0.0) / (before_ratio - 1), 1.0) if before_ratio > 1 else 1.0
+    covariances = np.eye(extra), left, _posterior(Z[:n]), left + np.outer(mean, mean)
+    of_parameters = [through @ c @ through.T for c in covariances]
+    moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
+    names = " and ".join(e.name for e in missing)
+    untold, by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
+    how = f"{names} not in the model; the temperature moved by {moved:.2g} K from pose to pose{untold}"
+    return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], how, by)], beyond
+
+
+def _posterior(Z: Floats) -> Floats:
+    """Covariance that the data leave of coefficients of which ``Z`` (n,q) is what each does to the residuals, in units
+    of the coefficients' prior widths and of the residuals' errors."""
+    return np.asarray(np.linalg.inv(np.eye(Z.shape[1]) + Z.T @ Z))
+
+
+def _halved_by(
+    calibration: Calibration, names: str, prior: float, left: float, apart: float, whole: float
+) -> tuple[str, str]:
+    """What `Component.how` adds, and what would halve the component. As magnitudes: what the ``prior`` makes, what the
+    data leave of it, what they would leave were the parameters known (so that nothing takes an effect for them), and
+    the ``whole`` component, which has the effects' means too."""
+    told = 2 * left < prior
+    if told and 2 * left < whole:
+        return "", f"take into the model what the residuals come from: {names}, or another effect"
+    if 2 * apart < left:
+        more = "record more poses, or the same ones again in another order, while the temperature differs"
+        return ", but these poses cannot tell what that did", f"{more}, until {names} can be fitted"
+    if told:
+        return "", half_the_noise([p.pose for p in calibration.poses if p.used])
+    return "", f"hold the temperature twice as steady, or let it swing until {names} can be fitted"
+
+
+def _thermal_but(effects: tuple[Effect, ...]) -> list[Effect]:
+    present = {e.name for e in effects}
+    return [e for e in CATALOGUE if e.name in SENSITIVITY_PER_K and e.name not in present]
+
+
+def _sensitivity(effect: Effect, reference: float) -> float:
+    per_reference = reference if effect.coefficients[0].unit.startswith("g") else 1.0
+    return SENSITIVITY_PER_K[effect.name] * per_reference
+
+
+def thermometer(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[Component]:
+    """With thermal effects in the model its values hold at a temperature that somebody has to measure."""
+    if not stated.thermometer_k or not needs_temperature(linearised.effects):
+        return []
+    shift = linearised.when_shifted(calibration, TEMPERATURE, stated.thermometer_k)
+    how = f"thermal effects, reckoned from {calibration.channel_reference[TEMPERATURE]:.4g} °C"
+    by = f"know the temperature to {stated.thermometer_k / 2:.2g} K"
+    return [Component.of(linearised, "thermometer", "B", np.inf, np.outer(shift, shift), how, by)]
+
+
+def needs_temperature(effects: tuple[Effect, ...]) -> bool:
+    return any(TEMPERATURE in e.needs for e in effects)
