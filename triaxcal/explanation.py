@@ -43,6 +43,8 @@ class Explanation:
     """That with those poses left out which the linear fit leaves out."""
     rivals: tuple[tuple[Effect, ...], ...] = ()
     """Effects that explain as much with other poses left out."""
+    instead: tuple[tuple[Effect, ...], ...] = ()
+    """Effects that explain as much as the linear fit does by the poses that it leaves out."""
     spoiled: tuple[int, ...] = ()
     """Poses that explain as much without any effect, were they spoiled."""
     whole_p: float | None = None
@@ -100,23 +102,29 @@ def explained(
         trials.append(other)
         found = other
     return replace(
-        _compared(found, trials),
+        _compared(found, trials, aside),
         linear=next((t.search for t in trials if t.aside == aside), found.search),
         whole_p=first.anything_p(first.linear) if aside and not trials[0].aside else None,
     )
 
 
-def _compared(found: Explanation, trials: Sequence[Explanation]) -> Explanation:
-    """With what explains as much."""
-    near = found.score + (NEAR if found.adopted else OPEN)
-    others = [t for t in trials if t.aside != found.aside]
-    rivals: list[tuple[Effect, ...]] = []
-    for t in others:
-        models = [t.search.found, *t.search.singles_from(t.search.linear)]
-        rivals += [m.effects for m in models if m.effects and t.search.score(m) + t.price < near]
-    without = [t for t in others if found.adopted and not t.adopted and t.score < near]
+def _compared(found: Explanation, trials: Sequence[Explanation], aside: tuple[int, ...]) -> Explanation:
+    """With what explains as much; ``aside`` are the poses that the linear fit leaves out."""
+    near = found.score + NEAR
+    without = [t for t in trials if t.aside != found.aside and found.adopted and not t.adopted and t.score < near]
     spoiled = min(without, key=lambda t: t.score).aside if without else ()
-    return replace(found, rivals=tuple(rivals), spoiled=spoiled)
+    linear = [t.search.score(t.search.linear) + t.price for t in trials if aside and t.aside == aside]
+    instead = _others(trials, aside, linear[0] + OPEN) if linear else ()
+    return replace(found, rivals=_others(trials, found.aside, near), instead=instead, spoiled=spoiled)
+
+
+def _others(trials: Sequence[Explanation], aside: tuple[int, ...], limit: float) -> tuple[tuple[Effect, ...], ...]:
+    """The effects of all models of other poses than those without ``aside`` that score below a limit."""
+    out: list[tuple[Effect, ...]] = []
+    for t in trials:
+        models = [] if t.aside == aside else [t.search.found, *t.search.singles_from(t.search.linear)]
+        out += [m.effects for m in models if m.effects and t.search.score(m) + t.price < limit]
+    return tuple(out)
 
 
 def _searched(

@@ -27,7 +27,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.runs import by_run
 from triaxcal.search import NO_LOWER, Search, compared
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
-from triaxcal.unexplained import SIGNIFICANT, Unexplained, hints_of, spoiled_or, unexplained_of
+from triaxcal.unexplained import SIGNIFICANT, Unexplained, beyond_noise, hints_of, spoiled_or, unexplained_of
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class _Made:
     @property
     def rivals(self) -> list[str]:
         """Effects that would explain as much as leaving these poses out, where none is adopted."""
-        found = () if self.adopted or not self.aside else self.found.rivals
+        found = () if self.adopted else self.found.instead
         return list(dict.fromkeys(e.name for effects in found for e in effects))
 
 
@@ -178,9 +178,11 @@ def _made(linear: Calibration, of_linear: _Given, effects: Sequence[Effect]) -> 
 def _unexplained(made: _Made) -> Unexplained:
     search, p = made.search, made.search.anything_p(made.search.found)
     left = unexplained_of(made.quiet.fit(made.adopted), search.passed_over, p, search.nearest(), hints_of(search))
+    # Its size beside the residuals that are told.
+    left = replace(left, rms_g=beyond_noise(made.steps[-1], left.significant))
     whole_p = made.found.whole_p
-    if made.rivals and not left.significant and whole_p is not None and whole_p < SIGNIFICANT:
-        return spoiled_or(replace(made.quiet, aside=()).fit(()), whole_p, made.aside, made.rivals)
+    if made.rivals and whole_p is not None and whole_p < SIGNIFICANT:
+        return spoiled_or(replace(made.quiet, aside=()).fit(()), whole_p, made.aside, made.rivals, left)
     return left
 
 

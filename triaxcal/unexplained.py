@@ -69,20 +69,28 @@ def unexplained_of(
     p = residual.lack_of_fit_p if p is None else p
     significant = p is not None and p < SIGNIFICANT
     return Unexplained(
-        significant, p, _beyond(after, significant), lead(after, passed_over, nearest, hints) if significant else ""
+        significant,
+        p,
+        beyond_noise(after, significant),
+        lead(after, passed_over, nearest, hints) if significant else "",
     )
 
 
-def spoiled_or(whole: Calibration, p: float, spoiled: Sequence[PoseResult], names: Sequence[str]) -> Unexplained:
+def spoiled_or(
+    whole: Calibration, p: float, spoiled: Sequence[PoseResult], names: Sequence[str], left: Unexplained
+) -> Unexplained:
     """What the poses leave where those that are ``spoiled`` explain it no better than the effects of these ``names``
-    would. ``whole`` is the fit to all poses, ``p`` the probability of what it leaves, which is significant."""
+    would. ``whole`` is the fit to all poses, ``p`` the probability of what it leaves, which is significant; ``left`` is
+    what the others leave, without those."""
     off = " and ".join(f"the pose at {s.pose.at} ({micro_g(s.residual_g, '+')})" for s in spoiled)
     lead = f"most of it is {off}: spoiled, or it is {' or '.join(names)}, which would explain as much"
-    return Unexplained(True, p, _beyond(whole, True), lead, or_spoiled=True)
+    if left.significant:
+        lead += f"; without {'that pose' if len(spoiled) == 1 else 'those poses'} more is left, {left.lead}"
+    return Unexplained(True, p, beyond_noise(whole, True), lead, or_spoiled=True)
 
 
-def _beyond(after: Calibration, significant: bool) -> float:
-    """rms of the residuals beyond noise, in g."""
+def beyond_noise(after: Calibration, significant: bool) -> float:
+    """rms of the residuals beyond noise, in g; at least as much as raises the errors, where it is significant."""
     residual = after.residual
     beyond = float(np.sqrt(max(residual.rms_g**2 - residual.noise_floor_g**2, 0.0)))
     # One loud pose may hide in the plain rms what the others show, each by its own noise.

@@ -297,6 +297,7 @@ def loop_document(
             "p_value": probability(loop.unexplained.p_value),
             "rms_g": error(loop.unexplained.rms_g, reference),
             "lead": small.in_words(loop.unexplained.lead),
+            "or_spoiled": loop.unexplained.or_spoiled,
         },
         "data_quality": list(data_quality),
         "advice": [small.in_words(line) for line in loop.advice],

@@ -78,6 +78,22 @@ def test_a_pose_left_out_where_an_effect_would_explain_as_much_is_unexplained(
     assert certain >= 1
 
 
+def test_a_pose_hardly_off_enough_to_be_left_out_is_as_open(paper_unit: Sensor, fourteen: np.ndarray) -> None:
+    """The best explanation has no pose left out there, and none adopted: the calibration is without the pose."""
+    told = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        poses = noisy_poses(paper_unit, fourteen[rng.permutation(14)], SIGMA, rng)
+        bad = int(rng.integers(14))
+        poses[bad] = replace(poses[bad], mean=poses[bad].mean * (1 + 9 * SIGMA))
+        loop = diagnose(poses, signs=SIGNS)
+        assert not loop.findings
+        if left_out(loop.after) == (bad,):
+            told.append("would explain as much" in loop.advice[0])
+            assert told[-1] or not loop.unexplained.significant
+    assert sum(told) > len(told) / 2 > 4
+
+
 def test_a_spoiled_pose_shows_beside_an_effect_once_the_effect_is_in_the_model(
     with_effects: Callable[..., Sensor], twenty_six: np.ndarray
 ) -> None:

@@ -83,6 +83,7 @@ class Unexplained:
     p_value: float | None
     rms_g: float | None
     leads: tuple[str, ...]
+    or_spoiled: bool = False
 
 
 @dataclass(frozen=True)
@@ -212,6 +213,7 @@ def _unexplained(value: object) -> Unexplained | None:
         number(known.get("p_value")),
         number(known.get("rms_g")),
         tuple(part for part in words(lead or "").split("; ") if part),
+        bool(known.get("or_spoiled")),
     )
 
 

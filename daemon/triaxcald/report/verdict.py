@@ -57,14 +57,13 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
     if exceeded:
         return Verdict("outside", _OUTSIDE, f"{', '.join(exceeded)}: over the limit. {errors}", reservations, checks)
     if _unexplained(outcome):
-        kept = "Every declared limit is kept, but more" if checks and not open_checks else "More"
-        sentence = f"{kept} is left than the noise of the poses accounts for. {errors}"
-        if _rejected(outcome) and not outcome.findings and not _lacks_fit(outcome):
-            sentence = f"Something spoiled poses, which were left out, or an effect acts. {_errors(outcome)}"
-            return Verdict(
-                "unexplained", "Spoiled poses or an effect; poses to take again", sentence, reservations, checks
-            )
-        return Verdict("unexplained", _UNEXPLAINED, sentence, reservations, checks)
+        kept = "Every declared limit is kept, but " if checks and not open_checks else ""
+        headline, what = _UNEXPLAINED, f"more is left than the noise of the poses accounts for. {errors}"
+        if outcome.unexplained is not None and outcome.unexplained.or_spoiled:
+            headline = "Spoiled poses or an effect; poses to take again"
+            what = f"something spoiled poses, which were left out, or an effect acts. {_errors(outcome)}"
+        sentence = f"{kept}{what}" if kept else f"{what[0].upper()}{what[1:]}"
+        return Verdict("unexplained", headline, sentence, reservations, checks)
     if open_checks or not (checks or _tested(outcome)):
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
@@ -131,7 +130,9 @@ def _checks(outcome: Outcome, limits: Mapping[str, float | None]) -> list[LimitC
 
 
 def _tested(outcome: Outcome) -> bool:
-    return outcome.unexplained is not None or outcome.final.lack_of_fit_p is not None
+    if outcome.unexplained is not None and outcome.unexplained.p_value is not None:
+        return True
+    return outcome.final.lack_of_fit_p is not None
 
 
 def _unexplained(outcome: Outcome) -> bool:

@@ -258,6 +258,8 @@ def test_poses_left_out_or_an_effect_is_said_to_be_open(loop: dict[str, Any]) ->
     _, text = page(loop)
     assert "Unexplained error left" in text
     loop["calibration"]["poses"][4]["used"] = False
+    assert "Spoiled poses or an effect" not in page(loop)[1]
+    loop["unexplained"]["or_spoiled"] = True
     _, text = page(loop)
     assert "Spoiled poses or an effect; poses to take again" in text
     assert "Unexplained error left" not in text
