@@ -34,6 +34,9 @@ VERIFICATION: Phase = "verification"
 HELD_MOST_S, TURNED_MOST_S, TURNED_SAMPLES, PERIOD_MOST_S = 2000.0, 500.0, 30, 0.5
 """Times are in milliseconds, say, where all of these are exceeded: how long a pose is held, from one to the next in
 seconds and in samples, and from sample to sample."""
+LONG_LEAST = 4
+"""So many poses that long, or all there are: a slow logger rests over night, but does not turn the unit for minutes
+between one such rest and the next, time and again."""
 
 
 @dataclass(frozen=True)
@@ -87,16 +90,22 @@ def measure(
 
 def _not_seconds(poses: Sequence[Pose]) -> list[str]:
     """A line where the times of a text can hardly be seconds. A real recording may be sampled that slowly, or its poses
-    held that long, but then it takes few samples to turn the unit from one to the next."""
-    if len(poses) < 2:
+    held that long, but then it takes few samples to turn the unit from one to the next.
+
+    A trembling hand leaves short still spans within a move: only the long ones are poses here, and of what lies between
+    two of them the longest stretch in motion is the move.
+    """
+    held = [i for i, p in enumerate(poses) if p.end_s - p.start_s >= HELD_MOST_S]
+    if len(held) < max(2, min(LONG_LEAST, len(poses))):
         return []
-    held = float(np.median([p.end_s - p.start_s for p in poses]))
-    period = float(np.median([(p.end_s - p.start_s) / max(p.samples - 1, 1) for p in poses]))
-    turned = float(np.median([b.start_s - a.end_s for a, b in pairwise(poses)]))
-    if held < HELD_MOST_S or period < PERIOD_MOST_S or turned < max(TURNED_MOST_S, TURNED_SAMPLES * period):
+    lasted = float(np.median([poses[i].end_s - poses[i].start_s for i in held]))
+    period = float(np.median([(poses[i].end_s - poses[i].start_s) / max(poses[i].samples - 1, 1) for i in held]))
+    moved = [b.start_s - a.end_s for a, b in pairwise(poses)]
+    turned = float(np.median([max(moved[i:j]) for i, j in pairwise(held)]))
+    if period < PERIOD_MOST_S or turned < max(TURNED_MOST_S, TURNED_SAMPLES * period):
         return []
     return [
-        f"time_unit: a sample every {plain(period)} s, poses of {plain(held)} s, {plain(turned)} s from one to the "
+        f"time_unit: a sample every {plain(period)} s, poses of {plain(lasted)} s, {plain(turned)} s from one to the "
         "next: is t_s in seconds?"
     ]
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
+from triaxcal.effects import CATALOGUE
+from triaxcal.effects.contract import BEFORE, CLOCKS
 from triaxcal.uncertainty import SENSITIVITY_PER_K
 
 SHARE = "% of it goes with "
@@ -31,3 +35,9 @@ def overlap(lead: str) -> str:
         "each share is of the squares of all that is left, by that pattern alone; patterns overlap, so the shares do "
         "not sum to 100%"
     )
+
+
+def none_could_show(blind_to: Collection[str]) -> bool:
+    """Whether a search that found nothing could hardly find anything: no effect that goes with direction or time, which
+    every recording has, shows in full."""
+    return {e.name for e in CATALOGUE if set(e.needs) <= {*CLOCKS, *BEFORE}} <= set(blind_to)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from triaxcal.arrays import Floats
 from triaxcal.plan.directions import spiral
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import SyntheticUnit, Tumble
@@ -145,7 +147,11 @@ def _tumbled(path: Path, rate_hz: float, hold_s: float, move_s: float, times: fl
         Sensor(np.full(3, 2.0), np.zeros(3), np.zeros(3)), Tumble(spiral(6), hold_s, move_s), np.full(3, 2e-4), seed=1
     )
     t_s = np.arange(int(6 * (hold_s + move_s) * rate_hz)) / rate_hz
-    rows = (f"{t * times:.6f},{x:.6f},{y:.6f},{z:.6f}\n" for t, (x, y, z) in zip(t_s, unit.sample(t_s)[0], strict=True))
+    return _written(path, t_s * times, unit.sample(t_s)[0])
+
+
+def _written(path: Path, t_s: Floats, readings: Floats) -> str:
+    rows = (f"{t:.6f},{x:.6f},{y:.6f},{z:.6f}\n" for t, (x, y, z) in zip(t_s, readings, strict=True))
     path.write_text("t_s,ux,uy,uz\n" + "".join(rows), "utf-8")
     return str(path)
 
@@ -165,3 +171,31 @@ def test_a_recording_that_is_really_so_slow_is_asked_nothing(
     measured = measure(_tumbled(tmp_path / "slow.csv", rate_hz, hold_s, move_s))
     assert len(measured.poses) == 6
     assert measured.data_quality == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_milliseconds_are_asked_about_though_still_spans_are_found_within_moves(tmp_path: Path, seed: int) -> None:
+    """A hand that trembles while it turns the unit leaves such spans; most spans are then short."""
+    rng = np.random.default_rng(seed)
+    pieces = []
+    for one, other in pairwise(spiral(10)):
+        pieces.append(np.repeat(one[None], rng.integers(500, 800), axis=0))
+        along = np.linspace(0, 1, rng.integers(200, 300))[:, None]
+        way = (1 - along) * one + along * other
+        pieces.append(way / np.linalg.norm(way, axis=1)[:, None] + rng.normal(0, 0.03, way.shape))
+    readings = np.concatenate(pieces)
+    readings += rng.normal(0, 3e-4, readings.shape)
+    measured = measure(_written(tmp_path / "ms.csv", 10.0 * np.arange(len(readings)), readings))
+    assert np.median([p.samples for p in measured.poses]) < 60
+    assert measured.data_quality[-1].startswith("time_unit: a sample every 10 s, poses of ")
+
+
+def test_a_slow_logger_that_rests_for_nights_and_is_carried_about_between_is_asked_nothing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    night, carried = np.repeat([[0.0, 0.0, 1.0]], 9000, axis=0), rng.normal(0.5, 0.3, (900, 3))
+    session = [np.concatenate([np.repeat(v[None], 90, axis=0), rng.normal(0, 0.5, (8, 3))]) for v in spiral(10)]
+    readings = np.concatenate([night, carried, *session, carried, night, carried, night])
+    readings += rng.normal(0, 3e-4, readings.shape)
+    measured = measure(_written(tmp_path / "nights.csv", np.arange(len(readings)) * 1.0, readings))
+    assert sum(p.end_s - p.start_s > 2000 for p in measured.poses) == 3
+    assert not [line for line in measured.data_quality if line.startswith("time_unit")]

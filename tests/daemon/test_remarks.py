@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcald.remarks import SHARE, assumption, overlap
+from triaxcald.remarks import SHARE, assumption, none_could_show, overlap
 
 
 @pytest.mark.parametrize(
@@ -29,3 +29,13 @@ def test_shares_are_explained_where_there_are_several() -> None:
     one, other = f"93{SHARE}the time", f"60{SHARE}temp_c"
     assert overlap(f"{one}; {other}").startswith("each share is of the squares of all that is left")
     assert overlap(f"{one}; inside the poses |a| moves too") == ""
+
+
+def test_none_could_show_where_none_of_direction_and_time_does() -> None:
+    every = {
+        "second_order_nonlinearity", "third_order_nonlinearity", "scale_factor_asymmetry", "cross_coupling",
+        "bias_drift", "warm_up", "bias_step", "hysteresis",
+    }  # fmt: skip
+    assert none_could_show(every)
+    assert none_could_show({*every, "temperature_bias"})
+    assert not any(none_could_show(every - {name}) for name in every)

@@ -151,6 +151,22 @@ def test_creep_that_nothing_explains_makes_no_effect_and_is_left_where_the_magni
     assert np.all(wider > 1.1) if along else np.all(wider < 1.05)
 
 
+def test_what_is_left_is_no_less_than_the_residuals_that_are_told(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    """A slow swing of the bias that nothing explains, in poses that creep by it and are weighed by that."""
+    rng = np.random.default_rng(0)
+    t = 10.0 * np.arange(26)
+    swing = 4e-4 * np.sin(2 * np.pi * t / 70)[:, None] * np.ones(3)
+    settled = []
+    for k, p in enumerate(noisy_poses(paper_unit, twenty_six, SIGMA_G, rng)):
+        creep = paper_unit.scale_factor * 4e-4 * np.cos(2 * np.pi * t[k] / 70) * 2 * np.pi / 70 * HOLD_S
+        mean = p.mean + paper_unit.scale_factor * swing[k]
+        settled.append(replace(p, mean=mean, creep=creep, covariance=p.covariance + np.outer(creep, creep) / 12))
+    loop = diagnose(settled, signs=MINUS)
+    told = loop.after.residual
+    assert loop.unexplained.significant
+    assert loop.unexplained.rms_g >= np.sqrt(told.rms_g**2 - told.noise_floor_g**2) > SIGMA_G
+
+
 def test_in_another_recording_the_channel_explains_creep_and_the_clock_does_not(
     warm: list[Pose], paper_unit: Sensor, twenty_six: np.ndarray, rates: np.ndarray
 ) -> None:

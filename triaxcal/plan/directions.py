@@ -97,7 +97,7 @@ def most_wanted(
     unsure_rad: float = 0.0,
     weights: Floats | None = None,
 ) -> list[Direction]:
-    """The poses of the 26 that mend a set best, until its dilution is below ``enough``; at most ``most``.
+    """The poses of the 26 that mend a set best, each once, until its dilution is below ``enough``; at most ``most``.
 
     ``a`` (n,3): the directions of up that the set has; where they are known to no better than ``unsure_rad``, the
     dilution is that of the worst of some sets that are so far off. ``weights`` (n,) are 1/variance, of a pose to be
@@ -111,7 +111,7 @@ def most_wanted(
     rows = linear_design(ups, ups)
     information = np.array([J.T @ J for J in sets])
     wanted: list[int] = []
-    while len(wanted) < most and _worst(information, rows[wanted]) > enough:
+    while len(wanted) < min(most, len(rows)) and _worst(information, rows[wanted]) > enough:
         wanted.append(_best_addition(information, rows, wanted))
     wanted = _exchanged(information, rows, wanted, enough)
     return [candidates[i] for i in wanted]
@@ -136,10 +136,11 @@ def _worst(information: Floats, more: Floats) -> float:
 
 
 def _best_addition(information: Floats, rows: Floats, wanted: list[int]) -> int:
-    """The row that adds most to the determinant, over all sets; the first of those that add as much."""
+    """The row not yet wanted that adds most to the determinant, over all sets; the first of those that add as much."""
     held = rows[wanted]
     inverse = np.linalg.inv(information + held.T @ held + 1e-9 * np.eye(9))
     gain = np.log1p(np.einsum("ci,kij,cj->kc", rows, inverse, rows)).sum(axis=0)
+    gain[wanted] = -np.inf
     return int(np.argmax(gain >= gain.max() - 1e-6))
 
 
@@ -153,7 +154,8 @@ def _exchanged(information: Floats, rows: Floats, wanted: list[int], enough: flo
     for _ in range(3):
         before = list(wanted)
         for i in range(len(wanted)):
-            trials = [[*wanted[:i], c, *wanted[i + 1 :]] for c in range(len(rows))]
+            others = {*wanted[:i], *wanted[i + 1 :]}
+            trials = [[*wanted[:i], c, *wanted[i + 1 :]] for c in range(len(rows)) if c not in others]
             values = np.array([_worst(information, rows[t]) for t in trials])
             if values.min() < _worst(information, rows[wanted]) - 1e-6:
                 wanted = trials[int(np.argmax(values <= values.min() + 1e-6))]

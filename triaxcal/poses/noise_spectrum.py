@@ -159,14 +159,17 @@ def periodogram(tracks: Sequence[Track], components: Components, lowest: int = 1
 @dataclass(frozen=True)
 class Spectrum:
     """Autocovariance (q, lags) of window means, up to the scale of each pose; for each quantity the ``levels`` that the
-    variance of a mean of the usual length may have, and the degrees of freedom (q,) that intervals take for it.
-    ``highest`` is the frequency up to which it was fitted.
+    variance of a mean of the usual length may have. ``highest`` is the frequency up to which it was fitted.
     """
 
     autocovariance: Floats
     levels: tuple[NoiseLevels, ...]
-    dof: Floats
     highest: float
+
+    @property
+    def dof(self) -> Floats:
+        """(q,) that intervals take for the levels."""
+        return np.array([level.students_dof for level in self.levels])
 
     def variance_of_mean(self, track: Track) -> Floats:
         """(q,)"""
@@ -192,8 +195,7 @@ def fitted(p: Periodogram, components: Components, typical: int) -> tuple[Spectr
         if highest / 2 * typical < 5 or _fits(part, part.expected @ amplitude.T):
             break
         highest /= 2
-    dof = np.array([level.students_dof for level in levels])
-    return Spectrum(amplitude @ components.autocovariance, levels, dof, highest), p.expected @ amplitude.T
+    return Spectrum(amplitude @ components.autocovariance, levels, highest), p.expected @ amplitude.T
 
 
 def _fits(p: Periodogram, expected: Floats) -> bool:

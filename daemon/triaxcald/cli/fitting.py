@@ -20,6 +20,8 @@ from triaxcald.cli.results import show_calibration, show_loop
 from triaxcald.cli.several import (
     as_one_unit,
     channels_of_some,
+    doubts_of_check,
+    doubts_of_one_unit,
     measured_check,
     measured_each,
     named_quality,
@@ -32,7 +34,6 @@ from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, measure
 from triaxcald.several import agreement_document, with_recordings
-from triaxcald.verification import unlike
 
 
 def register(commands: Any) -> None:
@@ -108,12 +109,10 @@ def diagnose_command(a: argparse.Namespace) -> int:
     choice = chosen(a, measured)
     loop = _loop(a, measured, choice, check.poses if check else None)
     warnings = channels_of_some(recordings)
-    if len(names) > 1:
-        together = "do not look like one unit"
-        warnings += unlike(" and ".join(names), loop.before.residual.rms_g, choice.reference, together)
+    warnings += doubts_of_one_unit(recordings, loop, choice)
     if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
-        warnings += unlike(check.name, loop.held_out.before_rms_g, choice.reference)
+        warnings += doubts_of_check(measured, check, loop, choice)
     loop = replace(loop, after=replace(loop.after, warnings=(*loop.after.warnings, *warnings)))
     document = _loop_document(loop, measured, choice)
     if len(names) > 1:

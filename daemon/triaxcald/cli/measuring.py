@@ -18,8 +18,9 @@ from triaxcald.cli.arguments import add_recording, positive
 from triaxcald.cli.console import emit
 from triaxcald.cli.showing import counted, judge, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
-from triaxcald.held_sensor import model_of, reference_unit_in, sensor_of
+from triaxcald.held_sensor import calibration_part, model_of, reference_unit_in, sensor_of
 from triaxcald.inputs import Measured, measure, read_document
+from triaxcald.likeness import shape_by_poses, shape_in, unlike_shapes
 from triaxcald.units import ErrorUnit
 from triaxcald.verification import Verification, pose_rows, trust, unlike
 
@@ -76,10 +77,12 @@ def verify_command(a: argparse.Namespace) -> int:
         _require_trusted(measured)
     found = _verified(measured, model_of(sensor, channel_reference, reference), where=a.calibration)
     assert found.rms_g is not None
-    warnings = unlike(measured.name, found.rms_g, reference)
-    if own := [e.name for e, _ in sensor.effects if {TIME, SINCE_START, RUN} & set(e.needs)]:
+    own = shape_by_poses(measured.poses, np.sign(sensor.scale_factor).tolist(), reference)
+    held = shape_in(calibration_part(document, where=a.calibration))
+    warnings = unlike(measured.name, found.rms_g, reference) or unlike_shapes(a.calibration, measured.name, held, own)
+    if left := [e.name for e, _ in sensor.effects if {TIME, SINCE_START, RUN} & set(e.needs)]:
         warnings.append(
-            f"{', '.join(own)} in {a.calibration} belongs to the recording that it was made from, and counts as zero"
+            f"{', '.join(left)} in {a.calibration} belongs to the recording that it was made from, and counts as zero"
         )
     result = {
         "format": "triaxcal.verify/1",

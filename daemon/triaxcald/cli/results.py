@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 
-from triaxcal.calibration import Calibration
+from triaxcal.calibration import Calibration, Residual
 from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import probability
+from triaxcal.findings import the_poses
 from triaxcal.loop import Loop
 from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, counted
 from triaxcald.documents import holds_of
-from triaxcald.remarks import assumption, overlap
-from triaxcald.units import grouped, in_units_of
+from triaxcald.remarks import assumption, none_could_show, overlap
+from triaxcald.units import ErrorUnit, grouped, in_units_of
 
 
 def show_calibration(c: Calibration, choice: Choice) -> None:
@@ -24,11 +25,16 @@ def show_calibration(c: Calibration, choice: Choice) -> None:
     r, small = c.residual, choice.small
     poses = counted(len(c.poses), sum(not p.used for p in c.poses))
     print(
-        f"{poses}: residual rms {small.in_full(r.rms_g)}, cross-validated "
-        f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.in_full(r.noise_floor_g)}, "
-        f"lack of fit p {probability(r.lack_of_fit_p)}"
+        f"{poses}: residual rms {small.in_full(r.rms_g)}, {cross_validated(r, small)}, noise floor "
+        f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
     )
     show_budget(b, choice)
+
+
+def cross_validated(r: Residual, small: ErrorUnit) -> str:
+    if r.cross_validated_rms_g is None:
+        return "not cross-validated (without one of the poses the others carry no fit)"
+    return f"cross-validated {small.in_full(r.cross_validated_rms_g)}"
 
 
 def _temperature_of(c: Calibration) -> str:
@@ -102,11 +108,24 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     for finding in loop.findings:
         print(f"{finding.verdict}: {finding.effect} ({small.in_words(finding.reason)})")
     if not loop.findings:
-        print(f"no effect of the catalogue shows{' for certain' if loop.unexplained.or_spoiled else ''}")
+        certain = " for certain" if loop.unexplained.or_spoiled else ""
+        none = "; none could in full, with so few or such poses" if none_could_show(loop.after.blind_to) else ""
+        print(f"no effect of the catalogue shows{certain}{none}")
     if loop.unexplained.significant:
         lead = small.in_words(loop.unexplained.lead)
         print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")
         if said := overlap(lead):
             print(f"shares of what is unexplained: {said}")
+    for fault, at in _at_fault(loop.after).items():
+        print(f"advice: take again {the_poses(at)}: left out ({fault})")
     for line in loop.advice:
         print(f"advice: {small.in_words(line)}")
+
+
+def _at_fault(c: Calibration) -> dict[str, list[str]]:
+    """When the poses began in which the outputs did not follow the acceleration, by what was the matter."""
+    at: dict[str, list[str]] = {}
+    for p in c.poses:
+        if p.pose.fault:
+            at.setdefault(p.pose.fault, []).append(p.pose.at)
+    return at

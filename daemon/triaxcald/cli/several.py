@@ -18,6 +18,8 @@ from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, chosen, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure
+from triaxcald.likeness import shape_by_poses, shape_of, unlike_shapes
+from triaxcald.verification import unlike
 
 COLUMNS = {
     "cross-validated": "rms error of |a| in each pose under a fit to all the others, without and with the findings",
@@ -104,6 +106,27 @@ def channels_of_some(recordings: Sequence[Measured]) -> list[str]:
             having = ", ".join(name for name in logged if name not in lacking)
             out.append(f"channel {channel}: in {having}, but not in {', '.join(lacking)}; no effect of it was tried")
     return out
+
+
+def doubts_of_one_unit(recordings: Sequence[Measured], loop: Loop, choice: Choice) -> list[str]:
+    """Lines where several recordings can hardly be of one unit; ``loop`` is that of all of them."""
+    if len(recordings) == 1:
+        return []
+    names = " and ".join(m.name for m in recordings)
+    if said := unlike(names, loop.before.residual.rms_g, choice.reference, "do not look like one unit"):
+        return said
+    shapes = [(m.name, shape_by_poses(m.poses, choice.signs, choice.reference)) for m in recordings]
+    known = [(name, shape) for name, shape in shapes if shape is not None]
+    return [line for name, shape in known[1:] for line in unlike_shapes(known[0][0], name, known[0][1], shape)]
+
+
+def doubts_of_check(measured: Measured, check: Measured, loop: Loop, choice: Choice) -> list[str]:
+    """A line where the held-out poses can hardly be of the unit of those diagnosed in ``loop``."""
+    assert loop.held_out is not None
+    own = shape_by_poses(check.poses, choice.signs, choice.reference)
+    return unlike(check.name, loop.held_out.before_rms_g, choice.reference) or unlike_shapes(
+        measured.name, check.name, shape_of(loop.before), own
+    )
 
 
 def _serial(m: Measured) -> str | None:

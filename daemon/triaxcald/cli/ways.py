@@ -20,7 +20,7 @@ from triaxcald import documents, ways_in
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.arguments import not_negative, within
 from triaxcald.cli.console import micro, table
-from triaxcald.cli.results import show_coefficients
+from triaxcald.cli.results import cross_validated, show_coefficients
 from triaxcald.cli.showing import Choice, chosen, telling_data_quality
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, read_document, require_unit
@@ -169,9 +169,8 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
     small = choice.small
     r = c.residual
     print(
-        f"{len(c.poses)} poses: |a| off by {small.in_full(r.rms_g)} rms, cross-validated "
-        f"{small.in_full(r.cross_validated_rms_g)}, noise floor {small.in_full(r.noise_floor_g)}, "
-        f"lack of fit p {probability(r.lack_of_fit_p)}"
+        f"{len(c.poses)} poses: |a| off by {small.in_full(r.rms_g)} rms, {cross_validated(r, small)}, noise floor "
+        f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
     )
 
 

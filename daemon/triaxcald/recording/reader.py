@@ -80,6 +80,8 @@ class Recording:
         self._chunks: list[int] = []
         self._topics: dict[int, str] = {}
         self.size = size_of(stream)
+        if not self.size:
+            raise RecordingError(f"{name}: the file is empty; nothing was recorded")
         check_magic(stream, name)
         try:
             self._survey()

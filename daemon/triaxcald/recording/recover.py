@@ -11,6 +11,7 @@ from mcap.records import Attachment, Channel, DataEnd, Message, Metadata, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer as McapWriter
 
+from triaxcal.errors import Refused
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
 from triaxcald.recording.damaged import DamagedFile, Stretch
@@ -66,7 +67,7 @@ def recover(path: Path, out: Path) -> Recovery:
     """Writes what can be had of ``path`` to ``out``, a finished recording; ``path`` is only read.
 
     Raises RecordingError: ``path`` is no recording of ours or cannot be read, ``out`` exists or cannot be
-    written (nothing of it is left behind).
+    written; Refused: ``path`` holds neither a whole message nor an attachment. Nothing of ``out`` is left behind.
     """
     try:
         with open(path, "rb") as source:
@@ -82,7 +83,10 @@ def _write(damaged: DamagedFile, name: str, out: Path) -> Recovery:
     sink = open(out, "xb")  # noqa: SIM115 -- closed below, before it is deleted where that must be
     try:
         with sink:
-            return _Mending(damaged, McapWriter(sink, enable_data_crcs=True)).run(name)
+            recovery = _Mending(damaged, McapWriter(sink, enable_data_crcs=True)).run(name)
+        if not (recovery.messages or recovery.attachments):
+            raise Refused(f"{damaged.name}: nothing to recover: it holds no whole record; nothing was written")
+        return recovery
     except BaseException:
         out.unlink()
         raise

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from triaxcald.remarks import none_could_show
 from triaxcald.report.document import Finding, Outcome
 from triaxcald.report.faults import faults_of
 from triaxcald.report.figures import micro_g
@@ -68,7 +69,8 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
     headline = _WITHIN if checks else _without_limits(outcome)
-    uncertain = not checks and (_uncertain(outcome) or (not outcome.findings and _lacks_fit(outcome)))
+    nothing_sure = _lacks_fit(outcome) or _could_find_nothing(outcome)
+    uncertain = not checks and (_uncertain(outcome) or (not outcome.findings and nothing_sure))
     if _spoiled(outcome) or _rejected(outcome):
         headline, uncertain = f"{headline}; poses to take again", True
     return Verdict("unexplained" if uncertain else "within", headline, errors, reservations, checks)
@@ -77,10 +79,16 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
 def _without_limits(outcome: Outcome) -> str:
     if not outcome.searched:
         return "No lack of fit shows"
+    if _could_find_nothing(outcome):
+        return "No effect could show"
     if not outcome.findings:
         return "Nothing found beyond noise" if not _lacks_fit(outcome) else "Nothing certain found beyond noise"
     what = "Effect" if len(outcome.findings) == 1 else f"{len(outcome.findings)} effects"
     return f"{what} found, cause uncertain" if _uncertain(outcome) else f"{what} found and corrected"
+
+
+def _could_find_nothing(outcome: Outcome) -> bool:
+    return outcome.searched and not outcome.findings and none_could_show(outcome.blind_to)
 
 
 def _spoiled(outcome: Outcome) -> bool:
@@ -100,6 +108,8 @@ def _found(outcome: Outcome) -> str:
     """The effects in words, each with its name."""
     if not outcome.searched or not (outcome.findings or _tested(outcome)):
         return ""
+    if _could_find_nothing(outcome):
+        return "These poses are too few, or such that no effect beyond the linear model could show in full. "
     if not outcome.findings:
         return "No effect beyond the linear model was found. "
     return f"Found: {'; '.join(_named(finding, outcome) for finding in outcome.findings)}. "

@@ -20,10 +20,11 @@ RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
 REPEATED = "duplicate_samples: 1"
 
 
-def write(path: Path, seed: int, *, count: int = 14, repeated: bool = False, k: float = 2.0) -> Path:
-    """A recording as text, of scale factors ``k``; ``repeated``: with a sample that came twice."""
+def write(path: Path, seed: int, *, count: int = 14, repeated: bool = False, k: float = 2.0, m: float = 0.0) -> Path:
+    """A recording as text, of scale factors ``k`` and of misalignments larger by ``m`` rad; ``repeated``: with a sample
+    that came twice."""
     up = np.array([v for _, v in directions(14)])[np.random.default_rng(seed).permutation(14)][:count]
-    sensor = Sensor(np.full(3, k), np.array([2e-3, -1e-3, 1e-3]), np.array([1e-3, 2e-3, -1e-3]))
+    sensor = Sensor(np.full(3, k), np.array([2e-3, -1e-3, 1e-3]) + m, np.array([1e-3, 2e-3, -1e-3]))
     unit = SyntheticUnit(sensor, Tumble(up, HOLD_S, MOVE_S), np.full(3, 2e-4), Environment(), seed=seed)
     t_s = np.arange(int(count * (HOLD_S + MOVE_S) * RATE_HZ)) / RATE_HZ
     rows = [f"{t:.3f},{x:.9f},{y:.9f},{z:.9f}\n" for t, (x, y, z) in zip(t_s, unit.sample(t_s)[0], strict=True)]
@@ -42,6 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write(folder / "few.csv", 4, count=5, repeated=True)
     write(folder / "strange.csv", 5, k=3.2)
     write(folder / "aged.csv", 6, k=2.02)
+    write(folder / "other.csv", 7, m=6e-3)
     return folder
 
 
@@ -85,6 +87,19 @@ def test_a_check_recording_that_cannot_be_of_this_unit_is_told_from_one_whose_un
     done = triaxcal("diagnose", main, "--check", strange)
     assert (done.code, done.err) == (0, f"warning: {said}\n")
     assert triaxcal("diagnose", main, "--check", aged).err == ""
+
+
+def test_a_recording_of_a_unit_of_the_same_type_is_asked_about(folder: Path, triaxcal: Run, tmp_path: Path) -> None:
+    """Its errors are within what age could make of this one; its axes stand otherwise."""
+    main, other, cal = folder / "main.csv", folder / "other.csv", tmp_path / "main.json"
+    asked = f"and {other}: misalignment differs by up to 6"
+    (said,) = triaxcal("diagnose", main, "--check", other, "--json").json["calibration"]["warnings"]
+    assert said.startswith(f"{main} {asked}")
+    assert said.endswith("the same unit?")
+    assert f"warning: {said}\n" in triaxcal("diagnose", main, other).err
+    assert triaxcal("fit", main, "-o", cal).code == 0
+    (said,) = triaxcal("verify", cal, other, "--json").json["warnings"]
+    assert said.startswith(f"{cal} {asked}")
 
 
 def test_verify_says_when_a_recording_cannot_be_of_the_unit_of_the_calibration(folder: Path, triaxcal: Run) -> None:

@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcal.calibration import Residual
 from triaxcal.plan.directions import spiral
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+from triaxcald.cli.results import cross_validated
 from triaxcald.cli.several import COLUMNS
 from triaxcald.remarks import SHARE, overlap
+from triaxcald.units import ErrorUnit
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
@@ -192,3 +195,22 @@ def test_units_side_by_side_each_say_it_too_and_every_column_is_explained(
 def test_the_reference_explains_the_columns_of_units_in_the_same_words(column: str) -> None:
     page = (Path(__file__).parents[3] / "docs/reference/cli.md").read_text("utf-8")
     assert f"| {column} | {COLUMNS[column].replace('|a|', chr(92) + '|a' + chr(92) + '|')} |" in page
+
+
+def test_of_poses_that_can_show_no_effect_the_console_says_so_and_not_that_there_is_none(
+    folder: Path, rippled: Path, triaxcal: Run
+) -> None:
+    few = folder / "ten.csv"
+    few.write_text("".join(rippled.read_text("utf-8").splitlines(keepends=True)[: int(10 * 7 * RATE_HZ)]), "utf-8")
+    assert "no effect of the catalogue shows; none could in full, with so few or such poses\n" in (
+        triaxcal("diagnose", few).out
+    )
+    assert "none could" not in triaxcal("diagnose", rippled).out
+
+
+def test_an_error_that_cannot_be_cross_validated_is_no_dash_in_a_sentence() -> None:
+    unit = ErrorUnit()
+    assert cross_validated(Residual(1e-6, 2e-6, 3.5e-6, 1e-6, None), unit) == "cross-validated 3.5 µg"
+    assert cross_validated(Residual(1e-6, 2e-6, None, 1e-6, None), unit) == (
+        "not cross-validated (without one of the poses the others carry no fit)"
+    )

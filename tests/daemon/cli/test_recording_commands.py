@@ -109,6 +109,15 @@ def test_a_recording_cut_short_is_mended_and_the_loss_is_counted(
     triaxcal("audit", tmp_path / "b.mcap").failed(2, "certificate.json: missing")
 
 
+def test_of_an_empty_file_nothing_is_recovered_and_nobody_is_told_to_try(tmp_path: Path, triaxcal: Run) -> None:
+    path = tmp_path / "empty.mcap"
+    path.touch()
+    for command in (["log", "info"], ["diagnose"]):
+        triaxcal(*command, path).failed(2, f"{path}: the file is empty; nothing was recorded")
+    triaxcal("log", "recover", path, "--json").failed(3, f"{path}: nothing to recover")
+    assert list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.parametrize("out", ["missing/b.mcap", "file/b.mcap"])
 def test_a_place_where_nothing_can_be_mended_to(finished_run: Any, tmp_path: Path, triaxcal: Run, out: str) -> None:
     (tmp_path / "file").touch()

@@ -157,3 +157,9 @@ def test_fit_says_how_many_of_the_poses_it_left_out(folder: Path, triaxcal: Run)
     left_out = sum(not p["used"] for p in fitted["poses"])
     assert left_out >= 1
     assert f"26 poses, {left_out} of them left out: residual rms " in triaxcal("fit", folder / "rail.csv").out
+
+
+def test_diagnose_advises_to_take_such_a_pose_again(folder: Path, triaxcal: Run) -> None:
+    said = triaxcal("diagnose", folder / "rail.csv").out
+    assert "\nadvice: take again the pose at 0.1 s: left out (saturation)\n" in said
+    assert "take again" not in triaxcal("diagnose", folder / "clean.csv").out

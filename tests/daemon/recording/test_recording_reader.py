@@ -102,7 +102,9 @@ def _chunk_offsets(data: bytes) -> list[int]:
 
 def test_a_recording_cut_short_is_an_error_at_every_length(recording: Path) -> None:
     whole = recording.read_bytes()
-    for length in range(len(whole)):
+    with pytest.raises(RecordingError, match=r"^rec: the file is empty; nothing was recorded$"):
+        Recording(io.BytesIO(b""), "rec")
+    for length in range(1, len(whole)):
         with pytest.raises(RecordingError, match=r"^rec: .* at byte \d+; mend it with `triaxcal log recover`$"):
             Recording(io.BytesIO(whole[:length]), "rec")
 

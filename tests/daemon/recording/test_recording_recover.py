@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from mcap_protobuf.decoder import DecoderFactory
 
+from triaxcal.errors import Refused
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording.reader import Recording
@@ -68,7 +69,8 @@ def test_a_file_cut_anywhere_is_mended_and_holds_only_what_was_written(recording
     whole = recording.read_bytes()
     rows = raw_rows(recording)
     ends = [end for _, end in chunk_spans(whole)]
-    for length in range(0, len(whole), 17):
+    attached = whole.index(b"name = 'bench'\n") + len(b"name = 'bench'\n") + 4  # with its CRC
+    for length in range(attached, len(whole), 17):
         recovery, out = mend(whole[:length], tmp_path)
         kept = raw_rows(out)
         assert kept == rows[: len(kept)]
@@ -78,14 +80,13 @@ def test_a_file_cut_anywhere_is_mended_and_holds_only_what_was_written(recording
         assert recovery.raw_missing == recovery.chunks_failed == 0
 
 
-@pytest.mark.parametrize("length", range(9))
-def test_a_file_cut_in_its_first_bytes_is_mended_to_an_empty_recording(
+@pytest.mark.parametrize("length", [0, 1, 8, 9, 40])
+def test_of_a_file_cut_before_its_first_whole_record_nothing_is_mended(
     recording: Path, tmp_path: Path, length: int
 ) -> None:
-    recovery, out = mend(recording.read_bytes()[:length], tmp_path)
-    assert recovery == Recovery(cut_short=True)
-    with Recording.open(out) as rec:
-        assert list(rec.messages()) == []
+    with pytest.raises(Refused, match=r"damaged\.mcap: nothing to recover: .*; nothing was written$"):
+        mend(recording.read_bytes()[:length], tmp_path)
+    assert not (tmp_path / "mended.mcap").exists()
 
 
 def test_a_damaged_chunk_is_given_up_and_its_records_counted(recording: Path, tmp_path: Path) -> None:
@@ -255,6 +256,7 @@ _WRITES_UNTIL_KILLED = """
 import sys
 from pathlib import Path
 import numpy as np
+from triaxcal.errors import Refused
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter

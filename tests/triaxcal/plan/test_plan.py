@@ -116,6 +116,18 @@ def test_from_nothing_a_whole_set_is_wanted() -> None:
     assert dilution(vectors(wanted)) <= 2.0
 
 
+def test_no_direction_is_wanted_twice() -> None:
+    """Poses bunched on one side lack the same direction most, again and again."""
+    for seed in range(30):
+        a = np.random.default_rng(seed).normal((0.6, 0.6, 0.0), 0.35, (10, 3))
+        labels = [label for label, _ in most_wanted(a, 1.0)]
+        assert len(set(labels)) == len(labels)
+
+
+def test_all_directions_are_wanted_where_even_they_do_not_suffice() -> None:
+    assert len(most_wanted(np.zeros((0, 3)), 0.1, most=40)) == 26
+
+
 def test_of_directions_that_are_unsure_the_worst_that_they_may_be_is_mended() -> None:
     faces = vectors(cube_directions()[:6])
     sure, unsure = most_wanted(faces), most_wanted(faces, unsure_rad=0.15)

@@ -9,6 +9,7 @@ import pytest
 from scipy import integrate, linalg, stats
 
 from triaxcal.coloured_noise import first_order, flicker, moving_average, white
+from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.noise_spectrum import SLOWEST, Components, Spectrum, Track, periodogram
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.stillness.detector import Span
@@ -45,7 +46,7 @@ def test_variances_of_mean_and_slope_are_those_of_the_whole_covariance_matrix(pl
     track = Track(place, np.zeros((len(place), 1)))
     for row in c.autocovariance[:-1]:
         matrix = linalg.toeplitz(row)[np.ix_(place, place)]
-        spectrum = Spectrum(row[None], np.ones(1), 0.5)
+        spectrum = Spectrum(row[None], (NoiseLevels.known_by(10.0),), 0.5)
         x = place - place.mean()
         assert spectrum.variance_of_mean(track) == pytest.approx(matrix.mean(), rel=1e-9)
         assert spectrum.variance_of_slope(track) == pytest.approx(x @ matrix @ x / (x @ x) ** 2, rel=1e-9)
