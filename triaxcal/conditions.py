@@ -67,6 +67,13 @@ def with_scale(
     return dict(channels) | {name: values[:, i] for names, values in own for i, name in enumerate(names)}
 
 
+def of_unknown_history(poses: Sequence[Pose], effects: Iterable[Effect]) -> tuple[int, ...]:
+    """Which poses nothing is known of that one of the effects needs: what was before them. The conditions have them as
+    if the unit had rested there before."""
+    needed = {n for e in effects for n in e.needs} & {*BEFORE, *CHANGE}
+    return tuple(i for i, p in enumerate(poses) if p.before is None) if needed else ()
+
+
 def references(channels: Mapping[str, Floats]) -> dict[str, float]:
     """Whence conditions are counted: channels and time from their means, what is itself a deviation from zero.
 

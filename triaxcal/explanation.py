@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.calibration import Calibration
+from triaxcal.conditions import of_unknown_history
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.fit import fit
@@ -43,6 +44,8 @@ class Explanation:
     """That with those poses left out which the linear fit leaves out."""
     rivals: tuple[tuple[Effect, ...], ...] = ()
     """Effects that explain as much with other poses left out."""
+    unknown: int = 0
+    """Of the poses ``aside``, how many are so because what was before them is not known, which an effect needs."""
     instead: tuple[tuple[Effect, ...], ...] = ()
     """Effects that explain as much as the linear fit does by the poses that it leaves out."""
     spoiled: tuple[int, ...] = ()
@@ -59,7 +62,8 @@ class Explanation:
     def price(self) -> float:
         """Of the poses left out."""
         n = len(self.search.poses) + len(self.aside)
-        return len(self.aside) * float(np.log(n) + 2 * np.log(1 / SPOILED - 1))
+        spoiled = len(self.aside) - self.unknown
+        return len(self.aside) * float(np.log(n)) + spoiled * 2 * float(np.log(1 / SPOILED - 1))
 
 
 def left_out(c: Calibration) -> tuple[int, ...]:
@@ -147,7 +151,9 @@ def _searched(
     # What is nearly always there: beside it others show that neither alone nor in pairs would have.
     if expected and len(other.run(expected)) > 1 and other.score(other.found) < search.score(search.found):
         search, adopted = other, list(other.found.effects)
-    return Explanation(search, adopted if expected else _without_fillers(search), aside, search)
+    adopted = adopted if expected else _without_fillers(search)
+    unknown = len(set(aside) & set(of_unknown_history(poses, adopted)))
+    return Explanation(search, adopted, aside, search, unknown=unknown)
 
 
 def _without_fillers(search: Search) -> list[Effect]:

@@ -13,6 +13,7 @@ from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import package_of
 from triaxcal.figures import micro_g, probability
 from triaxcal.search import Search, alternatives, compared, telling_apart
+from triaxcal.search.alternatives import instead_of
 from triaxcal.unexplained import Unexplained
 
 OTHERS = ("", "the other effect", "the other two effects", "the other three effects", "the other four effects")
@@ -56,13 +57,10 @@ def finding_of(
     effects found; ``after`` is what is handed on. ``rivals`` explain as much with other poses left out, the poses
     ``spoiled`` without any effect."""
     found = alternatives(search, effect, search.found)
-    taken = {e.name for e in search.found.effects}
     for rival in rivals:
-        names = {e.name for e in rival}
-        # What stands beside one of the effects stands for the other; what shares none of them, for the first.
-        stands = effect.name not in names and (names & taken or effect is search.found.effects[0])
-        model = search.model(rival) if stands else None
-        found |= {name: model for name in sorted(names) if model and name not in taken | found.keys()}
+        names = instead_of(search, effect, rival)
+        model = search.model(rival) if names else None
+        found |= {name: model for name in names if model and name not in found}
     others = [e for e in search.found.effects if e is not effect]
     p = search.earned(effect, others)
     reason = f"{_fall(*pair, len(others))}familywise p {probability(p)}"
@@ -117,13 +115,13 @@ def _fall(without: Calibration | None, complete: Calibration, others: int) -> st
     )
 
 
-def description_of(smooth: Calibration, without: Calibration) -> Finding:
-    """The empirical term, the last effect of ``smooth``."""
+def description_of(smooth: Calibration, without: Calibration, p_value: float | None = None) -> Finding:
+    """The empirical term, the last effect of ``smooth``; ``p_value`` is that of what it describes."""
     effect = smooth.sensor.effects[-1][0]
     return Finding(
         effect=effect.name,
         verdict="adopted",
-        p_value=without.residual.lack_of_fit_p or 0.0,
+        p_value=without.residual.lack_of_fit_p or 0.0 if p_value is None else p_value,
         coefficients=smooth.coefficients_of(effect.name),
         alternatives=(),
         reason=(

@@ -9,10 +9,11 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration, PoseResult, Residual
+from triaxcal.conditions import of_unknown_history
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.outliers import Spoiled, spoiled
+from triaxcal.outliers import Spoiled, not_as_foretold, spoiled
 from triaxcal.plan.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import NOT_STILL, Problem, State, by_shape, everything, linearise, parameters_by_theta, solve
@@ -42,9 +43,10 @@ def fit(
     """Fit the linear model, and the effects given, to still poses.
 
     ``signs`` (3,) of the scale factors, which |a| does not show. ``aside`` are indices of poses to leave out; where it
-    is None, poses that something spoiled are found and left out (`triaxcal.outliers`). Poses with a fault are left out
-    in any case. Raises Refused where the poses cannot carry the parameters, InvalidData where a channel that an effect
-    needs is not there.
+    is None, poses that something spoiled are found and left out (`triaxcal.outliers`), and where an effect goes with
+    the pose before, a first pose in which the unit had not rested before. Poses with a fault are left out in any case.
+    Raises Refused where the poses cannot carry the parameters, InvalidData where a channel that an effect needs is not
+    there.
     """
     sound = [i for i, p in enumerate(poses) if not p.fault]
     if len(sound) < len(poses):
@@ -59,10 +61,14 @@ def fit(
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
     verdict = Spoiled(tuple(sorted(aside))) if aside is not None else Spoiled()
     by_means = None
+    unknown: tuple[int, ...] = ()
     if aside is None and len(poses) > 9 + sum(len(e.coefficients) for e in effects):
         by_means = solve(whole, begin, tuple(effects))
         verdict = _spoiled(whole, by_means, poses)
-    found = verdict.rows
+        unknown = _of_another_history(whole, by_means, poses, verdict.rows)
+        if set(verdict.rows) <= set(of_unknown_history(poses, effects)):
+            verdict = replace(verdict, doubtful=0.0)  # that it is off says nothing of how well poses come back
+    found = tuple(sorted((*verdict.rows, *unknown)))
     kept, problem = list(poses), whole
     if found:
         kept = [p for i, p in enumerate(poses) if i not in found]
@@ -72,7 +78,7 @@ def fit(
         by_means = None
     calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, verdict)
     if found:
-        calibration = _with_aside(calibration, poses, verdict)
+        calibration = _with_aside(calibration, poses, found, verdict)
     if verdict.rivals:
         sets = " or ".join(" and ".join(poses[i].at for i in rows) for rows in verdict.rivals)
         warning = f"some poses were spoiled, and these cannot be told from each other, so none is left out: {sets}"
@@ -123,6 +129,20 @@ def _spoiled(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
     return found
 
 
+def _of_another_history(
+    problem: Problem, state: State, poses: Sequence[Pose], aside: tuple[int, ...]
+) -> tuple[int, ...]:
+    """Poses, besides those ``aside``, that are not as if the unit had rested there before; what was is not known."""
+    if not (unknown := set(of_unknown_history(poses, state.effects)) - set(aside)):
+        return ()
+    rest: Ints = np.delete(np.arange(len(poses)), aside)
+    problem = problem.only(rest)
+    r, J, s = linearise(problem, solve(problem, state, state.effects))
+    rows = [k for k, i in enumerate(rest) if i in unknown]
+    found = not_as_foretold(r / s, J / s[:, None], pure_error_dof([poses[i] for i in rest]), rows)
+    return tuple(int(rest[k]) for k in found)
+
+
 def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
     """A calibration from the sound ones of ``poses`` with the faulty ones among its results, and a warning."""
     faulty = tuple(i for i, p in enumerate(poses) if p.fault)
@@ -151,22 +171,30 @@ def _among(
     return tuple(results), added
 
 
-def _with_aside(calibration: Calibration, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
-    """The calibration with the poses left out among its results, in order of time, and a warning that names them."""
-    results, added = _among(calibration, poses, verdict.rows)
-    names = [f"at {p.pose.at} ({p.studentized:+.0f} standard errors)" for p in added]
-    warning = f"left out as spoiled: the pose {', the pose '.join(names)}"
+def _with_aside(calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: Spoiled) -> Calibration:
+    """The calibration with the poses left out among its results, in order of time, and warnings that name them."""
+    results, added = _among(calibration, poses, rows)
+    unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects])
+    names = [f"the pose at {p.pose.at} ({p.studentized:+.0f} standard errors)" for p in added]
+    excused = [name for i, name in zip(rows, names, strict=True) if i in unknown]
+    others = [name for i, name in zip(rows, names, strict=True) if i not in unknown]
+    warnings = [f"left out, as what was before it is not known: {', '.join(excused)}"] if excused else []
+    warning = f"left out as spoiled: {', '.join(others)}"
     if verdict.doubtful:
         warning += (
             "; the noise inside the poses says so, while the other residuals leave it open whether all poses come "
             "back less well than that: the standard errors allow for both"
         )
-    return replace(calibration, poses=results, warnings=(warning, *calibration.warnings))
+    warnings += [warning] if others else []
+    return replace(calibration, poses=results, warnings=(*warnings, *calibration.warnings))
 
 
 def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
-    r, _, s = linearise(problem, state)
-    every_r, J, every_s = everything(problem, state)
+    with np.errstate(over="ignore", invalid="ignore"):
+        r, _, s = linearise(problem, state)
+        every_r, J, every_s = everything(problem, state)
+    if not (np.isfinite(J).all() and np.isfinite(every_r).all()):
+        raise Refused(f"the fit ran away; {NOT_STILL}")
     weighted = J / every_s[:, None]
     n, p = len(r), J.shape[1]
     q, _ = np.linalg.qr(weighted)

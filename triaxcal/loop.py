@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from triaxcal.calibration import Calibration, PoseResult
-from triaxcal.conditions import channels_of
+from triaxcal.conditions import channels_of, of_unknown_history
 from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.description import described
 from triaxcal.effects import catalogue_for
@@ -85,7 +85,7 @@ def diagnose(
         spoiled = () if findings else tuple(poses[i].at for i in made.found.spoiled)
         findings.append(finding_of(search, effect, (without, steps[-1]), after, step, made.found.rivals, spoiled))
     if smooth is not None:
-        findings.append(description_of(smooth, steps[-1]))
+        findings.append(description_of(smooth, steps[-1], unexplained.p_value))
         unexplained = unexplained_of(smooth, search.passed_over)
     faulty = faults_of(Ground.at(search.problem, search.linear.state), effects)
     shown = search.full | faulty.keys() | {e.name for e in made.adopted if not isinstance(e, Part)}
@@ -145,8 +145,9 @@ class _Made:
 
     @property
     def aside(self) -> list[PoseResult]:
-        """Poses left out as spoiled."""
-        return [p for p in self.before.poses if not p.used]
+        """Poses left out as spoiled, but not as what was before them is not known."""
+        unknown = of_unknown_history(self.given.poses, self.adopted)
+        return [p for i, p in enumerate(self.before.poses) if not p.used and i not in unknown]
 
     @property
     def rivals(self) -> list[str]:

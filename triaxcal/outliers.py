@@ -9,6 +9,7 @@ spoiled poses can hide each other. Where other sets explain it as well, none is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,6 +139,18 @@ def spoiled(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> Spoiled:
         if p < best_p and _each_stands_alone(judge, rows[most], float(taken[most])):
             best, best_p = _unless_rivalled(judge, rows, taken), p
     return best
+
+
+def not_as_foretold(r: Floats, J: Floats, pure_dof: float, rows: Sequence[int]) -> tuple[int, ...]:
+    """Those of a few ``rows`` of which something that they alone have is not known, and that show it: each takes more
+    out of the sum of squares than a coefficient of its own costs. Arguments are those of `spoiled`."""
+    n, parameters = J.shape
+    q, _ = np.linalg.qr(J)
+    judge = _Judge(r - q @ (q.T @ r), q, n - parameters, np.zeros(n), pure_dof)
+    _, taken = judge.singles()
+    if judge.left < 2:
+        return ()
+    return tuple(i for i in rows if taken[i] > np.log(n) * judge.excess(judge.chi2 - taken[i], judge.left - 1))
 
 
 def _unless_rivalled(judge: _Judge, rows: Ints, taken: Floats) -> Spoiled:

@@ -125,8 +125,7 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
         cost = float(np.sum((r / s) ** 2))
         scale = 1.0
         for _ in range(12):
-            trial, _, _ = everything(problem, State(theta + scale * step, effects), jacobian=False)
-            if np.sum((trial / s) ** 2) <= cost * (1 + 1e-9) + 1e-12:
+            if _cost(problem, State(theta + scale * step, effects), s) <= cost * (1 + 1e-9) + 1e-12:
                 break
             scale /= 2
         theta = theta + scale * step
@@ -136,6 +135,15 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
     if steps == STEPS_MOST and size > 1e-9:
         raise Refused(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e}); {NOT_STILL}")
     return State(theta, effects)
+
+
+def _cost(problem: Problem, state: State, s: Floats) -> float:
+    """Sum of squares of a trial step, with the standard errors from before it; infinite where it goes too far."""
+    try:
+        trial, _, _ = everything(problem, state, jacobian=False)
+    except Refused:
+        return np.inf
+    return float(np.sum((trial / s) ** 2))
 
 
 def everything(problem: Problem, state: State, jacobian: bool = True) -> Linearised:

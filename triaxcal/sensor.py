@@ -15,6 +15,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.part import mix_of, whole
+from triaxcal.errors import Refused
 
 SOLVE_TOLERANCE = 1e-13
 """Relative step, of the reference vector, at which the inverse of a nonlinear model counts as found."""
@@ -87,17 +88,21 @@ class Sensor:
         return slope
 
     def along_axes(self, u: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        """s = R a (n,3): the inverse up to the axes, by Newton's method where there are effects."""
+        """s = R a (n,3): the inverse up to the axes, by Newton's method where there are effects.
+
+        Raises Refused where the model has no inverse at a reading, as the methods that follow from this do.
+        """
         v = u / self.scale_factor - self.bias
         if not self.effects:
             return v
         s = v.copy()
-        for _ in range(50):
-            miss = s + self.departure(s, conditions) - v
-            step = np.linalg.solve(np.eye(3) + self.departure_slope(s, conditions), miss[..., None])[..., 0]
-            s -= step
-            if np.max(np.abs(step), initial=0.0) <= SOLVE_TOLERANCE * np.max(np.abs(v), initial=1.0):
-                break
+        with np.errstate(over="ignore", invalid="ignore"):  # beyond what the model holds for it may go anywhere
+            for _ in range(50):
+                miss = s + self.departure(s, conditions) - v
+                step = _solved(np.eye(3) + self.departure_slope(s, conditions), miss)
+                s -= step
+                if np.max(np.abs(step), initial=0.0) <= SOLVE_TOLERANCE * np.max(np.abs(v), initial=1.0):
+                    break
         return s
 
     def specific_force(self, u: Floats, conditions: Mapping[str, Floats]) -> Floats:
@@ -113,10 +118,18 @@ class Sensor:
         by_s = by_v = (a / length[:, None]) @ inverse
         if self.effects:
             slope = np.eye(3) + self.departure_slope(s, conditions)
-            by_v = np.linalg.solve(slope.transpose(0, 2, 1), by_s[..., None])[..., 0]
+            by_v = _solved(slope.transpose(0, 2, 1), by_s)
         return Radius(length, s, a, by_s, by_v)
 
     def magnitude(self, u: Floats, conditions: Mapping[str, Floats]) -> tuple[Floats, Floats]:
         """|a| (n,) and its gradient by the outputs (n,3)."""
         found = self.radius(u, conditions)
         return found.length, found.by_v / self.scale_factor
+
+
+def _solved(slopes: Floats, right: Floats) -> Floats:
+    """(n,3) by slopes (n,3,3)."""
+    try:
+        return np.asarray(np.linalg.solve(slopes, right[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        raise Refused("the model has no inverse at these readings: they lie far beyond what it holds for") from None

@@ -15,6 +15,7 @@ from triaxcal.conditions import (
     conditions_elsewhere,
     held_at,
     of_readings,
+    of_unknown_history,
     references,
     with_scale,
 )
@@ -128,6 +129,13 @@ def test_the_pose_before_and_the_scatter_come_in_g_along_the_axes(three: list[Po
     assert by_axis(found, CHANGE) == pytest.approx(np.array([[0, 0, 0], [-1.0, 1.4, 0.0], [-1.0, 0.0, 1.0]]))
     assert by_axis(found, SCATTER) == pytest.approx(np.full((3, 3), 1e-4))
     assert set(found) == {*channels_of(three), *BEFORE, *CHANGE, *SCATTER}
+
+
+def test_only_to_an_effect_of_the_pose_before_is_the_history_of_the_first_pose_unknown(three: list[Pose]) -> None:
+    for effect in Hysteresis(), Hysteresis("reversal"):
+        assert of_unknown_history(three, [TemperatureBias(), effect]) == (0,)
+        assert of_unknown_history(three[1:], [effect]) == ()
+    assert of_unknown_history(three, [TemperatureBias(), BiasDrift()]) == ()
 
 
 def test_channels_and_time_count_from_a_round_mean_and_all_else_from_zero(three: list[Pose]) -> None:

@@ -10,9 +10,11 @@ import pytest
 
 from triaxcal.creep import with_creep_left
 from triaxcal.effects import effect_named
+from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.second_order_nonlinearity import SecondOrderNonlinearity
 from triaxcal.effects.temperature_bias import TemperatureBias
 from triaxcal.effects.warm_up import WarmUp
+from triaxcal.findings import description_of
 from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
 from triaxcal.poses.pose import Pose
@@ -187,3 +189,11 @@ def test_what_moves_with_the_directions_alone_is_not_called_still(paper_unit: Se
 def test_blind_to_has_the_same_names_as_the_advice(paper_unit: Sensor, fourteen: np.ndarray) -> None:
     poses = noisy_poses(paper_unit, fourteen, SIGMA_G, np.random.default_rng(3), hold_s=HOLD_S)
     assert set(blind(poses)) == set(diagnose(poses, signs=MINUS).after.blind_to)
+
+
+def test_the_p_of_the_empirical_term_is_that_of_the_test_that_let_it_in(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, SIGMA_G, np.random.default_rng(4), hold_s=HOLD_S)
+    without, smooth = (fit(poses, signs=MINUS, effects=effects) for effects in ([], Empirical().forms[:1]))
+    assert description_of(smooth, without, 0.0042).p_value == 0.0042

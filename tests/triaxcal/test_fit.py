@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from scipy import stats
 
 from triaxcal.effects import CATALOGUE, TIME, effect_named
 from triaxcal.effects.contract import SCATTER, rate_of
-from triaxcal.errors import InvalidData
+from triaxcal.errors import InvalidData, Refused
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, solve
@@ -280,3 +281,20 @@ def test_a_faulty_pose_and_a_spoiled_one_are_both_left_out(paper_unit: Sensor, t
     found = fit(poses, signs=MINUS)
     assert [i for i, p in enumerate(found.poses) if not p.used] == [3, 12]
     assert [i for i, p in enumerate(fit(poses, signs=MINUS, aside=(3, 5)).poses) if not p.used] == [3, 5]
+
+
+@pytest.mark.parametrize(
+    ("seed", "amount", "name"),
+    [(47, 0.5, "third_order_nonlinearity"), (283, 0.5, "second_order_nonlinearity"), (0, 0.8, "cross_coupling")],
+)
+def test_a_step_to_where_the_model_has_no_inverse_is_one_too_far(
+    paper_unit: Sensor, twenty_six: np.ndarray, seed: int, amount: float, name: str
+) -> None:
+    """Two poses read half as much again, or more, which the effect bends itself to."""
+    rng = np.random.default_rng(seed)
+    bent = effect_named("second_order_nonlinearity"), rng.normal(size=3) * 1e-3
+    poses = noisy_poses(replace(paper_unit, effects=(bent,)), twenty_six, 1.5e-5, rng)
+    for i in rng.choice(26, 2, replace=False):
+        poses[i] = replace(poses[i], mean=poses[i].mean * (1 + amount))
+    with contextlib.suppress(Refused):
+        fit(poses, signs=MINUS, effects=[effect_named(name)], aside=())

@@ -11,8 +11,9 @@ from scipy import stats
 from benchmarks.spoiled import clean_loses, measure
 from benchmarks.truth import plan
 from triaxcal.calibration import Calibration
+from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.fit import fit
-from triaxcal.outliers import spoiled
+from triaxcal.outliers import not_as_foretold, spoiled
 from triaxcal.plan.directions import linear_design
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
@@ -144,3 +145,67 @@ def test_the_pose_that_every_likely_pair_contains_is_left_out() -> None:
             assert all(3 not in each for each in verdict.rivals)
             shown += 1
     assert shown > 5
+
+
+def remembering(paper_unit: Sensor, directions: np.ndarray, seed: int, *, rested: bool) -> list[Pose]:
+    """Poses of a unit with hysteresis, of which the first was reached from another, unless the unit had ``rested``."""
+    rng = np.random.default_rng(seed)
+    up = directions[rng.permutation(len(directions))]
+    unit = replace(paper_unit, effects=((Hysteresis(), np.array([4e-4, 3e-4, -5e-4])),))
+    poses = noisy_poses(unit, up if rested else np.vstack([-up[:1], up]), SIGMA, rng, hold_s=10.0)
+    return poses if rested else [replace(poses[1], before=None), *poses[2:]]
+
+
+def test_a_first_pose_that_another_went_before_is_left_out_and_not_called_spoiled(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    for seed in range(5):
+        poses = remembering(paper_unit, twenty_six, seed, rested=False)
+        c = fit(poses, signs=SIGNS, effects=[Hysteresis()])
+        assert left_out(c) == [0]
+        assert c.warnings[0].startswith("left out, as what was before it is not known: the pose at 10.0 s (")
+        told = fit(poses, signs=SIGNS, effects=[Hysteresis()], aside=[0])
+        assert c.warnings == told.warnings
+        assert c.inflation == told.inflation
+        assert not any("spoiled" in w for w in c.warnings)
+
+
+def test_beside_it_another_pose_is_spoiled_as_ever(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    poses = remembering(paper_unit, twenty_six, 0, rested=False)
+    poses[7] = replace(poses[7], mean=poses[7].mean * (1 + 60 * SIGMA))
+    c = fit(poses, signs=SIGNS, effects=[Hysteresis()])
+    assert left_out(c) == [0, 7]
+    assert [w.split(": ")[0] for w in c.warnings[:2]] == [
+        "left out, as what was before it is not known",
+        "left out as spoiled",
+    ]
+
+
+def test_a_first_pose_in_which_the_unit_had_rested_stays(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    lost = 0
+    for seed in range(40):
+        poses = remembering(paper_unit, twenty_six, seed, rested=True)
+        lost += left_out(fit(poses, signs=SIGNS, effects=[Hysteresis()])) == [0]
+    # It costs ln 26, which noise takes out of the sum of squares in one case of fourteen.
+    assert lost <= stats.binom.ppf(0.999, 40, stats.chi2.sf(np.log(26), 1))
+
+
+def test_without_an_effect_of_the_pose_before_a_first_pose_that_is_off_is_spoiled(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, SIGMA, np.random.default_rng(2))
+    poses[0] = spoil(poses[0], paper_unit, twenty_six[0], 50)
+    c = fit(poses, signs=SIGNS)
+    assert left_out(c) == [0]
+    assert c.warnings[0].startswith("left out as spoiled: the pose at 0.0 s")
+
+
+def test_a_pose_is_as_foretold_unless_it_takes_out_more_than_a_coefficient_costs() -> None:
+    n = 26
+    design = linear_design(plan(n), plan(n))
+    q, _ = np.linalg.qr(design)
+    for taken, found in ((0.9 * np.log(n), ()), (1.1 * np.log(n), (4,))):
+        own = np.eye(n)[4] - q @ q[4]
+        r = own / np.linalg.norm(own) * np.sqrt(taken)
+        assert not_as_foretold(r, design, 1e6, [4]) == found
+        assert not_as_foretold(r, design, 1e6, []) == ()

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from triaxcal.effects import CATALOGUE, TIME
+from triaxcal.effects import CATALOGUE, TIME, effect_named
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SCATTER, SINCE_START, rate_of
+from triaxcal.errors import Refused
 from triaxcal.sensor import Sensor
 
 EVERYTHING: dict[str, list[float]] = {
@@ -83,3 +84,12 @@ def test_the_magnitude_s_gradient_is_its_central_difference(with_effects: Callab
         h = 1e-6 * np.eye(3)[axis]
         difference = (sensor.magnitude(u + h, held)[0] - sensor.magnitude(u - h, held)[0]) / 2e-6
         assert gradient[:, axis] == pytest.approx(difference, abs=1e-8)
+
+
+def test_a_reading_at_which_the_model_turns_back_is_refused_in_one_line() -> None:
+    """s + q s² has no slope at s = −1/2q, where Newton's method begins."""
+    bent = effect_named("second_order_nonlinearity"), np.array([0.25, 0.0, 0.0])
+    sensor = Sensor(np.ones(3), np.zeros(3), np.zeros(3), (bent,))
+    for ask in (sensor.specific_force, sensor.magnitude):
+        with pytest.raises(Refused, match="no inverse at these readings"):
+            ask(np.array([[-2.0, 0.0, 0.5]]), {})

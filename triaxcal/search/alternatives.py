@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from triaxcal.effects.contract import Effect
+from triaxcal.problem import State
 from triaxcal.search.candidates import Candidate, Ground
 from triaxcal.search.search import Search
-from triaxcal.search.worth import FAMILYWISE, Model
+from triaxcal.search.worth import FAMILYWISE, Model, parameters
 
 NEAR = 10.0
 """An alternative is out where it is worse by so much in deviance and price. Of two effects that differ by δ standard
@@ -32,10 +33,8 @@ def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]
     for other in [*others, *search.by_trends(without, taken)]:
         if search.score(other) > search.score(now) + NEAR:
             continue
-        ground = Ground.at(search.problem, other.state)
-        contained = not ground.shown(ground.columns(effect), CONTAINED)[0].shape[1]
-        if contained and search.left(other.effects) < search.left(now.effects):
-            continue  # it contains the finding, and has more to it: the simpler of the two is the name
+        if search.left(other.effects) < search.left(now.effects) and _contains(search, other.state, effect):
+            continue  # it has more to it: the simpler of the two is the name
         found.append((other.effects[-1].name, other))
     out: dict[str, Model] = {}
     for name, other in sorted([*found, *_jointly(search, effect, now)], key=lambda f: search.score(f[1])):
@@ -64,21 +63,49 @@ def _near(search: Search, without: Model, taken: Collection[str], best: float) -
     return out
 
 
+def _contains(search: Search, state: State, effect: Effect) -> bool:
+    """Whether the model at a state makes whatever an effect makes."""
+    ground = Ground.at(search.problem, state)
+    return not ground.shown(ground.columns(effect), CONTAINED)[0].shape[1]
+
+
 def _jointly(search: Search, effect: Effect, now: Model) -> list[tuple[str, Model]]:
-    """Where two effects were found: the names in other pairs that explain as much. Of a pair that has one of the two,
-    in whatever form, its other name stands for the other; of a pair of two others, none of which stands beside one of
-    the two as well, both stand for the first.
+    """Where two effects were found: the names in other pairs that explain as much, as `instead_of` has them; but of two
+    others none of which stands beside one of the two as well.
     """
     if len(now.effects) != 2:
         return []
-    taken = [e.name for e in now.effects]
-    mine = effect.name
     near = [m for m in search.pairs_from(search.linear) if search.score(m) < search.score(now) + NEAR]
-    named = [{e.name for e in m.effects} for m in near]
-    beside = {name for names in named if names & set(taken) for name in names}
+    same = [_same(search, now.effects, m.effects) for m in near]
+    beside = {e.name for m, kept in zip(near, same, strict=True) if any(kept) for e in m.effects}
     out = []
-    for m, names in zip(near, named, strict=True):
-        kept = names & set(taken)
-        if mine not in names and (kept or (mine == taken[0] and not names & beside)):
-            out += [(name, m) for name in sorted(names - kept)]
+    for m, kept in zip(near, same, strict=True):
+        if any(kept) or not beside & {e.name for e in m.effects}:
+            out += [(name, m) for name in _new(effect, now.effects, m.effects, kept)]
     return out
+
+
+def instead_of(search: Search, effect: Effect, others: Sequence[Effect]) -> list[str]:
+    """The names among ``others``, which explain as much as all effects found, that stand for ``effect``. Of those that
+    have one of the effects found, in whatever form, the other names stand for the rest of these; of those that have
+    none, all stand for the first.
+    """
+    found = search.found.effects
+    return _new(effect, found, others, _same(search, found, others))
+
+
+def _new(effect: Effect, found: Sequence[Effect], others: Sequence[Effect], same: Sequence[set[str]]) -> list[str]:
+    kept = set().union(*same)
+    if effect.name in kept or not (kept or effect is found[0]):
+        return []
+    return sorted(e.name for e, is_there in zip(others, same, strict=True) if not is_there)
+
+
+def _same(search: Search, found: Sequence[Effect], others: Sequence[Effect]) -> list[set[str]]:
+    """For each of the others the names of the effects found that it is, or contains and has more to it."""
+
+    def is_there(f: Effect, e: Effect) -> bool:
+        more = parameters([e]) > parameters([f])
+        return e.name == f.name or (more and _contains(search, search.linear.state.extended([e]), f))
+
+    return [{f.name for f in found if is_there(f, e)} for e in others]

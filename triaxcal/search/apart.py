@@ -58,6 +58,8 @@ def telling_apart(search: Search, effect: Effect, others: Mapping[str, Model]) -
             one, *another = dict.fromkeys(c for c in (mine, theirs) if c not in (DIRECTION, CLOCK))
             if another:
                 out[f"record again while {one} changes and {another[0]} stands still"] = None
+            elif mine == theirs and set(effect.needs) == set(other.needs):
+                out[f"record again while {one} goes through a wider range, from pose to pose"] = None
             elif mine == theirs:
                 out[f"record again while {one} rises, falls and stands still, from pose to pose"] = None
             else:

@@ -12,6 +12,7 @@ from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.part import Part
 from triaxcal.poses.pose import Pose
 from triaxcal.search import Model, Search, alternatives
+from triaxcal.search.alternatives import instead_of
 from triaxcal.sensor import Sensor
 
 Recorded = Callable[..., list[Pose]]
@@ -64,6 +65,41 @@ def test_what_contains_the_finding_and_has_more_to_it_is_no_alternative(
     sensor = replace(paper_unit, effects=((WARMTH, Q),))
     search = searched(recorded(sensor, 0), catalogue("temperature_bias", "temperature_bias_quadratic"))
     assert beside_the_truth(search, WARMTH) == ()
+
+
+SECOND = effect_named("second_order_nonlinearity")
+
+
+def test_what_contains_one_of_two_findings_is_no_alternative_of_it_in_a_pair_either(
+    paper_unit: Sensor, recorded: Recorded, searched: Searched
+) -> None:
+    sensor = replace(paper_unit, effects=((WARMTH, Q), (SECOND, 3 * Q)))
+    others = catalogue("temperature_bias_quadratic", "bias_drift")
+    search = searched(recorded(sensor, 0), [WARMTH, SECOND, *others])
+    model = search.model([WARMTH, SECOND])
+    assert model is not None
+    search.found = model
+    parabola = {"temperature_bias_quadratic", SECOND.name}
+    assert any({e.name for e in m.effects} == parabola for m in search.pairs_from(search.linear))
+    assert names_of(search, model.effects) == {"temperature_bias": (), "second_order_nonlinearity": ()}
+
+
+def test_beside_what_contains_a_finding_the_other_name_stands_for_the_other_finding(
+    paper_unit: Sensor, recorded: Recorded, searched: Searched
+) -> None:
+    """As beside the finding itself, in whatever form."""
+    sensor = replace(paper_unit, effects=((WARMTH, Q), (SECOND, 3 * Q)))
+    parabola, third = catalogue("temperature_bias_quadratic", "third_order_nonlinearity")
+    search = searched(recorded(sensor, 0), [WARMTH, SECOND, parabola, third])
+    model = search.model([WARMTH, SECOND])
+    assert model is not None
+    search.found = model
+    for beside in (WARMTH, Part.of(WARMTH, "x"), parabola):
+        assert instead_of(search, WARMTH, [third, beside]) == []
+        assert instead_of(search, SECOND, [third, beside]) == ["third_order_nonlinearity"]
+    assert instead_of(search, WARMTH, [third]) == ["third_order_nonlinearity"]
+    assert instead_of(search, SECOND, [third]) == []
+    assert instead_of(search, WARMTH, [parabola]) == []
 
 
 def test_unlike_effects_are_told_apart(paper_unit: Sensor, recorded: Recorded, searched: Searched) -> None:
