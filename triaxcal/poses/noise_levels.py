@@ -84,9 +84,12 @@ class NoiseLevels:
         """Of residuals in ``left`` degrees of freedom whose sum of squares, by the stated variance, is ``chi2`` (any
         shape), but for a constant: Student's distribution in so many dimensions for every level."""
         chi2 = np.log(np.maximum(chi2, CHI2_LEAST))
-        # As a function of one number it is reckoned once, and looked up for the hundred thousands.
-        grid = np.linspace(chi2.min(), chi2.max() + 1e-9, GRID)
+        # As a function of one number it is reckoned once, and looked up for the hundred thousands, by even steps.
+        grid, step = np.linspace(chi2.min(), chi2.max() + 1e-9, GRID, retstep=True)
         dof = self._known
         constant = special.gammaln((dof + left) / 2) - special.gammaln(dof / 2) - left / 2 * np.log(dof * self.variance)
         each = constant - (dof + left) / 2 * np.log1p(np.exp(grid)[:, None] / (dof * self.variance))
-        return np.asarray(np.interp(chi2, grid, special.logsumexp(each, axis=1, b=self.share)))
+        known = special.logsumexp(each, axis=1, b=self.share)
+        place = (chi2 - grid[0]) / step
+        below = np.minimum(place.astype(np.int64), GRID - 2)
+        return np.asarray(known[below] + (place - below) * np.diff(known)[below])

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import special
 
 from triaxcal.arrays import Floats
 from triaxcal.poses.noise_levels import NoiseLevels
@@ -54,7 +53,8 @@ def anything_p(gains: Gains, names: Sequence[str], model: Floats, noise: NoiseLe
     share = size**2 / (size**2 + rank)
     by_noise = noise.log_likelihood(np.vstack([total - share * taken, total]), n - k)
     likelier = 0.5 * rank * np.log1p(-share) + by_noise[:-1] - by_noise[-1]
-    log_mean = special.logsumexp(likelier, axis=0, b=weights[:, None])
+    most = likelier.max(axis=0)
+    log_mean = most + np.log(weights @ np.exp(likelier - most))
     as_large = float(np.mean(np.append(log_mean[1:] >= log_mean[0], True)))
     # Under noise its mean is 1, so that a large one is rarer than its inverse (Markov), which draws cannot show.
     return float(min(as_large, np.exp(-log_mean[0])))

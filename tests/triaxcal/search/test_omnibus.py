@@ -141,7 +141,7 @@ SLOW_OR_NOT = NoiseLevels.of(np.array([0.9, 0.1]), np.array([1.0, 6.0]), np.arra
 
 
 def test_noise_that_may_be_slow_is_called_something_as_seldom_as_claimed(known: Known) -> None:
-    rng, runs = np.random.default_rng(5), 200
+    rng, runs = np.random.default_rng(5), 100
     truth = np.sqrt(SLOW_OR_NOT.drawn(runs, rng))
     p = np.array([known.p(rng.standard_normal(N) * scale, SLOW_OR_NOT) for scale in truth])
     for level in (0.01, 0.05, 0.2):
