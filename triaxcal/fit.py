@@ -81,7 +81,10 @@ def fit(
         calibration = _with_aside(calibration, poses, found, verdict)
     if verdict.rivals:
         sets = " or ".join(" and ".join(poses[i].at for i in rows) for rows in verdict.rivals)
-        warning = f"some poses were spoiled, and these cannot be told from each other, so none is left out: {sets}"
+        warning = (
+            f"the residuals look as if poses were spoiled ({sets}: these cannot be told from each other), or as if "
+            "something else acts; none is left out"
+        )
         calibration = replace(calibration, warnings=(warning, *calibration.warnings))
     return calibration
 
