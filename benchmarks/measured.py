@@ -66,7 +66,9 @@ def warnings(loop: Loop, measured: Measured) -> str:
     found += [w.split(":")[0] for w in loop.after.warnings if "poorly spread" in w or "alone carries" in w]
     aside = sum(not p.used for p in loop.after.poses)
     found += [f"{aside} poses set aside" if aside > 1 else "1 pose set aside"] if aside else []
-    found += ["spoiled poses that cannot be told apart" for w in loop.after.warnings if "look as if poses were spoiled" in w]
+    found += [
+        "spoiled poses that cannot be told apart" for w in loop.after.warnings if "look as if poses were spoiled" in w
+    ]
     return "; ".join(found) or "none"
 
 

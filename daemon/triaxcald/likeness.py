@@ -7,23 +7,25 @@ its axes stand to each other and which of them is the more sensitive.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
+from triaxcal.conditions import conditions_elsewhere
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.figures import plain
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
 
-MISALIGNMENT_RAD, SCALE_FACTOR = 1e-3, 2e-3
-"""Standard deviations, of each, by which one mass-market unit differs from itself in another recording. Of eight
-sensors of one type, recorded three times (MIMU4444), none is then asked about beside itself, and five in six of their
-pairs are."""
+MISALIGNMENT_RAD, SCALE_FACTOR = 1e-3, 6e-3
+"""Standard deviations, of each, by which one mass-market unit differs from itself in another recording: scale factors
+by what 20 K make of them where nothing corrects that (`triaxcal.uncertainty`, 3e-4/K)."""
+POSES_LEAST = 12
+"""Fewer tell hardly more than nine parameters: what the model lacks goes into these."""
 BY_CHANCE = 1e-4
 """The probability that one unit is asked about."""
 _RATIOS = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])
@@ -54,11 +56,25 @@ def shape_of(c: Calibration) -> Shape:
 
 
 def shape_by_poses(poses: Sequence[Pose], signs: Sequence[float], reference: float) -> Shape | None:
-    """By a fit of the linear model to these poses alone; None where they do not carry one."""
+    """By a fit of the linear model to these poses alone; None where they do not carry one, or are few."""
     try:
-        return shape_of(fit(poses, signs=signs, reference=reference))
+        found = fit(poses, signs=signs, reference=reference)
     except (Refused, InvalidData):
         return None
+    return shape_of(found) if sum(p.used for p in found.poses) >= POSES_LEAST else None
+
+
+def shape_beside(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
+    """The same by what the outputs would be without the effects that ``held`` has."""
+    sensor = held.sensor
+    if sensor.effects:
+        try:
+            at = conditions_elsewhere(poses, held.channel_reference, sensor.scale_factor, sensor.bias)
+            s = sensor.along_axes(np.array([p.mean for p in poses]), at)
+        except Refused:
+            return None
+        poses = [replace(p, mean=mean) for p, mean in zip(poses, sensor.scale_factor * (s + sensor.bias), strict=True)]
+    return shape_by_poses(poses, np.sign(sensor.scale_factor).tolist(), held.reference)
 
 
 def shape_in(calibration: Mapping[str, Any]) -> Shape | None:
@@ -93,5 +109,5 @@ def unlike_shapes(name: str, other: str, one: Shape | None, another: Shape | Non
     ratio, angle = (float(np.max(np.abs(v))) for v in ([*apart[:2], apart[:2].sum()], apart[2:]))
     return [
         f"{name} and {other}: misalignment differs by up to {plain(1e3 * angle, 2)} mrad and the ratio of scale "
-        f"factors by up to {plain(100 * ratio, 2)} %, more than age and temperature make of one unit: the same unit?"
+        f"factors by up to {plain(100 * ratio, 2)} %, more than age and 20 K make of one unit: the same unit?"
     ]

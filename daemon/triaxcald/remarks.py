@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import BEFORE, CLOCKS
+from triaxcal.loop import Loop
 from triaxcal.uncertainty import SENSITIVITY_PER_K
 
 SHARE = "% of it goes with "
@@ -41,3 +42,10 @@ def none_could_show(blind_to: Collection[str]) -> bool:
     """Whether a search that found nothing could hardly find anything: no effect that goes with direction or time, which
     every recording has, shows in full."""
     return {e.name for e in CATALOGUE if set(e.needs) <= {*CLOCKS, *BEFORE}} <= set(blind_to)
+
+
+def nothing_shows(loop: Loop) -> str:
+    """What a loop without findings says of the catalogue."""
+    certain = " for certain" if loop.unexplained.or_spoiled else ""
+    none = "; none could in full, with so few or such poses" if none_could_show(loop.after.blind_to) else ""
+    return f"no effect of the catalogue shows{certain}{none}"

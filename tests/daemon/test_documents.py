@@ -92,6 +92,15 @@ def test_poses_have_the_keys_of_the_contract(poses: list[Pose]) -> None:
     assert poses_document([]) == {"format": "triaxcal.poses/1", "poses": []}
 
 
+def test_a_pose_that_was_left_out_says_why(poses: list[Pose]) -> None:
+    begun = [replace(poses[0], before=None), *(replace(p, before=poses[i].mean) for i, p in enumerate(poses[1:]))]
+    for effects, why in (((), "spoiled"), ((effect_named("hysteresis"),), "unknown_history")):
+        c = fit(begun, effects=effects, aside=[0])
+        document = calibration_document(c, output_unit="V", reference_unit="g", stated=None)
+        assert document["poses"][0]["left_out"] == why
+        assert "left_out" not in document["poses"][1]
+
+
 def test_a_calibration_comes_back_as_a_sensor(poses: list[Pose]) -> None:
     calibration = fit(poses, signs=SIGNS, effects=[SECOND, effect_named("temperature_bias")], reference=1.5)
     document = json.loads(to_text(calibration_document(calibration, output_unit="V")))

@@ -20,6 +20,7 @@ from triaxcald.demo import DemoUnit, run_demo
 from triaxcald.documents import number
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
+from triaxcald.remarks import nothing_shows
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.eeprom import keep_eeprom, read_eeprom
 from triaxcald.station.collection import Collection
@@ -122,7 +123,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         for name, (value, error, unit) in finding.coefficients.items():
             print(f"    {name} {value:+.4g} ± {error:.1g} {unit}")
     if not loop.findings:
-        print(f"  no effect of the catalogue shows{' for certain' if loop.unexplained.or_spoiled else ''}")
+        print(f"  {nothing_shows(loop)}")
     if loop.unexplained.significant:
         print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms; {loop.unexplained.lead}")
     if o.provisioned:

@@ -20,7 +20,7 @@ from triaxcald.cli.showing import counted, judge, show_poses, telling_data_quali
 from triaxcald.errors import InputError
 from triaxcald.held_sensor import calibration_part, model_of, reference_unit_in, sensor_of
 from triaxcald.inputs import Measured, measure, read_document
-from triaxcald.likeness import shape_by_poses, shape_in, unlike_shapes
+from triaxcald.likeness import shape_beside, shape_in, unlike_shapes
 from triaxcald.units import ErrorUnit
 from triaxcald.verification import Verification, pose_rows, trust, unlike
 
@@ -75,9 +75,10 @@ def verify_command(a: argparse.Namespace) -> int:
     measured = measure(a.recording)
     with telling_data_quality(measured):
         _require_trusted(measured)
-    found = _verified(measured, model_of(sensor, channel_reference, reference), where=a.calibration)
+    model = model_of(sensor, channel_reference, reference)
+    found = _verified(measured, model, where=a.calibration)
     assert found.rms_g is not None
-    own = shape_by_poses(measured.poses, np.sign(sensor.scale_factor).tolist(), reference)
+    own = shape_beside(model, measured.poses)
     held = shape_in(calibration_part(document, where=a.calibration))
     warnings = unlike(measured.name, found.rms_g, reference) or unlike_shapes(a.calibration, measured.name, held, own)
     if left := [e.name for e, _ in sensor.effects if {TIME, SINCE_START, RUN} & set(e.needs)]:

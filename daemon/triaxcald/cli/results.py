@@ -13,7 +13,7 @@ from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, counted
 from triaxcald.documents import holds_of
-from triaxcald.remarks import assumption, none_could_show, overlap
+from triaxcald.remarks import assumption, nothing_shows, overlap
 from triaxcald.units import ErrorUnit, grouped, in_units_of
 
 
@@ -108,9 +108,7 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     for finding in loop.findings:
         print(f"{finding.verdict}: {finding.effect} ({small.in_words(finding.reason)})")
     if not loop.findings:
-        certain = " for certain" if loop.unexplained.or_spoiled else ""
-        none = "; none could in full, with so few or such poses" if none_could_show(loop.after.blind_to) else ""
-        print(f"no effect of the catalogue shows{certain}{none}")
+        print(nothing_shows(loop))
     if loop.unexplained.significant:
         lead = small.in_words(loop.unexplained.lead)
         print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")

@@ -85,7 +85,7 @@ def _write(damaged: DamagedFile, name: str, out: Path) -> Recovery:
         with sink:
             recovery = _Mending(damaged, McapWriter(sink, enable_data_crcs=True)).run(name)
         if not (recovery.messages or recovery.attachments):
-            raise Refused(f"{damaged.name}: nothing to recover: it holds no whole record; nothing was written")
+            raise Refused(f"{damaged.name}: nothing to recover, as there is no whole message or attachment in it")
         return recovery
     except BaseException:
         out.unlink()

@@ -33,7 +33,7 @@ class Coefficient:
 @dataclass(frozen=True)
 class Pose:
     """`direction` is the unit vector of up in the sensor's frame; `mean` in output units; `recording` that of several
-    whose clock its times are on.
+    whose clock its times are on. `again`: left out of the fit, and to be taken again.
     """
 
     number: int
@@ -46,6 +46,7 @@ class Pose:
     studentized: float | None
     leverage: float | None
     used: bool
+    again: bool = False
     standard_error_g: float | None = None
     recording: str = ""
     channels: Mapping[str, float | None] = field(default_factory=dict)
@@ -275,6 +276,7 @@ def _poses(
             mean=mean,
             direction=vector(known.get("direction")) or _direction(mean, matrix, centre),
             used=known.get("used") is None or bool(known["used"]),
+            again=known.get("used") is False and known.get("left_out") != "unknown_history",
             recording=recordings.get(str(known.get("recording")), ""),
             channels=numbers(known.get("channels")),
             **{name: number(known.get(name)) for name in _OF_A_POSE},

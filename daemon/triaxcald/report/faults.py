@@ -36,12 +36,13 @@ def faults_of(lines: Iterable[str]) -> tuple[Fault, ...]:
 
 
 def left_out(poses: Sequence[Pose], unit: ErrorUnit) -> tuple[str, ...]:
-    """The poses that the fit did not use, with where they are and by how much they are off."""
+    """The poses that the fit did not use and that are to be taken again, with where they are and by how much they are
+    off."""
     return tuple(
         f"Pose {pose.number}"
         + ("" if pose.start_s is None else f", at {pose.start_s:.1f} s")
         + (f" of {pose.recording}" if pose.recording else "")
         + ("" if pose.residual_g is None else f": off by {micro_g(pose.residual_g, unit)}")
         for pose in poses
-        if not pose.used
+        if pose.again
     )

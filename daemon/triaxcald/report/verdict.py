@@ -80,7 +80,7 @@ def _without_limits(outcome: Outcome) -> str:
     if not outcome.searched:
         return "No lack of fit shows"
     if _could_find_nothing(outcome):
-        return "No effect could show"
+        return "No effect could show in full"
     if not outcome.findings:
         return "Nothing found beyond noise" if not _lacks_fit(outcome) else "Nothing certain found beyond noise"
     what = "Effect" if len(outcome.findings) == 1 else f"{len(outcome.findings)} effects"
@@ -96,8 +96,8 @@ def _spoiled(outcome: Outcome) -> bool:
 
 
 def _rejected(outcome: Outcome) -> int:
-    """How many poses the fit left out."""
-    return len(outcome.poses) - outcome.poses_used
+    """How many poses the fit left out, to be taken again."""
+    return sum(pose.again for pose in outcome.poses)
 
 
 def _uncertain(outcome: Outcome) -> bool:

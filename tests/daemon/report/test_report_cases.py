@@ -253,6 +253,14 @@ def test_the_headline_is_not_that_all_is_well_while_poses_have_to_be_taken_again
     assert f"{good}; poses to take again" in text
 
 
+def test_a_first_pose_of_unknown_history_is_left_out_and_not_to_be_taken_again(loop: dict[str, Any]) -> None:
+    loop["calibration"]["poses"][0] |= {"used": False, "left_out": "unknown_history"}
+    _, text = page(loop)
+    assert "again" not in text
+    loop["calibration"]["poses"][0]["left_out"] = "spoiled"
+    assert "poses to take again" in page(loop)[1]
+
+
 def test_poses_left_out_or_an_effect_is_said_to_be_open(loop: dict[str, Any]) -> None:
     loop["unexplained"] |= {"significant": True, "p_value": 2e-4, "lead": "most of it is the pose at 166.0 s"}
     _, text = page(loop)
