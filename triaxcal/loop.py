@@ -180,7 +180,7 @@ def _unexplained(made: _Made) -> Unexplained:
     search, p = made.search, made.search.anything_p(made.search.found)
     left = unexplained_of(made.quiet.fit(made.adopted), search.passed_over, p, search.nearest(), hints_of(search))
     # Beside the residuals of poses with their creep, which are told, it must not look less than they are.
-    left = replace(left, rms_g=max(left.rms_g, beyond_noise(made.steps[-1], left.significant)))
+    left = replace(left, rms_g=max(left.rms_g, beyond_noise(made.steps[-1])))
     whole_p = made.found.whole_p
     if made.rivals and whole_p is not None and whole_p < SIGNIFICANT:
         return spoiled_or(replace(made.quiet, aside=()).fit(()), whole_p, made.aside, made.rivals, left)

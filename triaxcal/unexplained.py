@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,15 +65,10 @@ def unexplained_of(
     ``p`` is the probability of what is left by chance (`triaxcal.search.omnibus`): that of its sum of squares where it
     is None.
     """
-    residual = after.residual
-    p = residual.lack_of_fit_p if p is None else p
-    significant = p is not None and p < SIGNIFICANT
-    return Unexplained(
-        significant,
-        p,
-        beyond_noise(after, significant),
-        lead(after, passed_over, nearest, hints) if significant else "",
-    )
+    p = after.residual.lack_of_fit_p if p is None else p
+    if p is None or p >= SIGNIFICANT:
+        return Unexplained(False, p, beyond_noise(after), "")
+    return Unexplained(True, p, _size(after), lead(after, passed_over, nearest, hints))
 
 
 def spoiled_or(
@@ -81,21 +76,25 @@ def spoiled_or(
 ) -> Unexplained:
     """What the poses leave where those that are ``spoiled`` explain it no better than the effects of these ``names``
     would. ``whole`` is the fit to all poses, ``p`` the probability of what it leaves, which is significant; ``left`` is
-    what the others leave, without those."""
+    what the others leave without those: where that is significant, neither is all there is."""
     off = " and ".join(f"the pose at {s.pose.at} ({micro_g(s.residual_g, '+')})" for s in spoiled)
-    lead = f"most of it is {off}: spoiled, or it is {' or '.join(names)}, which would explain as much"
+    doubt = f"spoiled, or it is {' or '.join(names)}, which would explain as much"
     if left.significant:
-        lead += f"; without {'that pose' if len(spoiled) == 1 else 'those poses'} more is left, {left.lead}"
-    return Unexplained(True, p, beyond_noise(whole, True), lead, or_spoiled=True)
+        return replace(left, lead=f"{left.lead}; besides, left out is {off}: {doubt}")
+    return Unexplained(True, p, _size(whole), f"most of it is {off}: {doubt}", or_spoiled=True)
 
 
-def beyond_noise(after: Calibration, significant: bool) -> float:
-    """rms of the residuals beyond noise, in g; at least as much as raises the errors, where it is significant."""
+def beyond_noise(after: Calibration) -> float:
+    """rms of the residuals beyond noise, in g."""
     residual = after.residual
-    beyond = float(np.sqrt(max(residual.rms_g**2 - residual.noise_floor_g**2, 0.0)))
-    # One loud pose may hide in the plain rms what the others show, each by its own noise.
-    raised = residual.noise_floor_g * float(np.sqrt(max(after.inflation**2 - 1, 0.0)))
-    return max(beyond, raised) if significant else beyond
+    return float(np.sqrt(max(residual.rms_g**2 - residual.noise_floor_g**2, 0.0)))
+
+
+def _size(after: Calibration) -> float:
+    """The same where it is significant: one loud pose may hide in the plain rms what the others show, each by its own
+    noise."""
+    raised = after.residual.noise_floor_g * float(np.sqrt(max(after.inflation**2 - 1, 0.0)))
+    return max(beyond_noise(after), raised)
 
 
 def hints_of(search: Search) -> list[str]:

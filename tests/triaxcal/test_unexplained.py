@@ -18,7 +18,7 @@ from triaxcal.fit import fit
 from triaxcal.search import Nearest
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
-from triaxcal.unexplained import Unexplained, lead, unexplained_of
+from triaxcal.unexplained import Unexplained, lead, spoiled_or, unexplained_of
 
 MINUS = (-1, -1, -1)
 SIGMA_G = 1.5e-5
@@ -70,6 +70,27 @@ def test_the_size_is_what_is_there_beyond_noise(fitted: Fitted, ups: np.ndarray)
     assert left.p_value is not None
     assert left.p_value < 1e-12
     assert left.rms_g == pytest.approx(12 * SIGMA_G, rel=0.2)
+
+
+def test_poses_left_out_or_an_effect_are_what_is_left_unless_the_others_leave_more(
+    fitted: Fitted, ups: np.ndarray
+) -> None:
+    one = np.zeros(N)
+    one[7] = 1.0
+    whole = fitted(radial(ups, one) * 20)
+    off, names = [whole.poses[7]], ["bias_step", "hysteresis"]
+    clean, more = (unexplained_of(fitted(size * radial(ups, np.sin(TIME / 7))), {}) for size in (0.0, 12.0))
+    doubt = "spoiled, or it is bias_step or hysteresis, which would explain as much"
+    open_ = spoiled_or(whole, 1e-9, off, names, clean)
+    assert open_.or_spoiled
+    assert open_.p_value == 1e-9
+    assert open_.lead.startswith("most of it is the pose at 70.0 s (+")
+    assert open_.lead.endswith(f": {doubt}")
+    besides = spoiled_or(whole, 1e-9, off, names, more)
+    assert not besides.or_spoiled
+    assert besides.lead.startswith(f"{more.lead}; besides, left out is the pose at 70.0 s (+")
+    assert besides.lead.endswith(f": {doubt}")
+    assert (besides.p_value, besides.rms_g) == (more.p_value, more.rms_g)
 
 
 def odd(ups: np.ndarray) -> np.ndarray:
