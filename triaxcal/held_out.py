@@ -31,6 +31,8 @@ class HeldOut:
     """``after_rms_g`` with an alternative in the place of its finding, by name."""
     better: tuple[str, ...] = ()
     """The alternatives whose errors are clearly smaller, as far as these are near the smallest, that first."""
+    none_better: bool = False
+    """Whether the model before does clearly better than that after, and no alternative better than it."""
 
 
 def held_out(
@@ -54,12 +56,19 @@ def held_out(
     rms = {name: _rms(miss) for name, (miss, _) in errors.items()}
     misfit = {name: _deviance(*found) for name, found in errors.items()}
     most = min([_deviance(*last), *(m + 2 * NEAR for m in misfit.values())]) - NEAR  # near the best, far from the last
-    better = sorted((name for name in misfit if misfit[name] < most), key=lambda name: rms[name])
-    return HeldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), rms, tuple(better))
+    linear = _deviance(first[0], last[1])
+    none_better = linear < min([_deviance(*last) - NEAR, *misfit.values()])
+    better = [] if none_better else sorted((n for n, m in misfit.items() if m < most), key=lambda n: rms[n])
+    return HeldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), rms, tuple(better), none_better)
 
 
 def better_of(held: HeldOut | None) -> list[str]:
-    """Advice where the check recording speaks for an alternative."""
+    """Advice where the check recording speaks for an alternative, or for no effect at all."""
+    if held is not None and held.none_better:
+        return [
+            f"in the check recording no effect does better than the linear model ({micro_g(held.before_rms_g)}, with "
+            f"what was found {micro_g(held.after_rms_g)}): diagnose both recordings together"
+        ]
     if held is None or not held.better:
         return []
     named = " or ".join(f"{name} ({micro_g(held.instead[name])})" for name in held.better)

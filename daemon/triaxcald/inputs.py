@@ -19,6 +19,7 @@ from triaxcal.stillness.detector import StillnessDetector, Windows
 from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
 from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
+from triaxcald.doubts import TIME_UNIT
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline, creeping, together
 from triaxcald.recording.csv_text import read_csv
@@ -105,7 +106,7 @@ def _not_seconds(poses: Sequence[Pose]) -> list[str]:
     if period < PERIOD_MOST_S or turned < max(TURNED_MOST_S, TURNED_SAMPLES * period):
         return []
     return [
-        f"time_unit: a sample every {plain(period)} s, poses of {plain(lasted)} s, {plain(turned)} s from one to the "
+        f"{TIME_UNIT}a sample every {plain(period)} s, poses of {plain(lasted)} s, {plain(turned)} s from one to the "
         "next: is t_s in seconds?"
     ]
 

@@ -17,6 +17,7 @@ from triaxcal.distributions import f_sf
 from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose
 from triaxcald.documents import Document, error, number, uncertainty
+from triaxcald.doubts import ANOTHER_UNIT
 from triaxcald.pipeline import Pipeline, creeping
 
 WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"
@@ -87,8 +88,8 @@ def unlike(name: str, rms_g: float, reference: float, said: str = "does not look
     if not rms_g > UNLIKE * reference:
         return []
     return [
-        f"{name} {said}: |a| is off by {plain(rms_g / reference, 2)} of the reference; is it "
-        "another unit, or are signs, order or unit of its outputs others?"
+        f"{name} {said}: |a| is off by {plain(rms_g / reference, 2)} of the reference; "
+        f"{ANOTHER_UNIT}, or are signs, order or unit of its outputs others?"
     ]
 
 

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from tests.triaxcal.test_loop import MINUS, poses_of
-from triaxcal.held_out import magnitude_errors
+from triaxcal.effects import effect_named
+from triaxcal.fit import fit
+from triaxcal.held_out import better_of, held_out, magnitude_errors
 from triaxcal.loop import Loop, diagnose
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
+NONLINEAR = ("cross_coupling", "third_order_nonlinearity")
 SECOND = {"second_order_nonlinearity": [4e-4, -5e-4, 6e-4]}
 
 
@@ -49,6 +52,24 @@ def test_a_check_recording_speaks_for_the_truth_among_names_that_do_as_well(
             (line,) = speaks
             assert f"{name} ({1e6 * held.instead[name]:.3g} µg)" in line
     assert 1 <= mistaken < 12
+
+
+def test_where_no_effect_does_better_than_the_linear_model_in_the_check_recording_advice_says_so(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """A swing of the bias that passed for an effect of the unit; the check recording has none."""
+    rng = np.random.default_rng(0)
+    swing = 3e-4 * np.sin(2 * np.pi * np.arange(26) / 9)[:, None] * paper_unit.scale_factor
+    poses = [replace(p, mean=p.mean + e) for p, e in zip(poses_of(paper_unit, twenty_six, rng), swing, strict=True)]
+    check = poses_of(paper_unit, twenty_six, rng)
+    before = fit(poses, signs=MINUS, aside=())
+    wrong, other = (fit(poses, signs=MINUS, aside=(), effects=[effect_named(n)]) for n in NONLINEAR)
+    held = held_out(before, wrong, check, {NONLINEAR[1]: other})
+    assert held.after_rms_g > 1.2 * held.before_rms_g
+    (line,) = better_of(held)
+    assert line.startswith("in the check recording no effect does better than the linear model (")
+    right = held_out(wrong, before, check, {})
+    assert better_of(right) == []
 
 
 def test_the_error_of_an_alternative_is_that_of_its_own_fit(

@@ -11,14 +11,12 @@ from triaxcal.calibration import Calibration
 from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import micro_g
-from triaxcal.uncertainty.components import Component, reference, rounding, statistical
+from triaxcal.uncertainty.components import UNEXPLAINED, Component, reference, rounding, statistical
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
 from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
 
 LEVEL = 0.95
-UNEXPLAINED = 0.01
-"""p of the lack of fit below which more than noise is left in single readings."""
 
 
 @dataclass(frozen=True)

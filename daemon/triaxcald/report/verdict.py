@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
 from triaxcald.report.document import Finding, Outcome
 from triaxcald.report.faults import faults_of
@@ -13,6 +14,7 @@ from triaxcald.report.figures import micro_g
 from triaxcald.report.meanings import told
 from triaxcald.units import ErrorUnit
 
+Kind = Literal["within", "outside", "unexplained", "refused"]
 _SIGNIFICANT_P = 0.01
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
 _MOST_NAMED = 3
@@ -35,7 +37,7 @@ class LimitCheck:
 
 @dataclass(frozen=True)
 class Verdict:
-    kind: Literal["within", "outside", "unexplained", "refused"]
+    kind: Kind
     headline: str
     sentence: str
     reservations: tuple[str, ...]
@@ -46,8 +48,16 @@ def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expa
     """The verdict on an outcome.
 
     Limits are named like the fields of a residual, or `held_out_rms_g`, and hold inclusively. A limit that
-    nothing was measured against is never taken as kept.
+    nothing was measured against is never taken as kept, and nothing is well whose times or unit are in doubt.
     """
+    found = _judged(outcome, certificate_limits, expanded_g)
+    if not (doubts := doubts_of(outcome.data_quality, outcome.warnings)):
+        return found
+    kind: Kind = "unexplained" if found.kind == "within" else found.kind
+    return replace(found, kind=kind, headline="; ".join([found.headline, *doubts]))
+
+
+def _judged(outcome: Outcome, certificate_limits: Mapping[str, float | None], expanded_g: float | None) -> Verdict:
     checks = tuple(_checks(outcome, {**outcome.limits, **certificate_limits}))
     if outcome.refused is not None:
         return Verdict("refused", "Refused", outcome.refused, (), checks)

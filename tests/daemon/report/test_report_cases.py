@@ -253,6 +253,28 @@ def test_the_headline_is_not_that_all_is_well_while_poses_have_to_be_taken_again
     assert f"{good}; poses to take again" in text
 
 
+@pytest.mark.parametrize(
+    ("where", "line", "asked"),
+    [
+        (
+            "data_quality",
+            "time_unit: a sample every 10 s, poses of 5000 s: is t_s in seconds?",
+            "are the times in seconds?",
+        ),
+        ("warnings", "a.csv and b.csv: misalignment differs by up to 6 mrad: the same unit?", "is it the same unit?"),
+        ("warnings", "b.csv does not look like this unit: |a| is off; is it another unit?", "is it the same unit?"),
+    ],
+)
+def test_nothing_is_well_whose_times_or_unit_are_in_doubt(
+    loop: dict[str, Any], where: str, line: str, asked: str
+) -> None:
+    assert asked not in page(loop)[1]
+    (loop if where == "data_quality" else loop["calibration"])[where] = [line]
+    html, text = page(loop)
+    assert 'class="verdict unexplained"' in html
+    assert f"Nothing found beyond noise; {asked}" in text
+
+
 def test_a_first_pose_of_unknown_history_is_left_out_and_not_to_be_taken_again(loop: dict[str, Any]) -> None:
     loop["calibration"]["poses"][0] |= {"used": False, "left_out": "unknown_history"}
     _, text = page(loop)
