@@ -81,7 +81,7 @@ def test_one_pose_that_is_off_is_seen_more_often_than_by_the_sum_of_squares(know
 
 @pytest.mark.parametrize("pure_dof", [12.0, 200.0])
 def test_noise_alone_is_called_something_as_seldom_as_claimed(known: Known, pure_dof: float) -> None:
-    rng, runs, noise = np.random.default_rng(3), 100, NoiseLevels.known_by(pure_dof)
+    rng, runs, noise = np.random.default_rng(3), 60, NoiseLevels.known_by(pure_dof)
     truth = np.sqrt(noise.drawn(runs, rng))
     p = np.array([known.p(rng.standard_normal(N) * scale, noise) for scale in truth])
     for level in (0.01, 0.05, 0.2, 0.5):
@@ -141,7 +141,7 @@ SLOW_OR_NOT = NoiseLevels.of(np.array([0.9, 0.1]), np.array([1.0, 6.0]), np.arra
 
 
 def test_noise_that_may_be_slow_is_called_something_as_seldom_as_claimed(known: Known) -> None:
-    rng, runs = np.random.default_rng(5), 100
+    rng, runs = np.random.default_rng(5), 60
     truth = np.sqrt(SLOW_OR_NOT.drawn(runs, rng))
     p = np.array([known.p(rng.standard_normal(N) * scale, SLOW_OR_NOT) for scale in truth])
     for level in (0.01, 0.05, 0.2):
