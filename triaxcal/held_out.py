@@ -57,7 +57,7 @@ def held_out(
     misfit = {name: _deviance(*found) for name, found in errors.items()}
     most = min([_deviance(*last), *(m + 2 * NEAR for m in misfit.values())]) - NEAR  # near the best, far from the last
     linear = _deviance(first[0], last[1])
-    none_better = linear < min([_deviance(*last) - NEAR, *misfit.values()])
+    none_better = linear < min([_deviance(*last) - NEAR, *misfit.values()]) and _rms(first[0]) < _rms(last[0])
     better = [] if none_better else sorted((n for n, m in misfit.items() if m < most), key=lambda n: rms[n])
     return HeldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), rms, tuple(better), none_better)
 

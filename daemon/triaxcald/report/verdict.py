@@ -73,6 +73,8 @@ def _judged(outcome: Outcome, certificate_limits: Mapping[str, float | None], ex
         if outcome.unexplained is not None and outcome.unexplained.or_spoiled:
             headline = "Spoiled poses or an effect; poses to take again"
             what = f"something spoiled poses, which were left out, or an effect acts. {_errors(outcome)}"
+        elif _spoiled(outcome) or _rejected(outcome):
+            headline = f"{headline}; poses to take again"
         sentence = f"{kept}{what}" if kept else f"{what[0].upper()}{what[1:]}"
         return Verdict("unexplained", headline, sentence, reservations, checks)
     if open_checks or not (checks or _tested(outcome)):
