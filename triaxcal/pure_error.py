@@ -40,14 +40,13 @@ def pure_error_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
 
 
 def noise_levels(poses: Sequence[Pose]) -> NoiseLevels:
-    """How large the noise of the poses, of which none is known better than the others, may be: by the degrees of
-    freedom alone where they are of several recordings."""
-    first = poses[0]
+    """How large the noise of all poses together may be: by the degrees of freedom alone where they are of several
+    recordings."""
+    first, dof = poses[0], max(pure_error_dof(poses), 1.0)
     common = first.noise_levels
     if common is None or any(p.noise_levels is not common for p in poses):
-        return NoiseLevels.known_by(max(pure_error_dof(poses), 1.0))
-    own = np.maximum(1 / np.maximum(pose_dof(poses), 1.0) - 1 / first.shared_dof, 0.0)
-    return common.blurred(float(own.sum()) / len(poses) ** 2)
+        return NoiseLevels.known_by(dof)
+    return common.blurred(max(1 / dof - 1 / first.shared_dof, 0.0))
 
 
 def lack_of_fit_p(chi2: float, left: int, pure_dof: float) -> float | None:

@@ -9,11 +9,21 @@ import numpy as np
 
 from triaxcal.explanation import left_out
 from triaxcal.loop import diagnose
+from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
 SIGMA = 1.5e-5
 SIGNS = (-1, -1, -1)
+
+
+def with_one_off(unit: Sensor, ups: np.ndarray, sigmas: float, seed: int) -> tuple[list[Pose], int]:
+    """Poses in random order, one of which is off by so many standard errors, and which."""
+    rng = np.random.default_rng(seed)
+    poses = noisy_poses(unit, ups[rng.permutation(len(ups))], SIGMA, rng)
+    bad = int(rng.integers(len(ups)))
+    poses[bad] = replace(poses[bad], mean=poses[bad].mean * (1 + sigmas * SIGMA))
+    return poses, bad
 
 
 def test_an_effect_is_not_taken_for_spoiled_poses(
@@ -55,10 +65,7 @@ def test_a_pose_left_out_where_an_effect_would_explain_as_much_is_unexplained(
     """Of 14 poses; with 26 a pose as far off is spoiled and nothing else."""
     open_, certain = 0, 0
     for seed in range(6):
-        rng = np.random.default_rng(seed)
-        poses = noisy_poses(paper_unit, fourteen[rng.permutation(14)], SIGMA, rng)
-        bad = int(rng.integers(14))
-        poses[bad] = replace(poses[bad], mean=poses[bad].mean * (1 + 15 * SIGMA))
+        poses, bad = with_one_off(paper_unit, fourteen, 15, seed)
         loop = diagnose(poses, signs=SIGNS, empirical=True)
         assert left_out(loop.after) == (bad,)
         assert not loop.findings
@@ -82,10 +89,7 @@ def test_a_pose_hardly_off_enough_to_be_left_out_is_as_open(paper_unit: Sensor, 
     """The best explanation has no pose left out there, and none adopted: the calibration is without the pose."""
     told = []
     for seed in range(12):
-        rng = np.random.default_rng(seed)
-        poses = noisy_poses(paper_unit, fourteen[rng.permutation(14)], SIGMA, rng)
-        bad = int(rng.integers(14))
-        poses[bad] = replace(poses[bad], mean=poses[bad].mean * (1 + 9 * SIGMA))
+        poses, bad = with_one_off(paper_unit, fourteen, 9, seed)
         loop = diagnose(poses, signs=SIGNS)
         assert not loop.findings
         if left_out(loop.after) == (bad,):
@@ -113,10 +117,7 @@ def test_a_spoiled_pose_shows_beside_an_effect_once_the_effect_is_in_the_model(
 def test_a_pose_that_is_off_but_stays_in_the_fit_is_unexplained(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     """Too little off to be left out: what the search makes of the others does not excuse it."""
     for seed in (2, 15, 44, 92):
-        rng = np.random.default_rng(seed)
-        poses = noisy_poses(paper_unit, twenty_six[rng.permutation(26)], SIGMA, rng)
-        bad = int(rng.integers(26))
-        poses[bad] = replace(poses[bad], mean=poses[bad].mean * (1 + 6 * SIGMA))
+        poses, _ = with_one_off(paper_unit, twenty_six, 6, seed)
         loop = diagnose(poses, signs=SIGNS)
         assert not loop.findings
         assert not left_out(loop.after)

@@ -78,9 +78,10 @@ def verify_command(a: argparse.Namespace) -> int:
     model = model_of(sensor, channel_reference, reference)
     found = _verified(measured, model, where=a.calibration)
     assert found.rms_g is not None
-    own = shape_beside(model, measured.poses)
-    held = shape_in(calibration_part(document, where=a.calibration))
-    warnings = unlike(measured.name, found.rms_g, reference) or unlike_shapes(a.calibration, measured.name, held, own)
+    warnings = unlike(measured.name, found.rms_g, reference)
+    if not warnings:
+        held = shape_in(calibration_part(document, where=a.calibration))
+        warnings = unlike_shapes(a.calibration, measured.name, held, shape_beside(model, measured.poses))
     if left := [e.name for e, _ in sensor.effects if {TIME, SINCE_START, RUN} & set(e.needs)]:
         warnings.append(
             f"{', '.join(left)} in {a.calibration} belongs to the recording that it was made from, and counts as zero"

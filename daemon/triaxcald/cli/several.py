@@ -123,10 +123,10 @@ def doubts_of_one_unit(recordings: Sequence[Measured], loop: Loop, choice: Choic
 def doubts_of_check(measured: Measured, check: Measured, loop: Loop, choice: Choice) -> list[str]:
     """A line where the held-out poses can hardly be of the unit of those diagnosed in ``loop``."""
     assert loop.held_out is not None
+    if said := unlike(check.name, loop.held_out.before_rms_g, choice.reference):
+        return said
     own = shape_by_poses(check.poses, choice.signs, choice.reference)
-    return unlike(check.name, loop.held_out.before_rms_g, choice.reference) or unlike_shapes(
-        measured.name, check.name, shape_of(loop.before), own
-    )
+    return unlike_shapes(measured.name, check.name, shape_of(loop.before), own)
 
 
 def _serial(m: Measured) -> str | None:
