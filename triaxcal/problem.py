@@ -27,6 +27,8 @@ Linearised = tuple[Floats, Floats, Floats]
 """Residuals (n,), their derivatives by theta (n, 9+p), their standard errors (n,)."""
 NOT_STILL = "the poses do not look like those of one still triad"
 STEPS_MOST = 60
+HALVES = 0.5 ** np.arange(13)
+"""Shares of a step that are tried, until one is no worse."""
 NEARBY = 1e-6
 """Share of a shape by which it is moved to find the derivative."""
 CONVERGED = 1e-12
@@ -115,35 +117,35 @@ def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: in
 
 
 def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps: int) -> State:
-    for _ in range(steps):
-        r, J, s = everything(problem, State(theta, effects))
+    here: Linearised | None = None
+    for left in reversed(range(steps)):
+        r, J, s = here or everything(problem, State(theta, effects))
         if not (np.isfinite(J).all() and np.isfinite(r).all()):
             raise Refused(f"the fit ran away; {NOT_STILL}")
         norm = np.linalg.norm(J / s[:, None], axis=0)
         norm[norm == 0] = 1.0
         step = -np.linalg.lstsq(J / s[:, None] / norm, r / s, rcond=1e-14)[0] / norm
-        cost = float(np.sum((r / s) ** 2))
-        scale = 1.0
-        for _ in range(12):
-            if _cost(problem, State(theta + scale * step, effects), s) <= cost * (1 + 1e-9) + 1e-12:
-                break
-            scale /= 2
-        theta = theta + scale * step
-        size = np.linalg.norm(step * norm) / max(float(np.linalg.norm(theta * norm)), 1e-300)
+        size = np.linalg.norm(step * norm) / max(float(np.linalg.norm((theta + step) * norm)), 1e-300)
         if size < CONVERGED:
-            return State(theta, effects)
+            return State(theta + step, effects)
+        cost = float(np.sum((r / s) ** 2))
+        for scale in HALVES:
+            # Hardly any step is halved: a trial brings the derivatives along, unless none are wanted after it.
+            here = _tried(problem, State(theta + scale * step, effects), jacobian=left > 0)
+            if here is not None and float(np.sum((here[0] / s) ** 2)) <= cost * (1 + 1e-9) + 1e-12:
+                break
+        theta = theta + scale * step
     if steps == STEPS_MOST and size > 1e-9:
         raise Refused(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e}); {NOT_STILL}")
     return State(theta, effects)
 
 
-def _cost(problem: Problem, state: State, s: Floats) -> float:
-    """Sum of squares of a trial step, with the standard errors from before it; infinite where it goes too far."""
+def _tried(problem: Problem, state: State, jacobian: bool) -> Linearised | None:
+    """None where a step goes too far for the model."""
     try:
-        trial, _, _ = everything(problem, state, jacobian=False)
+        return everything(problem, state, jacobian)
     except Refused:
-        return np.inf
-    return float(np.sum((trial / s) ** 2))
+        return None
 
 
 def everything(problem: Problem, state: State, jacobian: bool = True) -> Linearised:

@@ -99,7 +99,7 @@ class Sensor:
         with np.errstate(over="ignore", invalid="ignore"):  # beyond what the model holds for it may go anywhere
             for _ in range(50):
                 miss = s + self.departure(s, conditions) - v
-                step = _solved(np.eye(3) + self.departure_slope(s, conditions), miss)
+                step = _solved(self.departure_slope(s, conditions), miss)
                 s -= step
                 if np.max(np.abs(step), initial=0.0) <= SOLVE_TOLERANCE * np.max(np.abs(v), initial=1.0):
                     break
@@ -117,8 +117,7 @@ class Sensor:
         length = np.linalg.norm(a, axis=1)
         by_s = by_v = (a / length[:, None]) @ inverse
         if self.effects:
-            slope = np.eye(3) + self.departure_slope(s, conditions)
-            by_v = _solved(slope.transpose(0, 2, 1), by_s)
+            by_v = _solved(self.departure_slope(s, conditions).transpose(0, 2, 1), by_s)
         return Radius(length, s, a, by_s, by_v)
 
     def magnitude(self, u: Floats, conditions: Mapping[str, Floats]) -> tuple[Floats, Floats]:
@@ -127,9 +126,14 @@ class Sensor:
         return found.length, found.by_v / self.scale_factor
 
 
+_UNITY = np.eye(3)
+
+
 def _solved(slopes: Floats, right: Floats) -> Floats:
-    """(n,3) by slopes (n,3,3)."""
+    """(n,3) by unity and the slopes (n,3,3) of a departure."""
+    if not slopes.any():  # what acts on the bias alone
+        return right
     try:
-        return np.asarray(np.linalg.solve(slopes, right[..., None])[..., 0])
+        return np.asarray(np.linalg.solve(_UNITY + slopes, right[..., None])[..., 0])
     except np.linalg.LinAlgError:
         raise Refused("the model has no inverse at these readings: they lie far beyond what it holds for") from None
