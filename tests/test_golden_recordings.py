@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ def truth_of(name: str) -> dict[str, Any]:
     return document
 
 
+@cache
 def diagnosed(name: str) -> Any:
     return diagnose(measure(str(RECORDINGS / name)).poses, signs=(-1, -1, -1))
 

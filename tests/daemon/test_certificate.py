@@ -41,9 +41,12 @@ def _without_second_order(text: str) -> str:
     return re.sub(r'"second_order_.", ?', "", text)
 
 
-@pytest.fixture
-def certified(finished_run: Any) -> Callable[..., Certified]:
-    def make(bundle: Bundle | None = None, limits: str = "", signs: tuple[int, int, int] = (-1, -1, -1)) -> Certified:
+Make = Callable[..., Certified]
+
+
+@pytest.fixture(scope="module")
+def anew(finished_run: Any) -> Make:
+    def make(bundle: Bundle | None = None, limits: str = "") -> Certified:
         bundle = bundle or _bundle()
         text = STATION.replace("LIMITS", limits).encode()
         pipeline, digest = Pipeline(bundle, "readings"), RawDigest()
@@ -60,19 +63,25 @@ def certified(finished_run: Any) -> Callable[..., Certified]:
             digest,
             unit_name="can",
             serial="4711",
-            signs=signs,
+            signs=(-1, -1, -1),
             computed_with={"triaxcal": "9.9"},
         )
 
     return make
 
 
-def test_the_same_input_gives_the_same_bytes(certified: Callable[..., Certified]) -> None:
-    assert to_text(certified().document) == to_text(certified().document)
+@pytest.fixture(scope="module")
+def plain(anew: Make) -> Certified:
+    """By the built-in profile, without limits."""
+    return anew()
 
 
-def test_the_document_says_what_it_stands_on(certified: Callable[..., Certified], finished_run: Any) -> None:
-    document = certified().document
+def test_the_same_input_gives_the_same_bytes(anew: Make, plain: Certified) -> None:
+    assert to_text(anew().document) == to_text(plain.document)
+
+
+def test_the_document_says_what_it_stands_on(plain: Certified) -> None:
+    document = plain.document
     assert document["format"] == "triaxcal.certificate/1"
     assert document["unit"] == {"name": "can", "vendor": "triaxcal", "product": "TRIAX-REF", "serial": "4711"}
     assert document["software"] == {"triaxcal": "9.9"}
@@ -93,18 +102,16 @@ def test_the_document_says_what_it_stands_on(certified: Callable[..., Certified]
         ("verification_rms_g = 1e-9", "not judged", 0),
     ],
 )
-def test_the_verdict_follows_the_limits(
-    certified: Callable[..., Certified], limits: str, verdict: str, outside: int
-) -> None:
-    made = certified(limits=limits)
+def test_the_verdict_follows_the_limits(anew: Make, plain: Certified, limits: str, verdict: str, outside: int) -> None:
+    made = anew(limits=limits) if limits else plain
     assert made.document["verdict"] == verdict
     assert len(made.document["outside"]) == outside
     assert made.within_limits is (outside == 0)
     assert all(" is above the limit 0.001 µg" in line for line in made.document["outside"])
 
 
-def test_the_registers_hold_the_result_and_what_rounding_costs_is_said(certified: Callable[..., Certified]) -> None:
-    made = certified()
+def test_the_registers_hold_the_result_and_what_rounding_costs_is_said(plain: Certified) -> None:
+    made = plain
     registers = made.document["registers"]
     assert registers["terms"] == ["linear", "second_order_nonlinearity"]
     assert registers["left_to_host"] == []
@@ -120,10 +127,8 @@ def test_the_registers_hold_the_result_and_what_rounding_costs_is_said(certified
     assert made.image.words[-1].role == "calibration_crc"
 
 
-def test_an_effect_without_registers_is_left_to_the_host_and_the_rest_fitted_anew(
-    certified: Callable[..., Certified],
-) -> None:
-    full, cut = certified(), certified(_bundle(_without_second_order))
+def test_an_effect_without_registers_is_left_to_the_host_and_the_rest_fitted_anew(anew: Make, plain: Certified) -> None:
+    full, cut = plain, anew(_bundle(_without_second_order))
     assert cut.document["result"]["after"] == full.document["result"]["after"]
     registers = cut.document["registers"]
     assert registers["terms"] == ["linear"]
@@ -135,23 +140,23 @@ def test_an_effect_without_registers_is_left_to_the_host_and_the_rest_fitted_ane
 
 
 def test_a_device_without_calibration_registers_gets_a_certificate_all_the_same(
-    certified: Callable[..., Certified],
+    anew: Make,
 ) -> None:
     def without_roles(text: str) -> str:
         return re.sub(r', role = "(scale_factor|misalignment|bias)\.."', "", text)
 
-    made = certified(_bundle(without_roles))
+    made = anew(_bundle(without_roles))
     assert made.image is None
     assert made.document["registers"] is None
     assert made.document["result"]["findings"]
 
 
-def test_what_no_register_can_hold_is_refused(certified: Callable[..., Certified]) -> None:
+def test_what_no_register_can_hold_is_refused(anew: Make) -> None:
     def narrow(text: str) -> str:
         return text.replace("minimum = -10.0, maximum = 10.0", "minimum = -2.0, maximum = 2.0")
 
     with pytest.raises(RegisterValueError, match="scale_factor_x"):
-        certified(_bundle(narrow))
+        anew(_bundle(narrow))
 
 
 def test_too_few_poses_are_refused(finished_run: Any, tmp_path: Path) -> None:
@@ -171,8 +176,8 @@ def test_too_few_poses_are_refused(finished_run: Any, tmp_path: Path) -> None:
         )
 
 
-def test_the_registers_have_a_budget_of_their_own_with_their_steps_in_it(certified: Callable[..., Certified]) -> None:
-    document = certified().document
+def test_the_registers_have_a_budget_of_their_own_with_their_steps_in_it(plain: Certified) -> None:
+    document = plain.document
     free = {x["source"]: x for x in document["result"]["calibration"]["uncertainty"]["budget"]}
     held = {x["source"]: x for x in document["registers"]["uncertainty"]["budget"]}
     assert set(held) - set(free) == {"register_rounding"}

@@ -28,14 +28,18 @@ def checked(unit: Sensor, fourteen: np.ndarray, seed: int) -> tuple[Loop, list[P
     return diagnose(poses_of(unit, fourteen, rng), signs=MINUS, check=check), check
 
 
+@pytest.fixture(scope="module")
+def recordings(with_effects: Callable[..., Sensor], fourteen: np.ndarray) -> list[tuple[Loop, list[Pose]]]:
+    return [checked(with_effects(**SECOND), fourteen, seed) for seed in range(6)]
+
+
 def test_a_check_recording_speaks_for_the_truth_among_names_that_do_as_well(
-    with_effects: Callable[..., Sensor], fourteen: np.ndarray
+    recordings: list[tuple[Loop, list[Pose]]],
 ) -> None:
     """Or for cross coupling, which contains the second order."""
     (name,) = SECOND
     mistaken = 0
-    for seed in range(12):
-        loop, _ = checked(with_effects(**SECOND), fourteen, seed)
+    for loop, _ in recordings:
         (finding,) = loop.findings
         held = loop.held_out
         assert held is not None
@@ -51,7 +55,7 @@ def test_a_check_recording_speaks_for_the_truth_among_names_that_do_as_well(
             assert set(held.better) <= {name, "cross_coupling"}
             (line,) = speaks
             assert f"{name} ({1e6 * held.instead[name]:.3g} µg)" in line
-    assert 1 <= mistaken < 12
+    assert 1 <= mistaken < len(recordings)
 
 
 def test_where_no_effect_does_better_than_the_linear_model_in_the_check_recording_advice_says_so(
@@ -73,9 +77,9 @@ def test_where_no_effect_does_better_than_the_linear_model_in_the_check_recordin
 
 
 def test_the_error_of_an_alternative_is_that_of_its_own_fit(
-    with_effects: Callable[..., Sensor], fourteen: np.ndarray
+    recordings: list[tuple[Loop, list[Pose]]],
 ) -> None:
-    loop, check = checked(with_effects(**SECOND), fourteen, 0)
+    loop, check = recordings[0]
     assert loop.held_out
     assert loop.held_out.instead
     for name, rms in loop.held_out.instead.items():
@@ -87,9 +91,9 @@ def test_the_error_of_an_alternative_is_that_of_its_own_fit(
 
 
 def test_an_alternative_whose_channel_the_check_recording_lacks_is_passed_over(
-    with_effects: Callable[..., Sensor], fourteen: np.ndarray
+    recordings: list[tuple[Loop, list[Pose]]],
 ) -> None:
-    loop, check = checked(with_effects(**SECOND), fourteen, 0)
+    loop, check = recordings[0]
     assert loop.held_out
     thermal = {name for name in loop.held_out.instead if name.startswith("temperature_")}
     assert thermal

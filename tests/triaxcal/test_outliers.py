@@ -32,7 +32,7 @@ def left_out(c: Calibration) -> list[int]:
     return [i for i, p in enumerate(c.poses) if not p.used]
 
 
-@pytest.mark.parametrize("sigmas", [10, 30, 100, 1000])
+@pytest.mark.parametrize("sigmas", [10, 30, 1000])
 @pytest.mark.parametrize("number", [1, 2])
 def test_one_or_two_spoiled_poses_of_the_26_are_named(
     paper_unit: Sensor, twenty_six: np.ndarray, number: int, sigmas: float
@@ -63,7 +63,7 @@ def test_a_clean_set_hardly_ever_loses_a_pose(poses: int, excess: float, dof: fl
     assert clean_loses(poses, runs, excess, dof) <= stats.binom.ppf(0.999, runs, 0.01) / runs
 
 
-@pytest.mark.parametrize("sigmas", [10.0, 30.0, 1000.0])
+@pytest.mark.parametrize("sigmas", [10.0, 1000.0])
 def test_a_spoiled_pose_of_the_14_is_named_nearly_as_often_as_it_can_be(sigmas: float) -> None:
     runs = 120
     found = measure(14, 1, sigmas, runs, peer=False)

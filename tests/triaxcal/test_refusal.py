@@ -124,7 +124,7 @@ def test_the_poses_wanted_mend_a_deficient_set_in_one_round(kind: str, alike: bo
     rng = np.random.default_rng(KINDS.index(kind))
     where = dict(cube_directions())
     refused = 0
-    for _ in range(25):
+    for _ in range(25 if kind == "nine of fourteen" else 16):
         sensor, signs = a_triad(rng, alike)
         there, error = deficient(kind, rng), 10 ** rng.uniform(-6, -3.5)
         wanted = wanted_by(noisy_poses(sensor, there, error, rng), signs)
@@ -240,10 +240,8 @@ def test_the_singular_nine_pose_subsets_of_the_fourteen_and_only_they_are_refuse
             return True
         return False
 
-    some = np.random.default_rng(0).permutation(len(subsets))[:400]
-    every_singular = np.flatnonzero(singular)
-    assert all(refused(subsets[i]) for i in every_singular)
-    assert [refused(subsets[i]) for i in some] == singular[some].tolist()
+    assert all(refused(subset) for subset in subsets[singular])
+    assert not any(refused(subset) for subset in np.random.default_rng(0).permutation(subsets[~singular])[:150])
 
 
 def test_any_eleven_of_the_fourteen_are_enough(paper_unit: Sensor, fourteen: np.ndarray) -> None:

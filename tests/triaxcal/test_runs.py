@@ -250,7 +250,7 @@ def test_a_scale_factor_that_differs_from_run_to_run_is_named() -> None:
 def test_the_residual_by_run_is_the_rms_over_its_poses() -> None:
     rng = np.random.default_rng(4)
     runs = [recording(rng, count=14), recording(rng, lambda t: np.outer(t, [2e-6, 0, 0]), count=18)]
-    loop = diagnose(together(runs), signs=SIGNS, catalogue=FEW)
+    loop = diagnose(together(runs), signs=SIGNS, catalogue=(BiasDrift(),))
     first, second = residuals_by_run(loop.before, loop.after)
     assert (first.poses, second.poses) == (14, 18)
     off = [p.residual_g for p in loop.after.poses]

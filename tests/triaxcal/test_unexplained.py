@@ -147,7 +147,7 @@ def waves(ups: np.ndarray) -> np.ndarray:
 def test_the_lead_is_the_pattern_that_is_there(
     pattern: Callable[[np.ndarray], np.ndarray], words: str, fitted: Fitted, ups: np.ndarray
 ) -> None:
-    for seed in range(5):
+    for seed in range(2):
         left = unexplained_of(fitted(12 * pattern(ups), seed), {})
         assert left.significant
         first = left.lead.split("; ")[0]
@@ -175,13 +175,13 @@ def test_one_pose_that_was_not_still_is_named_by_its_time(fitted: Fitted, ups: n
 
 def test_where_nothing_stands_out_nothing_is_made_up(fitted: Fitted, ups: np.ndarray) -> None:
     """Every pose off by an amount of its own: of 100 a lead is declared for one, by chance."""
-    runs, leads = 30, 0
+    runs, leads = 24, 0
     for seed in range(runs):
         rng = np.random.default_rng(1000 + seed)
         text = lead(fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)), seed), {})
         leads += text != "no candidate comes near, and no pose, pattern or channel stands out"
-    # binom.isf(1e-3, 40, 0.01)
-    assert leads <= 3
+    # binom.isf(2e-3, 24, 0.01)
+    assert leads <= 2
 
 
 MANY: list[Sequence[Effect]] = [[BiasDrift(3)], [Empirical("even")], [BiasDrift(3), Empirical("even")]]
@@ -205,15 +205,14 @@ def test_beside_effects_in_the_model_the_lead_is_what_they_leave(
     assert int(first.split("%")[0]) > 95
 
 
-@pytest.mark.parametrize("effects", MANY, ids=lambda e: len(e))
-def test_beside_effects_in_the_model_nothing_is_made_up(
-    effects: Sequence[Effect], fitted: Fitted, ups: np.ndarray
-) -> None:
-    runs, leads = 40, 0
+def test_beside_effects_in_the_model_nothing_is_made_up(fitted: Fitted, ups: np.ndarray) -> None:
+    effects = [BiasDrift(3), Empirical("even")]
+    runs, leads = 30, 0
     for seed in range(runs):
         off = 8 * SIGMA_G * ups * np.random.default_rng(1000 + seed).standard_normal((N, 1))
         leads += "goes with" in lead(fitted(off, seed, effects), {})
-    assert leads <= 4
+    # binom.isf(1e-3, 30, 0.01)
+    assert leads <= 3
 
 
 def test_effects_that_came_near_are_told_with_their_reasons(fitted: Fitted, ups: np.ndarray) -> None:

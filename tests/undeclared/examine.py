@@ -137,10 +137,6 @@ def overstated(loop: Loop, r: Recording) -> float:
     return Linear.of(r.triad, u, r.errors_g).size(miss) / Linear.of(r.triad, u, stated).size(miss)
 
 
-def diagnosed(r: Recording) -> Loop:
-    return diagnose(still_poses(r.samples()), signs=r.signs, check=still_poses(r.held_out_samples()))
-
-
 def examine(case: Case) -> Outcome:
     """Whatever goes wrong in the loop is an outcome too."""
     try:
@@ -159,15 +155,16 @@ def _told_power(r: Recording) -> float:
 
 
 def _compared(truth: Outcome, r: Recording) -> Outcome:
-    poses, check = still_poses(r.samples()), still_poses(r.held_out_samples())
+    poses = still_poses(r.samples())
+    check = still_poses(r.held_out_samples()) if truth.case.held_out else None
     loop = diagnose(poses, signs=r.signs, check=check)
-    nine, told = told_errors_g(r)
+    if check is not None:
+        nine, told = told_errors_g(r)
+        truth = replace(truth, after_ratio=_held_out(loop, check, r) / _alone(r), told_ratio=told / nine)
     return replace(
         truth,
         found=tuple((f.effect, f.verdict, tuple(f.alternatives)) for f in loop.findings),
         unexplained=bool(loop.unexplained.significant),
-        after_ratio=_held_out(loop, check, r) / _alone(r) if truth.case.held_out else float("nan"),
-        told_ratio=told / nine,
         poses_found=len(poses),
         moving=moving(poses, r),
         overstated=overstated(loop, r),

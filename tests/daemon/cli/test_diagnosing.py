@@ -46,23 +46,33 @@ def write(path: Path, seed: int, *, settling_g: float = 0.0, step_g: float = 0.0
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("diagnosing")
+def folder(once: Callable[..., Path]) -> Path:
+    def make(folder: Path) -> None:
+        write(folder / "settling.csv", 1, settling_g=5e-3)
+        write(folder / "rippled.csv", 3, ripple=1e-3)
+        write(folder / "warm.csv", 6, settling_g=5e-3, warms_k=1.0)
+
+    return once("diagnosing", make)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def settling(folder: Path) -> Path:
-    return write(folder / "settling.csv", 1, settling_g=5e-3)
+    return folder / "settling.csv"
 
 
-@pytest.fixture(scope="module")
-def knocked(folder: Path) -> Path:
-    return write(folder / "knocked.csv", 2, step_g=2e-3)
+@pytest.fixture
+def knocked(tmp_path: Path) -> Path:
+    return write(tmp_path / "knocked.csv", 2, step_g=2e-3)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def rippled(folder: Path) -> Path:
-    return write(folder / "rippled.csv", 3, ripple=1e-3)
+    return folder / "rippled.csv"
+
+
+@pytest.fixture
+def warm(folder: Path) -> Path:
+    return folder / "warm.csv"
 
 
 def empirical_lines(said: str) -> list[str]:
@@ -76,10 +86,10 @@ def cells(said: str, name: str) -> list[str]:
 
 
 def test_a_warm_up_is_told_with_its_time_constant_and_the_values_are_said_to_hold_long_after_it(
-    settling: Path, triaxcal: Run
+    settling: Path, asked: Run
 ) -> None:
-    said = triaxcal("diagnose", settling).out
-    document = triaxcal("diagnose", settling, "--json").json
+    said = asked("diagnose", settling).out
+    document = asked("diagnose", settling, "--json").json
     _, value, error, _, unit = cells(said, "warm_up.time_constant")
     assert float(value) == pytest.approx(40.0, abs=5 * float(error))
     assert unit == "s"
@@ -100,55 +110,52 @@ def test_a_step_is_told_with_its_moment_and_the_values_are_said_to_hold_after_it
     assert "held_s" not in said
 
 
-def test_values_that_hold_always_are_not_said_to_hold_anywhere(rippled: Path, triaxcal: Run) -> None:
-    assert "hold" not in triaxcal("fit", rippled).out.split("uncertainty")[0]
-    assert triaxcal("fit", rippled, "--json").json["holds"] == []
+def test_values_that_hold_always_are_not_said_to_hold_anywhere(rippled: Path, asked: Run) -> None:
+    assert "hold" not in asked("fit", rippled).out.split("uncertainty")[0]
+    assert asked("fit", rippled, "--json").json["holds"] == []
 
 
 def test_values_without_an_effect_of_temperature_are_said_to_be_those_at_the_mean_of_the_poses(
-    folder: Path, rippled: Path, triaxcal: Run
+    warm: Path, rippled: Path, asked: Run
 ) -> None:
     said = "scale factor, misalignment and bias are those at temp_c = "
-    assert f"{said}25 °C\n" in triaxcal("fit", rippled).out
-    warm = folder / "warm.csv"
-    shown = triaxcal("fit", write(warm, 5, settling_g=5e-3, warms_k=1.0)).out
-    poses = triaxcal("fit", warm, "--json").json["poses"]
+    assert f"{said}25 °C\n" in asked("fit", rippled).out
+    shown = asked("fit", warm).out
+    poses = asked("fit", warm, "--json").json["poses"]
     temp_c = [pose["channels"]["temp_c"] for pose in poses if pose["used"]]
     mean, low, high = (f"{v:.4g}" for v in (np.mean(temp_c), min(temp_c), max(temp_c)))
     assert f"{said}{mean} °C, the mean of the poses ({low} to {high} °C)\n" in shown
 
 
 def test_a_budget_that_temperature_dominates_says_what_of_it_is_assumed(
-    folder: Path, rippled: Path, triaxcal: Run
+    warm: Path, rippled: Path, tmp_path: Path, triaxcal: Run, asked: Run
 ) -> None:
-    warm = write(folder / "assumed.csv", 6, settling_g=5e-3, warms_k=1.0)
     said = "temperature: where the poses do not tell, this is an assumption, typical of data sheets: bias 500 "
-    assert f"{said}µg/K and scale factor 300 ppm/K; " in triaxcal("fit", warm).out
+    assert f"{said}µg/K and scale factor 300 ppm/K; " in asked("fit", warm).out
     assert f"{said}ppm of the reference per K and scale" in triaxcal("fit", warm, "--reference", "9.80665").out
-    page = folder / "assumed.html"
+    page = tmp_path / "assumed.html"
     triaxcal("fit", warm, "--report", page)
     assert "Where the poses do not tell, this is an assumption, typical of data sheets: bias 500" in page.read_text()
-    assert "assumption" not in triaxcal("fit", rippled, "--report", page).out
-    assert "this is an assumption" not in page.read_text("utf-8")
+    assert "assumption" not in asked("fit", rippled).out
 
 
 def test_no_probability_is_said_to_be_nothing_and_no_error_has_an_exponent(
-    rippled: Path, settling: Path, triaxcal: Run
+    rippled: Path, settling: Path, asked: Run
 ) -> None:
-    said = triaxcal("diagnose", rippled).out + triaxcal("diagnose", settling).out
+    said = asked("diagnose", rippled).out + asked("diagnose", settling).out
     assert "lack of fit p < 1e-12" in said
     assert "familywise p < 1e-12" in said
     assert not re.search(r"p 0(?![.\d])|e[+-]\d+ µg", said)
 
 
-def test_the_reason_has_the_errors_of_the_table_above_it(settling: Path, triaxcal: Run) -> None:
-    said = triaxcal("diagnose", settling).out
+def test_the_reason_has_the_errors_of_the_table_above_it(settling: Path, asked: Run) -> None:
+    said = asked("diagnose", settling).out
     _, before, after = cells(said, "cross-validated rms")
     assert f"falls from {before} µg to {after} µg (noise floor" in said
 
 
-def test_what_no_effect_explains_is_described_only_where_that_is_asked_for(folder: Path, triaxcal: Run) -> None:
-    recording = write(folder / "swollen.csv", 4, swell=4e-3)
+def test_what_no_effect_explains_is_described_only_where_that_is_asked_for(tmp_path: Path, triaxcal: Run) -> None:
+    recording = write(tmp_path / "swollen.csv", 4, swell=4e-3)
     plainly = triaxcal("diagnose", recording, "--json").json
     assert not empirical_lines("\n".join(plainly["advice"]))
     assert "empirical" not in plainly["calibration"]["terms"]
@@ -171,9 +178,11 @@ def test_the_console_explains_the_shares_of_what_is_left(
     assert re.search(r"unexplained: \S+ µg rms; (.+)\nshares of what is unexplained: of \1\n", said)
 
 
-def test_one_line_says_why_the_empirical_term_is_not_in_the_model(rippled: Path, settling: Path, triaxcal: Run) -> None:
+def test_one_line_says_why_the_empirical_term_is_not_in_the_model(
+    rippled: Path, settling: Path, triaxcal: Run, asked: Run
+) -> None:
     (tried,) = empirical_lines(triaxcal("diagnose", rippled, "--empirical").out)
-    after = triaxcal("diagnose", rippled, "--json").json["after"]["cross_validated_rms_g"]
+    after = asked("diagnose", rippled, "--json").json["after"]["cross_validated_rms_g"]
     assert tried.startswith("advice: empirical: tried, but not in the model: ")
     assert f"the cross-validated error goes from {after * 1e6:.1f} µg to " in tried
     (not_tried,) = empirical_lines(triaxcal("diagnose", settling, "--empirical").out)
@@ -198,14 +207,14 @@ def test_the_reference_explains_the_columns_of_units_in_the_same_words(column: s
 
 
 def test_of_poses_that_can_show_no_effect_the_console_says_so_and_not_that_there_is_none(
-    folder: Path, rippled: Path, triaxcal: Run
+    tmp_path: Path, rippled: Path, triaxcal: Run, asked: Run
 ) -> None:
-    few = folder / "ten.csv"
+    few = tmp_path / "ten.csv"
     few.write_text("".join(rippled.read_text("utf-8").splitlines(keepends=True)[: int(10 * 7 * RATE_HZ)]), "utf-8")
     assert "no effect of the catalogue shows; none could in full, with so few or such poses\n" in (
         triaxcal("diagnose", few).out
     )
-    assert "none could" not in triaxcal("diagnose", rippled).out
+    assert "none could" not in asked("diagnose", rippled).out
 
 
 def test_an_error_that_cannot_be_cross_validated_is_no_dash_in_a_sentence() -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from triaxcal.plan.directions import directions
 from triaxcald.recording.frames import MAGIC
 
 Run = Callable[..., Any]
@@ -76,10 +79,8 @@ def _reading_commands(path: Path) -> list[list[Any]]:
 
 
 @pytest.fixture
-def good(finished_run: Any, tmp_path: Path, triaxcal: Run) -> Path:
-    path = tmp_path / "good.json"
-    assert triaxcal("fit", finished_run.can, "-o", path).code == 0
-    return path
+def good(calibrations: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(calibrations / "linear.json", tmp_path / "good.json"))
 
 
 def _each_fails(path: Path, triaxcal: Run, words: str) -> None:
@@ -185,15 +186,23 @@ def test_a_calibration_by_temperature_needs_the_temperature(finished_run: Any, t
     triaxcal("verify", path, csv).failed(2, "temp_c")
 
 
+@pytest.fixture
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Still for 1.6 s in each of fourteen poses; in a folder of its own."""
+    a = np.repeat([v for _, v in directions(14)], 80, axis=0)
+    a = a + 1e-4 * np.random.default_rng(1).standard_normal(a.shape)
+    path = tmp_path_factory.mktemp("short") / "fourteen.csv"
+    path.write_text(HEADER + "".join(f"{i / 50},{x:.6f},{y:.6f},{z:.6f}\n" for i, (x, y, z) in enumerate(a)))
+    return path
+
+
 @pytest.mark.parametrize("option", ["-o", "--report"])
 @pytest.mark.parametrize("where", ["missing/x", "file/x", "folder"])
-def test_a_place_where_no_result_can_go(
-    finished_run: Any, tmp_path: Path, triaxcal: Run, option: str, where: str
-) -> None:
+def test_a_place_where_no_result_can_go(short: Path, tmp_path: Path, triaxcal: Run, option: str, where: str) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     for command in ("fit", "diagnose"):
-        triaxcal(command, finished_run.can, option, tmp_path / where, "--json").failed(2, f"{tmp_path / where}: ")
+        triaxcal(command, short, option, tmp_path / where, "--json").failed(2, f"{tmp_path / where}: ")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
 
 

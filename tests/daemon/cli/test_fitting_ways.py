@@ -58,14 +58,15 @@ def turning(path: Path, sensor: Sensor, noise: float, reference: float = 1.0, co
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("ways")
-    still(folder / "14.csv", UNIT, UPS, 1e-3, 1)
-    still(folder / "check.csv", UNIT, UPS[::-1], 1e-3, 2)
-    still(folder / "4.csv", UNIT, UPS[2:6], 1e-3, 3)
-    turning(folder / "turning.csv", UNIT, 0.01)
-    (folder / "labels.csv").write_text("label\n" + "".join(f"{label}\n" for label, _ in PLAN))
-    return folder
+def files(once: Callable[..., Path]) -> Path:
+    def make(folder: Path) -> None:
+        still(folder / "14.csv", UNIT, UPS, 1e-3, 1)
+        still(folder / "check.csv", UNIT, UPS[::-1], 1e-3, 2)
+        still(folder / "4.csv", UNIT, UPS[2:6], 1e-3, 3)
+        turning(folder / "turning.csv", UNIT, 0.01)
+        (folder / "labels.csv").write_text("label\n" + "".join(f"{label}\n" for label, _ in PLAN))
+
+    return once("ways", make)
 
 
 def attitudes(folder: Path, text: str) -> Path:
@@ -261,9 +262,11 @@ def test_an_attitude_file_that_is_not_there(files: Path, triaxcal: Run, tmp_path
 
 
 @pytest.fixture
-def passport(files: Path, triaxcal: Run, tmp_path: Path) -> Path:
+def passport(files: Path, asked: Run, tmp_path: Path) -> Path:
+    done = asked("fit", files / "turning.csv", "--turning", SIGNS, "--output-unit", "V", "--json")
+    assert done.code == 0
     path = tmp_path / "passport.json"
-    assert triaxcal("fit", files / "turning.csv", "--turning", SIGNS, "--output-unit", "V", "-o", path).code == 0
+    path.write_text(done.out, "utf-8")
     return path
 
 

@@ -26,15 +26,24 @@ def _csv(path: Path, ups: list[Any]) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def folder(once: Callable[..., Path]) -> Path:
+    def make(folder: Path) -> None:
+        _csv(folder / "half.csv", [v for _, v in directions(26) if v[0] < 0.4])
+        _csv(folder / "fourteen.csv", [v for _, v in directions(14)])
+
+    return once("planning", make)
+
+
 @pytest.fixture
-def half(tmp_path: Path) -> Path:
+def half(folder: Path) -> Path:
     """Poses enough for a fit, and none with X up."""
-    return _csv(tmp_path / "half.csv", [v for _, v in directions(26) if v[0] < 0.4])
+    return folder / "half.csv"
 
 
 @pytest.fixture
-def fourteen(tmp_path: Path) -> Path:
-    return _csv(tmp_path / "fourteen.csv", [v for _, v in directions(14)])
+def fourteen(folder: Path) -> Path:
+    return folder / "fourteen.csv"
 
 
 def _x_of(document: Any) -> list[float]:
@@ -42,8 +51,8 @@ def _x_of(document: Any) -> list[float]:
     return [p["up"][0] for p in document["poses"]]
 
 
-def test_the_recording_may_follow_the_effects_that_it_is_wanted_for(half: Path, triaxcal: Run) -> None:
-    plain = triaxcal("plan", half, "--json").json
+def test_the_recording_may_follow_the_effects_that_it_is_wanted_for(half: Path, triaxcal: Run, asked: Run) -> None:
+    plain = asked("plan", half, "--json").json
     for effects in (["second_order_nonlinearity"], ["temperature_bias", "second_order_nonlinearity"]):
         after = triaxcal("plan", "--json", "--for", *effects, half)
         before = triaxcal("plan", half, "--json", "--for", *effects)
@@ -69,8 +78,8 @@ def test_poses_that_cannot_show_an_effect_are_told_which_others_do(fourteen: Pat
     assert all(v is not None for v in shown["promised"]["second_order_nonlinearity"].values())
 
 
-def test_what_each_added_pose_would_do_is_said(half: Path, triaxcal: Run) -> None:
-    document = triaxcal("plan", half, "--json").json
+def test_what_each_added_pose_would_do_is_said(half: Path, triaxcal: Run, asked: Run) -> None:
+    document = asked("plan", half, "--json").json
     dilutions = [document["dilution"], *(p["dilution"] for p in document["poses"])]
     assert dilutions == sorted(dilutions, reverse=True)
     assert dilutions[-1] <= 1.25 < dilutions[-2]
@@ -189,14 +198,14 @@ def test_an_effect_that_nobody_knows_is_named(half: Path, triaxcal: Run) -> None
     triaxcal("plan", "--for", half, "flat_earth").failed(2, f"--for {half}: no effect of that name")
 
 
-def test_the_signs_decide_which_way_is_up(half: Path, triaxcal: Run) -> None:
-    assert min(_x_of(triaxcal("plan", half, "--json").json)) > 0
+def test_the_signs_decide_which_way_is_up(half: Path, triaxcal: Run, asked: Run) -> None:
+    assert min(_x_of(asked("plan", half, "--json").json)) > 0
     assert min(_x_of(triaxcal("plan", half, "--json", "--sign=+,+,+").json)) > 0
     assert max(_x_of(triaxcal("plan", half, "--json", "--sign=-,+,+").json)) < 0
 
 
-def test_the_size_of_the_reference_does_not_change_the_plan(half: Path, triaxcal: Run) -> None:
-    plain = triaxcal("plan", half, "--json")
+def test_the_size_of_the_reference_does_not_change_the_plan(half: Path, triaxcal: Run, asked: Run) -> None:
+    plain = asked("plan", half, "--json")
     assert triaxcal("plan", half, "--json", "--reference", "50").json == plain.json
 
 

@@ -22,8 +22,6 @@ def test_audit_says_that_all_is_the_same(finished_run: Any, triaxcal: Run) -> No
     for audit in done.json["audits"]:
         assert audit["checked"] == ["certificate.json", "verification.json", "registers-after.json"]
         assert audit["differences"] == []
-    shown = triaxcal("audit", finished_run.can)
-    assert shown.out.startswith(f"{finished_run.can}: the same, byte for byte (certificate.json, ")
 
 
 def test_audit_ends_with_1_and_names_the_difference(
@@ -35,9 +33,9 @@ def test_audit_ends_with_1_and_names_the_difference(
     )
     done = triaxcal("audit", finished_run.can, path)
     assert done.code == 1
+    assert done.out.startswith(f"{finished_run.can}: the same, byte for byte (certificate.json, ")
     assert f"{path}: differs" in done.out
     assert '  certificate.json: station.name: stored "bench", computed again "Bench"' in done.out
-    assert triaxcal("audit", path, "--json").code == 1
 
 
 def test_info_tells_what_is_in_a_recording(finished_run: Any, triaxcal: Run) -> None:

@@ -36,9 +36,13 @@ def write(
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    folder = tmp_path_factory.mktemp("runs")
-    return [write(folder / "one.csv", 1), write(folder / "two.csv", 2, bias=3e-3)]
+def runs(once: Callable[..., Path]) -> list[Path]:
+    def make(folder: Path) -> None:
+        write(folder / "one.csv", 1)
+        write(folder / "two.csv", 2, bias=3e-3)
+
+    folder = once("several-runs", make)
+    return [folder / "one.csv", folder / "two.csv"]
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +55,12 @@ def settling(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_recordings_of_different_units_given_as_one_are_remarked_on(
-    tmp_path: Path, runs: list[Path], triaxcal: Run
+    tmp_path: Path, runs: list[Path], triaxcal: Run, asked: Run
 ) -> None:
     one, other = (write(tmp_path / f"{k:g}.csv", seed, k=k) for seed, k in ((1, 2.0), (2, 2.3)))
     remark = f"{one} and {other} do not look like one unit: |a| is off by 0."
     assert any(w.startswith(remark) for w in triaxcal("diagnose", one, other, "--json").json["calibration"]["warnings"])
-    assert "do not look like" not in triaxcal("diagnose", *runs).err
+    assert "do not look like" not in asked("diagnose", *runs).err
 
 
 def test_the_document_says_which_pose_is_of_which_recording(runs: list[Path], triaxcal: Run) -> None:
@@ -79,8 +83,10 @@ def test_the_document_says_which_pose_is_of_which_recording(runs: list[Path], tr
 
 def test_options_may_stand_between_recordings(runs: list[Path], triaxcal: Run) -> None:
     one, two = runs
-    between = triaxcal("diagnose", one, "--sign=+,+,+", two, "--json", "--output-unit", "V")
-    assert between.json == triaxcal("diagnose", one, two, "--sign=+,+,+", "--output-unit", "V", "--json").json
+    between = ["diagnose", str(one), "--sign=+,+,+", str(two), "--json", "--output-unit", "V"]
+    behind = ["diagnose", str(one), str(two), "--sign=+,+,+", "--output-unit", "V", "--json"]
+    assert parsed(parser("diagnose"), between) == parsed(parser("diagnose"), behind)
+    triaxcal("diagnose", one, "--sign=+,+,+", one, "--json").failed(2, "one.csv", "given twice")
     audits = parsed(parser("audit"), ["audit", str(one), "--json", str(two)])
     assert (audits.recordings, audits.json) == (runs, True)
 
@@ -104,8 +110,8 @@ def test_the_calibration_of_two_runs_serves_another(runs: list[Path], triaxcal: 
     assert verified.json["rms_g"] < 2 * verified.json["noise_floor_g"]  # the mean bias of the two is that of the third
 
 
-def test_a_person_sees_a_line_for_each_recording(runs: list[Path], triaxcal: Run) -> None:
-    said = triaxcal("diagnose", *runs).out
+def test_a_person_sees_a_line_for_each_recording(runs: list[Path], asked: Run) -> None:
+    said = asked("diagnose", *runs).out
     assert "by recording, µg rms" in said
     assert "one.csv" in said
     assert "two.csv" in said
@@ -157,7 +163,7 @@ def test_what_does_not_go_together_is_said_in_a_line(runs: list[Path], triaxcal:
 
 
 def test_a_channel_that_one_of_several_recordings_lacks_is_told(
-    runs: list[Path], triaxcal: Run, tmp_path: Path
+    runs: list[Path], triaxcal: Run, asked: Run, tmp_path: Path
 ) -> None:
     head, *rows = runs[1].read_text("utf-8").splitlines()
     warm = tmp_path / "warm.csv"
@@ -166,7 +172,7 @@ def test_a_channel_that_one_of_several_recordings_lacks_is_told(
     done = triaxcal("diagnose", runs[0], warm)
     assert done.err.count("temp_c") == done.err.count(f"warning: {told}\n") == 1
     assert told in triaxcal("diagnose", runs[0], warm, "--json").json["calibration"]["warnings"]
-    assert "temp_c" not in triaxcal("diagnose", *runs).err
+    assert "temp_c" not in asked("diagnose", *runs).err
 
 
 def test_help_says_that_the_order_of_several_recordings_is_that_of_time(triaxcal: Run) -> None:

@@ -44,14 +44,30 @@ def labels(html: str) -> list[str]:
     return re.findall(r'aria-label="([^"]*)"', html)
 
 
-@pytest.fixture
-def loop() -> dict[str, Any]:
-    """Nothing found."""
+def nothing_found() -> dict[str, Any]:
     document = copy.deepcopy(_SAMPLE)
     document["findings"], document["data_quality"], document["advice"], document["held_out"] = [], [], [], None
     document["before"] = document["after"]
     document["calibration"] |= {"terms": ["linear"], "effects": {}, "warnings": [], "blind_to": []}
     return document
+
+
+@pytest.fixture
+def loop() -> dict[str, Any]:
+    return nothing_found()
+
+
+@pytest.fixture
+def bare(loop: dict[str, Any]) -> dict[str, Any]:
+    """The same with poses whose residuals nobody knows: without their pictures, which take most of a page's time."""
+    for pose in loop["calibration"]["poses"]:
+        pose |= {"residual_g": None, "before_residual_g": None}
+    return loop
+
+
+@pytest.fixture(scope="module")
+def page_of_nothing() -> tuple[str, str]:
+    return page(nothing_found())
 
 
 @pytest.fixture
@@ -87,8 +103,8 @@ def add(document: dict[str, Any], effect: str, coefficients: dict[str, Any], **m
     )
 
 
-def test_nothing_found_says_so_in_the_first_sentence(loop: dict[str, Any]) -> None:
-    html, text = page(loop)
+def test_nothing_found_says_so_in_the_first_sentence(page_of_nothing: tuple[str, str]) -> None:
+    html, text = page_of_nothing
     assert text.index("Nothing found beyond noise") < text.index("No effect beyond the linear model was found.") < 300
     assert 'class="verdict within"' in html
     assert "Poses to take again" not in text
@@ -116,8 +132,12 @@ def test_a_step_is_marked_on_the_time_axis_and_said_to_lie_between_its_poses(loo
         f"between pose 4 and pose 5, that is between {poses[3]['end_s']:.1f} s and {poses[4]['start_s']:.1f} s" in text
     )
     assert ">Bias step</text>" in html
-    loop["findings"][0]["coefficients"]["at"]["value"] = poses[6]["start_s"] + 1.0
-    assert "The moment lies in pose 7." in page(loop)[1]
+
+
+def test_a_step_within_a_pose_is_said_to_lie_in_it(bare: dict[str, Any]) -> None:
+    at_s = bare["calibration"]["poses"][6]["start_s"] + 1.0
+    add(bare, "bias_step", {"x": (7e-4, 2e-5, "g"), "at": (at_s, None, "s")})
+    assert "The moment lies in pose 7." in page(bare)[1]
 
 
 def test_confounded_effects_are_all_told_in_words_with_what_would_tell_them_apart(words: dict[str, Any]) -> None:
@@ -174,6 +194,7 @@ def test_two_effects_are_a_ladder_of_three_models_above_the_channels_that_moved(
     for picture in (bars, sphere, time):
         assert "+ channel bias: supply_v" in picture
     assert re.search(r"before and \+ channel bias: supply_v and after, above temp_c$", time)
+    assert html.count(">After: + hysteresis</text>") == 2  # the panels of the last step say what it added
 
 
 def test_the_leads_of_what_is_unexplained_are_a_list(words: dict[str, Any]) -> None:
@@ -238,17 +259,17 @@ def test_poses_left_out_are_named_above_all_figures(loop: dict[str, Any]) -> Non
 @pytest.mark.parametrize("limits", [{}, {"limits": {"rms_g": 1e-3}}])
 @pytest.mark.parametrize("fault", ["saturation", "stuck_output", ""])
 def test_the_headline_is_not_that_all_is_well_while_poses_have_to_be_taken_again(
-    loop: dict[str, Any], limits: dict[str, Any], fault: str
+    bare: dict[str, Any], limits: dict[str, Any], fault: str
 ) -> None:
     good = "Within limits" if limits else "Nothing found beyond noise"
-    html, text = page(loop, limits)
+    html, text = page(bare, limits)
     assert 'class="verdict within"' in html
     assert f"{good}; poses" not in text
     if fault:
-        loop["data_quality"] = [f"{fault}: x at 2.1 in 687 samples, in the pose that begins at 171.6 s: take again"]
+        bare["data_quality"] = [f"{fault}: x at 2.1 in 687 samples, in the pose that begins at 171.6 s: take again"]
     else:
-        loop["calibration"]["poses"][4]["used"] = False
-    html, text = page(loop, limits)
+        bare["calibration"]["poses"][4]["used"] = False
+    html, text = page(bare, limits)
     assert 'class="verdict unexplained"' in html
     assert f"{good}; poses to take again" in text
 
@@ -266,41 +287,41 @@ def test_the_headline_is_not_that_all_is_well_while_poses_have_to_be_taken_again
     ],
 )
 def test_nothing_is_well_whose_times_or_unit_are_in_doubt(
-    loop: dict[str, Any], where: str, line: str, asked: str
+    bare: dict[str, Any], where: str, line: str, asked: str
 ) -> None:
-    assert asked not in page(loop)[1]
-    (loop if where == "data_quality" else loop["calibration"])[where] = [line]
-    html, text = page(loop)
+    assert asked not in page(bare)[1]
+    (bare if where == "data_quality" else bare["calibration"])[where] = [line]
+    html, text = page(bare)
     assert 'class="verdict unexplained"' in html
     assert f"Nothing found beyond noise; {asked}" in text
 
 
-def test_a_first_pose_of_unknown_history_is_left_out_and_not_to_be_taken_again(loop: dict[str, Any]) -> None:
-    loop["calibration"]["poses"][0] |= {"used": False, "left_out": "unknown_history"}
-    _, text = page(loop)
+def test_a_first_pose_of_unknown_history_is_left_out_and_not_to_be_taken_again(bare: dict[str, Any]) -> None:
+    bare["calibration"]["poses"][0] |= {"used": False, "left_out": "unknown_history"}
+    _, text = page(bare)
     assert "again" not in text
-    loop["calibration"]["poses"][0]["left_out"] = "spoiled"
-    assert "poses to take again" in page(loop)[1]
+    bare["calibration"]["poses"][0]["left_out"] = "spoiled"
+    assert "poses to take again" in page(bare)[1]
 
 
-def test_poses_left_out_or_an_effect_is_said_to_be_open(loop: dict[str, Any]) -> None:
-    loop["unexplained"] |= {"significant": True, "p_value": 2e-4, "lead": "most of it is the pose at 166.0 s"}
-    _, text = page(loop)
+def test_poses_left_out_or_an_effect_is_said_to_be_open(bare: dict[str, Any]) -> None:
+    bare["unexplained"] |= {"significant": True, "p_value": 2e-4, "lead": "most of it is the pose at 166.0 s"}
+    _, text = page(bare)
     assert "Unexplained error left" in text
-    loop["calibration"]["poses"][4]["used"] = False
-    assert "Unexplained error left; poses to take again" in page(loop)[1]
-    loop["unexplained"]["or_spoiled"] = True
-    _, text = page(loop)
+    bare["calibration"]["poses"][4]["used"] = False
+    assert "Unexplained error left; poses to take again" in page(bare)[1]
+    bare["unexplained"]["or_spoiled"] = True
+    _, text = page(bare)
     assert "Spoiled poses or an effect; poses to take again" in text
     assert "Unexplained error left" not in text
 
 
-def test_nothing_found_is_not_certain_where_the_fit_is_worse_than_noise(loop: dict[str, Any]) -> None:
-    _, text = page(loop)
+def test_nothing_found_is_not_certain_where_the_fit_is_worse_than_noise(bare: dict[str, Any]) -> None:
+    _, text = page(bare)
     assert "Nothing found beyond noise" in text
-    for block in (loop["after"], loop["calibration"]["residual"]):
+    for block in (bare["after"], bare["calibration"]["residual"]):
         block["lack_of_fit_p"] = 0.003
-    html, text = page(loop)
+    html, text = page(bare)
     assert 'class="verdict unexplained"' in html
     assert "Nothing certain found beyond noise" in text
 
@@ -462,13 +483,7 @@ def test_notes_that_would_lie_on_each_other_are_left_out() -> None:
     assert ">pose 20</text>" not in drawing
 
 
-def test_panels_of_the_last_step_say_what_it_added(loop: dict[str, Any]) -> None:
-    add(loop, "channel_bias:supply_v", {"x": (1e-4, 1e-5, "g/[supply_v]")})
-    add(loop, "hysteresis", {"x": (1e-4, 1e-5, "g/g")})
-    assert page(loop)[0].count(">After: + hysteresis</text>") == 2
-
-
-def test_no_table_hides_its_rows_in_a_box(loop: dict[str, Any]) -> None:
-    html, _ = page(loop)
+def test_no_table_hides_its_rows_in_a_box(page_of_nothing: tuple[str, str]) -> None:
+    html, _ = page_of_nothing
     assert "max-height" not in html
     assert "overflow: hidden" not in html

@@ -26,9 +26,9 @@ from triaxcald.station.write_back import NEW_UNCHECKED, NEW_UNJUDGED, RESTORED
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())
-FIXTURE = {"poses": 12, "hold_s": 2.0, "move_s": 0.8}
+FIXTURE = {"poses": 12, "hold_s": 1.4, "move_s": 0.6}
 QUICK = {"speed": 60.0, "fixture": FIXTURE}
-PLAN = {"poses": 12, "hold_s": 1.0, "check_poses": 2}
+PLAN = {"poses": 12, "hold_s": 0.6, "check_poses": 2}
 NO_ROOM = "rec.mcap: writing failed: No space left on device"
 PROGRAM = Path(sys.executable).with_name("triaxcal")
 
@@ -307,7 +307,7 @@ async def test_what_a_run_loses_between_bus_and_disk_is_in_its_table_and_its_doc
 def test_what_a_recording_loses_between_bus_and_disk_is_in_its_summary(workshop: Any, triaxcal: Run) -> None:
     path = workshop.folder / "rec.mcap"
     with workshop.serve(workshop.device(**QUICK)) as served:
-        done = triaxcal("record", workshop.station({"bus": served.bus}), "-o", path, "--seconds", "70")
+        done = triaxcal("record", workshop.station({"bus": served.bus}), "-o", path, "--seconds", "40")
     assert done.code == 0
     (lost,) = re.findall(r", (\d+) records lost between bus and disk$", done.err.splitlines()[-1])
     with Recording.open(path) as recording:

