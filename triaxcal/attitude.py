@@ -16,16 +16,15 @@ import numpy as np
 import scipy.linalg
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.calibration import Calibration, PoseResult, Residual
+from triaxcal.calibration import SPOILED, Calibration, PoseResult, Residual
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.plan.directions import most_wanted
 from triaxcal.poses.pose import Pose
-from triaxcal.pure_error import pure_error_dof
+from triaxcal.pure_error import LACK_OF_FIT, pure_error_dof
 from triaxcal.sensor import Sensor
 from triaxcal.turntable import (
     ERROR_MOST,
-    LACK_OF_FIT,
     TurntableData,
     TurntableSolution,
     iterated,
@@ -173,7 +172,6 @@ def _concluded(
     G = _by_differences(s, flips, C)
     covariance = G @ s.covariance @ G.T * raised**2
     covariance += np.diag(_of_second_order(covariance, sensor, data.reference) ** 2)
-    used = np.isin(np.arange(len(poses)), kept)
     a = sensor.specific_force(data.u, {})
     length, by_u = sensor.magnitude(data.u, {})
     noise = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", by_u, data.covariance, by_u), (1e-12 * data.reference) ** 2))
@@ -186,8 +184,16 @@ def _concluded(
     studentized = np.where(free > 1e-3, miss / noise / np.maximum(free, 1e-3), 0.0)
     direction = a / length[:, None]
     results = tuple(
-        PoseResult(p, direction[i], float(miss[i]), float(noise[i]), float(studentized[i]), float(leverage[i]), bool(u))
-        for i, (p, u) in enumerate(zip(poses, used, strict=True))
+        PoseResult(
+            p,
+            direction[i],
+            float(miss[i]),
+            float(noise[i]),
+            float(studentized[i]),
+            float(leverage[i]),
+            left_out="" if i in kept else p.fault or SPOILED,
+        )
+        for i, p in enumerate(poses)
     )
     attitudes = _judged(data, s, direction, C, names)
     norms = np.sqrt(np.diag(np.linalg.inv(s.covariance)))

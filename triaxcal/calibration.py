@@ -33,6 +33,11 @@ class Residual:
     lack_of_fit_p: float | None
 
 
+SPOILED = "spoiled"
+UNKNOWN_HISTORY = "unknown_history"
+"""An effect goes with what was before the pose, and nobody knows that: it need not be taken again."""
+
+
 @dataclass(frozen=True)
 class PoseResult:
     """One pose under the fit. ``direction`` (3,) is up in the sensor's frame; ``residual_g`` is |a| − reference."""
@@ -43,9 +48,14 @@ class PoseResult:
     standard_error_g: float
     studentized: float
     leverage: float
-    used: bool = True
+    left_out: str = ""
+    """Why the fit does not use it: `SPOILED`, `UNKNOWN_HISTORY`, or the fault of its samples; empty where it does."""
     carries: float = 0.0
     """0…1: how much of some combination of its mean and its trend the pose determines by itself."""
+
+    @property
+    def used(self) -> bool:
+        return not self.left_out
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.calibration import Calibration, PoseResult, Residual
+from triaxcal.calibration import SPOILED, UNKNOWN_HISTORY, Calibration, PoseResult, Residual
 from triaxcal.conditions import of_unknown_history
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
@@ -153,36 +153,35 @@ def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
         return calibration
     faults = ", ".join(f"the pose at {poses[i].at} ({poses[i].fault})" for i in faulty)
     warning = f"left out, as the outputs did not follow the acceleration: {faults}"
-    results, _ = _among(calibration, poses, faulty)
+    results, _ = _among(calibration, poses, {i: poses[i].fault for i in faulty})
     return replace(calibration, poses=results, warnings=(warning, *calibration.warnings))
 
 
 def _among(
-    calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int]
+    calibration: Calibration, poses: Sequence[Pose], reasons: Mapping[int, str]
 ) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
-    """The results of a calibration with those of further ``rows`` of all poses among them, in order; and these."""
+    """The results of a calibration with those of further poses left out among them, by rows of all; and these."""
     u = np.array([p.mean for p in poses])
     conditioned = calibration.conditions_of(poses)
     length, by_u = calibration.sensor.magnitude(u, conditioned)
     a = calibration.sensor.specific_force(u, conditioned)
     results, added = list(calibration.poses), []
-    for i in rows:
+    for i, reason in sorted(reasons.items()):
         error = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
         miss = float(length[i] - calibration.reference)
-        added.append(PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, error, miss / error, 0.0, used=False))
+        added.append(PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, error, miss / error, 0.0, reason))
         results.insert(i, added[-1])
     return tuple(results), added
 
 
 def _with_aside(calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: Spoiled) -> Calibration:
     """The calibration with the poses left out among its results, in order of time, and warnings that name them."""
-    results, added = _among(calibration, poses, rows)
     unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects])
-    names = [f"the pose at {p.pose.at} ({p.studentized:+.0f} standard errors)" for p in added]
-    excused = [name for i, name in zip(rows, names, strict=True) if i in unknown]
-    others = [name for i, name in zip(rows, names, strict=True) if i not in unknown]
-    warnings = [f"left out, as what was before it is not known: {', '.join(excused)}"] if excused else []
-    warning = f"left out as spoiled: {', '.join(others)}"
+    results, added = _among(calibration, poses, {i: UNKNOWN_HISTORY if i in unknown else SPOILED for i in rows})
+    names = [(p.left_out, f"the pose at {p.pose.at} ({p.studentized:+.0f} standard errors)") for p in added]
+    excused, others = (", ".join(n for why, n in names if why == reason) for reason in (UNKNOWN_HISTORY, SPOILED))
+    warnings = [f"left out, as what was before it is not known: {excused}"] if excused else []
+    warning = f"left out as spoiled: {others}"
     if verdict.doubtful:
         warning += (
             "; the noise inside the poses says so, while the other residuals leave it open whether all poses come "

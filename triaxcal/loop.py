@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from triaxcal.calibration import Calibration, PoseResult
-from triaxcal.conditions import channels_of, of_unknown_history
+from triaxcal.calibration import SPOILED, Calibration, PoseResult
+from triaxcal.conditions import channels_of
 from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.description import described
 from triaxcal.effects import catalogue_for
@@ -24,10 +24,11 @@ from triaxcal.findings import Finding, advice_of, description_of, finding_of, th
 from triaxcal.fit import fit, with_faulty
 from triaxcal.held_out import HeldOut, better_of, held_out
 from triaxcal.poses.pose import Pose
+from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.runs import by_run
 from triaxcal.search import NO_LOWER, Search, compared
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
-from triaxcal.unexplained import SIGNIFICANT, Unexplained, beyond_noise, hints_of, spoiled_or, unexplained_of
+from triaxcal.unexplained import Unexplained, beyond_noise, hints_of, spoiled_or, unexplained_of
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ def diagnose(
             before=with_faulty(loop.before, poses),
             after=with_faulty(loop.after, poses),
             findings=tuple(replace(f, step=with_faulty(f.step, poses)) for f in loop.findings),
+            advice=(*_without_faults(poses), *loop.advice),
         )
     linear = fit(poses, signs=signs, reference=reference)
     moving = set(channels_of(poses)) - still_conditions(poses)
@@ -145,9 +147,8 @@ class _Made:
 
     @property
     def aside(self) -> list[PoseResult]:
-        """Poses left out as spoiled, but not as what was before them is not known."""
-        unknown = of_unknown_history(self.given.poses, self.adopted)
-        return [p for i, p in enumerate(self.before.poses) if not p.used and i not in unknown]
+        """Poses left out as spoiled."""
+        return [p for p in self.steps[-1].poses if p.left_out == SPOILED]
 
     @property
     def rivals(self) -> list[str]:
@@ -182,9 +183,15 @@ def _unexplained(made: _Made) -> Unexplained:
     # Beside the residuals of poses with their creep, which are told, it must not look less than they are.
     left = replace(left, rms_g=max(left.rms_g, beyond_noise(made.steps[-1])))
     whole_p = made.found.whole_p
-    if made.rivals and whole_p is not None and whole_p < SIGNIFICANT:
+    if made.rivals and whole_p is not None and whole_p < LACK_OF_FIT:
         return spoiled_or(replace(made.quiet, aside=()).fit(()), whole_p, made.aside, made.rivals, left)
     return left
+
+
+def _without_faults(poses: Sequence[Pose]) -> list[str]:
+    """To take again the poses in which the outputs did not follow the acceleration, by what was the matter."""
+    faults = dict.fromkeys(p.fault for p in poses if p.fault)
+    return [f"take again {the_poses([p.at for p in poses if p.fault == f])}: left out ({f})" for f in faults]
 
 
 def _again(made: _Made) -> list[str]:

@@ -27,6 +27,8 @@ Linearised = tuple[Floats, Floats, Floats]
 """Residuals (n,), their derivatives by theta (n, 9+p), their standard errors (n,)."""
 NOT_STILL = "the poses do not look like those of one still triad"
 STEPS_MOST = 60
+FAR = 1e6
+"""Times the reference vector: what no unit has as bias, nor as the half of its range."""
 HALVES = 0.5 ** np.arange(13)
 """Shares of a step that are tried, until one is no worse."""
 NEARBY = 1e-6
@@ -120,7 +122,7 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
     here: Linearised | None = None
     for left in reversed(range(steps)):
         r, J, s = here or everything(problem, State(theta, effects))
-        if not (np.isfinite(J).all() and np.isfinite(r).all()):
+        if not (np.isfinite(J).all() and np.isfinite(r).all() and np.abs(theta[:6]).max() < FAR * problem.reference):
             raise Refused(f"the fit ran away; {NOT_STILL}")
         norm = np.linalg.norm(J / s[:, None], axis=0)
         norm[norm == 0] = 1.0

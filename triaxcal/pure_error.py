@@ -15,6 +15,8 @@ from triaxcal.distributions import DOF_MOST, f_sf
 from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.pose import Pose
 
+LACK_OF_FIT = 0.01
+"""Residuals of less probability (`Residual.lack_of_fit_p`) are more than noise."""
 BEYOND_DOUBT = 0.2
 """Where residuals like these have less than this probability, the residuals alone say how large the noise is."""
 

@@ -113,7 +113,8 @@ def trends_p(problem: Problem, state: State, pure: float) -> float:
 def left_by_trends(problem: Problem, state: State) -> float:
     """By how much the sum of squares of a fit to everything is larger than that of a fit to the means alone."""
     r, _, s = everything(problem, state)
-    return max(float(np.sum((r / s) ** 2)) - left_by_means(problem, state), 0.0)
+    both = float(np.sum((r / s) ** 2))
+    return max(both - left_by_means(problem, state), 0.0) if np.isfinite(both) else np.inf
 
 
 def left_by_means(problem: Problem, state: State) -> float:
@@ -123,7 +124,10 @@ def left_by_means(problem: Problem, state: State) -> float:
 
 
 def _unabsorbed(columns: Floats, misses: Floats) -> float:
-    """Sum of squares of what is left of misses (n,) beside columns (n,p), however different these are in size."""
+    """Sum of squares of what is left of misses (n,) beside columns (n,p), however different these are in size; infinite
+    where the model does not hold."""
+    if not (np.isfinite(columns).all() and np.isfinite(misses).all()):
+        return np.inf
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     step = np.linalg.lstsq(columns / size, misses, rcond=1e-13)[0]
     return float(np.sum((misses - columns / size @ step) ** 2))

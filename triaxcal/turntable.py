@@ -21,7 +21,6 @@ ROUNDS_MOST = 60
 CONVERGED = 1e-11
 ALARM = 0.005
 """Probability that one of a set of right rows is called wrong."""
-LACK_OF_FIT = 0.01
 ESTIMATE_BELOW = 0.2
 """Residuals of less probability are put down to the attitudes, where nobody declared their error."""
 ERROR_LEAST = 1e-8

@@ -14,9 +14,9 @@ from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, channel_of
 from triaxcal.figures import micro_g, plain, probability
 from triaxcal.plan.directions import linear_design
-from triaxcal.search import NEAR, Nearest, Search
+from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.search import FAMILYWISE, NEAR, Nearest, Search
 
-SIGNIFICANT = 0.01
 LEAD = 0.01
 """Probability of a pattern as clear as this by chance, the choice among all patterns allowed for, up to which it is a
 lead."""
@@ -66,7 +66,7 @@ def unexplained_of(
     is None.
     """
     p = after.residual.lack_of_fit_p if p is None else p
-    if p is None or p >= SIGNIFICANT:
+    if p is None or p >= LACK_OF_FIT:
         return Unexplained(False, p, beyond_noise(after), "")
     return Unexplained(True, p, _size(after), lead(after, passed_over, nearest, hints))
 
@@ -124,7 +124,7 @@ def lead(
     parts += [*_clear_patterns(after, used, _patterns(after, used)), *hints]
     inside = {effect.name for effect, _ in after.sensor.effects}
     near = {name: why for name, why in passed_over.items() if _is_hint(why) and name not in inside}
-    if nearest is not None and nearest.p_value < SIGNIFICANT:
+    if nearest is not None and nearest.p_value < FAMILYWISE:
         why = f"p {probability(nearest.p_value)}, but it explains too little for what it adds"
         near.setdefault(nearest.effect, why)
     parts += [f"the nearest effect is {name}, not adopted: {why}" for name, why in list(near.items())[:2]]

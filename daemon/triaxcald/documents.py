@@ -15,7 +15,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Residual
-from triaxcal.conditions import held_at, of_unknown_history
+from triaxcal.conditions import held_at
 from triaxcal.loop import Loop
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Budget, Stated, budget
@@ -139,7 +139,6 @@ def calibration_document(
     def group(name: str) -> list[Any]:
         return numbers([errors[f"{name}.{axis}"] for axis in "xyz"], UNCERTAINTY_DIGITS)
 
-    unknown = of_unknown_history([p.pose for p in c.poses], [e for e, _ in c.sensor.effects])
     return {
         "format": "triaxcal.calibration/1",
         "terms": list(c.terms),
@@ -178,10 +177,10 @@ def calibration_document(
                 "studentized": uncertainty(p.studentized),
                 "leverage": uncertainty(p.leverage),
                 "used": p.used,
-                **({} if p.used else {"left_out": p.pose.fault or ("unknown_history" if i in unknown else "spoiled")}),
+                **({"left_out": p.left_out} if p.left_out else {}),
                 "channels": {name: number(v) for name, v in p.pose.channels.items()},
             }
-            for i, p in enumerate(c.poses)
+            for p in c.poses
         ],
         "trends": c.trends,
         "condition": uncertainty(c.condition),

@@ -435,6 +435,7 @@ def test_a_faulty_pose_tells_the_loop_nothing(with_effects: Make, twenty_six: np
         assert len(c.poses) == 26
         assert not c.poses[5].used
         assert "(saturation)" in c.warnings[0]
+    assert loop.advice == ("take again the pose at 50.0 s: left out (saturation)", *clean.advice)
 
 
 def test_an_effect_too_small_to_be_named_is_seen_all_the_same(with_effects: Make, twenty_six: np.ndarray) -> None:

@@ -18,13 +18,15 @@ from triaxcal.effects.contract import HELD, RUN, SINCE_START, TIME
 from triaxcal.effects.in_run import InRuns
 from triaxcal.effects.run_bias import RunBias
 from triaxcal.effects.warm_up import WarmUp
-from triaxcal.errors import InvalidData
+from triaxcal.errors import InvalidData, Refused
 from triaxcal.fit import fit
 from triaxcal.loop import diagnose
 from triaxcal.plan.directions import directions
 from triaxcal.poses.pose import Pose, Run
+from triaxcal.problem import solve
 from triaxcal.runs import ByRun, by_run, residuals_by_run, together
 from triaxcal.search import telling_apart
+from triaxcal.start import problem_of, start
 
 K, ANGLES, BIAS = np.array([2.4, -2.1, 2.2]), np.array([6e-3, 4e-3, -1e-3]), np.array([5e-3, -3e-3, 4e-3])
 SIGMA_G, HOLD_S = 1e-5, 10.0
@@ -84,6 +86,18 @@ def test_a_pose_says_which_recording_it_is_of(three: list[Pose]) -> None:
     assert three[20].run == Run(1, 3, 70.0)
     assert three[20].at == "60.0 s of recording 2"
     assert three[14].before is None  # nobody knows how the unit lay before it was switched on
+
+
+def test_a_fit_that_runs_away_on_poses_of_two_units_is_refused() -> None:
+    """Before they are so large that nothing makes a difference to them, coefficients tell nothing of a unit."""
+    third = effect_named("third_order_nonlinearity")
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        other = [replace(p, mean=1.15 * p.mean) for p in recording(rng, count=9)]
+        poses = together([recording(rng, count=9), other])
+        problem = problem_of(poses, signs=SIGNS, reference=1.0)
+        with pytest.raises(Refused, match="the fit ran away"):
+            solve(problem, start(problem, poses, SIGNS), (third,))
 
 
 def test_a_recording_without_a_pose_is_named() -> None:

@@ -22,7 +22,7 @@ from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start
 from triaxcal.stillness.detector import StillnessDetector
 from triaxcal.synthetic import Tumble, noisy_poses
-from triaxcal.trends import Trends, with_trends
+from triaxcal.trends import Trends, left_by_trends, trends_p, with_trends
 from triaxcal.uncertainty import Stated, budget
 
 MINUS = (-1.0, -1.0, -1.0)
@@ -122,6 +122,20 @@ def test_a_thermometer_that_says_nothing_of_its_rate_proves_nothing(paper_unit: 
 def test_poses_that_know_no_trend_have_none(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     poses = noisy_poses(paper_unit, twenty_six, SIGMA_G, np.random.default_rng(0))
     assert Trends.of(problem_of(poses, signs=MINUS, reference=1.0), poses) is None
+
+
+def test_a_model_that_does_not_hold_inside_the_poses_is_infinitely_far_from_their_trends(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = moving(paper_unit, twenty_six, np.random.default_rng(0))
+    problem = with_trends(problem_of(poses, signs=MINUS, reference=1.0), poses, (TEMPERATURE,))
+    assert problem is not None
+    fitted = solve(problem, start(problem, poses, MINUS), (TEMPERATURE,))
+    assert left_by_trends(problem, fitted) < 100
+    nowhere = State(fitted.theta * np.nan, fitted.effects)
+    with np.errstate(invalid="ignore"):
+        assert left_by_trends(problem, nowhere) == np.inf
+        assert trends_p(problem, nowhere, 1e6) == 0.0
 
 
 @pytest.mark.parametrize(("effect", "size"), [(TEMPERATURE, SENSITIVITY), (SQUARE, np.array([2e-3, -1e-3, 3e-3]))])

@@ -21,11 +21,11 @@ from triaxcal.frame.faces import LABELS, axis_of, nearest_rotation, opposite
 from triaxcal.frame.fixture import Fixture, fixture_of
 from triaxcal.frame.orientations import LARGE_RAD
 from triaxcal.frame.standing import Standing, basis_of
+from triaxcal.pure_error import LACK_OF_FIT
 
 ROUNDS = 8
 SINGULAR = 0.05
 """Faces that connect units give singular values near 1; ones that do not, those of the faces' own errors."""
-LACK_OF_FIT = 0.01
 
 
 @dataclass(frozen=True)

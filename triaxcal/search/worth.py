@@ -93,7 +93,8 @@ class Worth:
             state = solve(self.problem, self.linear.state, effects)
         except Refused:
             return None
-        return self._model(effects, state, sum(self.price(e) for e in effects))
+        found = self._model(effects, state, sum(self.price(e) for e in effects))
+        return found if np.isfinite(found.chi2 + found.trends) else None
 
     def _by_trends(self, effects: tuple[Effect, ...]) -> Model | None:
         """A model that is too much for the means alone, where the trends inside the poses put it to the test: they are
@@ -105,9 +106,11 @@ class Worth:
             state = solve(both, self.linear.state, effects)
         except (Refused, EffectFault):
             return None
+        if trends_p(both, state, self.pure) < FAMILYWISE:
+            return None
         trends, n, rank = left_by_trends(both, state), len(self.poses), parameters(effects)
         tested = familywise(self.p_value(self.linear.trends, trends, rank, n - rank), self.tests)
-        if trends_p(both, state, self.pure) < FAMILYWISE or tested >= FAMILYWISE:
+        if tested >= FAMILYWISE:
             return None
         price = sum(self.price(e) for e in effects)
         return Model(effects, state, left_by_means(both, state), price, trends, tested)

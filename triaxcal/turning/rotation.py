@@ -21,6 +21,7 @@ from triaxcal.calibration import Calibration, Residual
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.plan.directions import linear_design, most_wanted
+from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.sensor import Sensor
 from triaxcal.turning.adjusted import (
     ARITHMETIC,
@@ -46,7 +47,6 @@ QUICK = 0.7
 less the unit turns too fast for its sample rate, and they are not noise."""
 UNEQUAL = 2.5
 """Ratio of the axes' noises from which on weights, which this fit has not, would lower the errors by a tenth."""
-LACK_OF_FIT = 0.01
 STRETCHES_LEAST = 30
 """With fewer, the scatter between stretches says too little for nine parameters."""
 SPOILED_SIGMA = 6.0

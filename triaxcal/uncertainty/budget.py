@@ -11,7 +11,8 @@ from triaxcal.calibration import Calibration
 from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import micro_g
-from triaxcal.uncertainty.components import UNEXPLAINED, Component, reference, rounding, statistical
+from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.uncertainty.components import Component, reference, rounding, statistical
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
 from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
@@ -99,7 +100,7 @@ def _not_evaluated(calibration: Calibration, linearised: Linearised, stated: Sta
     elif stated.thermometer_k is None and needs_temperature(linearised.effects):
         out.append("thermometer: its uncertainty was not stated")
     p, crossed = calibration.residual.lack_of_fit_p, calibration.residual.cross_validated_rms_g
-    if p is not None and p < UNEXPLAINED and crossed is not None:
+    if p is not None and p < LACK_OF_FIT and crossed is not None:
         out.append(
             f"lack of fit of a single reading: {micro_g(crossed)} cross-validated, of which only what it does to the "
             "parameters is above"

@@ -16,8 +16,6 @@ from triaxcal.uncertainty.stated import Stated
 
 NOTHING = 1e-12
 """Share of a variance that is none."""
-UNEXPLAINED = 0.01
-"""p of the lack of fit below which more than noise is left in single readings."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.effects import CATALOGUE, TEMPERATURE, Effect
 from triaxcal.problem import everything
-from triaxcal.uncertainty.components import UNEXPLAINED, Component, half_the_noise
+from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.uncertainty.components import Component, half_the_noise
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
 
@@ -69,7 +70,7 @@ def _halved_by(
     data leave of it, what they would leave were the parameters known (so that nothing takes an effect for them), and
     the ``whole`` component, which has the effects' means too."""
     told, p = 2 * left < prior, calibration.residual.lack_of_fit_p
-    if told and 2 * left < whole and p is not None and p < UNEXPLAINED:
+    if told and 2 * left < whole and p is not None and p < LACK_OF_FIT:
         return "", f"take into the model what the residuals come from: {names}, or another effect"
     if 2 * apart < left:
         more = "record more poses, or the same ones again in another order, while the temperature differs"

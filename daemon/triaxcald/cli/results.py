@@ -7,7 +7,6 @@ import math
 from triaxcal.calibration import Calibration, Residual
 from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import probability
-from triaxcal.findings import the_poses
 from triaxcal.loop import Loop
 from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcald.cli.console import table
@@ -114,16 +113,5 @@ def show_loop(loop: Loop, choice: Choice) -> None:
         print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")
         if said := overlap(lead):
             print(f"shares of what is unexplained: {said}")
-    for fault, at in _at_fault(loop.after).items():
-        print(f"advice: take again {the_poses(at)}: left out ({fault})")
     for line in loop.advice:
         print(f"advice: {small.in_words(line)}")
-
-
-def _at_fault(c: Calibration) -> dict[str, list[str]]:
-    """When the poses began in which the outputs did not follow the acceleration, by what was the matter."""
-    at: dict[str, list[str]] = {}
-    for p in c.poses:
-        if p.pose.fault:
-            at.setdefault(p.pose.fault, []).append(p.pose.at)
-    return at

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from triaxcal.pure_error import LACK_OF_FIT
 from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
 from triaxcald.report.document import Finding, Outcome
@@ -15,7 +16,6 @@ from triaxcald.report.meanings import told
 from triaxcald.units import ErrorUnit
 
 Kind = Literal["within", "outside", "unexplained", "refused"]
-_SIGNIFICANT_P = 0.01
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
 _MOST_NAMED = 3
 
@@ -165,7 +165,7 @@ def _unexplained(outcome: Outcome) -> bool:
 
 def _lacks_fit(outcome: Outcome) -> bool:
     p = outcome.final.lack_of_fit_p
-    return p is not None and p < _SIGNIFICANT_P
+    return p is not None and p < LACK_OF_FIT
 
 
 def _errors(outcome: Outcome) -> str:
