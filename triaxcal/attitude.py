@@ -55,8 +55,8 @@ class Attitude:
 class AttitudeFit:
     """``rotation`` C (3,3): ``a_sensor = C a_table``; ``rotation_error_rad`` (3,) standard errors of turns of the
     sensor's frame about its axes. ``attitude_error_rad`` by axis and pose, declared or ``estimated`` from the
-    residuals. ``noise_error`` (9,) are the standard errors that the same poses would give, were the attitudes exact.
-    ``used`` rows; ``attitudes`` of all.
+    residuals. ``noise_error`` (9,) are the standard errors that the same poses would give, were the attitudes exact;
+    ``attitudes`` are those of all poses.
     """
 
     calibration: Calibration

@@ -113,8 +113,8 @@ def trends_p(problem: Problem, state: State, pure: float) -> float:
 def left_by_trends(problem: Problem, state: State) -> float:
     """By how much the sum of squares of a fit to everything is larger than that of a fit to the means alone."""
     r, _, s = everything(problem, state)
-    both = float(np.sum((r / s) ** 2))
-    return max(both - left_by_means(problem, state), 0.0) if np.isfinite(both) else np.inf
+    apart = float(np.sum((r / s) ** 2)) - left_by_means(problem, state)
+    return max(apart, 0.0) if np.isfinite(apart) else np.inf
 
 
 def left_by_means(problem: Problem, state: State) -> float:
