@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
+import hashlib
 import io
 import json
 import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -247,6 +248,22 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[P
         return folder
 
     return folder_of
+
+
+@pytest.fixture
+def asked(triaxcal: Callable[..., Done], once: Callable[..., Path]) -> Callable[..., Done]:
+    """Runs a command that writes nothing, on files that stay as they are: once for all tests that ask the same."""
+
+    def ask(*arguments: Any) -> Done:
+        words = [str(a) for a in arguments]
+
+        def make(folder: Path) -> None:
+            (folder / "done.json").write_text(json.dumps(asdict(triaxcal(*words))), "utf-8")
+
+        folder = once(f"asked-{hashlib.sha256(json.dumps(words).encode()).hexdigest()[:24]}", make)
+        return Done(**json.loads((folder / "done.json").read_text("utf-8")))
+
+    return ask
 
 
 @pytest.fixture(scope="session")

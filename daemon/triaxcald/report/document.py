@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from triaxcal.calibration import UNKNOWN_HISTORY
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names
 from triaxcald.report.stages import HeldOut, Residual, Stage, held_out_of, stages_of
@@ -276,7 +277,7 @@ def _poses(
             mean=mean,
             direction=vector(known.get("direction")) or _direction(mean, matrix, centre),
             used=known.get("used") is None or bool(known["used"]),
-            again=known.get("used") is False and known.get("left_out") != "unknown_history",
+            again=known.get("used") is False and known.get("left_out") != UNKNOWN_HISTORY,
             recording=recordings.get(str(known.get("recording")), ""),
             channels=numbers(known.get("channels")),
             **{name: number(known.get(name)) for name in _OF_A_POSE},

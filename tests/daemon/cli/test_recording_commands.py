@@ -36,6 +36,7 @@ def test_audit_ends_with_1_and_names_the_difference(
     assert done.out.startswith(f"{finished_run.can}: the same, byte for byte (certificate.json, ")
     assert f"{path}: differs" in done.out
     assert '  certificate.json: station.name: stored "bench", computed again "Bench"' in done.out
+    assert triaxcal("audit", path, "--json").code == 1
 
 
 def test_info_tells_what_is_in_a_recording(finished_run: Any, triaxcal: Run) -> None:

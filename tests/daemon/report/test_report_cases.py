@@ -59,10 +59,8 @@ def loop() -> dict[str, Any]:
 
 @pytest.fixture
 def bare(loop: dict[str, Any]) -> dict[str, Any]:
-    """The same with poses whose residuals nobody knows: without their pictures, which take most of a page's time."""
-    for pose in loop["calibration"]["poses"]:
-        pose |= {"residual_g": None, "before_residual_g": None}
-    return loop
+    document: dict[str, Any] = samples.without_pictures(loop)
+    return document
 
 
 @pytest.fixture(scope="module")

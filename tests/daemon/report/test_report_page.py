@@ -94,10 +94,7 @@ def changed(loop: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def bare(loop: dict[str, Any]) -> dict[str, Any]:
-    """The same with poses whose residuals nobody knows: without their pictures, which take most of a page's time."""
-    document = copy.deepcopy(loop)
-    for pose in document["calibration"]["poses"]:
-        pose |= {"residual_g": None, "before_residual_g": None}
+    document: dict[str, Any] = samples.without_pictures(loop)
     return document
 
 

@@ -49,16 +49,10 @@ def loop() -> dict[str, Any]:
     return two_recordings()
 
 
-def without_pictures(document: dict[str, Any]) -> dict[str, Any]:
-    """With poses whose residuals nobody knows; their pictures take most of a page's time."""
-    for pose in document["calibration"]["poses"]:
-        pose |= {"residual_g": None, "before_residual_g": None}
-    return document
-
-
 @pytest.fixture
 def bare(loop: dict[str, Any]) -> dict[str, Any]:
-    return without_pictures(loop)
+    document: dict[str, Any] = samples.without_pictures(loop)
+    return document
 
 
 def page(document: dict[str, Any]) -> tuple[str, str]:
@@ -131,7 +125,7 @@ def test_a_coefficient_of_one_recording_says_so(shown: tuple[str, str]) -> None:
 
 
 def test_a_single_recording_has_no_word_of_several(loop: dict[str, Any]) -> None:
-    _, text = page(without_pictures(copy.deepcopy(_SAMPLE)))
+    _, text = page(samples.without_pictures(_SAMPLE))
     assert "Recording |" not in text
     assert "Of recordings" not in text
     assert "by its own clock" not in text
@@ -140,14 +134,14 @@ def test_a_single_recording_has_no_word_of_several(loop: dict[str, Any]) -> None
 @pytest.mark.parametrize("damage", [None, 3, "first.csv", [], [None, {}], [FIRST]])
 def test_damaged_names_of_recordings_still_give_a_page(loop: dict[str, Any], damage: object) -> None:
     if damage != [FIRST]:  # one of them with pictures
-        without_pictures(loop)
+        loop = samples.without_pictures(loop)
     loop["recordings"] = loop["by_recording"] = damage
     loop["calibration"]["poses"][3]["recording"] = damage
     loop["findings"][0]["coefficients"]["x_run" + "9" * 5000] = {"value": 1.0}
     assert "Bias step" in page(loop)[1]
 
 
-@pytest.mark.parametrize("unit", ["<uT>", "µg-like"])
+@pytest.mark.parametrize("unit", ["T", "<uT>", "µg-like"])
 def test_names_with_the_unit_of_errors_in_them_stay_as_they_are(loop: dict[str, Any], unit: str) -> None:
     """Where the reference is not in g."""
     loop["calibration"]["units"] = {"reference": unit, "output": "V"}
