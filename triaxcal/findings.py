@@ -168,10 +168,7 @@ def advice_of(
             others = [*f.alternatives, *(["spoiled poses"] if f.spoiled else [])]
             out.append(f"{f.effect} cannot be told from {', '.join(others)} here: {'; '.join(f.apart)}")
     if unexplained.significant and not unexplained.or_spoiled:
-        out.append(
-            "something is left that no candidate explains: take some directions again at another "
-            "azimuth and at another time, and log what else changes (temperature, supply, what stands nearby)"
-        )
+        out.append(f"something is left that no candidate explains: {unexplained.towards}")
     if undescribed:
         out.append(f"empirical: {undescribed}")
     for why in dict.fromkeys(blind.values()):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,6 +46,10 @@ def fitted(paper_unit: Sensor, ups: np.ndarray) -> Fitted:
         return fit(moved, signs=MINUS, aside=(), effects=effects)
 
     return make
+
+
+def told(*given: Any) -> str:
+    return lead(*given).text
 
 
 def radial(ups: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -132,20 +137,20 @@ def waves(ups: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("pattern", "words"),
+    ("pattern", "words", "towards"),
     [
-        (odd, "an odd pattern on the sphere"),
-        (even, "an even pattern on the sphere"),
-        (swing, "a swing in time with a period of "),
-        (bias_swing, " s, as a bias"),
-        (waves, "a wave along the output of every axis, 0.4"),
-        (by_channel, "supply_v"),
-        (bias_by_channel, "supply_v, as a bias"),
-        (wave, "a wave along the output of axis y, "),
+        (odd, "an odd pattern on the sphere", "take some directions again at another azimuth"),
+        (even, "an even pattern on the sphere", "take some directions again at another azimuth"),
+        (swing, "a swing in time with a period of ", "log what may go up and down about every "),
+        (bias_swing, " s, as a bias", "log what may go up and down about every "),
+        (waves, "a wave along the output of every axis, 0.4", "or tilt an axis in steps of much less than 0.4"),
+        (by_channel, "supply_v", "take the same poses again while supply_v goes another way"),
+        (bias_by_channel, "supply_v, as a bias", "take the same poses again while supply_v goes another way"),
+        (wave, "a wave along the output of axis y, ", "or tilt axis y in steps of much less than 0.3"),
     ],
 )
-def test_the_lead_is_the_pattern_that_is_there(
-    pattern: Callable[[np.ndarray], np.ndarray], words: str, fitted: Fitted, ups: np.ndarray
+def test_the_lead_is_the_pattern_that_is_there_and_points_to_what_would_tell_more(
+    pattern: Callable[[np.ndarray], np.ndarray], words: str, towards: str, fitted: Fitted, ups: np.ndarray
 ) -> None:
     for seed in range(2):
         left = unexplained_of(fitted(12 * pattern(ups), seed), {})
@@ -153,14 +158,15 @@ def test_the_lead_is_the_pattern_that_is_there(
         first = left.lead.split("; ")[0]
         assert words in first, left.lead
         assert int(first.split("%")[0]) > 60
+        assert towards in left.towards
 
 
 def test_the_period_of_a_swing_and_the_length_of_a_wave_are_near_those_that_are_there(
     fitted: Fitted, ups: np.ndarray
 ) -> None:
-    period = float(lead(fitted(12 * swing(ups)), {}).split("a period of ")[1].split()[0])
+    period = float(told(fitted(12 * swing(ups)), {}).split("a period of ")[1].split()[0])
     assert period == pytest.approx(95.0, rel=0.1)
-    length = float(lead(fitted(12 * wave(ups)), {}).split("axis y, ")[1].split()[0])
+    length = float(told(fitted(12 * wave(ups)), {}).split("axis y, ")[1].split()[0])
     assert length == pytest.approx(0.33, rel=0.1)
 
 
@@ -168,7 +174,9 @@ def test_one_pose_that_was_not_still_is_named_by_its_time(fitted: Fitted, ups: n
     for i in (0, 17, 39):
         off = np.zeros((N, 3))
         off[i] = 40 * SIGMA_G * ups[i]
-        text = lead(fitted(off), {})
+        found = lead(fitted(off), {})
+        text = found.text
+        assert f"take the pose at {i * HOLD_S:.1f} s again" in found.towards
         assert text.startswith(f"most of it is one pose, at {i * HOLD_S:.1f} s (+")
         assert "was it still?" in text
 
@@ -178,7 +186,7 @@ def test_where_nothing_stands_out_nothing_is_made_up(fitted: Fitted, ups: np.nda
     runs, leads = 24, 0
     for seed in range(runs):
         rng = np.random.default_rng(1000 + seed)
-        text = lead(fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)), seed), {})
+        text = told(fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)), seed), {})
         leads += text != "no candidate comes near, and no pose, pattern or channel stands out"
     # binom.isf(2e-3, 24, 0.01)
     assert leads <= 2
@@ -200,7 +208,7 @@ def test_beside_effects_in_the_model_the_lead_is_what_they_leave(
     ups: np.ndarray,
 ) -> None:
     """They absorb a part of every pattern, as the nine parameters do."""
-    first = lead(fitted(12 * pattern(ups), 0, effects), {}).split("; ")[0]
+    first = told(fitted(12 * pattern(ups), 0, effects), {}).split("; ")[0]
     assert words in first
     assert int(first.split("%")[0]) > 95
 
@@ -210,7 +218,7 @@ def test_beside_effects_in_the_model_nothing_is_made_up(fitted: Fitted, ups: np.
     runs, leads = 30, 0
     for seed in range(runs):
         off = 8 * SIGMA_G * ups * np.random.default_rng(1000 + seed).standard_normal((N, 1))
-        leads += "goes with" in lead(fitted(off, seed, effects), {})
+        leads += "goes with" in told(fitted(off, seed, effects), {})
     # binom.isf(1e-3, 30, 0.01)
     assert leads <= 3
 
@@ -218,7 +226,7 @@ def test_beside_effects_in_the_model_nothing_is_made_up(fitted: Fitted, ups: np.
 def test_effects_that_came_near_are_told_with_their_reasons(fitted: Fitted, ups: np.ndarray) -> None:
     rng = np.random.default_rng(1000)
     c = fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)))
-    text = lead(c, {"warm_up": "p 0.02", "hysteresis": "the poses cannot carry it", "bias_step": "p 0.03"})
+    text = told(c, {"warm_up": "p 0.02", "hysteresis": "the poses cannot carry it", "bias_step": "p 0.03"})
     assert "the nearest effect is warm_up, not adopted: p 0.02" in text
     assert "hysteresis, not adopted: the poses cannot carry it" in text
     assert "bias_step" not in text
@@ -227,15 +235,15 @@ def test_effects_that_came_near_are_told_with_their_reasons(fitted: Fitted, ups:
 def test_what_chance_may_well_have_done_is_no_lead(fitted: Fitted, ups: np.ndarray) -> None:
     rng = np.random.default_rng(1000)
     c = fitted(8 * SIGMA_G * ups * rng.standard_normal((N, 1)))
-    text = lead(c, {"warm_up": "p 1", "hysteresis": "p 0.2", "bias_step": "p 0.04"})
+    text = told(c, {"warm_up": "p 1", "hysteresis": "p 0.2", "bias_step": "p 0.04"})
     assert text == "the nearest effect is bias_step, not adopted: p 0.04"
-    assert lead(c, {"warm_up": "p 1"}) == "no candidate comes near, and no pose, pattern or channel stands out"
+    assert told(c, {"warm_up": "p 1"}) == "no candidate comes near, and no pose, pattern or channel stands out"
 
 
 def test_numbers_of_a_lead_have_no_exponent(fitted: Fitted, ups: np.ndarray) -> None:
     off = np.zeros((N, 3))
     off[3] = 4e-3 * ups[3]
-    text = lead(fitted(off), {}, Nearest("warm_up", 0.0))
+    text = told(fitted(off), {}, Nearest("warm_up", 0.0))
     found = re.match(r"most of it is one pose, at 30.0 s \(\+(\d{4})\.\d µg\)", text)
     assert found, text
     assert 3000 < int(found[1]) < 4000
@@ -248,6 +256,6 @@ def test_a_channel_that_stands_still_is_no_lead(paper_unit: Sensor, ups: np.ndar
     x, y, z = ups.T
     off = 12 * radial(ups, x * y * z)
     moved = [replace(p, mean=p.mean + paper_unit.scale_factor * e) for p, e in zip(poses, off, strict=True)]
-    text = lead(fit(moved, signs=MINUS, aside=()), {})
+    text = told(fit(moved, signs=MINUS, aside=()), {})
     assert "an odd pattern" in text
     assert "supply_v" not in text
