@@ -424,6 +424,15 @@ def test_the_table_of_measured_recordings_is_there() -> None:
     assert len(rows) == len(set(rows)) >= 28
 
 
+def test_the_readme_tells_the_share_that_the_benchmark_measured() -> None:
+    told = re.search(r"named or listed the truth in ([\d.]+) %", (PROJECT / "README.md").read_text("utf-8"))
+    page = (PROJECT / "docs/explanation/undeclared-effects.md").read_text("utf-8")
+    measured = re.search(r"^\| s = 20 to 200: .*?\| 95 % \| ([\d.]+) %", page, re.MULTILINE)
+    assert told
+    assert measured
+    assert told[1] == measured[1]
+
+
 def test_the_documentation_speaks_of_no_machine() -> None:
     spoken = {name_of(p): re.findall(r"/(?:home|root)/\S+", p.read_text("utf-8"), re.I) for p in PAGES}
     assert not {page: found for page, found in spoken.items() if found}

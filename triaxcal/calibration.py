@@ -124,8 +124,8 @@ class Calibration:
     def coefficients_of(self, name: str) -> dict[str, tuple[float, float | None, str]]:
         """name → (value, standard error, unit) of the coefficients of the effect of that name, and of its shape.
 
-        The standard error is None where |a| does not tell it: of a step between two poses, the moment; of coefficients
-        that show by a combination of them alone, each.
+        The standard error is None where |a| does not tell it: of coefficients that show by a combination of them alone,
+        each. That of the moment of a step holds that it may have been anywhere between two poses.
         Raises KeyError for an effect that is not in the model.
         """
         errors = dict(zip(self.parameters, self.standard_errors, strict=True))

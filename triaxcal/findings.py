@@ -139,8 +139,8 @@ def why_not_shown(search: Search, effect: Effect) -> str:
     known = search.problem.channel_reference
     for name in effect.needs:
         rate, channel = name.endswith(rate_of("")), channel_of(name.removesuffix(rate_of("")))
-        if name not in known and not (rate or is_derived(name)):
-            logged = any(channel in p.channels for p in search.poses)
+        logged = any(channel in p.channels for p in search.poses)
+        if name not in known and (rate or not is_derived(name)) and not (rate and logged):
             return f"channel {channel} is not logged{' in every pose' if logged else ''}"
         if name not in known:
             return f"how fast {channel} changes is not known in every pose" if rate else f"{name} is not known"

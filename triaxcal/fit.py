@@ -18,6 +18,7 @@ from triaxcal.plan.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import NOT_STILL, Problem, State, by_shape, everything, linearise, parameters_by_theta, solve
 from triaxcal.pure_error import lack_of_fit_p, pose_dof, pure_error_dof, raised
+from triaxcal.shapes import shape_errors
 from triaxcal.start import DILUTION_LIMIT, problem_of, start, with_history
 from triaxcal.trends import left_by_means, trends_p, with_trends
 
@@ -252,7 +253,7 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Sp
         dilution=spread,
         inflation=inflation,
         dof=dof,
-        shape_errors=_shape_errors(state, shapes, np.sqrt(np.diag(covariance)[p:])),
+        shape_errors=shape_errors(problem, state, shapes, np.sqrt(np.diag(covariance)[p:]), inflation),
         trends=problem.further is not None,
     )
     return replace(calibration, warnings=tuple(_warnings(calibration)))
@@ -268,17 +269,6 @@ def _covariance(problem: Problem, state: State, weighted: Floats) -> Floats:
     G = np.eye(len(theta))
     G[: len(state.theta), : len(state.theta)] = parameters_by_theta(problem, state)
     return np.asarray(G @ theta @ G.T)
-
-
-def _shape_errors(state: State, columns: Floats, thousandths: Floats) -> dict[str, float]:
-    """By "effect.name", of the shapes that move the residuals; their errors come in thousandths of their values."""
-    named = [(f"{e.name}.{n}", value) for e in state.effects for n, (value, _) in e.shape.items()]
-    moves = np.abs(columns).max(axis=0, initial=0.0) > 0
-    return {
-        name: 1e-3 * abs(value) * float(error)
-        for (name, value), error, tells in zip(named, thousandths, moves, strict=True)
-        if tells
-    }
 
 
 def cross_validated(problem: Problem, state: State) -> float | None:

@@ -23,8 +23,8 @@ def assumption(source: str, how: str, reference_unit: str = "g") -> str:
     if source != "temperature" or not assumed:
         return ""
     return (
-        f"where the poses do not tell, this is an assumption, typical of data sheets: {assumed}; diagnose of a "
-        "recording in which the temperature swings would tell"
+        f"as far as the poses do not tell, this rests on an assumption, typical of data sheets: {assumed}; diagnose of "
+        "a recording in which the temperature swings more would tell"
     )
 
 

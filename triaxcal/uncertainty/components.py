@@ -74,7 +74,7 @@ def statistical(calibration: Calibration, linearised: Linearised, beyond: float)
     excess = beyond * (calibration.covariance - (S * linearised.error**2) @ S.T)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
         how = f"residuals are {calibration.inflation:.2f} times what noise explains"
-        by = "find what the model lacks: diagnose; more poses, some of them repeated"
+        by = "find what the model lacks (diagnose, and what it advises); more poses, some of them repeated"
         out.append(Component.of(linearised, "lack_of_fit", "A", calibration.dof, excess, how, by))
     return out
 

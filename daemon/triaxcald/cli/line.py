@@ -121,7 +121,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         others = "".join(f" or {name}" for name in finding.alternatives)
         print(f"  {finding.verdict}: {finding.effect}{others}")
         for name, (value, error, unit) in finding.coefficients.items():
-            print(f"    {name} {value:+.4g} ± {error:.1g} {unit}")
+            told = f"{unit} (no standard error by itself)" if error is None else f"± {error:.1g} {unit}"
+            print(f"    {name} {value:+.4g} {told}")
     if not loop.findings:
         print(f"  {nothing_shows(loop)}")
     if loop.unexplained.significant:

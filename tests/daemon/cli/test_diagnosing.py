@@ -105,7 +105,8 @@ def test_a_step_is_told_with_its_moment_and_the_values_are_said_to_hold_after_it
     said = triaxcal("diagnose", knocked).out
     _, moment, error, _, unit = cells(said, "bias_step.at")
     assert float(moment) == pytest.approx(87.5, abs=HOLD_S + MOVE_S)
-    assert (error, unit) == ("—", "s")  # between two poses |a| does not tell it
+    assert unit == "s"
+    assert abs(float(moment) - 87.5) < 3 * float(error)
     assert f"bias hold after the step at {float(moment):.1f} s\n" in said
     assert "held_s" not in said
 
@@ -130,12 +131,13 @@ def test_values_without_an_effect_of_temperature_are_said_to_be_those_at_the_mea
 def test_a_budget_that_temperature_dominates_says_what_of_it_is_assumed(
     warm: Path, rippled: Path, tmp_path: Path, triaxcal: Run, asked: Run
 ) -> None:
-    said = "temperature: where the poses do not tell, this is an assumption, typical of data sheets: bias 500 "
+    assumed = "s far as the poses do not tell, this rests on an assumption, typical of data sheets: bias 500 "
+    said = f"temperature: a{assumed}"
     assert f"{said}µg/K and scale factor 300 ppm/K; " in asked("fit", warm).out
     assert f"{said}ppm of the reference per K and scale" in triaxcal("fit", warm, "--reference", "9.80665").out
     page = tmp_path / "assumed.html"
     triaxcal("fit", warm, "--report", page)
-    assert "Where the poses do not tell, this is an assumption, typical of data sheets: bias 500" in page.read_text()
+    assert f"A{assumed}" in page.read_text()
     assert "assumption" not in asked("fit", rippled).out
 
 
