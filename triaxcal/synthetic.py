@@ -7,12 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from triaxcal.arrays import Floats
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SINCE_START, TIME
+from triaxcal.arrays import Floats, Ints
+from triaxcal.effects import TEMPERATURE
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SINCE_START, TIME, rate_of
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
 STANDARD_GRAVITY = 9.80665
+CONDITIONS = frozenset({TEMPERATURE, rate_of(TEMPERATURE), TIME, SINCE_START, HELD, *BEFORE, *CHANGE})
+"""What an effect of a synthetic unit may go with."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,17 @@ class Tumble:
         """Seconds until the path is back at its first pose."""
         return self.step_s * len(self.directions)
 
+    def before(self, t_s: Floats) -> Floats:
+        """a (n,3) in g in the pose before, that at times (n,) is held or left; that of the first pose itself in it."""
+        step = np.maximum(self._step(t_s) - 1, 0)
+        return np.asarray(self.directions[step % len(self.directions)])
+
+    def _step(self, t_s: Floats) -> Ints:
+        return np.asarray(np.floor_divide(t_s, self.step_s).astype(int))
+
     def specific_force(self, t_s: Floats) -> Floats:
         """a (n,3) in g at times (n,) from the start."""
-        step = np.floor_divide(t_s, self.step_s).astype(int)
+        step = self._step(t_s)
         here = self.directions[step % len(self.directions)]
         there = self.directions[(step + 1) % len(self.directions)]
         x = np.clip((t_s - step * self.step_s - self.hold_s) / self.move_s, 0.0, 1.0)
@@ -77,10 +88,15 @@ class Environment:
         swing = self.swing_c * np.sin(2 * np.pi * t_s / self.swing_period_s)
         return np.asarray(self.temperature_c + self.ramp_c_per_s * t_s + swing)
 
+    def temperature_rate(self, t_s: Floats) -> Floats:
+        turn = 2 * np.pi / self.swing_period_s
+        return np.asarray(self.ramp_c_per_s + self.swing_c * turn * np.cos(turn * t_s))
+
 
 @dataclass
 class SyntheticUnit:
-    """A sensor on its path. ``noise_g`` (3,) is white, of one sample; effects count from ``channel_reference``."""
+    """A sensor on its path. ``noise_g`` (3,) is white, of one sample; effects count from ``channel_reference``, and
+    from zero what goes with the temperature's rate, the time since the start or the pose before (`CONDITIONS`)."""
 
     sensor: Sensor
     path: Tumble
@@ -96,9 +112,16 @@ class SyntheticUnit:
         """Outputs (n,3) and temperature (n,) at times (n,). The noise goes on from call to call."""
         t_s = np.asarray(t_s, dtype=float)
         temperature = self.environment.temperature(t_s)
-        held = {"temp_c": temperature, TIME: t_s}
+        a = self.path.specific_force(t_s)
+        held = {TEMPERATURE: temperature, TIME: t_s}
         conditions = {n: v - self.channel_reference[n] for n, v in held.items() if n in self.channel_reference}
-        clean = self.sensor.output(self.path.specific_force(t_s), conditions)
+        conditions |= {SINCE_START: t_s, HELD: np.zeros(len(t_s))}
+        conditions[rate_of(TEMPERATURE)] = self.environment.temperature_rate(t_s)
+        if any(set(effect.needs) & {*BEFORE, *CHANGE} for effect, _ in self.sensor.effects):
+            before = self.path.before(t_s) @ self.sensor.axes.T
+            change = a @ self.sensor.axes.T - before
+            conditions |= dict(zip((*BEFORE, *CHANGE), (*before.T, *change.T), strict=True))
+        clean = self.sensor.output(a, conditions)
         noise = self._rng.standard_normal((len(t_s), 3)) * self.noise_g * self.sensor.scale_factor
         return clean + noise, temperature
 

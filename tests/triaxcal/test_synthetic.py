@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from triaxcal.effects import TIME
+from triaxcal.effects import TIME, Effect
+from triaxcal.effects.bias_step import BiasStep
+from triaxcal.effects.hysteresis import Hysteresis
+from triaxcal.effects.thermal_gradient import ThermalGradient
+from triaxcal.effects.warm_up import WarmUp
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import STANDARD_GRAVITY, Environment, SyntheticUnit, Tumble, noisy_poses
 
@@ -107,6 +111,39 @@ def test_effects_count_from_their_references(with_effects: Callable[..., Sensor]
     added = (u - plain.output(np.array([[0.0, 0.0, 1.0]]), {}))[0] / plain.scale_factor
     assert temperature == pytest.approx([30.0])
     assert added == pytest.approx([5e-3, 2e-3, 0.0], abs=1e-12)
+
+
+FORCE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+OF_TIME: list[tuple[Effect, float, float, list[float]]] = [
+    (WarmUp(10.0), 6.0, 1e-3, [1e-3 * np.exp(-0.6)] * 3),
+    (BiasStep(7.0), 6.0, 1e-3, [-1e-3] * 3),
+    (BiasStep(5.0), 6.0, 1e-3, [0.0] * 3),
+    (ThermalGradient(), 6.0, 1e-3, [2e-3] * 3),
+    # From the second pose (1, 0, 0), which began at 5 s, one looks back at the first (0, 0, 1).
+    (Hysteresis(), 6.0, 1e-3, [0.0, 0.0, 1e-3]),
+    (Hysteresis("reversal"), 6.0, 1e-3, [1e-3, 0.0, -1e-3]),
+    (Hysteresis(), 3.0, 1e-3, [0.0, 0.0, 1e-3]),
+    (Hysteresis("reversal"), 3.0, 1e-3, [0.0, 0.0, 0.0]),
+    (Hysteresis("reversal"), 16.0, 1e-3, [0.0, 1e-3, 1e-3]),
+]
+
+
+@pytest.mark.parametrize(("effect", "t_s", "size", "added"), OF_TIME)
+def test_effects_go_with_the_time_since_the_start_the_temperatures_rate_and_the_pose_before(
+    effect: Effect, t_s: float, size: float, added: list[float]
+) -> None:
+    path = Tumble(FORCE, hold_s=4.0, move_s=1.0)
+    square = Sensor(np.ones(3), np.zeros(3), np.zeros(3), ((effect, np.full(3, size)),))
+    unit = SyntheticUnit(square, path, np.zeros(3), Environment(ramp_c_per_s=2.0))
+    u, _ = unit.sample(np.array([t_s]))
+    assert u - path.specific_force(np.array([t_s])) == pytest.approx(np.array([added]), abs=1e-12)
+
+
+def test_the_rate_of_the_temperature_is_that_of_its_course() -> None:
+    room = Environment(ramp_c_per_s=0.01, swing_c=3.0, swing_period_s=50.0)
+    t_s, step = np.linspace(0, 100, 41), 1e-4
+    slope = (room.temperature(t_s + step) - room.temperature(t_s - step)) / (2 * step)
+    assert room.temperature_rate(t_s) == pytest.approx(slope, abs=1e-8)
 
 
 def test_noisy_poses_scatter_by_the_standard_error_that_they_state(paper_unit: Sensor, fourteen: np.ndarray) -> None:

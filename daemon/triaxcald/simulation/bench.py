@@ -11,11 +11,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from triaxcal.effects import effect_named
+from triaxcal.arrays import Floats
+from triaxcal.effects import effect_named, effect_of
+from triaxcal.effects.contract import Effect, channel_of
 from triaxcal.errors import InvalidData
 from triaxcal.plan.directions import directions
 from triaxcal.sensor import Sensor
-from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+from triaxcal.synthetic import CONDITIONS, Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.modbus.model import ModbusBus
@@ -92,17 +94,8 @@ def load_device(path: Path) -> DeviceFile:
 
 
 def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics:
-    """Raises InputError where an effect is not in the catalogue; ``where`` names the file in it."""
-    effects = []
-    for name, held in device.sensor.effects.items():
-        try:
-            effect = effect_named(name)
-        except KeyError:
-            raise InputError(f"{where}: sensor.effects.{name}: no effect of that name is known") from None
-        known = [c.name for c in effect.coefficients]
-        if unknown := set(held) - set(known):
-            raise InputError(f"{where}: sensor.effects.{name}.{min(unknown)}: known coefficients: {', '.join(known)}")
-        effects.append((effect, np.array([held.get(c, 0.0) for c in known])))
+    """Raises InputError where an effect is not known or not simulated; ``where`` names the file in it."""
+    effects = [_effect(name, held, where) for name, held in device.sensor.effects.items()]
     truth = device.sensor
     sensor = Sensor(np.array(truth.scale_factor), np.array(truth.misalignment), np.array(truth.bias), tuple(effects))
     place = device.surroundings
@@ -110,6 +103,27 @@ def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics
     return SyntheticPhysics(
         SyntheticUnit(sensor, tumble_of(device), np.full(3, truth.noise_g), environment, seed=device.seed)
     )
+
+
+def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[Effect, Floats]:
+    """An effect and its coefficients, as a device file has them. Raises InputError."""
+    here = f"{where}: sensor.effects.{name}"
+    try:
+        forms = effect_named(name).forms
+    except KeyError:
+        raise InputError(f"{here}: no effect of that name is known") from None
+    known = list(dict.fromkeys(n for e in forms for n in (*(c.name for c in e.coefficients), *e.shape)))
+    try:
+        effect, coefficients = effect_of(name, held)
+    except KeyError:
+        unknown = min(set(held) - set(known), default=", ".join(held))
+        raise InputError(f"{here}.{unknown}: known coefficients: {', '.join(known)}") from None
+    if bad := next((n for n, (v, _) in effect.shape.items() if not v > 0), None):
+        raise InputError(f"{here}.{bad}: has to be above 0")
+    if lacking := set(effect.needs) - CONDITIONS:
+        needed = ", ".join(map(channel_of, sorted(lacking)))
+        raise InputError(f"{here}: a simulated unit has no {needed}, which it goes with")
+    return effect, coefficients
 
 
 def tumble_of(device: DeviceFile) -> Tumble:

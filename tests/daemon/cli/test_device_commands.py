@@ -300,6 +300,18 @@ def test_devices_says_what_is_wrong_with_somebody_elses_broken_driver(tmp_path: 
             {"sensor": {"effects": {"temperature_bias": {"w": 1}}}},
             "sensor.effects.temperature_bias.w: known coefficients",
         ),
+        (
+            {"sensor": {"effects": {"warm_up": {"x": 1e-3, "time_constant": 0.0}}}},
+            "sensor.effects.warm_up.time_constant: has to be above 0",
+        ),
+        (
+            {"sensor": {"effects": {"vibration_rectification": {"x": 1.0}}}},
+            "sensor.effects.vibration_rectification: a simulated unit has no scatter_x, scatter_y, scatter_z, which",
+        ),
+        (
+            {"sensor": {"effects": {'"channel_bias:supply_v"': {"x": 1e-3}}}},
+            "sensor.effects.channel_bias:supply_v: a simulated unit has no supply_v, which it goes with",
+        ),
         ({"fixture": {"poses": 8}}, "fixture.poses: input should be greater than or equal to 9"),
         ({"seed": -1}, "seed: input should be greater than or equal to 0, not -1"),
         ({"profile": "a\0b"}, r"'a\x00b': no file has such a name"),
