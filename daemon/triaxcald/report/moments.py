@@ -19,7 +19,7 @@ def moments_in(outcome: Outcome, recording: str) -> Mapping[str, float]:
 
 
 def bracket(finding: Finding, outcome: Outcome) -> str:
-    """Between which poses a moment lies that the magnitude tells no nearer; empty where there is none."""
+    """In which pose or between which a moment lies, and how far it may be from there; empty where there is none."""
     at_s, recording = finding.shape("at"), _recording(finding, outcome)
     timed = [
         (pose, pose.start_s, pose.end_s)
@@ -29,18 +29,24 @@ def bracket(finding: Finding, outcome: Outcome) -> str:
     if at_s is None:
         return ""
     where = f" of {recording}" if recording else ""
-    within = [pose for pose, start_s, end_s in timed if start_s <= at_s <= end_s]
-    if within:
-        return f"The moment lies in pose {within[0].number}{where}."
+    error_s = next((c.standard_error for c in finding.coefficients if c.name == "at"), None)
+    for pose, start_s, end_s in timed:
+        if start_s <= at_s <= end_s:
+            return _said(f"in pose {pose.number}{where}", "", at_s, error_s, end_s - start_s)
     before = [(end_s, pose.number) for pose, _, end_s in timed if end_s < at_s]
     after = [(start_s, pose.number) for pose, start_s, _ in timed if start_s > at_s]
     if not (before and after):
         return ""
     (end_s, first), (start_s, last) = max(before), min(after)
-    return (
-        f"The moment lies between pose {first} and pose {last}{where}, that is between {end_s:.1f} s and "
-        f"{start_s:.1f} s; the poses tell it no nearer."
-    )
+    gap = f"between pose {first} and pose {last}{where}, that is between {end_s:.1f} s and {start_s:.1f} s"
+    return _said(gap, "; the poses tell it no nearer", at_s, error_s, start_s - end_s)
+
+
+def _said(place: str, but: str, at_s: float, error_s: float | None, wide_s: float) -> str:
+    if error_s is None or 2 * error_s <= wide_s:
+        return f"The moment lies {place}{but}."
+    first, last = max(at_s - 2 * error_s, 0.0), at_s + 2 * error_s
+    return f"The moment lies most likely {place}; two standard errors reach from {first:.1f} s to {last:.1f} s."
 
 
 def _recording(finding: Finding, outcome: Outcome) -> str:

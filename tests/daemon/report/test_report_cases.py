@@ -138,6 +138,14 @@ def test_a_step_within_a_pose_is_said_to_lie_in_it(bare: dict[str, Any]) -> None
     assert "The moment lies in pose 7." in page(bare)[1]
 
 
+def test_a_step_that_may_have_been_poses_away_is_said_to(bare: dict[str, Any]) -> None:
+    pose = bare["calibration"]["poses"][6]
+    at_s, error_s = pose["start_s"] + 1.0, 0.6 * (pose["end_s"] - pose["start_s"])
+    add(bare, "bias_step", {"x": (7e-4, 2e-5, "g"), "at": (at_s, error_s, "s")})
+    said = f"two standard errors reach from {at_s - 2 * error_s:.1f} s to {at_s + 2 * error_s:.1f} s."
+    assert f"The moment lies most likely in pose 7; {said}" in page(bare)[1]
+
+
 def test_confounded_effects_are_all_told_in_words_with_what_would_tell_them_apart(words: dict[str, Any]) -> None:
     others = ["bias_drift", "warm_up", "channel_bias:fan_rpm"]
     add(words, "temperature_bias", {"y": (-2e-5, 1e-6, "g/K")}, alternatives=others,
