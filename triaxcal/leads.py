@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, PoseResult
 from triaxcal.conditions import channels_of, with_scale
 from triaxcal.distributions import f_sf
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, channel_of
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, channel_of, rate_of
 from triaxcal.figures import plain
 from triaxcal.plan.directions import linear_design
 
@@ -19,6 +19,8 @@ LEAD = 0.01
 """Probability of a pattern as clear as this by chance, the choice among all patterns allowed for, up to which it is a
 lead."""
 LEADS_MOST = 3
+NEAR_1 = 0.05
+"""A reference that is no further from one is a gravity, in g."""
 PERIODS = 24
 NAMES = {TIME: "the time", RUN: "the recording", HELD: "how long the pose was held"}
 NAMES |= {b: f"the pose before, along {b[-1]}" for b in BEFORE}
@@ -29,7 +31,7 @@ LOG = "log what else changes (temperature, supply, what stands nearby)"
 SWINGS = "log what may go up and down about every {} s (supply, heating, what runs nearby)"
 CONVERTER = (
     "test the converter by itself, with a slow ramp or a sine at its input, or tilt AXIS in steps of much less than "
-    "{} g: an integral nonlinearity makes such a wave"
+    "{} UNIT: an integral nonlinearity makes such a wave"
 )
 AGAIN = f"take some directions again at another azimuth and at another time, and {LOG}"
 """Where nothing points anywhere: the unit's own error comes back, the room's goes with the azimuth."""
@@ -106,8 +108,7 @@ def _patterns(after: Calibration, used: Sequence[PoseResult]) -> list[_Pattern]:
     for name, values in held.items():
         if name != SINCE_START and np.ptp(values) > 1e-9 * np.max(np.abs(values)):
             scaled = (values - values.mean()) / np.ptp(values)
-            said = NAMES.get(name, channel_of(name))
-            towards = TOWARDS.get(name, f"take the same poses again while {said} goes another way")
+            said, towards = _of_condition(name)
             out.append(_Pattern(scaled[:, None], said, name, towards))
             out.append(_Pattern(scaled[:, None] * direction, f"{said}, as a bias", name, towards))
     t, n = held[TIME], len(poses)
@@ -116,12 +117,24 @@ def _patterns(after: Calibration, used: Sequence[PoseResult]) -> list[_Pattern]:
     swing = _Wave("time", "a swing in time with a period of {} s", SWINGS, digits=2)
     out += swing.along([(t, np.ones((n, 1)))], slow)
     out += swing.along([(t, direction)], slow, ", as a bias")
+    unit = "g" if abs(after.reference - 1) < NEAR_1 else "of the reference"
     for axis, own in axes:
         out += swing.along([(t, own)], slow, f", as a bias of axis {axis}")
-        out += _wave_of(f"axis {axis}").along([(own[:, 0], own)], long)
+        out += _wave_of(f"axis {axis}", unit).along([(own[:, 0], own)], long)
     # Longer ones along all axes make any even pattern.
-    out += _wave_of("every axis").along([(own[:, 0], own) for _, own in axes], short)
+    out += _wave_of("every axis", unit).along([(own[:, 0], own) for _, own in axes], short)
     return out
+
+
+def _of_condition(name: str) -> tuple[str, str]:
+    """How it is said, and what would tell more of it."""
+    if name in NAMES:
+        return NAMES[name], TOWARDS[name]
+    again, rate = "take the same poses again while", rate_of("")
+    if name.endswith(rate):
+        channel = channel_of(name.removesuffix(rate))
+        return f"how fast {channel} changes", f"{again} {channel} changes at another rate"
+    return channel_of(name), f"{again} {channel_of(name)} goes another way"
 
 
 @dataclass(frozen=True)
@@ -150,10 +163,10 @@ class _Wave:
         return out
 
 
-def _wave_of(axis: str) -> _Wave:
-    text = f"a wave along the output of {axis}, {{}} g long"
+def _wave_of(axis: str, unit: str) -> _Wave:
+    text = f"a wave along the output of {axis}, {{}} {unit} long"
     tilted = "an axis" if axis == "every axis" else axis
-    return _Wave("wave", text, CONVERTER.replace("AXIS", tilted), digits=2)
+    return _Wave("wave", text, CONVERTER.replace("AXIS", tilted).replace("UNIT", unit), digits=2)
 
 
 def _monomials(a: Floats, degree: int) -> Floats:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Bools, Floats
+from triaxcal.effects.contract import HELD, SINCE_START
 from triaxcal.effects.part import whole
 from triaxcal.problem import Problem, State, everything
+from triaxcal.trends import unabsorbed
 
-NODES = 8
-"""Between two of the values that the search tries the likelihood is looked at so often."""
-UNLIKELY = 25.0
+UNLIKELY = 16.0
 """Chi-square over its minimum beyond which a value, and what is next to it, needs no closer look."""
+STRAIGHT = 1.0
+"""The likelihood is looked at so closely that chi-square changes by no more from one value to the next."""
+HALVED_MOST = 8
+FLAT = 1e-6
+"""A change of chi-square that is none."""
+PARTS = 20
+NOTHING_LIKE = 1e300
+"""In place of infinity, between which and the next nothing could be interpolated."""
 
 
 def shape_errors(
@@ -40,21 +50,63 @@ def _by_likelihood(problem: Problem, state: State, i: int, name: str, inflation:
     the likelihood is nowhere flat: there its curvature tells."""
     effect = state.effects[i]
     value = effect.shape[name][0]
-    grid = np.unique([value, *(v.shape[name][0] for v in whole(effect).variants(problem.conditions))])
-    coarse = np.array([_left(problem, state, i, name, float(v)) for v in grid]) / inflation**2
-    likely = coarse < np.nanmin(coarse) + UNLIKELY
-    cells = [k for k in range(len(grid) - 1) if likely[k] or likely[k + 1]]
-    if not cells:
-        return None
-    # The middles of equal parts, so that each stands for as much time as any other of its cell.
-    middles = (np.arange(NODES) + 0.5) / NODES
-    x = np.concatenate([grid[k] + (grid[k + 1] - grid[k]) * middles for k in cells])
-    stands_for = np.concatenate([np.full(NODES, (grid[k + 1] - grid[k]) / NODES) for k in cells])
-    chi2 = np.array([_left(problem, state, i, name, float(v)) for v in x]) / inflation**2
-    if len(np.unique(chi2)) == len(chi2):
-        return None
-    weight = stands_for * np.exp((np.nanmin(chi2) - chi2) / 2)
-    return float(np.sqrt(np.nansum(weight * (x - value) ** 2) / np.nansum(weight)))
+    tried = [v.shape[name][0] for v in whole(effect).variants(problem.conditions) if name in v.shape]
+    profile = _Profile(lambda v: _left(problem, state, i, name, v) / inflation**2)
+    profile.look_at(np.unique([value, *tried]))
+    if HELD in effect.needs:
+        profile.look_at(profile.where_likely(_edges(problem)))
+    profile.look_closer()
+    return profile.spread_about(value) if profile.is_flat_somewhere else None
+
+
+class _Profile:
+    """Chi-square (m,), over the inflation's square, at ascending values ``x`` (m,) of a shape."""
+
+    def __init__(self, chi2_at: Callable[[float], float]) -> None:
+        self._chi2_at = chi2_at
+        self.x, self.chi2 = np.empty(0), np.empty(0)
+
+    def look_at(self, more: Floats) -> None:
+        rows = np.searchsorted(self.x, more)
+        self.chi2 = np.insert(self.chi2, rows, [self._chi2_at(float(v)) for v in more])
+        self.x = np.insert(self.x, rows, more)
+
+    @property
+    def _likely(self) -> Bools:
+        """(m−1,) the intervals of which one end is."""
+        return np.asarray(np.minimum(self.chi2[:-1], self.chi2[1:]) < self.chi2.min() + UNLIKELY)
+
+    def where_likely(self, more: Floats) -> Floats:
+        """Of further values those in intervals that are likely."""
+        more = np.setdiff1d(more, self.x)
+        more = more[(self.x[0] < more) & (more < self.x[-1])]
+        return np.asarray(more[self._likely[np.searchsorted(self.x, more) - 1]])
+
+    @property
+    def is_flat_somewhere(self) -> bool:
+        return bool(np.any(np.abs(np.diff(self.chi2)) < FLAT))
+
+    def look_closer(self) -> None:
+        """Halves the likely intervals along which chi-square changes."""
+        for _ in range(HALVED_MOST):
+            coarse = self._likely & (np.abs(np.diff(self.chi2)) > STRAIGHT)
+            if not coarse.any():
+                return
+            self.look_at((self.x[:-1] + self.x[1:])[coarse] / 2)
+
+    def spread_about(self, value: float) -> float:
+        """The rms distance from a value, each weighted by its likelihood, of which the logarithm is straight between
+        two."""
+        wide = np.diff(self.x)
+        at = (self.x[:-1, None] + wide[:, None] * (np.arange(PARTS) + 0.5) / PARTS).ravel()
+        weight = np.repeat(wide, PARTS) * np.exp((self.chi2.min() - np.interp(at, self.x, self.chi2)) / 2)
+        return float(np.sqrt(np.sum(weight * (at - value) ** 2) / np.sum(weight)))
+
+
+def _edges(problem: Problem) -> Floats:
+    """When poses begin and end."""
+    middle, half = problem.conditions[SINCE_START], problem.conditions[HELD] / 2
+    return np.concatenate([middle - half, middle + half])
 
 
 def _left(problem: Problem, state: State, i: int, name: str, value: float) -> float:
@@ -63,6 +115,4 @@ def _left(problem: Problem, state: State, i: int, name: str, value: float) -> fl
     other = effect.shaped({k: v for k, (v, _) in effect.shape.items()} | {name: value})
     with np.errstate(over="ignore", invalid="ignore"):
         r, J, s = everything(problem, State(state.theta, (*state.effects[:i], other, *state.effects[i + 1 :])))
-        y = r / s
-        q, _ = np.linalg.qr(J / s[:, None])
-        return float(np.sum((y - q @ (q.T @ y)) ** 2))
+        return min(unabsorbed(J / s[:, None], r / s), NOTHING_LIKE)

@@ -88,7 +88,7 @@ class Trends:
         """
         r, J, error = self.linearise(state)
         stacked = np.concatenate([weighted, J / error[:, None]])
-        return _unabsorbed(stacked, np.concatenate([np.zeros(len(weighted)), r / error]))
+        return unabsorbed(stacked, np.concatenate([np.zeros(len(weighted)), r / error]))
 
     def touch(self, effects: Sequence[Effect]) -> bool:
         """Whether any of the effects goes with something that moves inside the poses."""
@@ -120,10 +120,10 @@ def left_by_trends(problem: Problem, state: State) -> float:
 def left_by_means(problem: Problem, state: State) -> float:
     """The sum of squares that a fit to the means alone leaves; ``state`` is that of a fit to everything."""
     r, J, s = linearise(problem, state)
-    return _unabsorbed(J / s[:, None], r / s)
+    return unabsorbed(J / s[:, None], r / s)
 
 
-def _unabsorbed(columns: Floats, misses: Floats) -> float:
+def unabsorbed(columns: Floats, misses: Floats) -> float:
     """Sum of squares of what is left of misses (n,) beside columns (n,p), however different these are in size; infinite
     where the model does not hold."""
     if not (np.isfinite(columns).all() and np.isfinite(misses).all()):

@@ -17,6 +17,8 @@ LIVE: dict[str, Mapping[str, float]] = {
     "bias_step": {"x": 7e-4, "y": -6e-4, "z": 8e-4, "at": KNOCKED_S},
     "hysteresis": {"x": 6e-4, "y": -7e-4, "z": 6e-4},
 }
+CONFOUNDED = {"warm_up"}
+"""What may come out as the second name of something else."""
 
 
 @pytest.mark.parametrize("effect", LIVE)
@@ -31,10 +33,12 @@ def test_a_unit_with_an_effect_that_no_register_takes_is_told_of_with_every_coef
     assert done.code == 0, done.err
     (named,) = [line for line in said if line.startswith(("adopted: ", "confounded: "))]
     assert effect in named.split(": ")[1].split(" or ")
-    if named.startswith("confounded"):
+    first = said.index(named) + 1
+    told = said[first : first + len(LIVE[effect])]
+    if not named.split(": ")[1].startswith(effect):
+        assert effect in CONFOUNDED
         return
-    told = said[said.index(named) + 1 :]
-    for (name, truth), line in zip(LIVE[effect].items(), told, strict=False):
+    for (name, truth), line in zip(LIVE[effect].items(), told, strict=True):
         found = re.fullmatch(rf"{name} (\S+) ± (\S+) .*", line)
         assert found, line
         late = START_S if name == "at" else 0.0

@@ -16,6 +16,7 @@ from triaxcal.effects import Effect
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.empirical import Empirical
 from triaxcal.fit import fit
+from triaxcal.leads import Lead
 from triaxcal.search import Nearest
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -259,3 +260,24 @@ def test_a_channel_that_stands_still_is_no_lead(paper_unit: Sensor, ups: np.ndar
     text = told(fit(moved, signs=MINUS, aside=()), {})
     assert "an odd pattern" in text
     assert "supply_v" not in text
+
+
+def test_the_rate_of_a_channel_is_told_in_words_and_the_length_of_a_wave_in_the_references_unit(
+    paper_unit: Sensor, ups: np.ndarray
+) -> None:
+    rng, rate = np.random.default_rng(0), np.random.default_rng(3).standard_normal(N)
+
+    def off(e: np.ndarray, reference: float = 1.0) -> Lead:
+        poses = noisy_poses(paper_unit, ups, SIGMA_G, rng, channels={"temp_c": 20 + CHANNEL}, hold_s=HOLD_S)
+        moved = [
+            replace(p, mean=p.mean + paper_unit.scale_factor * v, rates={"temp_c": float(r)})
+            for p, v, r in zip(poses, e, rate, strict=True)
+        ]
+        return lead(fit(moved, signs=MINUS, aside=(), reference=reference), {})
+
+    found = off(12 * radial(ups, rate))
+    assert "goes with how fast temp_c changes" in found.text
+    assert "take the same poses again while temp_c changes at another rate" in found.towards
+    of_field = off(12 * wave(ups), reference=50.0)
+    assert re.search(r"a wave along the output of axis y, 0\.3\d of the reference long", of_field.text)
+    assert re.search(r"in steps of much less than 0\.3\d of the reference: ", of_field.towards)

@@ -44,7 +44,7 @@ def sharpened(ground: Ground, candidate: Candidate) -> Candidate | None:
 
 def _best_shape(effect: Effect, problem: Problem, cost: Callable[[Effect], float]) -> Effect:
     for name, (value, _) in effect.shape.items():
-        grid = sorted({v.shape[name][0] for v in whole(effect).variants(problem.conditions)})
+        grid = sorted({v.shape[name][0] for v in whole(effect).variants(problem.conditions) if name in v.shape})
         low = max((g for g in grid if g < value * (1 - 1e-9)), default=value)
         high = min((g for g in grid if g > value * (1 + 1e-9)), default=value)
         if not low < high:

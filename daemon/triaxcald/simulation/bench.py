@@ -116,8 +116,9 @@ def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[Effect, F
     try:
         effect, coefficients = effect_of(name, held)
     except KeyError:
-        unknown = min(set(held) - set(known), default=", ".join(held))
-        raise InputError(f"{here}.{unknown}: known coefficients: {', '.join(known)}") from None
+        if unknown := set(held) - set(known):
+            raise InputError(f"{here}.{min(unknown)}: known coefficients: {', '.join(known)}") from None
+        raise InputError(f"{here}: {', '.join(held)} are not of one form of it") from None
     if bad := next((n for n, (v, _) in effect.shape.items() if not v > 0), None):
         raise InputError(f"{here}.{bad}: has to be above 0")
     if lacking := set(effect.needs) - CONDITIONS:

@@ -305,6 +305,10 @@ def test_devices_says_what_is_wrong_with_somebody_elses_broken_driver(tmp_path: 
             "sensor.effects.warm_up.time_constant: has to be above 0",
         ),
         (
+            {"sensor": {"effects": {"hysteresis": {"x": 1e-3, "sign_x": 1e-3}}}},
+            "sensor.effects.hysteresis: x, sign_x are not of one form of it",
+        ),
+        (
             {"sensor": {"effects": {"vibration_rectification": {"x": 1.0}}}},
             "sensor.effects.vibration_rectification: a simulated unit has no scatter_x, scatter_y, scatter_z, which",
         ),
