@@ -25,6 +25,8 @@ from triaxcal.trends import Trends, left_by_means, left_by_trends, trends_p
 FAMILYWISE = 0.01
 """Probability of any false finding on data with nothing inside."""
 P_LEAST = 1e-300
+DECIMALS = 7
+"""Of a deviance, of which a tenth matters."""
 KEPT = 2.6
 """A model keeps at least one of so many degrees of freedom, or it would fit anything."""
 
@@ -190,11 +192,14 @@ class Worth:
 def deviance(chi2: Floats, left: Ints | int) -> Floats:
     """Chi-square as far as noise explains it; beyond its ``left`` degrees of freedom by its logarithm, as what is left
     may be another noise, of a size that nobody told (profile likelihood of a factor on the errors, at least 1).
+
+    Rounded, lest a processor's rounding decide between models that say the same: a step after one of the first poses
+    and one after the next, say.
     """
     degrees = np.maximum(left, 1)
     chi2 = np.maximum(chi2, 0.0)
     beyond = np.log(np.maximum(chi2 / degrees, 1.0))
-    return np.asarray(np.where(chi2 > degrees, degrees * (1 + beyond), chi2))
+    return np.round(np.where(chi2 > degrees, degrees * (1 + beyond), chi2), DECIMALS)
 
 
 def parameters(effects: Sequence[Effect]) -> int:

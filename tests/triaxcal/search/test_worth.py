@@ -97,3 +97,10 @@ def test_what_an_effect_adds_beside_others_is_its_drop_of_chi_square(search: Sea
 def test_beside_itself_an_effect_has_nothing_to_add(search: Search) -> None:
     assert search.given(Part.of(SECOND, "x"), [SECOND]) == 1.0
     assert search.given(BiasDrift(1), [BiasDrift(2)]) == 1.0
+
+
+def test_the_rounding_of_a_processor_tells_no_models_apart() -> None:
+    left = 17.0 + 100 * np.random.default_rng(0).random(200)
+    apart = deviance(left, 17) - deviance(left * (1 + 1e-12), 17)
+    assert np.count_nonzero(apart) <= 2
+    assert deviance(np.array(30.0), 17) < deviance(np.array(30.001), 17)
