@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from triaxcal.arrays import Floats
 from triaxcal.distributions import chi2_sf
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.part import Part
@@ -22,6 +23,7 @@ from triaxcal.search.alternatives import NEAR
 from triaxcal.search.candidates import Ground
 from triaxcal.search.search import Search
 from triaxcal.search.worth import Model, deviance
+from triaxcal.shapes import edges_of, has_edges, spread
 
 LOOKED_AT = 2
 """Of each effect so many variants, the best for all units together in linear reckoning, are fitted in earnest."""
@@ -33,8 +35,8 @@ BEYOND = 3
 
 @dataclass(frozen=True)
 class SharedShape:
-    """A shape that the units share, by the minimum of their summed deviance; ``standard_error`` by the curvature of
-    that, None where it has none, as between two poses that a step lies between. ``own`` are value and standard error in
+    """A shape that the units share, by the minimum of their summed deviance; ``standard_error`` None where the
+    poses do not tell it. ``own`` are value and standard error in
     each of ``units`` (indices), ``p_value`` the probability of own values as different as these, were they one
     (likelihood ratio); None for one unit alone.
     """
@@ -258,8 +260,10 @@ def _shared(name: str, unit: str, j: _Joint, units: Sequence[_Unit], some: Seque
     own = [_lowest(profile, grid) for profile in profiles]
     apart = sum(profile(value) - profile(x) for profile, x in zip(profiles, own, strict=True))
     p = float(chi2_sf(max(apart, 0.0), len(some) - 1)) if len(some) > 1 else None
-    errors = [_error(profile, x, grid) for profile, x in zip(profiles, own, strict=True)]
-    return SharedShape(value, _error(together, value, grid), unit, tuple(some), tuple(zip(own, errors, strict=True)), p)
+    edges = {i: edges_of(units[i].search.problem) for i in some} if has_edges(j.variants[0]) else {}
+    errors = [_error(profile, x, grid, edges.get(i)) for i, profile, x in zip(some, profiles, own, strict=True)]
+    error = _error(together, value, grid, np.concatenate(list(edges.values())) if edges else None)
+    return SharedShape(value, error, unit, tuple(some), tuple(zip(own, errors, strict=True)), p)
 
 
 def _profile(unit: _Unit, j: _Joint, i: int, name: str) -> Callable[[float], float]:
@@ -295,8 +299,13 @@ def _beyond(grid: Sequence[float]) -> float:
     return grid[-1] * (grid[-1] / grid[-2]) ** BEYOND if len(grid) > 1 and grid[-2] > 0 else grid[-1]
 
 
-def _error(profile: Callable[[float], float], x: float, grid: Sequence[float]) -> float | None:
-    """By the curvature of a deviance at its minimum; None where it is flat, or at the end of what was tried."""
+def _error(
+    profile: Callable[[float], float], x: float, grid: Sequence[float], edges: Floats | None = None
+) -> float | None:
+    """By the curvature of a deviance at its minimum; None where it is flat, or at the end of what was tried. Of what
+    changes at the ``edges`` of poses, by its likelihood."""
+    if edges is not None:
+        return spread(x, profile, grid, edges)
     if x <= grid[0] or x >= 0.99 * _beyond(grid):
         return None
     step, error = STEP * x, None

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
-from triaxcal.effects.contract import HELD, SINCE_START
+from triaxcal.effects.contract import HELD, SINCE_START, Effect
 from triaxcal.effects.part import whole
 from triaxcal.problem import Problem, State, everything
 from triaxcal.trends import unabsorbed
@@ -17,8 +17,6 @@ UNLIKELY = 16.0
 STRAIGHT = 1.0
 """The likelihood is looked at so closely that chi-square changes by no more from one value to the next."""
 HALVED_MOST = 8
-FLAT = 1e-6
-"""A change of chi-square that is none."""
 PARTS = 20
 NOTHING_LIKE = 1e300
 """In place of infinity, between which and the next nothing could be interpolated."""
@@ -35,32 +33,56 @@ def shape_errors(
     out = {}
     named = [(i, name, value) for i, e in enumerate(state.effects) for name, (value, _) in e.shape.items()]
     for (i, name, value), column, thousandth in zip(named, columns.T, thousandths, strict=True):
-        error = _by_likelihood(problem, state, i, name, inflation)
-        if error is None and np.any(column):
+        error = None
+        if has_edges(state.effects[i]):
+            error = _by_likelihood(problem, state, i, name, inflation)
+        elif np.any(column):
             error = 1e-3 * abs(value) * float(thousandth)
         if error is not None:
             out[f"{state.effects[i].name}.{name}"] = error
     return out
 
 
-def _by_likelihood(problem: Problem, state: State, i: int, name: str, inflation: float) -> float | None:
-    """The rms distance from the shape's value to what it may be, by its profile likelihood over all that the search
-    tries: of a step between two poses the rectangular distribution over the time between them (JCGM 100, 4.3.7), with
-    shoulders where it may have been inside a pose, and other gaps where the directions of the poses hide it. None where
-    the likelihood is nowhere flat: there its curvature tells."""
-    effect = state.effects[i]
-    value = effect.shape[name][0]
-    tried = [v.shape[name][0] for v in whole(effect).variants(problem.conditions) if name in v.shape]
-    profile = _Profile(lambda v: _left(problem, state, i, name, v) / inflation**2)
+def has_edges(effect: Effect) -> bool:
+    """Whether it changes at the edges of poses, as a step does: the likelihood of its shape has kinks there, and is
+    flat between two poses, so that its curvature tells nothing."""
+    return HELD in effect.needs
+
+
+def spread(value: float, chi2_at: Callable[[float], float], tried: Sequence[float], edges: Floats) -> float | None:
+    """The rms distance from a shape's ``value`` to what it may be, each weighted by its likelihood, from the lowest to
+    the highest of those ``tried``; ``edges`` are those of the poses. None where only one was tried.
+
+    Of a step between two poses that is the rectangular distribution over the time between them (JCGM 100, 4.3.7), with
+    shoulders where it may have been inside a pose, and other gaps where the directions of the poses hide it.
+    """
+    profile = _Profile(chi2_at)
     profile.look_at(np.unique([value, *tried]))
-    if HELD in effect.needs:
-        profile.look_at(profile.where_likely(_edges(problem)))
+    if len(profile.x) < 2:
+        return None
+    profile.look_at(profile.where_likely(edges))
     profile.look_closer()
-    return profile.spread_about(value) if profile.is_flat_somewhere else None
+    return profile.spread_about(value)
+
+
+def edges_of(problem: Problem) -> Floats:
+    """When poses begin and end, in seconds since the start."""
+    middle, half = problem.conditions[SINCE_START], problem.conditions[HELD] / 2
+    return np.concatenate([middle - half, middle + half])
+
+
+def _by_likelihood(problem: Problem, state: State, i: int, name: str, inflation: float) -> float | None:
+    effect = state.effects[i]
+    tried = [v.shape[name][0] for v in whole(effect).variants(problem.conditions) if name in v.shape]
+
+    def chi2_at(value: float) -> float:
+        return _left(problem, state, i, name, value) / inflation**2
+
+    return spread(effect.shape[name][0], chi2_at, tried, edges_of(problem))
 
 
 class _Profile:
-    """Chi-square (m,), over the inflation's square, at ascending values ``x`` (m,) of a shape."""
+    """Chi-square (m,) at ascending values ``x`` (m,) of a shape."""
 
     def __init__(self, chi2_at: Callable[[float], float]) -> None:
         self._chi2_at = chi2_at
@@ -68,7 +90,7 @@ class _Profile:
 
     def look_at(self, more: Floats) -> None:
         rows = np.searchsorted(self.x, more)
-        self.chi2 = np.insert(self.chi2, rows, [self._chi2_at(float(v)) for v in more])
+        self.chi2 = np.insert(self.chi2, rows, [min(self._chi2_at(float(v)), NOTHING_LIKE) for v in more])
         self.x = np.insert(self.x, rows, more)
 
     @property
@@ -81,10 +103,6 @@ class _Profile:
         more = np.setdiff1d(more, self.x)
         more = more[(self.x[0] < more) & (more < self.x[-1])]
         return np.asarray(more[self._likely[np.searchsorted(self.x, more) - 1]])
-
-    @property
-    def is_flat_somewhere(self) -> bool:
-        return bool(np.any(np.abs(np.diff(self.chi2)) < FLAT))
 
     def look_closer(self) -> None:
         """Halves the likely intervals along which chi-square changes."""
@@ -103,16 +121,10 @@ class _Profile:
         return float(np.sqrt(np.sum(weight * (at - value) ** 2) / np.sum(weight)))
 
 
-def _edges(problem: Problem) -> Floats:
-    """When poses begin and end."""
-    middle, half = problem.conditions[SINCE_START], problem.conditions[HELD] / 2
-    return np.concatenate([middle - half, middle + half])
-
-
 def _left(problem: Problem, state: State, i: int, name: str, value: float) -> float:
     """Chi-square with another value of a shape, everything else fitted again, in linear reckoning."""
     effect = state.effects[i]
     other = effect.shaped({k: v for k, (v, _) in effect.shape.items()} | {name: value})
     with np.errstate(over="ignore", invalid="ignore"):
         r, J, s = everything(problem, State(state.theta, (*state.effects[:i], other, *state.effects[i + 1 :])))
-        return min(unabsorbed(J / s[:, None], r / s), NOTHING_LIKE)
+        return unabsorbed(J / s[:, None], r / s)

@@ -12,6 +12,7 @@ from triaxcal.agreement import Agreement, agreement
 from triaxcal.arrays import Floats
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.bias_drift import BiasDrift
+from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.loop import Loop, diagnose
@@ -19,12 +20,13 @@ from triaxcal.plan.directions import directions
 from triaxcal.poses.pose import Pose
 
 SIGMA_G, HOLD_S, COUNT = 1e-5, 10.0, 26
+GAP_S = 1.0
 FEW: tuple[Effect, ...] = (effect_named("second_order_nonlinearity"), BiasDrift(), WarmUp())
 UP = np.array([v for _, v in directions(COUNT)])
 Added = Callable[[Floats, Floats], Floats]
 
 
-def unit(rng: np.random.Generator, added: Added) -> Loop:
+def unit(rng: np.random.Generator, added: Added, catalogue: Sequence[Effect] = FEW) -> Loop:
     """A unit of its own scale factors, misalignments and biases, diagnosed; ``added`` in g, of time and attitude.
 
     Physics of its own: u = K (R a + b + added).
@@ -35,8 +37,9 @@ def unit(rng: np.random.Generator, added: Added) -> Loop:
     t_s = (np.arange(COUNT) + 0.5) * HOLD_S
     u = k * (s + b + added(t_s, s) + SIGMA_G * rng.standard_normal(s.shape))
     covariance = np.diag((k * SIGMA_G) ** 2)
-    poses = [Pose(i * HOLD_S, (i + 1) * HOLD_S, 1000, u[i], covariance, 1e6) for i in range(COUNT)]
-    return diagnose(poses, catalogue=FEW)
+    start_s = np.arange(COUNT) * HOLD_S + GAP_S / 2
+    poses = [Pose(t, t + HOLD_S - GAP_S, 1000, u[i], covariance, 1e6) for i, t in enumerate(start_s.tolist())]
+    return diagnose(poses, catalogue=catalogue)
 
 
 def warming(rng: np.random.Generator, time_constant_s: float, size_g: float = 1e-4) -> Added:
@@ -109,6 +112,23 @@ def test_over_many_seeds_the_time_constant_is_as_far_off_as_its_standard_error_s
         pulls.append((shared.value - 60.0) / shared.standard_error)
     low, high = stats.chi2.ppf([0.0005, 0.9995], len(pulls))
     assert low < float(np.sum(np.square(pulls))) < high
+
+
+def test_a_step_that_units_share_lies_between_two_poses_as_far_as_its_standard_error_says() -> None:
+    """Where the poses of one unit hide it, its own moment may be poses away."""
+    off, own = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(50 + seed)
+        at_s = HOLD_S * int(rng.integers(6, 20))
+        size = 3e-4 * np.sign(rng.standard_normal(3))
+        loops = [unit(rng, lambda t, s: np.where(t[:, None] < at_s, -size, 0.0), [BiasStep()]) for _ in range(3)]  # noqa: B023
+        shared = agreement(loops).effects[0].shapes["at"]
+        assert shared.standard_error is not None
+        off.append((shared.value - at_s) / shared.standard_error)
+        own += [(value - at_s) / error for value, error in shared.own if error is not None]
+    assert len(own) == 18
+    assert np.max(np.abs(off)) < 1  # the middle of the gap, or near it
+    assert np.sqrt(np.mean(np.square(own))) < 2
 
 
 def test_units_whose_time_constants_differ_are_seen_not_to_share_one() -> None:

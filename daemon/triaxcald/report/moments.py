@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from triaxcald.report.document import Finding, Outcome
@@ -30,23 +31,28 @@ def bracket(finding: Finding, outcome: Outcome) -> str:
         return ""
     where = f" of {recording}" if recording else ""
     error_s = next((c.standard_error for c in finding.coefficients if c.name == "at"), None)
+
+    def reach(sure: bool) -> str:
+        if sure or error_s is None:
+            return ""
+        first, last = max(at_s - 2 * error_s, 0.0), min(at_s + 2 * error_s, max(end_s for _, _, end_s in timed))
+        return f"; two standard errors reach from {first:.1f} s to {last:.1f} s"
+
     for pose, start_s, end_s in timed:
         if start_s <= at_s <= end_s:
-            return _said(f"in pose {pose.number}{where}", "", at_s, error_s, end_s - start_s)
+            sure = error_s is None or (start_s <= at_s - 2 * error_s and at_s + 2 * error_s <= end_s)
+            return f"The moment lies {'' if sure else 'most likely '}in pose {pose.number}{where}{reach(sure)}."
     before = [(end_s, pose.number) for pose, _, end_s in timed if end_s < at_s]
     after = [(start_s, pose.number) for pose, start_s, _ in timed if start_s > at_s]
     if not (before and after):
         return ""
     (end_s, first), (start_s, last) = max(before), min(after)
-    gap = f"between pose {first} and pose {last}{where}, that is between {end_s:.1f} s and {start_s:.1f} s"
-    return _said(gap, "; the poses tell it no nearer", at_s, error_s, start_s - end_s)
-
-
-def _said(place: str, but: str, at_s: float, error_s: float | None, wide_s: float) -> str:
-    if error_s is None or 2 * error_s <= wide_s:
-        return f"The moment lies {place}{but}."
-    first, last = max(at_s - 2 * error_s, 0.0), at_s + 2 * error_s
-    return f"The moment lies most likely {place}; two standard errors reach from {first:.1f} s to {last:.1f} s."
+    # Anywhere between the two is a rectangle; a tenth more, and it may have been inside them.
+    sure = error_s is None or error_s <= 1.1 * (start_s - end_s) / math.sqrt(12)
+    return (
+        f"The moment lies {'' if sure else 'most likely '}between pose {first} and pose {last}{where}, that is between "
+        f"{end_s:.1f} s and {start_s:.1f} s{reach(sure) or '; the poses tell it no nearer'}."
+    )
 
 
 def _recording(finding: Finding, outcome: Outcome) -> str:

@@ -146,6 +146,23 @@ def test_a_step_that_may_have_been_poses_away_is_said_to(bare: dict[str, Any]) -
     assert f"The moment lies most likely in pose 7; {said}" in page(bare)[1]
 
 
+def test_a_step_at_the_edge_of_a_pose_may_have_been_beside_it(bare: dict[str, Any]) -> None:
+    at_s = bare["calibration"]["poses"][6]["start_s"] + 0.5
+    add(bare, "bias_step", {"x": (7e-4, 2e-5, "g"), "at": (at_s, 0.5, "s")})
+    said = f"The moment lies most likely in pose 7; two standard errors reach from {at_s - 1:.1f} s to {at_s + 1:.1f} s"
+    assert said in page(bare)[1]
+
+
+@pytest.mark.parametrize(("gaps", "words"), [(1 / 12**0.5, "; the poses tell it no nearer."), (0.4, "; two standard")])
+def test_a_step_between_poses_lies_there_where_its_error_is_that_of_a_rectangle(
+    gaps: float, words: str, loop: dict[str, Any]
+) -> None:
+    poses = loop["calibration"]["poses"]
+    begin, end = poses[3]["end_s"], poses[4]["start_s"]
+    add(loop, "bias_step", {"x": (7e-4, 2e-5, "g"), "at": ((begin + end) / 2, gaps * (end - begin), "s")})
+    assert f"between pose 4 and pose 5, that is between {begin:.1f} s and {end:.1f} s{words}" in page(loop)[1]
+
+
 def test_confounded_effects_are_all_told_in_words_with_what_would_tell_them_apart(words: dict[str, Any]) -> None:
     others = ["bias_drift", "warm_up", "channel_bias:fan_rpm"]
     add(words, "temperature_bias", {"y": (-2e-5, 1e-6, "g/K")}, alternatives=others,

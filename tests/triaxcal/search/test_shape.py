@@ -103,6 +103,21 @@ def test_a_step_between_two_poses_is_put_between_them_and_may_have_been_at_any_m
     assert c.values[9:12] == pytest.approx(size, abs=8e-5)
 
 
+@pytest.mark.parametrize("hold_s", [7.3, 9.7, 10.0])
+def test_the_moment_of_a_step_on_one_axis_is_as_uncertain_without_gaps_whatever_the_clock(
+    hold_s: float, paper_unit: Sensor, recorded: Recorded
+) -> None:
+    """The likelihood has kinks there, which no derivative tells: 0.25 of a pose by that."""
+    poses = [
+        replace(p, start_s=i * hold_s, end_s=(i + 1) * hold_s)
+        for i, p in enumerate(recorded(replace(paper_unit, effects=((BiasStep(120.0), np.array([1e-4, 0, 0])),)), 0))
+    ]
+    c = fit(poses, signs=MINUS, effects=[Part.of(BiasStep(12 * hold_s), "x")], aside=())
+    error = c.coefficients_of("bias_step")["at"][1]
+    assert error is not None
+    assert error / hold_s == pytest.approx(0.62, abs=0.03)
+
+
 def test_a_late_step_between_two_poses_is_as_uncertain_as_an_early_one(paper_unit: Sensor, recorded: Recorded) -> None:
     """Hours into a recording a thousandth of the moment is longer than a gap."""
     late = 20000.0
