@@ -35,10 +35,9 @@ BEYOND = 3
 
 @dataclass(frozen=True)
 class SharedShape:
-    """A shape that the units share, by the minimum of their summed deviance; ``standard_error`` None where the
-    poses do not tell it. ``own`` are value and standard error in
-    each of ``units`` (indices), ``p_value`` the probability of own values as different as these, were they one
-    (likelihood ratio); None for one unit alone.
+    """A shape that the units share, by the minimum of their summed deviance; ``standard_error`` None where the poses do
+    not tell it. ``own`` are value and standard error in each of ``units`` (indices), ``p_value`` the probability of own
+    values as different as these, were they one (likelihood ratio); None for one unit alone.
     """
 
     value: float

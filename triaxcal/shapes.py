@@ -33,10 +33,8 @@ def shape_errors(
     out = {}
     named = [(i, name, value) for i, e in enumerate(state.effects) for name, (value, _) in e.shape.items()]
     for (i, name, value), column, thousandth in zip(named, columns.T, thousandths, strict=True):
-        error = None
-        if has_edges(state.effects[i]):
-            error = _by_likelihood(problem, state, i, name, inflation)
-        elif np.any(column):
+        error = _by_likelihood(problem, state, i, name, inflation) if has_edges(state.effects[i]) else None
+        if error is None and np.any(column):
             error = 1e-3 * abs(value) * float(thousandth)
         if error is not None:
             out[f"{state.effects[i].name}.{name}"] = error
