@@ -163,7 +163,7 @@ def apart(poses: list[Pose], each_s: float = 0.5) -> list[Pose]:
 def test_a_step_within_a_pose_is_timed_with_the_standard_error_that_is_its_scatter(
     paper_unit: Sensor, recorded: Recorded
 ) -> None:
-    truth, runs = 123.5, 20
+    truth, runs = 123.5, 12
     pulls = []
     for seed in range(runs):
         sensor = replace(paper_unit, effects=((BiasStep(truth), np.array([6e-4, -7e-4, 8e-4])),))
