@@ -15,7 +15,7 @@ import scipy
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import chi2_sf
-from triaxcal.effects.contract import Effect
+from triaxcal.effects.contract import Effect, reshaped
 from triaxcal.effects.part import Part
 from triaxcal.errors import InvalidData
 from triaxcal.loop import Loop
@@ -272,8 +272,7 @@ def _profile(unit: _Unit, j: _Joint, i: int, name: str) -> Callable[[float], flo
 
     def of(x: float) -> float:
         if x not in known:
-            shape = {n: v for n, (v, _) in part.shape.items()} | {name: x}
-            model = unit.model([*j.rest[i], part.shaped(shape)])
+            model = unit.model([*j.rest[i], reshaped(part, name, x)])
             known[x] = np.inf if model is None else unit.deviance(model)
         return known[x]
 

@@ -14,6 +14,7 @@ from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, channel_of, rate_of
 from triaxcal.figures import plain
 from triaxcal.plan.directions import linear_design
+from triaxcal.search.apart import FROM_OTHER_SIDES, UNSHAKEN
 
 LEAD = 0.01
 """Probability of a pattern as clear as this by chance, the choice among all patterns allowed for, up to which it is a
@@ -35,11 +36,9 @@ CONVERTER = (
 )
 AGAIN = f"take some directions again at another azimuth and at another time, and {LOG}"
 """Where nothing points anywhere: the unit's own error comes back, the room's goes with the azimuth."""
-ANOTHER_WAY = "come to the same poses from other sides: another order, or the same backwards"
 TOWARDS = {TIME: f"record again, and {LOG}", RUN: f"record again, and {LOG}"}
 TOWARDS |= {HELD: "hold each pose for as long as any other, or some directions for both long and short"}
-TOWARDS |= dict.fromkeys((*BEFORE, *CHANGE), ANOTHER_WAY)
-TOWARDS |= dict.fromkeys(SCATTER, "record again with what shakes the stand switched off")
+TOWARDS |= dict.fromkeys((*BEFORE, *CHANGE), FROM_OTHER_SIDES) | dict.fromkeys(SCATTER, UNSHAKEN)
 
 
 @dataclass(frozen=True)

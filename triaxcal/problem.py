@@ -19,7 +19,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.conditions import conditions, references
-from triaxcal.effects.contract import Effect
+from triaxcal.effects.contract import Effect, reshaped
 from triaxcal.errors import Refused
 from triaxcal.sensor import Sensor
 
@@ -185,9 +185,7 @@ def by_shape(problem: Problem, state: State) -> Floats:
         for name, (value, _) in effect.shape.items():
             sides = []
             for sign in (1, -1):
-                other = effect.shaped(
-                    {k: v for k, (v, _) in effect.shape.items()} | {name: value * (1 + sign * NEARBY)}
-                )
+                other = reshaped(effect, name, value * (1 + sign * NEARBY))
                 effects = (*state.effects[:i], other, *state.effects[i + 1 :])
                 sides.append(everything(problem, State(state.theta, effects), jacobian=False)[0])
             columns.append((sides[0] - sides[1]) / (2000 * NEARBY))

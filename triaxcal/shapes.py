@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
-from triaxcal.effects.contract import HELD, SINCE_START, Effect
+from triaxcal.effects.contract import HELD, SINCE_START, Effect, reshaped
 from triaxcal.effects.part import whole
 from triaxcal.problem import Problem, State, everything
 from triaxcal.trends import unabsorbed
@@ -121,8 +121,7 @@ class _Profile:
 
 def _left(problem: Problem, state: State, i: int, name: str, value: float) -> float:
     """Chi-square with another value of a shape, everything else fitted again, in linear reckoning."""
-    effect = state.effects[i]
-    other = effect.shaped({k: v for k, (v, _) in effect.shape.items()} | {name: value})
+    other = reshaped(state.effects[i], name, value)
     with np.errstate(over="ignore", invalid="ignore"):
         r, J, s = everything(problem, State(state.theta, (*state.effects[:i], other, *state.effects[i + 1 :])))
         return unabsorbed(J / s[:, None], r / s)

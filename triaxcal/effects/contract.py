@@ -162,3 +162,8 @@ def held_within(remedy: str, largest: float, floor: float, unit: str) -> str:
     if not 0 < floor < np.inf or not largest:
         return remedy
     return f"{remedy} Within ±{plain(floor / abs(largest), 2)} {unit} what it does is below the noise floor."
+
+
+def reshaped(effect: Effect, name: str, value: float) -> Effect:
+    """The effect with another value of one of its shapes."""
+    return effect.shaped({n: v for n, (v, _) in effect.shape.items()} | {name: value})

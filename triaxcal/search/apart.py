@@ -32,6 +32,9 @@ POSES = 3
 TOLD = 3.0
 """Two models are told apart by poses in which they differ by so many of their standard errors, all together."""
 
+FROM_OTHER_SIDES = "come to the same poses from other sides: another order, or the same backwards"
+UNSHAKEN = "record again with what shakes the stand switched off"
+
 DIRECTION, CLOCK, HISTORY, SHAKING, START = "direction", "time", "history", "shaking", "start"
 
 
@@ -51,9 +54,9 @@ def telling_apart(search: Search, effect: Effect, others: Mapping[str, Model]) -
         elif DIRECTION in (mine, theirs) and CLOCK in (mine, theirs):
             out["record the same poses again in another order, the first of them repeated at the end"] = None
         elif HISTORY in (mine, theirs):
-            out["come to the same poses from other sides: another order, or the same backwards"] = None
+            out[FROM_OTHER_SIDES] = None
         elif SHAKING in (mine, theirs):
-            out["record again with what shakes the stand switched off"] = None
+            out[UNSHAKEN] = None
         else:
             one, *another = dict.fromkeys(c for c in (mine, theirs) if c not in (DIRECTION, CLOCK))
             if another:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy
 
-from triaxcal.effects.contract import Effect
+from triaxcal.effects.contract import Effect, reshaped
 from triaxcal.effects.part import whole
 from triaxcal.problem import Problem
 from triaxcal.search.candidates import Candidate, Ground
@@ -51,7 +51,7 @@ def _best_shape(effect: Effect, problem: Problem, cost: Callable[[Effect], float
             continue
 
         def of(x: float, name: str = name, effect: Effect = effect) -> Effect:
-            return effect.shaped({n: v for n, (v, _) in effect.shape.items()} | {name: x})
+            return reshaped(effect, name, x)
 
         found = scipy.optimize.minimize_scalar(
             lambda x, of=of: cost(of(x)), bounds=(low, high), method="bounded", options={"xatol": 1e-3 * high}
