@@ -40,7 +40,9 @@ UNKNOWN_HISTORY = "unknown_history"
 
 @dataclass(frozen=True)
 class PoseResult:
-    """One pose under the fit. ``direction`` (3,) is up in the sensor's frame; ``residual_g`` is |a| − reference."""
+    """One pose under the fit. ``direction`` (3,) is up in the sensor's frame; ``residual_g`` is |a| − reference;
+    ``standard_error_g`` that of its noise, ``raised_g`` with what residuals show beyond noise, where that is known.
+    """
 
     pose: Pose
     direction: Floats
@@ -50,8 +52,14 @@ class PoseResult:
     leverage: float
     left_out: str = ""
     """Why the fit does not use it: `SPOILED`, `UNKNOWN_HISTORY`, or the fault of its samples; empty where it does."""
+    raised_g: float | None = None
     carries: float = 0.0
     """0…1: how much of some combination of its mean and its trend the pose determines by itself."""
+
+    @property
+    def error_g(self) -> float:
+        """The standard error by all that is known."""
+        return self.standard_error_g if self.raised_g is None else self.raised_g
 
     @property
     def used(self) -> bool:
@@ -63,11 +71,13 @@ class Calibration:
     """A fitted sensor. ``covariance`` is of `parameters`, in that order.
 
     ``reference`` is the magnitude of the reference vector; ``channel_reference`` the values from which the effects'
-    conditions are counted; ``inflation`` is the factor on the standard errors by which residuals exceed the noise:
-    at least 1, unless no pose knows its noise (then the residuals alone set it). ``dof`` are the effective degrees of
-    freedom behind the standard errors. ``shape_errors`` are standard errors of the effects' shapes, by "effect.name";
-    ``shared`` are coefficients, named so, that only a combination of them is known of. ``trends``: how |a| goes inside
-    the poses was fitted along with their means.
+    conditions are counted. Residuals that exceed the noise raise the standard errors: by a factor on all errors,
+    ``inflation``, at least 1 unless no pose knows its noise (then the residuals alone set it); or by ``excess_g``, a
+    standard deviation of |a| that every pose has beside its noise (`triaxcal.beyond`). ``dof`` are the effective
+    degrees of freedom behind the standard errors. ``shape_errors`` are standard errors of the effects' shapes, by
+    "effect.name"; ``shared`` are coefficients, named so, that only a combination of them is known of. ``trends``: how
+    |a| goes inside the poses was fitted along with their means. ``rivals`` are models that explain the same poses as
+    well, by what they have in the place of an effect; standard errors are those of this model, were it the right one.
     """
 
     sensor: Sensor
@@ -80,11 +90,13 @@ class Calibration:
     dilution: float
     inflation: float
     dof: float
+    excess_g: float = 0.0
     shape_errors: Mapping[str, float] = field(default_factory=dict)
     shared: frozenset[str] = frozenset()
     trends: bool = False
     blind_to: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    rivals: Mapping[str, Calibration] = field(default_factory=dict, repr=False)
 
     @property
     def terms(self) -> tuple[str, ...]:

@@ -3,24 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.beyond import Beyond
 from triaxcal.calibration import SPOILED, UNKNOWN_HISTORY, Calibration, PoseResult, Residual
 from triaxcal.conditions import of_unknown_history
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, Refused
+from triaxcal.figures import micro_g
 from triaxcal.outliers import Spoiled, not_as_foretold, spoiled
 from triaxcal.plan.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
-from triaxcal.problem import NOT_STILL, Problem, State, by_shape, everything, linearise, parameters_by_theta, solve
-from triaxcal.pure_error import lack_of_fit_p, pose_dof, pure_error_dof, raised
+from triaxcal.problem import (
+    NOT_STILL,
+    Linearised,
+    Problem,
+    State,
+    by_shape,
+    everything,
+    linearise,
+    parameters_by_theta,
+    solve,
+)
+from triaxcal.pure_error import lack_of_fit_p, of_both, pose_dof, pure_error_dof, raised_dof
 from triaxcal.shapes import shape_errors
 from triaxcal.start import DILUTION_LIMIT, problem_of, start, with_history
-from triaxcal.trends import left_by_means, trends_p, with_trends
+from triaxcal.trends import trends_p, unabsorbed, with_trends
 
 DILUTION_WARNING = 10.0
 SPREAD_WARNING = 15.0
@@ -68,7 +80,7 @@ def fit(
         verdict = _spoiled(whole, by_means, poses)
         unknown = _of_another_history(whole, by_means, poses, verdict.rows)
         if set(verdict.rows) <= set(of_unknown_history(poses, effects)):
-            verdict = replace(verdict, doubtful=0.0)  # that it is off says nothing of how well poses come back
+            verdict = replace(verdict, doubtful=False)  # that it is off says nothing of how well poses come back
     found = tuple(sorted((*verdict.rows, *unknown)))
     kept, problem = list(poses), whole
     if found:
@@ -77,7 +89,9 @@ def fit(
         begin = start(problem, kept, signs)
         problem = with_history(problem, kept, begin.sensor(problem))
         by_means = None
-    calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, verdict)
+    # What may be no worse than the others shows by how much all come back less well than their noise.
+    judged = whole.only(np.setdiff1d(np.arange(len(poses)), unknown)) if verdict.doubtful else None
+    calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, judged)
     if found:
         calibration = _with_aside(calibration, poses, found, verdict)
     if verdict.rivals:
@@ -116,20 +130,25 @@ def _solved(
 
 
 def _spoiled(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
-    """Indices of spoiled poses, from the fit to all. Sought anew without those found, until the same are found again.
+    """Indices of spoiled poses, from the fit to all. Sought anew without those found, until the same are found again:
+    a pose spoiled by a thousand times its noise bends the fit so far that linear reckoning is off.
 
-    A pose spoiled by a thousand times its noise bends the fit so far that linear reckoning is off.
+    What the others show beside their noise, all are taken to have: by the noise alone the quietest would look spoiled.
     """
-    dof, pure = pose_dof(poses), pure_error_dof(poses)
-    found = Spoiled()
+    own, together = pose_dof(poses), pure_error_dof(poses)
+    dof, pure, judged, found = own, together, problem, Spoiled()
     for _ in range(SPOILED_ROUNDS):
-        r, J, s = linearise(problem, state)
+        r, J, s = linearise(judged, state)
         again = spoiled(r / s, J / s[:, None], dof, pure)
         if again.rows == found.rows:
             return again
         found = again
         rest: Ints = np.delete(np.arange(len(poses)), found.rows)
-        state = solve(problem.only(rest), state, state.effects)
+        others, left = problem.only(rest), len(rest) - len(state.theta)
+        state = solve(others, state, state.effects)
+        judged = replace(problem, excess=Beyond.shown(linearise(others, state), len(rest), left, together).excess_g)
+        share = judged.excess**2 / linearise(judged, state)[2] ** 2
+        dof, pure = of_both(share, left, own), float(of_both(share.mean(), left, together))
     return found
 
 
@@ -168,9 +187,10 @@ def _among(
     a = calibration.sensor.specific_force(u, conditioned)
     results, added = list(calibration.poses), []
     for i, reason in sorted(reasons.items()):
-        error = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
+        noise = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
+        error = float(np.hypot(noise, calibration.excess_g))
         miss = float(length[i] - calibration.reference)
-        added.append(PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, error, miss / error, 0.0, reason))
+        added.append(PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, noise, miss / error, 0.0, reason, error))
         results.insert(i, added[-1])
     return tuple(results), added
 
@@ -188,31 +208,63 @@ def _with_aside(calibration: Calibration, poses: Sequence[Pose], rows: Sequence[
             "; the noise inside the poses says so, while the other residuals leave it open whether all poses come "
             "back less well than that: the standard errors allow for both"
         )
+        if calibration.excess_g:
+            warning += f", {micro_g(calibration.excess_g / calibration.reference)} beside the noise of each pose"
     warnings += [warning] if others else []
     return replace(calibration, poses=results, warnings=(*warnings, *calibration.warnings))
 
 
-def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
+@dataclass(frozen=True)
+class _Left:
+    """``chi2``, in units of the noise inside the poses, that a fit leaves in ``left`` degrees of freedom; ``wider`` the
+    same with poses left out whose residuals tell how well all come back, and what these show ``beyond`` noise."""
+
+    chi2: float
+    left: int
+    wider: tuple[float, int]
+    beyond: Beyond
+
+    @classmethod
+    def of(
+        cls, everything_left: Linearised, problem: Problem, state: State, judged: Problem | None, pure: float
+    ) -> _Left:
+        """``judged`` are the means of all those poses where they are more; ``pure`` the degrees of freedom of the noise
+        inside them."""
+        n = len(problem.u)
+        # What the shape of an effect was chosen by is spent, though no column of the Jacobian stands for it.
+        spent = len(state.theta) + sum(len(e.shape) for e in state.effects)
+        by_means = problem.further is None or n > spent
+        r, J, s = (part[:n] if by_means else part for part in everything_left)
+        chi2, left = unabsorbed(J / s[:, None], r / s), len(r) - spent
+        wider = chi2, left
+        if judged is not None and by_means:
+            r, J, s = linearise(judged, State.of(judged, state.sensor(problem)))
+            wider = unabsorbed(J / s[:, None], r / s), left + len(r) - n
+            n = len(r)
+        return cls(chi2, left, wider, Beyond.shown((r, J, s), n, wider[1], pure))
+
+
+def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Problem | None) -> Calibration:
     with np.errstate(over="ignore", invalid="ignore"):
-        r, _, s = linearise(problem, state)
         every_r, J, every_s = everything(problem, state)
     if not (np.isfinite(J).all() and np.isfinite(every_r).all()):
         raise Refused(f"the fit ran away; {NOT_STILL}")
+    n, p = len(poses), J.shape[1]
+    found = _Left.of((every_r, J, every_s), problem, state, judged, pure_error_dof(poses))
+    noise, inflation = every_s[:n], found.beyond.inflation
+    if found.beyond.excess_g:
+        problem = found.beyond.beside(problem, state)
+        state = solve(problem, state, state.effects)
+        every_r, J, every_s = everything(problem, state)
+    r, s = every_r[:n], every_s[:n]
     weighted = J / every_s[:, None]
-    n, p = len(r), J.shape[1]
     q, _ = np.linalg.qr(weighted)
     leverage = np.clip((q**2).sum(axis=1), 0.0, 1.0)[:n]
     own = q.reshape(-1, n, p).transpose(1, 0, 2)
     carries = np.linalg.eigvalsh(own @ own.transpose(0, 2, 1))[:, -1]
     free = np.sqrt(np.maximum(1 - leverage, 0.0))
     studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
-    # What the shape of an effect was chosen by is spent, though no column of the Jacobian stands for it.
-    spent = p + sum(len(e.shape) for e in state.effects)
-    chi2, left = float(np.sum((every_r / every_s) ** 2)), len(every_r) - spent
-    if problem.further is not None and n > spent:
-        chi2, left = left_by_means(problem, state), n - spent
-    doubtful = len(verdict.rows) if verdict.doubtful else 0
-    inflation, dof = raised(chi2 + verdict.doubtful, left + doubtful, pure_error_dof(poses, leverage / leverage.sum()))
+    dof = raised_dof(*found.wider, pure_error_dof(poses, leverage / leverage.sum()))
     sensor = state.sensor(problem)
     direction = sensor.specific_force(problem.u, problem.conditions)
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
@@ -228,8 +280,8 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Sp
         rms_g=float(np.sqrt(np.mean(r**2))),
         max_abs_g=float(np.max(np.abs(r))),
         cross_validated_rms_g=cross_validated(problem, state),
-        noise_floor_g=float(np.sqrt(np.mean(s**2))),
-        lack_of_fit_p=lack_of_fit_p(chi2, left, pure_error_dof(poses)),
+        noise_floor_g=float(np.sqrt(np.mean(noise**2))),
+        lack_of_fit_p=lack_of_fit_p(found.chi2, found.left, pure_error_dof(poses)),
     )
     calibration = Calibration(
         sensor=sensor,
@@ -242,9 +294,10 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Sp
                 pose,
                 direction[i],
                 float(r[i]),
-                float(s[i]),
+                float(noise[i]),
                 float(studentized[i]),
                 float(leverage[i]),
+                raised_g=float(s[i]) * inflation,
                 carries=float(carries[i]),
             )
             for i, pose in enumerate(poses)
@@ -252,6 +305,7 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], verdict: Sp
         condition=float(np.linalg.cond(weighted / np.maximum(norms, 1e-300))),
         dilution=spread,
         inflation=inflation,
+        excess_g=found.beyond.excess_g,
         dof=dof,
         shape_errors=shape_errors(problem, state, shapes, np.sqrt(np.diag(covariance)[p:]), inflation),
         trends=problem.further is not None,
@@ -316,12 +370,17 @@ def _warnings(c: Calibration) -> list[str]:
     if worst.leverage > 0.95:
         out.append(f"the pose at {worst.pose.at} alone carries a parameter (leverage {worst.leverage:.2f})")
     if c.residual.lack_of_fit_p is not None and c.residual.lack_of_fit_p < SIGNIFICANT:
-        out.append(
-            f"residuals are {c.inflation:.1f} times what the noise explains; the standard errors are raised by that"
-        )
+        out.append(_how_raised(c))
     if c.residual.lack_of_fit_p is not None and c.residual.lack_of_fit_p > 1 - SIGNIFICANT / 5:
         out.append(
             "residuals are smaller than the poses' noise and creep explain: what moves the outputs inside a pose (a "
             "temperature, a stand that settles) moves the means less, and the standard errors are on the safe side"
         )
     return out
+
+
+def _how_raised(c: Calibration) -> str:
+    if c.excess_g:
+        beside = micro_g(c.excess_g / c.reference)
+        return f"residuals show {beside} beside the noise of each pose; the standard errors allow for it"
+    return f"residuals are {c.inflation:.1f} times what the noise explains; the standard errors are raised by that"

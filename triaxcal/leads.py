@@ -62,7 +62,7 @@ class _Pattern:
 def clear_patterns(after: Calibration, used: Sequence[PoseResult]) -> list[Lead]:
     """The patterns that the residuals of the poses ``used`` show beyond chance, the clearest first."""
     patterns = _patterns(after, used)
-    error = np.array([p.standard_error_g for p in used])
+    error = np.array([p.error_g for p in used])
     y = np.array([p.residual_g for p in used]) / error
     model, _ = np.linalg.qr(_fitted(after, used) / error[:, None])
     free = len(y) - model.shape[1] - sum(len(effect.shape) for effect, _ in after.sensor.effects)

@@ -17,7 +17,7 @@ from triaxcal.description import described
 from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.part import Part
-from triaxcal.effects.plugins import plugins
+from triaxcal.effects.plugins import EffectFault, plugins
 from triaxcal.errors import Refused
 from triaxcal.explanation import Explanation, explained, left_out
 from triaxcal.findings import Finding, advice_of, description_of, finding_of, the_poses, why_not_shown
@@ -94,10 +94,11 @@ def diagnose(
     blind = {e.name: why_not_shown(search, e) for e in effects if e.name not in shown}
     if catalogue is None:
         faulty = dict(plugins()[1]) | faulty
-    held = None
-    if check is not None:
-        instead = {n: made.given.tried(effects) for f in findings for n, effects in f.instead.items()}
-        held = held_out(before, after, check, {n: c for n, c in instead.items() if c is not None})
+    instead = {n: made.given.tried(effects) for f in findings for n, effects in f.instead.items()}
+    known = {n: c for n, c in instead.items() if c is not None}
+    if smooth is None:
+        after = replace(after, rivals=known | _spoiled_instead(made))
+    held = None if check is None else held_out(before, after, check, known)
     advice = advice_of(findings, unexplained, undescribed, blind, faulty)
     return Loop(
         before=before.with_blind_to(tuple(blind)),
@@ -126,7 +127,7 @@ class _Given:
         """None where the poses cannot carry it."""
         try:
             return self.fit(effects)
-        except Refused:
+        except (Refused, EffectFault):
             return None
 
 
@@ -186,6 +187,17 @@ def _unexplained(made: _Made) -> Unexplained:
     if made.rivals and whole_p is not None and whole_p < LACK_OF_FIT:
         return spoiled_or(replace(made.quiet, aside=()).fit(()), whole_p, made.aside, made.rivals, left)
     return left
+
+
+def _spoiled_instead(made: _Made) -> dict[str, Calibration]:
+    """The linear model without poses that explain as much as the effects do, were they spoiled."""
+    if not made.found.spoiled or not made.adopted:
+        return {}
+    model = replace(made.given, aside=made.found.spoiled).tried(())
+    if model is None:
+        return {}
+    left_out = the_poses([p.pose.at for p in model.poses if not p.used])
+    return {f"that something spoiled {left_out}": model}
 
 
 def _without_faults(poses: Sequence[Pose]) -> list[str]:

@@ -40,13 +40,13 @@ CARRIES = 1e-6
 class Spoiled:
     """``rows`` were spoiled. Besides, one of ``rivals`` was: sets of rows that explain it as well as each other.
 
-    Where only the noise inside the poses says so, because the rows do not stand out from the other residuals,
-    ``doubtful`` is what they take out of the sum of squares: it may be that the poses come back less well than that.
+    Where only the noise inside the poses says so, because the rows do not stand out from the other residuals, it is
+    ``doubtful``: it may be that the poses come back less well than that.
     """
 
     rows: tuple[int, ...] = ()
     rivals: tuple[tuple[int, ...], ...] = ()
-    doubtful: float = 0.0
+    doubtful: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,6 @@ class _Judge:
     def free(self, rows: Ints) -> Floats:
         """(1 − H) among ``rows``."""
         return np.eye(len(rows)) - self.q[rows] @ self.q[rows].T
-
-    def taken(self, rows: Ints) -> float:
-        """What ``rows`` take out of the sum of squares."""
-        return float(self.rest[rows] @ self.off(rows))
 
     def excess(self, after: float, left: int) -> float:
         """What is left, ``after`` in ``left`` degrees of freedom, over the noise; 1 where that explains it."""
@@ -162,7 +158,7 @@ def _unless_rivalled(judge: _Judge, rows: Ints, taken: Floats) -> Spoiled:
     certain = tuple(sorted(set.intersection(*map(set, sets))))
     rivals = tuple(tuple(i for i in each if i not in certain) for each in sets) if len(sets) > 1 else ()
     doubtful = judge.by_rest(most, size) * len(rows) > DOUBT
-    return Spoiled(certain, rivals, judge.taken(np.array(certain)) if certain and doubtful else 0.0)
+    return Spoiled(certain, rivals, bool(certain) and doubtful)
 
 
 def _each_stands_alone(judge: _Judge, rows: Ints, both: float) -> bool:

@@ -46,11 +46,15 @@ class Further(Protocol):
 
     def only(self, rows: Ints | slice) -> Self: ...
 
+    def widened(self, factor: Floats) -> Self:
+        """With errors so many times (n,) as large."""
+        ...
+
 
 @dataclass(frozen=True)
 class Problem:
     """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each. ``further`` is
-    fitted along with the means."""
+    fitted along with the means. ``excess`` is a standard deviation of |a| that all have beside their covariance."""
 
     u: Floats
     covariance: Floats
@@ -61,6 +65,7 @@ class Problem:
     signs: Floats
     reference: float
     further: Further | None = None
+    excess: float = 0.0
 
     @cached_property
     def conditions(self) -> dict[str, Floats]:
@@ -160,7 +165,8 @@ def everything(problem: Problem, state: State, jacobian: bool = True) -> Lineari
 
 
 def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
-    """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise (n,)."""
+    """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise, and what is
+    beside it (n,)."""
     sensor = state.sensor(problem)
     held = problem.conditions
     if not jacobian:
@@ -174,7 +180,8 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearis
     by_u = by_v / sensor.scale_factor
     variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
     # Poses without any scatter (made up, or below the resolution) would otherwise weigh infinitely.
-    return length - problem.reference, J, np.sqrt(np.maximum(variance, (1e-12 * problem.reference) ** 2))
+    variance = np.maximum(variance, (1e-12 * problem.reference) ** 2) + problem.excess**2
+    return length - problem.reference, J, np.sqrt(variance)
 
 
 def by_shape(problem: Problem, state: State) -> Floats:

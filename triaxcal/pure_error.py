@@ -41,6 +41,13 @@ def pure_error_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
     return min(float(1 / (np.sum(w**2 * own) + (w @ np.sqrt(common)) ** 2 + 1e-300)), DOF_MOST)
 
 
+def of_both(share: Floats, left: int, dof: Floats | float) -> Floats:
+    """Degrees of freedom of variances of which a ``share`` is what residuals show beyond noise, in ``left`` degrees of
+    freedom, and the rest noise known by ``dof``, zero where it is not."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(1 / ((1 - share) ** 2 / dof + share**2 / left))
+
+
 def noise_levels(poses: Sequence[Pose]) -> NoiseLevels:
     """How large the noise of all poses together may be: by the degrees of freedom alone where they are of several
     recordings."""
@@ -59,21 +66,20 @@ def lack_of_fit_p(chi2: float, left: int, pure_dof: float) -> float | None:
     return float(f_sf(chi2 / left, left, pure_dof)) if left > 0 and pure_dof >= 1 else None
 
 
-def raised(chi2: float, left: int, pure_dof: float) -> tuple[float, float]:
-    """By what the standard errors are multiplied, and the degrees of freedom that they then have.
+def raised_dof(chi2: float, left: int, pure_dof: float) -> float:
+    """Degrees of freedom of standard errors that residuals raise wherever they exceed the noise inside the poses.
 
-    ``chi2`` is the sum of squares in ``left`` degrees of freedom, ``pure_dof`` those of the noise inside the poses.
-    Residuals larger than that noise raise the errors (Birge 1932, Phys. Rev. 40:207), however little they exceed it,
-    and step by step the degrees of freedom become those of the residuals: a test that decides between the two would
-    leave intervals too short where the excess is too small for it. Residuals that are smaller lower nothing.
+    ``chi2`` is the sum of squares in ``left`` degrees of freedom, ``pure_dof`` those of the noise. However little the
+    residuals exceed it they raise the errors, and step by step the degrees of freedom become those of the residuals: a
+    test that decides between the two would leave intervals too short where the excess is too small for it.
     """
     if left <= 0:
-        return 1.0, max(pure_dof, 1.0)
+        return max(pure_dof, 1.0)
     ratio = chi2 / left
     if pure_dof < 1:
-        return float(np.sqrt(ratio)), float(left)
+        return float(left)
     if ratio <= 1:
-        return 1.0, pure_dof + left
+        return pure_dof + left
     p, at_one = float(f_sf(ratio, left, pure_dof)), float(f_sf(1.0, left, pure_dof))
     doubt = max(0.0, (p - BEYOND_DOUBT) / (at_one - BEYOND_DOUBT))
-    return float(np.sqrt(ratio)), float(1 / (doubt / (pure_dof + left) + (1 - doubt) / left))
+    return float(1 / (doubt / (pure_dof + left) + (1 - doubt) / left))

@@ -33,6 +33,8 @@ class Trends:
     middle: Problem
     errors: Mapping[str, Floats]
     moving: frozenset[str]
+    wider: Floats | float = 1.0
+    """Times the errors that the noise makes, (n,) or all."""
 
     @classmethod
     def of(cls, problem: Problem, poses: Sequence[Pose]) -> Trends | None:
@@ -44,7 +46,7 @@ class Trends:
         change, errors = _changes(problem, poses, length)
         moving = frozenset(change)
         change |= {n: np.zeros(len(poses)) for n in problem.channels.keys() - change.keys()}
-        middle = replace(problem, covariance=error[:, None, None] ** 2 * np.eye(3))
+        middle = replace(problem, excess=0.0, covariance=error[:, None, None] ** 2 * np.eye(3))
         inside = replace(
             middle,
             u=_moved(problem.u, np.array([p.trend for p in poses])),
@@ -71,16 +73,19 @@ class Trends:
             channels = dict(self.middle.channels) | {name: self.middle.channels[name] + self.errors[name]}
             there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
             variance = variance + (there - here) ** 2
-        return r, J, np.sqrt(variance)
+        return r, J, self.wider * np.sqrt(variance)
+
+    def widened(self, factor: Floats) -> Trends:
+        return replace(self, wider=self.wider * factor)
 
     def only(self, rows: Ints | slice) -> Trends:
         """Those of some of the poses."""
         n = len(self.middle.u)
         kept = np.arange(n)[rows]
         inside = self.inside.only(np.concatenate([kept + n * k for k in range(len(PLACES))]))
-        return Trends(
-            inside, self.middle.only(rows), {name: error[rows] for name, error in self.errors.items()}, self.moving
-        )
+        errors = {name: error[rows] for name, error in self.errors.items()}
+        wider: Floats = np.broadcast_to(self.wider, n)[rows]
+        return replace(self, inside=inside, middle=self.middle.only(rows), errors=errors, wider=wider)
 
     def chi2(self, state: State, weighted: Floats) -> float:
         """How far the trends are from those that a model foretells, as a sum of squares of n; as near as the means,

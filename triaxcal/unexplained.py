@@ -75,8 +75,9 @@ def beyond_noise(after: Calibration) -> float:
 def _size(after: Calibration) -> float:
     """The same where it is significant: one loud pose may hide in the plain rms what the others show, each by its own
     noise."""
-    raised = after.residual.noise_floor_g * float(np.sqrt(max(after.inflation**2 - 1, 0.0)))
-    return max(beyond_noise(after), raised)
+    noise = after.residual.noise_floor_g
+    raised = after.inflation**2 * (noise**2 + after.excess_g**2) - noise**2
+    return max(beyond_noise(after), float(np.sqrt(max(raised, 0.0))))
 
 
 def hints_of(search: Search) -> list[Lead]:

@@ -158,7 +158,12 @@ def _held_by_device(
     ]
     if len(kept) == len(full.sensor.effects):
         return full
-    return fit(poses, signs=signs, reference=reference, effects=kept)
+    held = fit(poses, signs=signs, reference=reference, effects=kept)
+    if not full.rivals:
+        return held
+    # Whatever it is called, it is not in the registers; what it makes of them is as open as with it.
+    named = " with ".join(effect.name for effect, _ in full.sensor.effects)
+    return replace(held, rivals={named: full, **full.rivals})
 
 
 def _image(profile: Profile, held: Calibration, date_days: int) -> RegisterImage:

@@ -11,7 +11,7 @@ from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.errors import InvalidData
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
-from triaxcal.pure_error import pure_error_dof, raised
+from triaxcal.pure_error import pure_error_dof, raised_dof
 
 SEEDS = 220
 CERTAIN = stats.norm.isf(1e-4)
@@ -82,19 +82,18 @@ def test_coverage_factors_are_those_of_the_gum_s_table() -> None:
         found.coverage_factor(95)
 
 
-def test_the_errors_are_raised_without_a_jump_and_end_with_the_residuals_own_degrees_of_freedom() -> None:
+def test_a_factor_raises_the_errors_without_a_jump_and_they_end_with_the_residuals_own_degrees_of_freedom() -> None:
     for pure, left in ((1e6, 5), (28.0, 5), (1e6, 100), (5.0, 17)):
         ratio = np.linspace(0.0, 6.0, 3001)
-        factor, dof = np.array([raised(r * left, left, pure) for r in ratio]).T
-        half = factor * stats.t.ppf(0.975, dof)
+        dof = np.array([raised_dof(r * left, left, pure) for r in ratio])
+        half = np.sqrt(np.maximum(ratio, 1.0)) * stats.t.ppf(0.975, dof)
         assert np.all(np.diff(half) >= -1e-12)
         assert np.max(np.diff(half)) < 0.05
-        assert (factor[0], dof[0]) == (1.0, pure + left)
-        assert (factor[-1], dof[-1]) == (pytest.approx(np.sqrt(6)), left)
+        assert (dof[0], dof[-1]) == (pure + left, left)
 
 
 def test_where_no_pose_knows_its_noise_the_residuals_lower_the_errors_too() -> None:
-    assert raised(0.2, 5, 0.0) == (pytest.approx(0.2), 5)
+    assert raised_dof(0.2, 5, 0.0) == 5
     c = Condition("", PAPER_UNIT, plan(14), np.array(1.5e-5))
     rng = np.random.default_rng(3)
     poses = c.poses(rng.standard_normal(c.ups.shape) * c.error)

@@ -101,7 +101,7 @@ def test_the_fit_agrees_with_scipy_s_least_squares_on_the_magnitude(
     seed: int, paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
     rng = np.random.default_rng(seed)
-    poses = [replace(p, covariance=np.eye(3) * 1e-10) for p in noisy_poses(paper_unit, twenty_six, 1e-4, rng)]
+    poses = [replace(p, covariance=np.eye(3) * 2.4e-4**2) for p in noisy_poses(paper_unit, twenty_six, 1e-4, rng)]
     u = np.array([p.mean for p in poses])
 
     def miss(p: np.ndarray) -> np.ndarray:

@@ -201,8 +201,8 @@ def test_residuals_far_beyond_the_noise_raise_the_standard_errors_however_small_
     # Said to be known a thousand times better than they are: p underflows to nothing.
     c = fit([replace(p, covariance=p.covariance * 1e-6) for p in poses], signs=MINUS)
     assert c.residual.lack_of_fit_p == pytest.approx(0, abs=1e-300)
-    assert c.inflation == pytest.approx(1000, rel=0.6)
-    assert any("times what the noise explains" in w for w in c.warnings)
+    assert c.excess_g == pytest.approx(1e-3, rel=0.6)
+    assert any("beside the noise of each pose" in w for w in c.warnings)
 
 
 def test_the_noise_floor_is_the_rms_of_standard_errors_along_the_vector(

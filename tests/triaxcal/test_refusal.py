@@ -271,7 +271,7 @@ def test_readings_of_no_still_triad_are_never_passed_off_as_well_calibrated(seed
     assert found.residual.rms_g > 0.05
     assert found.residual.lack_of_fit_p is not None
     assert found.residual.lack_of_fit_p < 1e-6
-    assert found.inflation > 100
+    assert found.excess_g > 0.05
 
 
 def test_a_poorly_spread_set_that_just_passes_is_warned_of_and_told_what_to_add(paper_unit: Sensor) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from triaxcal.beyond import Beyond
 from triaxcal.conditions import held_at
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import TIME, Coefficient, Effect, no_slope, on_each_axis, per_axis, per_axis_slope, xyz
@@ -17,7 +18,7 @@ from triaxcal.errors import Refused
 from triaxcal.fit import cross_validated, fit
 from triaxcal.loop import diagnose
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.problem import State, linearise, solve
+from triaxcal.problem import State, everything, linearise, solve
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start
 from triaxcal.stillness.detector import StillnessDetector
@@ -348,6 +349,41 @@ def test_a_pose_left_out_for_cross_validation_leaves_with_its_trend(paper_unit: 
         rest = solve(problem.only(np.delete(np.arange(len(poses)), i)), begin, (TEMPERATURE,))
         misses.append(linearise(problem.only(slice(i, i + 1)), rest, jacobian=False)[0][0])
     assert cross_validated(problem, state) == pytest.approx(np.sqrt(np.mean(np.square(misses))), rel=1e-3)
+
+
+def test_what_all_poses_have_beside_their_noise_widens_the_trend_of_each_as_its_mean(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    rng = np.random.default_rng(11)
+    poses = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),))
+    poses = [replace(p, covariance=p.covariance * f) for p, f in zip(poses, rng.uniform(1, 9, 26), strict=True)]
+    problem = with_trends(problem_of(poses, signs=MINUS), poses, [TEMPERATURE])
+    assert problem
+    state = solve(problem, start(problem, poses, MINUS), (TEMPERATURE,))
+    before = everything(problem, state)[2].reshape(2, 26)
+    beside = Beyond(excess_g=SIGMA_G).beside(problem, state)
+    after = everything(beside, state)[2].reshape(2, 26)
+    assert after[0] == pytest.approx(np.hypot(before[0], SIGMA_G))
+    assert after[1] / before[1] == pytest.approx(after[0] / before[0])
+    some = everything(beside.only(np.array([3, 20])), state)[2].reshape(2, 2)
+    assert some == pytest.approx(after[:, [3, 20]])
+
+
+def test_means_that_come_back_less_well_leave_honest_errors_beside_the_trends(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    truth = np.concatenate([paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias])
+    pulls = []
+    for seed in range(24):
+        rng = np.random.default_rng([seed, 12])
+        off = 4 * SIGMA_G * rng.standard_normal((26, 1)) * twenty_six * paper_unit.scale_factor
+        poses = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),))
+        poses = [replace(p, mean=p.mean + o) for p, o in zip(poses, off, strict=True)]
+        c = fit(poses, signs=MINUS, effects=[TEMPERATURE], aside=())
+        if c.trends and c.excess_g:
+            pulls.append((c.values[:6] - truth[:6]) / c.standard_errors[:6])
+    assert len(pulls) > 15
+    assert 0.8 < np.sqrt(np.mean(np.square(pulls))) < 1.2
 
 
 def test_the_budget_of_a_fit_to_means_and_trends_has_the_errors_of_the_fit(

@@ -47,6 +47,7 @@ def verticals(calibration: Calibration) -> Verticals:
         calibration.reference,
         calibration.covariance / calibration.inflation**2,
         used,
+        calibration.excess_g,
     )
     return Verticals(poses, direction, scale**2 * covariance, used, max(float(calibration.dof), 1.0))
 
@@ -77,6 +78,7 @@ def _directions(
     reference: float,
     P: Floats,
     used: Bools,
+    excess_g: float = 0.0,
 ) -> tuple[Floats, Floats]:
     """Up (n,3), and the covariance (3n,3n) of all, where that of the parameters is P (p,p).
 
@@ -90,7 +92,7 @@ def _directions(
     length = np.linalg.norm(a, axis=1)
     if not np.all(length > 0):
         raise InvalidData("a pose reads no specific force at all under the calibration")
-    noise = by_u @ np.array([p.covariance for p in poses]) @ by_u.transpose(0, 2, 1)
+    noise = by_u @ np.array([p.covariance for p in poses]) @ by_u.transpose(0, 2, 1) + excess_g**2 * np.eye(3)
     v = a / length[:, None]
     along = np.einsum("nij,nj->ni", noise, v)
     gain = along * (used / np.maximum(np.einsum("ni,ni->n", v, along), 1e-300))[:, None]

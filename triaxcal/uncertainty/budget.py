@@ -12,6 +12,7 @@ from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import micro_g
 from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.uncertainty.choice import choice
 from triaxcal.uncertainty.components import Component, reference, rounding, statistical
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
@@ -69,6 +70,7 @@ def budget(calibration: Calibration, stated: Stated | None = None, level: float 
     thermal, beyond = temperature(calibration, linearised)
     found = [*statistical(calibration, linearised, beyond), *reference(linearised, stated), *thermal]
     found += thermometer(calibration, linearised, stated)
+    found += choice(calibration, linearised)
     found += rounding(calibration, linearised, stated)
     found.sort(key=lambda c: -c.magnitude)
     return Budget(

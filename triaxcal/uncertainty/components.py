@@ -9,6 +9,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
+from triaxcal.figures import micro_g
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import pure_error_dof
 from triaxcal.uncertainty.linearised import Linearised
@@ -54,8 +55,8 @@ def statistical(calibration: Calibration, linearised: Linearised, beyond: float)
     creep = np.zeros(S.shape[1])
     creep[: len(poses)] = np.einsum("ni,nij,nj->n", by_u, creeping, by_u)
     # Creep across the measured vector, of which a processor's rounding leaves something, is none.
-    creep = np.where(creep > NOTHING * linearised.error**2, creep, 0.0)
-    noise = np.maximum(linearised.error**2 - creep, 0.0)
+    creep = np.where(creep > NOTHING * linearised.noise**2, creep, 0.0)
+    noise = np.maximum(linearised.noise**2 - creep, 0.0)
     out = [
         Component.of(
             linearised,
@@ -71,9 +72,12 @@ def statistical(calibration: Calibration, linearised: Linearised, beyond: float)
         how = f"{np.count_nonzero(creep)} poses creep; rectangular over the change in each"
         by = "wait before each pose until the outputs creep by half as much"
         out.append(Component.of(linearised, "creep", "B", np.inf, (S * creep) @ S.T, how, by))
-    excess = beyond * (calibration.covariance - (S * linearised.error**2) @ S.T)
+    excess = beyond * (calibration.covariance - (S * linearised.noise**2) @ S.T)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
         how = f"residuals are {calibration.inflation:.2f} times what noise explains"
+        if calibration.excess_g:
+            beside = micro_g(calibration.excess_g / calibration.reference)
+            how = f"residuals show {beside} beside the noise of each pose"
         by = "find what the model lacks (diagnose, and what it advises); more poses, some of them repeated"
         out.append(Component.of(linearised, "lack_of_fit", "A", calibration.dof, excess, how, by))
     return out

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.beyond import Beyond
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import at_reference
 from triaxcal.plan.directions import directions
@@ -34,6 +35,9 @@ class Linearised:
         self.effects = self.state.effects
         if calibration.trends:
             self.problem = with_trends(self.problem, poses, self.effects) or self.problem
+        self.noise = everything(self.problem, self.state)[2]
+        """(n,) standard errors of the residuals by the noise and creep of the poses."""
+        self.problem = Beyond(excess_g=calibration.excess_g).beside(self.problem, self.state)
         _, J, self.error = everything(self.problem, self.state)
         # What the shapes of effects were chosen by blurs the parameters too.
         self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
@@ -41,6 +45,8 @@ class Linearised:
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
         """(p,n): shift of the parameters for an error of each residual (`triaxcal.problem.everything`)."""
+        self.up = np.array([v for _, v in directions(SPHERE)]) * calibration.reference
+        """(m,3) specific force all over the sphere."""
         self.sphere = self._sphere(calibration, {})
         _, J, _ = linearise(self.sphere, self.state)
         self.by_parameters = J @ np.linalg.inv(self.G)
@@ -48,7 +54,7 @@ class Linearised:
 
     def _sphere(self, calibration: Calibration, shift: Mapping[str, float]) -> Problem:
         """Outputs of the unit all over the sphere, at the reference conditions but for ``shift``."""
-        up = np.array([v for _, v in directions(SPHERE)]) * calibration.reference
+        up = self.up
         reference = self.problem.channel_reference
         held = at_reference(reference, len(up))
         u = calibration.sensor.output(up, held)

@@ -29,12 +29,14 @@ def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[
     if TEMPERATURE not in linearised.problem.channel_reference or not missing:
         return [], 1.0
     extra = sum(len(e.coefficients) for e in missing)
-    r, J, s = everything(linearised.problem, linearised.state.extended(missing))
+    r, J, _ = everything(linearised.problem, linearised.state.extended(missing))
+    # What residuals show beyond noise may be these very effects.
+    s = linearised.noise
     spread = np.concatenate([[_sensitivity(e, calibration.reference)] * len(e.coefficients) for e in missing])
     p = len(linearised.state.theta)
     Z = J[:, p:] * spread / s[:, None]
-    absorbed = linearised.gain @ Z
-    rest = Z - linearised.weighted @ absorbed
+    absorbed = linearised.gain @ (J[:, p:] * spread / linearised.error[:, None])
+    rest = Z - linearised.weighted * (linearised.error / s)[:, None] @ absorbed
     # With the prior's width as unit: what the poses do not show stays as wide as it was.
     # By the means alone: trends know nothing of an effect whose coefficients, and so its conditions' errors, are zero.
     n = len(linearised.problem.u)

@@ -60,7 +60,7 @@ def lacking(poses: Sequence[Pose], effects: Sequence[Effect], *, signs: Sequence
 
 def _had_of(c: Calibration, moves: dict[str, str], channels: Sequence[str]) -> tuple[Had, float]:
     used = [p for p in c.poses if p.used]
-    error = np.array([p.standard_error_g for p in used]) * c.inflation
+    error = np.array([p.error_g for p in used])
     typical = float(np.sqrt(np.median(error**2)))
     up = np.array([p.direction for p in used])
     return _had(up, (typical / error) ** 2, [p.pose for p in used], moves, channels), typical / c.reference
