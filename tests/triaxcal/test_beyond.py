@@ -16,7 +16,7 @@ from triaxcal.loop import diagnose
 from triaxcal.poses.pose import Pose
 
 NOISE_G = 6e-6
-SEEDS = 40
+SEEDS = 30
 
 
 def unequal(seed: int, most: float = 30.0) -> Condition:

@@ -216,11 +216,11 @@ def test_beside_effects_in_the_model_the_lead_is_what_they_leave(
 
 def test_beside_effects_in_the_model_nothing_is_made_up(fitted: Fitted, ups: np.ndarray) -> None:
     effects = [BiasDrift(3), Empirical("even")]
-    runs, leads = 30, 0
+    runs, leads = 20, 0
     for seed in range(runs):
         off = 8 * SIGMA_G * ups * np.random.default_rng(1000 + seed).standard_normal((N, 1))
         leads += "goes with" in told(fitted(off, seed, effects), {})
-    # binom.isf(1e-3, 30, 0.01)
+    # binom.isf(1e-3, 20, 0.01)
     assert leads <= 3
 
 

@@ -138,7 +138,7 @@ def test_the_moment_of_a_step_anywhere_is_off_by_its_standard_error_in_the_rms(
 ) -> None:
     """In gaps, at the edge of a pose and inside one, of sizes of which the direction of a pose hides some: the best
     place may be some poses away, and the standard error has to know."""
-    runs, pulls, away = 120, [], 0
+    runs, pulls, away = 80, [], 0
     for seed in range(runs):
         rng = np.random.default_rng([7, seed])
         truth, size = float(rng.uniform(50, 200)), rng.choice([-1, 1], 3) * rng.uniform(3e-5, 3e-4, 3)
@@ -151,8 +151,8 @@ def test_the_moment_of_a_step_anywhere_is_off_by_its_standard_error_in_the_rms(
         pulls.append((value - truth) / error)
         away += abs(value - truth) > HOLD_S
     assert away > 1
-    # Of 1200 runs the mean square is 0.93; that of 120 scatters by 0.15.
-    assert 0.93 - 3.3 * 0.15 < np.mean(np.square(pulls)) < 0.93 + 3.3 * 0.15
+    # Of 1200 runs the mean square is 0.93; that of 80 scatters by 0.18.
+    assert 0.93 - 3.3 * 0.18 < np.mean(np.square(pulls)) < 0.93 + 3.3 * 0.18
 
 
 def apart(poses: list[Pose], each_s: float = 0.5) -> list[Pose]:
