@@ -76,7 +76,11 @@ def cases(counts: Counts, section: str) -> list[Case]:
     if section == "two":
         return [Case("two", i, PAIR, 26, NOISES[i % 3]) for i in range(counts.two)]
     kinds = uncatalogued.KINDS
-    return [Case(*_turn(kinds, i), LARGE, 26, _noise(kinds, i)) for i in range(counts.outside)]
+    return [
+        Case(*_turn(kinds, i), LARGE, poses, _noise(kinds, i))
+        for poses, n in ((26, counts.outside), (14, counts.outside // 2))
+        for i in range(n)
+    ]
 
 
 def _turn(kinds: Sequence[str], i: int) -> tuple[str, int]:
@@ -204,7 +208,14 @@ def _two(found: Sequence[Outcome]) -> Iterable[Table]:
     yield Table("Two at once, s = 20 to 40 each, 26 poses: named or listed", head, rows)
 
 
-def _outside(found: Sequence[Outcome]) -> Iterable[Table]:
+def _outside(all_found: Sequence[Outcome]) -> Iterable[Table]:
+    for poses in (26, 14):
+        found = [o for o in all_found if o.case.poses == poses]
+        if found:
+            yield _of_no_catalogue(found, poses)
+
+
+def _of_no_catalogue(found: Sequence[Outcome], poses: int) -> Table:
     rows = []
     apart = [o for o in found if o.imitation[1] >= APART]
     sums = [("all", list(found)), (f"all of which no name leaves less than s = {APART:g}", apart)]
@@ -215,7 +226,7 @@ def _outside(found: Sequence[Outcome]) -> Iterable[Table]:
         cells = [percent(c, len(group)) for c in (left, only, wrong)]
         rows.append([kind, str(len(group)), *cells, ", ".join(f"{n} {c}" for n, c in names.most_common(3))])
     head = ["truth", "n", "unexplained, %", "unexplained and nothing named, %", "wrong unique, %", "names"]
-    yield Table("In no catalogue, s = 20 to 200, 26 poses", head, rows)
+    return Table(f"In no catalogue, s = 20 to 200, {poses} poses", head, rows)
 
 
 def misses(section: str, outcomes: Sequence[Outcome]) -> list[str]:
