@@ -16,10 +16,12 @@ import numpy as np
 import scipy
 
 from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration
 from triaxcal.errors import Refused
+from triaxcal.figures import micro_g
 from triaxcal.problem import NOT_STILL, Linearised, Problem, State, linearise
 from triaxcal.pure_error import lack_of_fit_p
-from triaxcal.trends import unabsorbed
+from triaxcal.trends import left_of
 
 NO_CHANCE = 1e-4
 """Probability of residuals below which the noise no longer has the weights to itself. Rarer than what is called more
@@ -50,7 +52,7 @@ class Beyond:
 
         def ratio(excess: float) -> float:
             error = s * np.tile(_widened(s[:n], excess), len(s) // n)
-            return unabsorbed(J / error[:, None], r / error) / left
+            return left_of((r, J, error)) / left
 
         whole = ratio(0.0) if left > 0 else 1.0
         if not np.isfinite(whole):
@@ -70,6 +72,11 @@ class Beyond:
             return problem
         further = problem.further and problem.further.widened(_widened(linearise(problem, state)[2], self.excess_g))
         return replace(problem, excess=self.excess_g, further=further)
+
+
+def in_words(calibration: Calibration) -> str:
+    """How much is beside the noise."""
+    return f"{micro_g(calibration.excess_g / calibration.reference)} beside the noise of each pose"
 
 
 def _widened(error: Floats, excess: float) -> Floats:

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.beyond import Beyond
+from triaxcal.beyond import Beyond, in_words
 from triaxcal.calibration import SPOILED, UNKNOWN_HISTORY, Calibration, PoseResult, Residual
 from triaxcal.conditions import of_unknown_history
+from triaxcal.cross_validation import cross_validated
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.figures import micro_g
 from triaxcal.outliers import Spoiled, not_as_foretold, spoiled
 from triaxcal.plan.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
@@ -32,7 +32,7 @@ from triaxcal.problem import (
 from triaxcal.pure_error import lack_of_fit_p, of_both, pose_dof, pure_error_dof, raised_dof
 from triaxcal.shapes import shape_errors
 from triaxcal.start import DILUTION_LIMIT, problem_of, start, with_history
-from triaxcal.trends import trends_p, unabsorbed, with_trends
+from triaxcal.trends import left_of, trends_p, with_trends
 
 DILUTION_WARNING = 10.0
 SPREAD_WARNING = 15.0
@@ -41,8 +41,6 @@ SPOILED_ROUNDS = 4
 SIGNIFICANT = 0.05
 CONTRADICTED = 0.01
 """p of the trends inside the poses below which the coefficients are left to the means."""
-STRAIGHT = 1e-4
-"""Steps of the scaled parameters up to which the fit is straight, to about this share of the step."""
 
 
 def fit(
@@ -209,7 +207,7 @@ def _with_aside(calibration: Calibration, poses: Sequence[Pose], rows: Sequence[
             "back less well than that: the standard errors allow for both"
         )
         if calibration.excess_g:
-            warning += f", {micro_g(calibration.excess_g / calibration.reference)} beside the noise of each pose"
+            warning += f", {in_words(calibration)}"
     warnings += [warning] if others else []
     return replace(calibration, poses=results, warnings=(*warnings, *calibration.warnings))
 
@@ -234,14 +232,14 @@ class _Left:
         # What the shape of an effect was chosen by is spent, though no column of the Jacobian stands for it.
         spent = len(state.theta) + sum(len(e.shape) for e in state.effects)
         by_means = problem.further is None or n > spent
-        r, J, s = (part[:n] if by_means else part for part in everything_left)
-        chi2, left = unabsorbed(J / s[:, None], r / s), len(r) - spent
-        wider = chi2, left
-        if judged is not None and by_means:
-            r, J, s = linearise(judged, State.of(judged, state.sensor(problem)))
-            wider = unabsorbed(J / s[:, None], r / s), left + len(r) - n
-            n = len(r)
-        return cls(chi2, left, wider, Beyond.shown((r, J, s), n, wider[1], pure))
+        r, J, s = everything_left
+        own = (r[:n], J[:n], s[:n]) if by_means else everything_left
+        chi2, left = left_of(own), len(own[0]) - spent
+        if judged is None or not by_means:
+            return cls(chi2, left, (chi2, left), Beyond.shown(own, n, left, pure))
+        others = linearise(judged, State.of(judged, state.sensor(problem)))
+        wider = left_of(others), left + len(judged.u) - n
+        return cls(chi2, left, wider, Beyond.shown(others, len(judged.u), wider[1], pure))
 
 
 def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Problem | None) -> Calibration:
@@ -325,35 +323,6 @@ def _covariance(problem: Problem, state: State, weighted: Floats) -> Floats:
     return np.asarray(G @ theta @ G.T)
 
 
-def cross_validated(problem: Problem, state: State) -> float | None:
-    """rms of each pose's |a| − reference under a fit to all the others; None where a pose alone carries a parameter.
-
-    ``state`` is at the minimum. What leaving a pose out moves is exact for a linear problem; where that is so far that
-    the curvature could show, the rest is fitted again from there.
-    """
-    r, J, s = everything(problem, state)
-    n = len(problem.u)
-    if len(r) <= len(state.theta):
-        return None
-    norms = np.maximum(np.linalg.norm(J / s[:, None], axis=0), 1e-300)
-    weighted = J / s[:, None] / norms
-    gain = np.linalg.pinv(weighted, rcond=1e-14)
-    # By pose (n,k): its mean, and what else it tells, which is left out with it.
-    of_pose = np.arange(len(r)).reshape(-1, n).T
-    hat = np.einsum("nkp,pnl->nkl", weighted[of_pose], gain[:, of_pose])
-    free = np.eye(of_pose.shape[1]) - hat
-    if np.linalg.eigvalsh(free).min() < 1e-6:
-        return None
-    misses = np.linalg.solve(free, (r / s)[of_pose][..., None])[..., 0]
-    moved = np.einsum("pnk,nk->np", gain[:, of_pose] / norms[:, None, None], misses)
-    misses = misses[:, 0] * s[:n]
-    for i in np.flatnonzero(np.abs(moved).max(axis=1) > STRAIGHT):
-        rest: Ints = np.delete(np.arange(n), i)
-        without = solve(problem.only(rest), State(state.theta + moved[i], state.effects), state.effects, steps=2)
-        misses[i] = linearise(problem.only(slice(i, i + 1)), without, jacobian=False)[0][0]
-    return float(np.sqrt(np.mean(misses**2)))
-
-
 def _warnings(c: Calibration) -> list[str]:
     out = []
     if c.dilution > DILUTION_WARNING or c.dilution * np.sqrt(len(c.poses)) > SPREAD_WARNING:
@@ -381,6 +350,5 @@ def _warnings(c: Calibration) -> list[str]:
 
 def _how_raised(c: Calibration) -> str:
     if c.excess_g:
-        beside = micro_g(c.excess_g / c.reference)
-        return f"residuals show {beside} beside the noise of each pose; the standard errors allow for it"
+        return f"residuals show {in_words(c)}; the standard errors allow for it"
     return f"residuals are {c.inflation:.1f} times what the noise explains; the standard errors are raised by that"

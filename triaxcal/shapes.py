@@ -10,7 +10,7 @@ from triaxcal.arrays import Bools, Floats
 from triaxcal.effects.contract import HELD, SINCE_START, Effect, reshaped
 from triaxcal.effects.part import whole
 from triaxcal.problem import Problem, State, everything
-from triaxcal.trends import unabsorbed
+from triaxcal.trends import left_of
 
 UNLIKELY = 16.0
 """Chi-square over its minimum beyond which a value, and what is next to it, needs no closer look."""
@@ -123,5 +123,4 @@ def _left(problem: Problem, state: State, i: int, name: str, value: float) -> fl
     """Chi-square with another value of a shape, everything else fitted again, in linear reckoning."""
     other = reshaped(state.effects[i], name, value)
     with np.errstate(over="ignore", invalid="ignore"):
-        r, J, s = everything(problem, State(state.theta, (*state.effects[:i], other, *state.effects[i + 1 :])))
-        return unabsorbed(J / s[:, None], r / s)
+        return left_of(everything(problem, State(state.theta, (*state.effects[:i], other, *state.effects[i + 1 :]))))

@@ -124,7 +124,12 @@ def left_by_trends(problem: Problem, state: State) -> float:
 
 def left_by_means(problem: Problem, state: State) -> float:
     """The sum of squares that a fit to the means alone leaves; ``state`` is that of a fit to everything."""
-    r, J, s = linearise(problem, state)
+    return left_of(linearise(problem, state))
+
+
+def left_of(linearised: Linearised) -> float:
+    """The sum of squares that is left of residuals at the minimum, in linear reckoning from near it."""
+    r, J, s = linearised
     return unabsorbed(J / s[:, None], r / s)
 
 

@@ -11,11 +11,12 @@ from scipy import stats
 
 from triaxcal.beyond import Beyond
 from triaxcal.conditions import held_at
+from triaxcal.cross_validation import cross_validated
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import TIME, Coefficient, Effect, no_slope, on_each_axis, per_axis, per_axis_slope, xyz
 from triaxcal.effects.plugins import Foreign
 from triaxcal.errors import Refused
-from triaxcal.fit import cross_validated, fit
+from triaxcal.fit import fit
 from triaxcal.loop import diagnose
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.problem import State, everything, linearise, solve

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.beyond import in_words
 from triaxcal.calibration import Calibration
-from triaxcal.figures import micro_g
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import pure_error_dof
 from triaxcal.uncertainty.linearised import Linearised
@@ -76,8 +76,7 @@ def statistical(calibration: Calibration, linearised: Linearised, beyond: float)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
         how = f"residuals are {calibration.inflation:.2f} times what noise explains"
         if calibration.excess_g:
-            beside = micro_g(calibration.excess_g / calibration.reference)
-            how = f"residuals show {beside} beside the noise of each pose"
+            how = f"residuals show {in_words(calibration)}"
         by = "find what the model lacks (diagnose, and what it advises); more poses, some of them repeated"
         out.append(Component.of(linearised, "lack_of_fit", "A", calibration.dof, excess, how, by))
     return out

@@ -54,10 +54,9 @@ class Linearised:
 
     def _sphere(self, calibration: Calibration, shift: Mapping[str, float]) -> Problem:
         """Outputs of the unit all over the sphere, at the reference conditions but for ``shift``."""
-        up = self.up
         reference = self.problem.channel_reference
-        held = at_reference(reference, len(up))
-        u = calibration.sensor.output(up, held)
+        held = at_reference(reference, len(self.up))
+        u = calibration.sensor.output(self.up, held)
         channels = {n: held[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
         none = np.zeros((len(u), 3, 3))
         return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, further=None)
