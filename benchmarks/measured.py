@@ -16,7 +16,6 @@ from pathlib import Path
 from pictures import draw
 
 from triaxcal.errors import Refused
-from triaxcal.findings import Finding
 from triaxcal.loop import Loop, diagnose
 from triaxcald.inputs import Measured, measure
 from triaxcald.recording.csv_text import read_csv
@@ -50,12 +49,8 @@ def micro(value: float | None) -> str:
 
 
 def findings(loop: Loop) -> str:
-    """An effect in question has the others that would do as well behind it."""
-
-    def others(f: Finding) -> str:
-        return ", ".join([*f.alternatives, *(["spoiled poses"] if f.spoiled else [])])
-
-    named = [f.effect if f.verdict == "adopted" else f"{f.effect} (or {others(f)})" for f in loop.findings]
+    """An effect in question has what would do as well behind it."""
+    named = [f.effect if f.verdict == "adopted" else f"{f.effect} (or {', '.join(f.rivals)})" for f in loop.findings]
     return "; ".join(named) or "none"
 
 

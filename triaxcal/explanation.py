@@ -50,6 +50,8 @@ class Explanation:
     """Effects that explain as much as the linear fit does by the poses that it leaves out."""
     spoiled: tuple[int, ...] = ()
     """Poses that explain as much without any effect, were they spoiled."""
+    whole: float = 0.0
+    """Chi-square of what the linear model leaves of all poses."""
     whole_p: float | None = None
     """Where the linear fit leaves poses out: the probability of what it leaves of all of them."""
 
@@ -57,6 +59,11 @@ class Explanation:
     def score(self) -> float:
         """The score of the model; a pose left out costs a parameter and how seldom one is spoiled."""
         return self.search.score(self.search.found) + self.price
+
+    @property
+    def coincidence(self) -> float:
+        """Probability that some effects, with as many poses left out, would explain as much, whatever it was."""
+        return self.search.coincidence(self.search.found, len(self.aside) - self.unknown, self.whole)
 
     @property
     def price(self) -> float:
@@ -108,6 +115,7 @@ def explained(
     return replace(
         _compared(found, trials, aside),
         linear=next((t.search for t in trials if t.aside == aside), found.search),
+        whole=first.linear.chi2,
         whole_p=first.anything_p(first.linear) if aside and not trials[0].aside else None,
     )
 

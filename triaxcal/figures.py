@@ -1,6 +1,8 @@
-"""How numbers are written in sentences: without an exponent where one can do without."""
+"""How numbers, and poses, are written in sentences: without an exponent where one can do without."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 P_LEAST = 1e-12
 """Below this a probability says how well the noise is known, and no more."""
@@ -25,3 +27,8 @@ def probability(p: float | None) -> str:
     if p is None:
         return "—"
     return f"< {P_LEAST:.0e}" if p < P_LEAST else f"{p:.2g}"
+
+
+def the_poses(at: Sequence[str]) -> str:
+    """In words, by when they began."""
+    return " and ".join(f"the pose at {a}" for a in at)

@@ -11,11 +11,12 @@ from triaxcal.calibration import Calibration
 from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, rate_of
 from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import package_of
-from triaxcal.figures import micro_g, probability
-from triaxcal.search import Search, alternatives, compared, telling_apart
+from triaxcal.figures import micro_g, probability, the_poses
+from triaxcal.search import FAMILYWISE, Search, alternatives, compared, telling_apart
 from triaxcal.search.alternatives import instead_of
-from triaxcal.unexplained import Unexplained
+from triaxcal.unexplained import MORE, UNTESTED, Unexplained
 
+SPOILED_POSES, NAMELESS = "spoiled poses", "something in no catalogue"
 OTHERS = ("", "the other effect", "the other two effects", "the other three effects", "the other four effects")
 
 
@@ -24,7 +25,7 @@ class Finding:
     """An effect that the data show. ``coefficients`` name → (value, standard error, unit).
 
     ``verdict`` is "adopted" where the name is earned, "confounded" where ``alternatives``, or poses that something
-    ``spoiled``, fit as well.
+    ``spoiled``, fit as well, or where it is not put to the test (``coincidence``).
     """
 
     effect: str
@@ -40,8 +41,16 @@ class Finding:
     """What to record so as to tell it from its alternatives."""
     spoiled: tuple[str, ...] = ()
     """When poses began that would do as well as any effect, were they spoiled."""
+    coincidence: float | None = None
+    """Probability that one effect or another would have explained as much, whatever it was; None where it is small."""
     instead: Mapping[str, tuple[Effect, ...]] = field(default_factory=dict, repr=False)
     """The effects of the model with each alternative in its place, by name."""
+
+    @property
+    def rivals(self) -> tuple[str, ...]:
+        """What would do as well: the alternatives, that poses are spoiled, that it is nothing known."""
+        others = {SPOILED_POSES: bool(self.spoiled), NAMELESS: self.coincidence is not None}
+        return (*self.alternatives, *(name for name, open_ in others.items() if open_))
 
 
 def finding_of(
@@ -52,10 +61,11 @@ def finding_of(
     step: Calibration,
     rivals: Sequence[Sequence[Effect]],
     spoiled: Sequence[str],
+    coincidence: float,
 ) -> Finding:
     """The ``pair`` are the model that lacks this effect alone (None where the poses cannot carry it), and that with all
     effects found; ``after`` is what is handed on. ``rivals`` explain as much with other poses left out, the poses
-    ``spoiled`` without any effect."""
+    ``spoiled`` without any effect; ``coincidence`` as `triaxcal.explanation.Explanation` has it."""
     found = alternatives(search, effect, search.found)
     for rival in rivals:
         names = instead_of(search, effect, rival)
@@ -70,28 +80,27 @@ def finding_of(
         reason += f"; {', '.join(found)} would do as well on these poses"
     if spoiled:
         reason += f"; that something spoiled {the_poses(spoiled)} would {'also ' * bool(found)}do as well"
+    untested = coincidence >= FAMILYWISE
+    if untested:
+        reason += f"; {UNTESTED.format(probability(coincidence))}"
     apart = dict.fromkeys(telling_apart(search, effect, found)) if found else ()
     floor = pair[1].residual.noise_floor_g
     if not effect.coefficients[0].unit.startswith("g"):
         floor /= after.reference  # the effect is a share of the magnitude
     return Finding(
         effect=effect.name,
-        verdict="confounded" if found or spoiled else "adopted",
+        verdict="confounded" if found or spoiled or untested else "adopted",
         p_value=p,
         coefficients=after.coefficients_of(effect.name),
         alternatives=tuple(found),
         reason=reason,
         remedy=effect.advice(_largest(after, effect), floor),
         step=step,
-        apart=(*([f"take {the_poses(spoiled)} again"] if spoiled else []), *apart),
+        apart=(*([f"take {the_poses(spoiled)} again"] if spoiled else []), *apart, *([MORE] if untested else [])),
         spoiled=tuple(spoiled),
+        coincidence=coincidence if untested else None,
         instead={name: model.effects for name, model in found.items()},
     )
-
-
-def the_poses(at: Sequence[str]) -> str:
-    """In words, by when they began."""
-    return " and ".join(f"the pose at {a}" for a in at)
 
 
 def _largest(c: Calibration, effect: Effect) -> float:
@@ -165,9 +174,8 @@ def advice_of(
     out = [f"{f.effect}: {f.remedy}" for f in findings if f.verdict == "adopted"]
     for f in findings:
         if f.verdict == "confounded":
-            others = [*f.alternatives, *(["spoiled poses"] if f.spoiled else [])]
-            out.append(f"{f.effect} cannot be told from {', '.join(others)} here: {'; '.join(f.apart)}")
-    if unexplained.significant and not unexplained.or_spoiled:
+            out.append(f"{f.effect} cannot be told from {', '.join(f.rivals)} here: {'; '.join(f.apart)}")
+    if unexplained.significant and not (unexplained.or_spoiled or unexplained.or_named):
         out.append(f"something is left that no candidate explains: {unexplained.towards}")
     if undescribed:
         out.append(f"empirical: {undescribed}")

@@ -20,15 +20,26 @@ from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import EffectFault, plugins
 from triaxcal.errors import Refused
 from triaxcal.explanation import Explanation, explained, left_out
-from triaxcal.findings import Finding, advice_of, description_of, finding_of, the_poses, why_not_shown
+from triaxcal.figures import the_poses
+from triaxcal.findings import Finding, advice_of, description_of, finding_of, why_not_shown
 from triaxcal.fit import fit, with_faulty
 from triaxcal.held_out import HeldOut, better_of, held_out
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.runs import by_run
-from triaxcal.search import NO_LOWER, Search, compared
+from triaxcal.search import FAMILYWISE, NO_LOWER, Search, compared
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
-from triaxcal.unexplained import Unexplained, beyond_noise, hints_of, spoiled_or, unexplained_of
+from triaxcal.unexplained import (
+    Unexplained,
+    beyond_noise,
+    hints_of,
+    moving_inside,
+    or_named,
+    spoiled_or,
+    unexplained_of,
+)
+
+SAME = "what comes out the same was not spoiled"
 
 
 @dataclass(frozen=True)
@@ -84,8 +95,9 @@ def diagnose(
     for effect, step in zip(made.adopted, steps, strict=False):
         others = [e for e in made.adopted if e is not effect]
         without = made.given.tried(others) if others else before
-        spoiled = () if findings else tuple(poses[i].at for i in made.found.spoiled)
-        findings.append(finding_of(search, effect, (without, steps[-1]), after, step, made.found.rivals, spoiled))
+        spoiled = tuple(poses[i].at for i in made.found.spoiled)
+        pair, chance = (without, steps[-1]), made.found.coincidence
+        findings.append(finding_of(search, effect, pair, after, step, made.found.rivals, spoiled, chance))
     if smooth is not None:
         findings.append(description_of(smooth, steps[-1], unexplained.p_value))
         unexplained = unexplained_of(smooth, search.passed_over)
@@ -184,6 +196,10 @@ def _unexplained(made: _Made) -> Unexplained:
     # Beside the residuals of poses with their creep, which are told, it must not look less than they are.
     left = replace(left, rms_g=max(left.rms_g, beyond_noise(made.steps[-1])))
     whole_p = made.found.whole_p
+    if made.adopted and not left.significant:
+        spoiled = [made.given.poses[i].at for i in made.found.spoiled]
+        nothing_p = search.anything_p(search.linear)
+        return moving_inside(search) or or_named(made.before, nothing_p, made.found.coincidence, spoiled) or left
     if made.rivals and whole_p is not None and whole_p < LACK_OF_FIT:
         return spoiled_or(replace(made.quiet, aside=()).fit(()), whole_p, made.aside, made.rivals, left)
     return left
@@ -212,5 +228,7 @@ def _again(made: _Made) -> list[str]:
         return []
     advice = f"take again {the_poses([p.pose.at for p in made.aside])}: left out as spoiled"
     if made.rivals:
-        advice += f", but {' or '.join(made.rivals)} would explain as much; what comes out the same was not spoiled"
+        advice += f", but {' or '.join(made.rivals)} would explain as much; {SAME}"
+    elif made.adopted and made.found.coincidence >= FAMILYWISE:
+        advice += f", beside effects that need not be what acts; {SAME}"
     return [advice]

@@ -95,6 +95,11 @@ class Trends:
         stacked = np.concatenate([weighted, J / error[:, None]])
         return unabsorbed(stacked, np.concatenate([np.zeros(len(weighted)), r / error]))
 
+    def rms_g(self, state: State) -> float:
+        """By how much |a| is off its mean over a pose, beyond noise and what the model foretells, rms of all."""
+        r, _, error = self.linearise(state)
+        return float(np.sqrt(max(float(np.mean(r**2 - error**2)), 0.0) / 12))
+
     def touch(self, effects: Sequence[Effect]) -> bool:
         """Whether any of the effects goes with something that moves inside the poses."""
         return any(n in self.moving for e in effects for n in e.needs)

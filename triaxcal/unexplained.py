@@ -9,11 +9,13 @@ import numpy as np
 
 from triaxcal.calibration import Calibration, PoseResult
 from triaxcal.effects.contract import TIME
-from triaxcal.figures import micro_g, probability
+from triaxcal.figures import micro_g, probability, the_poses
 from triaxcal.leads import AGAIN, LEAD, TOWARDS, Lead, clear_patterns
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.search import FAMILYWISE, NEAR, Nearest, Search
 
+UNTESTED = "whatever acts on these poses, one effect or another would explain it as well with a probability of {}"
+MORE = "take more poses, in further directions"
 HINT = 0.05
 """Familywise p up to which an effect that was passed over for it is a hint."""
 
@@ -22,7 +24,7 @@ HINT = 0.05
 class Unexplained:
     """What is left. ``p_value`` is the probability of as much by chance; ``rms_g`` its size beyond noise; ``lead`` the
     best hint at what it may be, ``towards`` what would tell more. ``or_spoiled``: it is poses that were left out as
-    spoiled, or an effect.
+    spoiled, or an effect. ``or_named``: it is what the findings name, or something that no effect explains.
     """
 
     significant: bool
@@ -30,6 +32,7 @@ class Unexplained:
     rms_g: float
     lead: str
     or_spoiled: bool = False
+    or_named: bool = False
     towards: str = ""
 
 
@@ -66,6 +69,27 @@ def spoiled_or(
     return Unexplained(True, p, _size(whole), f"most of it is {off}: {doubt}", or_spoiled=True)
 
 
+def or_named(before: Calibration, p: float | None, coincidence: float, spoiled: Sequence[str]) -> Unexplained | None:
+    """What the poses leave ``before`` any effect is in the model, with a probability ``p`` by chance, where those found
+    explain all of it, but need not be it: others would have done so whatever it was (``coincidence``), or that the
+    poses at these times are ``spoiled``. None where they have earned it."""
+    why = [UNTESTED.format(probability(coincidence))] if coincidence >= FAMILYWISE else []
+    why += [f"that something spoiled {the_poses(spoiled)} would do as well"] if spoiled else []
+    lead = f"it may be none of the effects named: {', and '.join(why)}"
+    return Unexplained(True, p, _size(before), lead, or_named=True) if why else None
+
+
+def moving_inside(search: Search) -> Unexplained | None:
+    """What the model found leaves of the trends inside the poses, where these are beyond chance."""
+    p = search.trends_p(search.found)
+    if search.trends is None or p >= LEAD:
+        return None
+    text = "inside the poses |a| moves too, so it goes with the time or something that changes, not the attitude"
+    if search.found.effects:
+        text = "inside the poses |a| moves otherwise than is explained, with the time or something that changes"
+    return Unexplained(True, p, search.trends.rms_g(search.found.state), text, towards=TOWARDS[TIME])
+
+
 def beyond_noise(after: Calibration) -> float:
     """rms of the residuals beyond noise, in g."""
     residual = after.residual
@@ -83,9 +107,8 @@ def _size(after: Calibration) -> float:
 def hints_of(search: Search) -> list[Lead]:
     """What the poses tell of what is left but by their residuals."""
     out = []
-    if search.trends_p() < LEAD:
-        text = "inside the poses |a| moves too, so it goes with the time or something that changes, not the attitude"
-        out.append(Lead(text, TOWARDS[TIME]))
+    if moving := moving_inside(search):
+        out.append(Lead(moving.lead, moving.towards))
     if not search.found.effects:
         limit = search.against_trends(search.found) + NEAR
         few = dict.fromkeys(m.effects[0].name for m in search.untestable() if search.against_trends(m) < limit)

@@ -274,6 +274,7 @@ def loop_document(
                 "coefficients": coefficients_document(f.coefficients, reference_unit),
                 "alternatives": list(f.alternatives),
                 "spoiled": list(f.spoiled),
+                "coincidence": probability(f.coincidence),
                 "held_out_rms_g": {n: error(held.instead[n], reference) for n in f.alternatives if n in held.instead}
                 if held
                 else {},
@@ -299,6 +300,7 @@ def loop_document(
             "rms_g": error(loop.unexplained.rms_g, reference),
             "lead": small.in_words(loop.unexplained.lead),
             "or_spoiled": loop.unexplained.or_spoiled,
+            "or_named": loop.unexplained.or_named,
         },
         "data_quality": list(data_quality),
         "advice": [small.in_words(line) for line in loop.advice],

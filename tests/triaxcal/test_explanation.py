@@ -54,8 +54,11 @@ def test_where_spoiled_poses_would_explain_as_much_as_an_effect_both_are_told(
         if loop.findings[0].spoiled:
             doubted += 1
             assert loop.findings[0].verdict == "confounded"
-            assert any("spoiled poses here: take the pose at " in a for a in loop.advice)
+            assert any(" from " in a and "spoiled poses" in a and ": take the pose at " in a for a in loop.advice)
             assert "that something spoiled the pose at " in loop.findings[0].reason
+            assert loop.unexplained.significant
+            assert loop.unexplained.or_named
+            assert "that something spoiled the pose at " in loop.unexplained.lead
     assert doubted >= 1
 
 

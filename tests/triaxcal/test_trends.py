@@ -399,3 +399,20 @@ def test_the_budget_of_a_fit_to_means_and_trends_has_the_errors_of_the_fit(
     (reference,) = [p for p in budget(c, Stated(reference=1e-4)).components if p.source == "reference"]
     assert reference.parameters[:3] == pytest.approx(1e-4 * np.abs(c.sensor.scale_factor), rel=0.01)
     assert np.all(reference.parameters[9:] < 1e-3 * np.abs(SENSITIVITY))
+
+
+def test_what_moves_inside_the_poses_and_is_not_foretold_has_a_size(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    """A ramp is off its mean by a √12th of its length."""
+    rng = np.random.default_rng(4)
+    off_g = []
+    for _ in range(10):
+        poses = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),))
+        problem = problem_of(poses, signs=MINUS, reference=1.0)
+        trends = Trends.of(problem, poses)
+        assert trends
+        off_g.append([trends.rms_g(solve(problem, start(problem, poses, MINUS), e)) for e in ((), (TEMPERATURE,))])
+    moved = np.linalg.inv(paper_unit.axes) @ np.outer(SENSITIVITY, history(26)[1] * HOLD_S)
+    along_g = np.einsum("in,ni->n", moved, twenty_six)
+    unforetold_g, foretold_g = np.mean(off_g, axis=0)
+    assert unforetold_g == pytest.approx(np.sqrt(np.mean(along_g**2) / 12), rel=0.1)
+    assert foretold_g < 0.5 * TREND_G / np.sqrt(12)

@@ -20,7 +20,7 @@ from triaxcal.leads import Lead
 from triaxcal.search import Nearest
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
-from triaxcal.unexplained import Unexplained, lead, spoiled_or, unexplained_of
+from triaxcal.unexplained import Unexplained, lead, or_named, spoiled_or, unexplained_of
 
 MINUS = (-1, -1, -1)
 SIGMA_G = 1.5e-5
@@ -97,6 +97,23 @@ def test_poses_left_out_or_an_effect_are_what_is_left_unless_the_others_leave_mo
     assert besides.lead.startswith(f"{more.lead}; besides, left out is the pose at 70.0 s (+")
     assert besides.lead.endswith(f": {doubt}")
     assert (besides.p_value, besides.rms_g) == (more.p_value, more.rms_g)
+
+
+def test_what_is_named_may_be_none_of_it_where_others_would_do_as_well(fitted: Fitted, ups: np.ndarray) -> None:
+    """The size is that of what the effects were found for."""
+    before = fitted(12 * radial(ups, np.sin(TIME / 7)))
+    assert or_named(before, 1e-9, 0.009, []) is None
+    chance, poses = or_named(before, 1e-9, 0.08, []), or_named(before, 1e-9, 0.009, ["70.0 s", "80.0 s"])
+    assert chance is not None
+    assert poses is not None
+    assert (chance.significant, chance.or_named, chance.p_value) == (True, True, 1e-9)
+    assert chance.rms_g == unexplained_of(before, {}).rms_g
+    assert chance.lead.startswith("it may be none of the effects named: ")
+    assert "with a probability of 0.08" in chance.lead
+    assert poses.lead == (
+        "it may be none of the effects named: that something spoiled the pose at 70.0 s and the pose at 80.0 s would "
+        "do as well"
+    )
 
 
 def odd(ups: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration
-from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.in_run import of_clocks
 from triaxcal.figures import probability
@@ -283,11 +282,6 @@ class Search(Worth):
             if 0 <= left < self.kept and not self._beyond_noise(chi2, left):
                 found.append(self._solved((c.effect,)))
         return [m for m in found if m is not None]
-
-    def trends_p(self) -> float:
-        """Probability of trends as far as these from those that the model found foretells; 1 where none are known."""
-        n = len(self.poses)
-        return float(f_sf(self.found.trends / n, n, self.pure))
 
     def earned_all(self, m: Model) -> bool:
         """Whether the effects of a model earn their places, from nothing."""

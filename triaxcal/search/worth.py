@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 
@@ -117,14 +118,30 @@ class Worth:
         price = sum(self.price(e) for e in effects)
         return Model(effects, state, left_by_means(both, state), price, trends, tested)
 
-    def coincidence(self, m: Model) -> float:
+    def coincidence(self, m: Model, spoiled: int = 0, whole: float = 0.0) -> float:
         """Probability that the best of all candidates would explain as much of residuals as large as these, did they
-        lie in any direction: small where a model has been put to the test."""
+        lie in any direction: small where a model has been put to the test.
+
+        Beside it so many poses were left out as ``spoiled``, chosen among all, of which the linear model leaves
+        ``whole`` as its chi-square.
+        """
         if m.tested is not None:
             return m.tested
-        left, dof = self.left(m.effects), self.left(())
-        rest = min(max(m.chi2, left) / max(self.linear.chi2, 1e-300), 1.0)
-        return familywise(float(beta_cdf(rest, left / 2, (dof - left) / 2)), self.tests) if m.effects else 1.0
+        if not m.effects:
+            return 1.0
+        left, dof = self.left(m.effects), self.left(()) + spoiled
+        p = _as_small(m.chi2, left, max(whole, self.linear.chi2), dof)
+        if self.trends_p(self.linear) < FAMILYWISE <= self.trends_p(m):
+            n = len(self.poses)
+            both = p * _as_small(m.trends, n - parameters(m.effects), self.linear.trends, n)
+            p = both * (1 - float(np.log(max(both, P_LEAST))))  # of a product of two (Fisher)
+        tries = self.tests ** len(m.effects) * comb(len(self.poses) + spoiled, spoiled)
+        return familywise(p, tries)
+
+    def trends_p(self, m: Model) -> float:
+        """Probability of trends as far as these from those that a model foretells; 1 where none are known."""
+        n = len(self.poses)
+        return float(f_sf(m.trends / n, n, self.pure))
 
     def price(self, effect: Effect) -> float:
         """What a model pays for an effect: Schwarz's for its coefficients, and the choice among all that was tried."""
@@ -200,6 +217,13 @@ def deviance(chi2: Floats, left: Ints | int) -> Floats:
     chi2 = np.maximum(chi2, 0.0)
     beyond = np.log(np.maximum(chi2 / degrees, 1.0))
     return np.round(np.where(chi2 > degrees, degrees * (1 + beyond), chi2), DECIMALS)
+
+
+def _as_small(rest: float, left: int, whole: float, dof: int) -> float:
+    """Probability that of residuals in ``dof`` dimensions, of any direction and ``whole`` as their sum of squares, no
+    more than ``rest`` lies in ``left`` of them; a rest of less than its noise counts as that."""
+    share = min(max(rest, left) / max(whole, P_LEAST), 1.0)
+    return float(beta_cdf(share, left / 2, (dof - left) / 2))
 
 
 def parameters(effects: Sequence[Effect]) -> int:

@@ -71,8 +71,15 @@ class Finding:
     """What to record so as to tell it from its alternatives."""
     spoiled: tuple[str, ...] = ()
     """When poses began that, were they spoiled, would do as well."""
+    coincidence: float | None = None
+    """Where it may be something in no catalogue: the probability that poses like these look as if it were an effect."""
     held_out_g: Mapping[str, float | None] = field(default_factory=dict)
     """The error in the check recording with an alternative in its place, by name."""
+
+    @property
+    def in_question(self) -> bool:
+        """Whether anything else would do as well."""
+        return bool(self.alternatives or self.spoiled) or self.coincidence is not None
 
     def shape(self, name: str) -> float | None:
         """The value of a coefficient, such as the moment of a step."""
@@ -86,6 +93,7 @@ class Unexplained:
     rms_g: float | None
     leads: tuple[str, ...]
     or_spoiled: bool = False
+    or_named: bool = False
 
 
 @dataclass(frozen=True)
@@ -216,6 +224,7 @@ def _unexplained(value: object) -> Unexplained | None:
         number(known.get("rms_g")),
         tuple(part for part in words(lead or "").split("; ") if part),
         bool(known.get("or_spoiled")),
+        bool(known.get("or_named")),
     )
 
 
@@ -235,6 +244,7 @@ def _findings(value: object, terms: set[str]) -> Iterator[Finding]:
             remedy=None if remedy is None else words(remedy),
             apart=texts(known.get("apart")),
             spoiled=texts(known.get("spoiled")),
+            coincidence=number(known.get("coincidence")),
             held_out_g=numbers(known.get("held_out_rms_g")),
         )
 

@@ -71,9 +71,11 @@ def _judged(outcome: Outcome, certificate_limits: Mapping[str, float | None], ex
         kept = "Every declared limit is kept, but " if checks and not open_checks else ""
         headline, what = _UNEXPLAINED, f"more is left than the noise of the poses accounts for. {errors}"
         if outcome.unexplained is not None and outcome.unexplained.or_spoiled:
-            headline = "Spoiled poses or an effect; poses to take again"
+            headline = "Spoiled poses or an effect"
             what = f"something spoiled poses, which were left out, or an effect acts. {_errors(outcome)}"
-        elif _spoiled(outcome) or _rejected(outcome):
+        elif outcome.unexplained is not None and outcome.unexplained.or_named:
+            headline, what = _effects(outcome), f"what was found explains these poses, but need not be it. {errors}"
+        if _spoiled(outcome) or _rejected(outcome):
             headline = f"{headline}; poses to take again"
         sentence = f"{kept}{what}" if kept else f"{what[0].upper()}{what[1:]}"
         return Verdict("unexplained", headline, sentence, reservations, checks)
@@ -95,6 +97,10 @@ def _without_limits(outcome: Outcome) -> str:
         return "No effect could show in full"
     if not outcome.findings:
         return "Nothing found beyond noise" if not _lacks_fit(outcome) else "Nothing certain found beyond noise"
+    return _effects(outcome)
+
+
+def _effects(outcome: Outcome) -> str:
     what = "Effect" if len(outcome.findings) == 1 else f"{len(outcome.findings)} effects"
     return f"{what} found, cause uncertain" if _uncertain(outcome) else f"{what} found and corrected"
 
@@ -113,7 +119,7 @@ def _rejected(outcome: Outcome) -> int:
 
 
 def _uncertain(outcome: Outcome) -> bool:
-    return any(finding.verdict == "confounded" or finding.alternatives for finding in outcome.findings)
+    return any(finding.verdict == "confounded" or finding.in_question for finding in outcome.findings)
 
 
 def _found(outcome: Outcome) -> str:
@@ -136,6 +142,7 @@ def _named(finding: Finding, outcome: Outcome) -> str:
         clauses.append(known.clause if known.clause == title else f"{known.clause} ({title})")
     clauses += ["others"] if len(names) > _MOST_NAMED else []
     clauses += ["spoiled poses"] if finding.spoiled else []
+    clauses += ["something in no catalogue"] if finding.coincidence is not None else []
     doubt = "" if len(clauses) == 1 else " – these poses cannot tell which"
     return " or ".join(clauses) + doubt
 

@@ -339,6 +339,23 @@ def test_poses_left_out_or_an_effect_is_said_to_be_open(bare: dict[str, Any]) ->
     assert "Unexplained error left" not in text
 
 
+def test_effects_that_may_be_none_of_what_acts_are_said_to_be_in_question(bare: dict[str, Any]) -> None:
+    bare["findings"] = [
+        {"effect": "bias_drift", "verdict": "confounded", "p_value": 1e-9, "coefficients": {}, "alternatives": [],
+         "spoiled": [], "coincidence": 0.08, "apart": ["take more poses"], "reason": "", "remedy": ""}
+    ]  # fmt: skip
+    bare["unexplained"] |= {"significant": True, "p_value": 1e-9, "or_named": True, "lead": "it may be none of them"}
+    html, text = page(bare)
+    assert 'class="verdict unexplained"' in html
+    assert "Effect found, cause uncertain" in text
+    assert "What was found explains these poses, but need not be it." in text
+    assert "or something in no catalogue – these poses cannot tell which" in text
+    assert "would explain it as well with a probability of 0.080" in text
+    assert "Would tell them apart" in text
+    assert "More is left than noise accounts for" not in text
+    assert "it may be none of them: " in text
+
+
 def test_nothing_found_is_not_certain_where_the_fit_is_worse_than_noise(bare: dict[str, Any]) -> None:
     _, text = page(bare)
     assert "Nothing found beyond noise" in text
