@@ -118,17 +118,18 @@ def _confusion(all_found: Sequence[Outcome]) -> Iterable[Table]:
         if not found:
             continue
         head = ["truth", "n", "adopted", "confounded, truth in it", "wrong unique name", "confounded, truth not in it"]
-        head += ["unexplained only", "nothing", "any wrong unique", "other names first"]
+        head += ["unexplained only", "nothing", "any wrong unique", "named, yet unexplained", "other names first"]
         groups = [(k, [o for o in found if o.case.kind == k]) for k in physics.KINDS]
         rows = []
         for kind, group in [*((k, g) for k, g in groups if g), ("all, %", found)]:
             verdicts = Counter(o.verdict for o in group)
             wrong = sum(o.wrong for o in group)
+            open_ = sum(bool(o.found) and o.unexplained for o in group)
             total = kind == "all, %"
             names = Counter(o.found[0][0] for o in group if o.found and o.found[0][0] not in o.names)
             first = "" if total else ", ".join(f"{n} {c}" for n, c in names.most_common(4))
             share = [verdicts[v] for v in ("adopted", "confounded", "wrong", "astray", "unexplained", "nothing")]
-            counts = [percent(c, len(group)) if total else str(c) for c in [*share, wrong]]
+            counts = [percent(c, len(group)) if total else str(c) for c in [*share, wrong, open_]]
             rows.append([kind, str(len(group)), *counts, first])
         yield Table(f"What is named first, one effect of s = 20 to 200, {poses} poses", head, rows)
         yield _held_out(found, poses)
@@ -220,6 +221,8 @@ def _of_no_catalogue(found: Sequence[Outcome], poses: int) -> Table:
     apart = [o for o in found if o.imitation[1] >= APART]
     sums = [("all", list(found)), (f"all of which no name leaves less than s = {APART:g}", apart)]
     for kind, group in [*((k, [o for o in found if o.case.kind == k]) for k in uncatalogued.KINDS), *sums]:
+        if not group:
+            continue
         left, wrong = sum(o.unexplained for o in group), sum(o.wrong for o in group)
         only = sum(o.unexplained and not o.found for o in group)
         names = Counter(n for o in group for n, verdict, _ in o.found if verdict == "adopted")

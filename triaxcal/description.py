@@ -19,8 +19,8 @@ def described(after: Calibration, unexplained: Unexplained, signs: Sequence[floa
     """The model with the smooth term that lowers the cross-validated error most; or None, and why there is none."""
     if unexplained.or_spoiled:
         return None, "not tried, as it is open whether poses were spoiled"
-    if unexplained.or_named:
-        return None, "not tried, as the effects found explain all there is, whether or not they are what it is"
+    if unexplained.or_named or unexplained.only_inside:
+        return None, "not tried, as the means of the poses are explained"
     if not unexplained.significant:
         return None, f"not tried, as what is left is no more than noise explains (p {probability(unexplained.p_value)})"
     old = after.residual.cross_validated_rms_g

@@ -13,14 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.calibration import Calibration
-from triaxcal.conditions import of_unknown_history
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.runs import expected_of
-from triaxcal.search import NEAR, Search, alternatives
+from triaxcal.search import NEAR, LeftOut, Search, alternatives
 from triaxcal.start import problem_of, start, with_history
 
 ANYTHING = 5
@@ -44,14 +43,10 @@ class Explanation:
     """That with those poses left out which the linear fit leaves out."""
     rivals: tuple[tuple[Effect, ...], ...] = ()
     """Effects that explain as much with other poses left out."""
-    unknown: int = 0
-    """Of the poses ``aside``, how many are so because what was before them is not known, which an effect needs."""
     instead: tuple[tuple[Effect, ...], ...] = ()
     """Effects that explain as much as the linear fit does by the poses that it leaves out."""
     spoiled: tuple[int, ...] = ()
     """Poses that explain as much without any effect, were they spoiled."""
-    whole: float = 0.0
-    """Chi-square of what the linear model leaves of all poses."""
     whole_p: float | None = None
     """Where the linear fit leaves poses out: the probability of what it leaves of all of them."""
 
@@ -61,15 +56,10 @@ class Explanation:
         return self.search.score(self.search.found) + self.price
 
     @property
-    def coincidence(self) -> float:
-        """Probability that some effects, with as many poses left out, would explain as much, whatever it was."""
-        return self.search.coincidence(self.search.found, len(self.aside) - self.unknown, self.whole)
-
-    @property
     def price(self) -> float:
         """Of the poses left out."""
         n = len(self.search.poses) + len(self.aside)
-        spoiled = len(self.aside) - self.unknown
+        spoiled = self.search.left_out.spoiled(self.adopted)
         return len(self.aside) * float(np.log(n)) + spoiled * 2 * float(np.log(1 / SPOILED - 1))
 
 
@@ -115,7 +105,6 @@ def explained(
     return replace(
         _compared(found, trials, aside),
         linear=next((t.search for t in trials if t.aside == aside), found.search),
-        whole=first.linear.chi2,
         whole_p=first.anything_p(first.linear) if aside and not trials[0].aside else None,
     )
 
@@ -151,7 +140,8 @@ def _searched(
     problem = problem_of(kept, signs=signs, reference=reference)
     linear = solve(problem, start(problem, kept, signs), ())
     problem = with_history(problem, kept, linear.sensor(problem))
-    search = Search(problem, kept, signs, reference, catalogue, before, linear)
+    left_out = LeftOut(poses, aside, signs, reference)
+    search = Search(problem, kept, signs, reference, catalogue, before, linear, left_out)
     other = copy(search)
     other.passed_over = {}
     adopted = search.run()
@@ -160,8 +150,7 @@ def _searched(
     if expected and len(other.run(expected)) > 1 and other.score(other.found) < search.score(search.found):
         search, adopted = other, list(other.found.effects)
     adopted = adopted if expected else _without_fillers(search)
-    unknown = len(set(aside) & set(of_unknown_history(poses, adopted)))
-    return Explanation(search, adopted, aside, search, unknown=unknown)
+    return Explanation(search, adopted, aside, search)
 
 
 def _without_fillers(search: Search) -> list[Effect]:

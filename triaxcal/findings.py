@@ -61,11 +61,11 @@ def finding_of(
     step: Calibration,
     rivals: Sequence[Sequence[Effect]],
     spoiled: Sequence[str],
-    coincidence: float,
+    chance: float,
 ) -> Finding:
     """The ``pair`` are the model that lacks this effect alone (None where the poses cannot carry it), and that with all
     effects found; ``after`` is what is handed on. ``rivals`` explain as much with other poses left out, the poses
-    ``spoiled`` without any effect; ``coincidence`` as `triaxcal.explanation.Explanation` has it."""
+    ``spoiled`` without any effect; ``chance`` is its coincidence (`triaxcal.search`)."""
     found = alternatives(search, effect, search.found)
     for rival in rivals:
         names = instead_of(search, effect, rival)
@@ -80,9 +80,9 @@ def finding_of(
         reason += f"; {', '.join(found)} would do as well on these poses"
     if spoiled:
         reason += f"; that something spoiled {the_poses(spoiled)} would {'also ' * bool(found)}do as well"
-    untested = coincidence >= FAMILYWISE
+    untested = chance >= FAMILYWISE
     if untested:
-        reason += f"; {UNTESTED.format(probability(coincidence))}"
+        reason += f"; {UNTESTED.format(probability(chance))}"
     apart = dict.fromkeys(telling_apart(search, effect, found)) if found else ()
     floor = pair[1].residual.noise_floor_g
     if not effect.coefficients[0].unit.startswith("g"):
@@ -98,7 +98,7 @@ def finding_of(
         step=step,
         apart=(*([f"take {the_poses(spoiled)} again"] if spoiled else []), *apart, *([MORE] if untested else [])),
         spoiled=tuple(spoiled),
-        coincidence=coincidence if untested else None,
+        coincidence=chance if untested else None,
         instead={name: model.effects for name, model in found.items()},
     )
 
@@ -175,7 +175,9 @@ def advice_of(
     for f in findings:
         if f.verdict == "confounded":
             out.append(f"{f.effect} cannot be told from {', '.join(f.rivals)} here: {'; '.join(f.apart)}")
-    if unexplained.significant and not (unexplained.or_spoiled or unexplained.or_named):
+    if unexplained.only_inside:
+        out.append(f"what was found does not explain how |a| moves inside the poses: {unexplained.towards}")
+    elif unexplained.significant and not (unexplained.or_spoiled or unexplained.or_named):
         out.append(f"something is left that no candidate explains: {unexplained.towards}")
     if undescribed:
         out.append(f"empirical: {undescribed}")

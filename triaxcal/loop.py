@@ -27,7 +27,7 @@ from triaxcal.held_out import HeldOut, better_of, held_out
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.runs import by_run
-from triaxcal.search import FAMILYWISE, NO_LOWER, Search, compared
+from triaxcal.search import FAMILYWISE, NO_LOWER, Search, coincidence, coincidence_of_spoiled, compared
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
 from triaxcal.unexplained import (
     Unexplained,
@@ -92,12 +92,12 @@ def diagnose(
     smooth, undescribed = described(steps[-1], unexplained, signs) if empirical else (None, "")
     after = smooth or steps[-1]
     findings: list[Finding] = []
-    for effect, step in zip(made.adopted, steps, strict=False):
+    for effect, step, chance in zip(made.adopted, steps, made.chances, strict=False):
         others = [e for e in made.adopted if e is not effect]
         without = made.given.tried(others) if others else before
         spoiled = tuple(poses[i].at for i in made.found.spoiled)
-        pair, chance = (without, steps[-1]), made.found.coincidence
-        findings.append(finding_of(search, effect, pair, after, step, made.found.rivals, spoiled, chance))
+        rivals, pair = made.found.rivals, (without, steps[-1])
+        findings.append(finding_of(search, effect, pair, after, step, rivals, spoiled, chance))
     if smooth is not None:
         findings.append(description_of(smooth, steps[-1], unexplained.p_value))
         unexplained = unexplained_of(smooth, search.passed_over)
@@ -158,6 +158,19 @@ class _Made:
     quiet: _Given
     """Poses without the creep that what moves the bias makes."""
 
+    chances: tuple[float, ...] = ()
+    """Of each effect adopted its coincidence (`triaxcal.search`)."""
+
+    spoiled_by_chance: float = 0.0
+    """That of the poses left out as spoiled, beside the effects."""
+
+    @property
+    def untested(self) -> dict[str, float]:
+        """What was not put to the test, in words, each with its coincidence."""
+        chances = {e.name: chance for e, chance in zip(self.adopted, self.chances, strict=True)}
+        chances["a spoiled pose"] = self.spoiled_by_chance
+        return {name: chance for name, chance in chances.items() if chance >= FAMILYWISE}
+
     @property
     def aside(self) -> list[PoseResult]:
         """Poses left out as spoiled."""
@@ -183,7 +196,10 @@ def _made(linear: Calibration, of_linear: _Given, effects: Sequence[Effect]) -> 
         steps = [left.fit(found.adopted[:count]) for count in range(1, len(found.adopted) + 1)]
         # The search has asked this of poses without their creep.
         if compared(steps[-1], before).lower:
-            return _Made(found, found.search, found.adopted, left, before, steps, quiet)
+            search = found.search
+            chances = tuple(coincidence(search, e, search.found) for e in found.adopted)
+            by_chance = coincidence_of_spoiled(search, search.found)
+            return _Made(found, search, found.adopted, left, before, steps, quiet, chances, by_chance)
         found.linear.passed_over[" with ".join(e.name for e in found.adopted)] = NO_LOWER
     # What is left is asked of the poses that the calibration is of.
     found.linear.settle_on(found.linear.linear)
@@ -197,12 +213,26 @@ def _unexplained(made: _Made) -> Unexplained:
     left = replace(left, rms_g=max(left.rms_g, beyond_noise(made.steps[-1])))
     whole_p = made.found.whole_p
     if made.adopted and not left.significant:
-        spoiled = [made.given.poses[i].at for i in made.found.spoiled]
-        nothing_p = search.anything_p(search.linear)
-        return moving_inside(search) or or_named(made.before, nothing_p, made.found.coincidence, spoiled) or left
+        return _named_or_none(made) or moving_inside(search) or left
     if made.rivals and whole_p is not None and whole_p < LACK_OF_FIT:
         return spoiled_or(replace(made.quiet, aside=()).fit(()), whole_p, made.aside, made.rivals, left)
     return left
+
+
+def _named_or_none(made: _Made) -> Unexplained | None:
+    """Where effects explain all there is, but need not be what it is; None where they were put to the test."""
+    search, spoiled = made.search, [made.given.poses[i].at for i in made.found.spoiled]
+    if not (made.untested or spoiled):
+        return None
+    sure = [] if spoiled else [e for e in made.adopted if e.name not in made.untested]
+    if made.spoiled_by_chance >= FAMILYWISE:
+        unknown = tuple(sorted(search.left_out.unknown(made.adopted)))
+        before = replace(made.quiet, aside=unknown).tried(sure) or made.quiet.fit(())
+        p = before.residual.lack_of_fit_p
+    else:
+        before = made.quiet.tried(sure) or made.quiet.fit(())
+        p = search.anything_p(search.model(sure) or search.linear)
+    return or_named(before, p, made.untested, spoiled, moving_inside(search))
 
 
 def _spoiled_instead(made: _Made) -> dict[str, Calibration]:
@@ -229,6 +259,6 @@ def _again(made: _Made) -> list[str]:
     advice = f"take again {the_poses([p.pose.at for p in made.aside])}: left out as spoiled"
     if made.rivals:
         advice += f", but {' or '.join(made.rivals)} would explain as much; {SAME}"
-    elif made.adopted and made.found.coincidence >= FAMILYWISE:
-        advice += f", beside effects that need not be what acts; {SAME}"
+    elif made.untested:
+        advice += f", beside effects, and one or the other need not be what acts; {SAME}"
     return [advice]

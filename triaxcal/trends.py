@@ -96,9 +96,11 @@ class Trends:
         return unabsorbed(stacked, np.concatenate([np.zeros(len(weighted)), r / error]))
 
     def rms_g(self, state: State) -> float:
-        """By how much |a| is off its mean over a pose, beyond noise and what the model foretells, rms of all."""
+        """By how much |a| is off its mean over a pose, beyond noise and what the model foretells: rms of all, the
+        quieter the more."""
         r, _, error = self.linearise(state)
-        return float(np.sqrt(max(float(np.mean(r**2 - error**2)), 0.0) / 12))
+        beyond = float(np.sum((r / error) ** 2)) - len(r)
+        return float(np.sqrt(max(beyond, 0.0) / np.sum(error**-2.0) / 12))
 
     def touch(self, effects: Sequence[Effect]) -> bool:
         """Whether any of the effects goes with something that moves inside the poses."""

@@ -14,8 +14,8 @@ from triaxcal.leads import AGAIN, LEAD, TOWARDS, Lead, clear_patterns
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.search import FAMILYWISE, NEAR, Nearest, Search
 
-UNTESTED = "whatever acts on these poses, one effect or another would explain it as well with a probability of {}"
-MORE = "take more poses, in further directions"
+UNTESTED = "whatever acts, one effect or another would explain these poses as well with a probability of {}"
+MORE = "take more poses, or where the error is small hold them for longer"
 HINT = 0.05
 """Familywise p up to which an effect that was passed over for it is a hint."""
 
@@ -25,6 +25,7 @@ class Unexplained:
     """What is left. ``p_value`` is the probability of as much by chance; ``rms_g`` its size beyond noise; ``lead`` the
     best hint at what it may be, ``towards`` what would tell more. ``or_spoiled``: it is poses that were left out as
     spoiled, or an effect. ``or_named``: it is what the findings name, or something that no effect explains.
+    ``only_inside``: the means of the poses are explained, and not how |a| moves inside them.
     """
 
     significant: bool
@@ -33,6 +34,7 @@ class Unexplained:
     lead: str
     or_spoiled: bool = False
     or_named: bool = False
+    only_inside: bool = False
     towards: str = ""
 
 
@@ -69,14 +71,23 @@ def spoiled_or(
     return Unexplained(True, p, _size(whole), f"most of it is {off}: {doubt}", or_spoiled=True)
 
 
-def or_named(before: Calibration, p: float | None, coincidence: float, spoiled: Sequence[str]) -> Unexplained | None:
-    """What the poses leave ``before`` any effect is in the model, with a probability ``p`` by chance, where those found
-    explain all of it, but need not be it: others would have done so whatever it was (``coincidence``), or that the
-    poses at these times are ``spoiled``. None where they have earned it."""
-    why = [UNTESTED.format(probability(coincidence))] if coincidence >= FAMILYWISE else []
-    why += [f"that something spoiled {the_poses(spoiled)} would do as well"] if spoiled else []
-    lead = f"it may be none of the effects named: {', and '.join(why)}"
-    return Unexplained(True, p, _size(before), lead, or_named=True) if why else None
+def or_named(
+    before: Calibration,
+    p: float | None,
+    untested: Mapping[str, float],
+    spoiled: Sequence[str],
+    moving: Unexplained | None = None,
+) -> Unexplained:
+    """What the poses leave ``before`` the effects in question, with a probability ``p`` by chance, where these explain
+    all of it, but need not be what it is: what is ``untested``, each with its coincidence, or that the poses at these
+    times are ``spoiled`` would do as well. ``moving`` is what they leave inside the poses."""
+    why = []
+    if untested:
+        chance = UNTESTED.format(probability(max(untested.values())))
+        why.append(f"it need not be {' or '.join(untested)}: {chance}")
+    why += [f"that something spoiled {the_poses(spoiled)} would do as well as any effect"] if spoiled else []
+    why += [moving.lead] if moving else []
+    return Unexplained(True, p, _size(before), "; ".join(why), or_named=True)
 
 
 def moving_inside(search: Search) -> Unexplained | None:
@@ -86,8 +97,12 @@ def moving_inside(search: Search) -> Unexplained | None:
         return None
     text = "inside the poses |a| moves too, so it goes with the time or something that changes, not the attitude"
     if search.found.effects:
-        text = "inside the poses |a| moves otherwise than is explained, with the time or something that changes"
-    return Unexplained(True, p, search.trends.rms_g(search.found.state), text, towards=TOWARDS[TIME])
+        text = (
+            "inside the poses |a| moves otherwise than is explained, with the time or something that changes, or with "
+            "a delay"
+        )
+    rms_g = search.trends.rms_g(search.found.state)
+    return Unexplained(True, p, rms_g, text, only_inside=True, towards=TOWARDS[TIME])
 
 
 def beyond_noise(after: Calibration) -> float:

@@ -301,6 +301,7 @@ def loop_document(
             "lead": small.in_words(loop.unexplained.lead),
             "or_spoiled": loop.unexplained.or_spoiled,
             "or_named": loop.unexplained.or_named,
+            "only_inside": loop.unexplained.only_inside,
         },
         "data_quality": list(data_quality),
         "advice": [small.in_words(line) for line in loop.advice],

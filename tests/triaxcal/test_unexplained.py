@@ -102,17 +102,15 @@ def test_poses_left_out_or_an_effect_are_what_is_left_unless_the_others_leave_mo
 def test_what_is_named_may_be_none_of_it_where_others_would_do_as_well(fitted: Fitted, ups: np.ndarray) -> None:
     """The size is that of what the effects were found for."""
     before = fitted(12 * radial(ups, np.sin(TIME / 7)))
-    assert or_named(before, 1e-9, 0.009, []) is None
-    chance, poses = or_named(before, 1e-9, 0.08, []), or_named(before, 1e-9, 0.009, ["70.0 s", "80.0 s"])
-    assert chance is not None
-    assert poses is not None
+    moving = Unexplained(True, 1e-5, SIGMA_G, "inside the poses |a| moves", only_inside=True)
+    chance = or_named(before, 1e-9, {"warm_up": 0.08, "a spoiled pose": 0.02}, [], moving)
+    poses = or_named(before, 1e-9, {}, ["70.0 s", "80.0 s"])
     assert (chance.significant, chance.or_named, chance.p_value) == (True, True, 1e-9)
     assert chance.rms_g == unexplained_of(before, {}).rms_g
-    assert chance.lead.startswith("it may be none of the effects named: ")
-    assert "with a probability of 0.08" in chance.lead
-    assert poses.lead == (
-        "it may be none of the effects named: that something spoiled the pose at 70.0 s and the pose at 80.0 s would "
-        "do as well"
+    assert chance.lead.startswith("it need not be warm_up or a spoiled pose: whatever acts, ")
+    assert chance.lead.endswith(" with a probability of 0.08; inside the poses |a| moves")
+    assert (
+        poses.lead == "that something spoiled the pose at 70.0 s and the pose at 80.0 s would do as well as any effect"
     )
 
 

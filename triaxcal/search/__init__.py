@@ -2,7 +2,9 @@
 
 from triaxcal.search.alternatives import NEAR, alternatives
 from triaxcal.search.apart import telling_apart
+from triaxcal.search.coincidence import coincidence, coincidence_of_spoiled
 from triaxcal.search.comparison import NO_LOWER, compared
+from triaxcal.search.left_out import LeftOut
 from triaxcal.search.search import Nearest, Search
 from triaxcal.search.worth import FAMILYWISE, Model, deviance
 
@@ -10,10 +12,13 @@ __all__ = [
     "FAMILYWISE",
     "NEAR",
     "NO_LOWER",
+    "LeftOut",
     "Model",
     "Nearest",
     "Search",
     "alternatives",
+    "coincidence",
+    "coincidence_of_spoiled",
     "compared",
     "deviance",
     "telling_apart",

@@ -10,6 +10,7 @@ import numpy as np
 from triaxcal.effects.contract import Effect
 from triaxcal.problem import State
 from triaxcal.search.candidates import Candidate, Ground
+from triaxcal.search.coincidence import coincidence
 from triaxcal.search.search import Search
 from triaxcal.search.worth import FAMILYWISE, Model, parameters
 
@@ -39,7 +40,7 @@ def alternatives(search: Search, effect: Effect, now: Model) -> dict[str, Model]
     out: dict[str, Model] = {}
     for name, other in sorted([*found, *_jointly(search, effect, now)], key=lambda f: search.score(f[1])):
         out.setdefault(name, other)
-    if search.coincidence(now) >= FAMILYWISE:
+    if coincidence(search, effect, now) >= FAMILYWISE:
         # So few poses would have shown one effect or another whatever it was: also one that they cannot test.
         for other in search.untestable():
             name = other.effects[0].name

@@ -19,6 +19,7 @@ from triaxcal.pure_error import noise_levels, pure_error_dof
 from triaxcal.search.candidates import Candidate, Ground, candidates_of
 from triaxcal.search.comparison import CARRIES, NO_LOWER, compared
 from triaxcal.search.gains import Gains
+from triaxcal.search.left_out import LeftOut
 from triaxcal.search.omnibus import anything_p
 from triaxcal.search.shape import refined, sharpened
 from triaxcal.search.worth import FAMILYWISE, Model, Worth, deviance, parameters
@@ -72,8 +73,9 @@ class Search(Worth):
         catalogue: Sequence[Effect],
         before: Calibration,
         linear: State,
+        left_out: LeftOut,
     ) -> None:
-        super().__init__(problem, poses, signs, reference, catalogue, linear)
+        super().__init__(problem, poses, signs, reference, catalogue, linear, left_out)
         self.before = self.best = before
         self.found = self.linear
         self.passed_over: dict[str, str] = {}

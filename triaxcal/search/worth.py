@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import comb
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration
-from triaxcal.distributions import beta_cdf, f_sf
+from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
@@ -21,6 +20,7 @@ from triaxcal.pure_error import lack_of_fit_p, pure_error_dof
 from triaxcal.search.candidates import Ground, candidates_of, still_conditions
 from triaxcal.search.familywise import familywise, independent_tests
 from triaxcal.search.gains import Gains
+from triaxcal.search.left_out import LeftOut
 from triaxcal.trends import Trends, left_by_means, left_by_trends, trends_p
 
 FAMILYWISE = 0.01
@@ -35,15 +35,14 @@ KEPT = 2.6
 @dataclass(frozen=True)
 class Model:
     """Effects in the model, fitted: ``chi2`` of the residuals, the price of the effects, and the sum of squares of the
-    ``trends`` inside the poses beside those that it foretells. ``tested`` is given where the trends alone put it to the
-    test: the familywise probability that chance brings so much of them about."""
+    ``trends`` inside the poses beside those that it ``foretells``."""
 
     effects: tuple[Effect, ...]
     state: State
     chi2: float
     price: float
     trends: float = 0.0
-    tested: float | None = None
+    foretells: bool = True
 
 
 class Worth:
@@ -57,7 +56,9 @@ class Worth:
         reference: float,
         catalogue: Sequence[Effect],
         linear: State,
+        left_out: LeftOut,
     ) -> None:
+        self.left_out = left_out
         self.problem, self.poses, self.signs, self.reference = problem, poses, signs, reference
         self.catalogue, self.still = catalogue, still_conditions(poses)
         self.pure = max(pure_error_dof(poses), 1.0)
@@ -80,7 +81,7 @@ class Worth:
         try:
             return replace(found, trends=self.trends.chi2(state, J / s[:, None]))
         except EffectFault:  # it is known in the middle of the poses alone, and foretells nothing
-            return replace(found, trends=self.linear.trends)
+            return replace(found, trends=self.linear.trends, foretells=False)
 
     def model(self, effects: Sequence[Effect]) -> Model | None:
         """Fitted; None where the poses cannot carry it."""
@@ -116,30 +117,12 @@ class Worth:
         if tested >= FAMILYWISE:
             return None
         price = sum(self.price(e) for e in effects)
-        return Model(effects, state, left_by_means(both, state), price, trends, tested)
-
-    def coincidence(self, m: Model, spoiled: int = 0, whole: float = 0.0) -> float:
-        """Probability that the best of all candidates would explain as much of residuals as large as these, did they
-        lie in any direction: small where a model has been put to the test.
-
-        Beside it so many poses were left out as ``spoiled``, chosen among all, of which the linear model leaves
-        ``whole`` as its chi-square.
-        """
-        if m.tested is not None:
-            return m.tested
-        if not m.effects:
-            return 1.0
-        left, dof = self.left(m.effects), self.left(()) + spoiled
-        p = _as_small(m.chi2, left, max(whole, self.linear.chi2), dof)
-        if self.trends_p(self.linear) < FAMILYWISE <= self.trends_p(m):
-            n = len(self.poses)
-            both = p * _as_small(m.trends, n - parameters(m.effects), self.linear.trends, n)
-            p = both * (1 - float(np.log(max(both, P_LEAST))))  # of a product of two (Fisher)
-        tries = self.tests ** len(m.effects) * comb(len(self.poses) + spoiled, spoiled)
-        return familywise(p, tries)
+        return Model(effects, state, left_by_means(both, state), price, trends)
 
     def trends_p(self, m: Model) -> float:
         """Probability of trends as far as these from those that a model foretells; 1 where none are known."""
+        if not m.foretells:
+            return 1.0
         n = len(self.poses)
         return float(f_sf(m.trends / n, n, self.pure))
 
@@ -217,13 +200,6 @@ def deviance(chi2: Floats, left: Ints | int) -> Floats:
     chi2 = np.maximum(chi2, 0.0)
     beyond = np.log(np.maximum(chi2 / degrees, 1.0))
     return np.round(np.where(chi2 > degrees, degrees * (1 + beyond), chi2), DECIMALS)
-
-
-def _as_small(rest: float, left: int, whole: float, dof: int) -> float:
-    """Probability that of residuals in ``dof`` dimensions, of any direction and ``whole`` as their sum of squares, no
-    more than ``rest`` lies in ``left`` of them; a rest of less than its noise counts as that."""
-    share = min(max(rest, left) / max(whole, P_LEAST), 1.0)
-    return float(beta_cdf(share, left / 2, (dof - left) / 2))
 
 
 def parameters(effects: Sequence[Effect]) -> int:

@@ -118,7 +118,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         [*rows, *extra],
     )
     for finding in loop.findings:
-        others = "".join(f" or {name}" for name in finding.alternatives)
+        others = "".join(f" or {name}" for name in finding.rivals)
         print(f"  {finding.verdict}: {finding.effect}{others}")
         for name, (value, error, unit) in finding.coefficients.items():
             told = f"{unit} (no standard error by itself)" if error is None else f"± {error:.1g} {unit}"

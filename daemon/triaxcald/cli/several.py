@@ -27,7 +27,7 @@ COLUMNS = {
     "gain": "by how much the summed score is better than without it",
     "shown by": "units that gain more by it than chance would give",
     "named by": "units that name it and nothing that would do as well",
-    "listed by": "units that have it among names of which each would do as well",
+    "listed by": "units that have it beside what would do as well, or as that",
     "not found by": "units that neither name nor list it",
 }
 """What stands in the tables of several units."""
@@ -163,7 +163,7 @@ def show_agreement(found: Agreement, names: Sequence[str], loops: Sequence[Loop]
                 name,
                 ", ".join(f.effect for f in loop.findings) or "none",
                 ", ".join(f.verdict for f in loop.findings),
-                ", ".join(dict.fromkeys(other for f in loop.findings for other in f.alternatives)),
+                ", ".join(dict.fromkeys(other for f in loop.findings for other in f.rivals)),
                 small.told(loop.before.residual.cross_validated_rms_g),
                 small.told(loop.after.residual.cross_validated_rms_g),
                 small.told(loop.after.residual.noise_floor_g),

@@ -94,6 +94,7 @@ class Unexplained:
     leads: tuple[str, ...]
     or_spoiled: bool = False
     or_named: bool = False
+    only_inside: bool = False
 
 
 @dataclass(frozen=True)
@@ -225,6 +226,7 @@ def _unexplained(value: object) -> Unexplained | None:
         tuple(part for part in words(lead or "").split("; ") if part),
         bool(known.get("or_spoiled")),
         bool(known.get("or_named")),
+        bool(known.get("only_inside")),
     )
 
 

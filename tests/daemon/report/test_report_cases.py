@@ -344,16 +344,25 @@ def test_effects_that_may_be_none_of_what_acts_are_said_to_be_in_question(bare: 
         {"effect": "bias_drift", "verdict": "confounded", "p_value": 1e-9, "coefficients": {}, "alternatives": [],
          "spoiled": [], "coincidence": 0.08, "apart": ["take more poses"], "reason": "", "remedy": ""}
     ]  # fmt: skip
-    bare["unexplained"] |= {"significant": True, "p_value": 1e-9, "or_named": True, "lead": "it may be none of them"}
+    bare["unexplained"] |= {"significant": True, "p_value": 1e-9, "or_named": True, "lead": "it need not be bias_drift"}
     html, text = page(bare)
     assert 'class="verdict unexplained"' in html
     assert "Effect found, cause uncertain" in text
-    assert "What was found explains these poses, but need not be it." in text
+    assert "What was found need not be what acts." in text
     assert "or something in no catalogue – these poses cannot tell which" in text
-    assert "would explain it as well with a probability of 0.080" in text
+    assert "would explain these poses as well with a probability of 0.080" in text
     assert "Would tell them apart" in text
     assert "More is left than noise accounts for" not in text
-    assert "it may be none of them: " in text
+    assert "It need not be" in text
+
+
+def test_what_moves_inside_the_poses_is_told_from_what_their_means_leave(bare: dict[str, Any]) -> None:
+    bare["unexplained"] |= {"significant": True, "p_value": 1e-9, "rms_g": 2e-5, "only_inside": True}
+    _, text = page(bare)
+    assert "What was found does not explain how the magnitude moves inside the poses." in text
+    assert "inside them the magnitude moves otherwise than foretold, 20.0 µg rms" in text
+    assert "a test of the trends inside the poses" in text
+    assert "More is left than" not in text
 
 
 def test_nothing_found_is_not_certain_where_the_fit_is_worse_than_noise(bare: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ from triaxcal.effects import CATALOGUE, TIME, Effect
 from triaxcal.fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
-from triaxcal.search import Search
+from triaxcal.search import LeftOut, Search
 from triaxcal.search.candidates import Ground
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start, with_history
@@ -105,7 +105,16 @@ def searched() -> Callable[..., Search]:
         problem = problem_of(poses, signs=MINUS)
         linear = solve(problem, start(problem, poses, MINUS), ())
         problem = with_history(problem, poses, linear.sensor(problem))
-        return Search(problem, poses, MINUS, 1.0, catalogue, fit(poses, signs=MINUS, aside=()), linear)
+        return Search(
+            problem,
+            poses,
+            MINUS,
+            1.0,
+            catalogue,
+            fit(poses, signs=MINUS, aside=()),
+            linear,
+            LeftOut(poses, (), MINUS, 1.0),
+        )
 
     return make
 

@@ -7,13 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.part import Part
 from triaxcal.poses.pose import Pose
-from triaxcal.problem import linearise
-from triaxcal.search import Model, Search, alternatives
+from triaxcal.search import Search, alternatives, coincidence
 from triaxcal.search.alternatives import instead_of
 from triaxcal.sensor import Sensor
 
@@ -186,67 +184,6 @@ def test_a_single_number_that_explains_all_is_no_coincidence(
     search = searched(recorded(sensor, 0, where=fourteen), [WARMTH, CROSS])
     model = search.model([one])
     assert model is not None
-    assert search.coincidence(model) < 1e-4
+    assert coincidence(search, one, model) < 1e-4
     search.found = model
     assert "cross_coupling" not in alternatives(search, one, model)
-
-
-def test_coincidence_is_the_chance_of_a_random_direction(
-    paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, searched: Searched
-) -> None:
-    """Residuals of the same size in random directions, of which one given candidate explains as much."""
-    search = searched(recorded(paper_unit, 0, where=fourteen), [WARMTH])
-    search.tests = 1.0
-    dof, rank = search.left([]), 3
-    rng = np.random.default_rng(3)
-    r = rng.standard_normal((200_000, dof)) * 30 / np.sqrt(dof)
-    share = np.sum(r[:, rank:] ** 2, axis=1) / np.sum(r**2, axis=1)
-    for chi2 in (40.0, 150.0):
-        model = Model((WARMTH,), search.linear.state, chi2, 0.0)
-        search.linear = replace(search.linear, chi2=900.0)
-        assert search.coincidence(model) == pytest.approx(np.mean(share < chi2 / 900), rel=0.05)
-
-
-def test_a_pose_to_leave_out_is_one_choice_more(
-    paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, searched: Searched
-) -> None:
-    """Residuals in random directions, of which a given candidate with the best of all poses left out explains as much:
-    never more often than is said, and where it is rare half as often at least."""
-    search = searched(recorded(paper_unit, 0, where=fourteen), [WARMTH])
-    _, singular, rows = np.linalg.svd(linearise(search.problem, search.linear.state)[1].T)
-    own = rows[len(singular) :].T  # (14,5), what nine parameters leave
-    rng = np.random.default_rng(4)
-    candidate = rng.standard_normal((5, 2))
-    y = rng.standard_normal((100_000, 5))
-    share = np.full(len(y), np.inf)
-    for pose in own:
-        q, _ = np.linalg.qr(np.column_stack([candidate, pose]))
-        share = np.minimum(share, 1 - np.sum((y @ q) ** 2, axis=1) / np.sum(y**2, axis=1))
-    kept = searched(recorded(paper_unit, 0, where=fourteen)[1:], [WARMTH])
-    kept.tests = 1.0
-    two = Part.of(WARMTH, "x"), Part.of(WARMTH, "y")
-    for rest in (0.002, 0.005):
-        model = Model(two, kept.linear.state, rest * 1e5, 0.0)
-        said = kept.coincidence(model, spoiled=1, whole=1e5)
-        assert 0.5 * said < np.mean(share < rest) < 1.05 * said
-
-
-def test_trends_that_are_as_foretold_make_it_less_of_a_coincidence(
-    paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, searched: Searched
-) -> None:
-    """As often as two tests in a row are passed, both by residuals and trends in random directions."""
-    search = searched(recorded(paper_unit, 0, where=fourteen), [WARMTH])
-    search.tests = 1.0
-    search.linear = replace(search.linear, chi2=900.0, trends=60.0)
-    alone = search.coincidence(Model((WARMTH,), search.linear.state, 150.0, 0.0, trends=60.0))
-    both = search.coincidence(Model((WARMTH,), search.linear.state, 150.0, 0.0, trends=20.0))
-    rng = np.random.default_rng(5)
-    left, dof = search.left([WARMTH]), search.left([])
-    p = [
-        stats.beta.cdf(share, free / 2, (whole - free) / 2)
-        for share, free, whole in ((150 / 900, left, dof), (20 / 60, 14 - 3, 14))
-    ]
-    drawn = rng.random((4_000_000, 2)).prod(axis=1)
-    assert alone == pytest.approx(p[0])
-    assert both == pytest.approx(np.mean(drawn < p[0] * p[1]), rel=0.1)
-    assert both < 0.1 * alone
