@@ -14,9 +14,9 @@ from triaxcal.effects.plugins import package_of
 from triaxcal.figures import micro_g, probability, the_poses
 from triaxcal.search import FAMILYWISE, Search, alternatives, compared, telling_apart
 from triaxcal.search.alternatives import instead_of
-from triaxcal.unexplained import MORE, UNTESTED, Unexplained
+from triaxcal.unexplained import MORE, NAMELESS, UNTESTED, Unexplained
 
-SPOILED_POSES, NAMELESS = "spoiled poses", "something in no catalogue"
+SPOILED_POSES = "spoiled poses"
 OTHERS = ("", "the other effect", "the other two effects", "the other three effects", "the other four effects")
 
 
@@ -172,9 +172,12 @@ def advice_of(
     """``undescribed`` is why the empirical term that was asked for is not in the model; ``blind`` are effects that do
     not show in full, ``faulty`` those of other packages that were left out, each with the reason why."""
     out = [f"{f.effect}: {f.remedy}" for f in findings if f.verdict == "adopted"]
+    said: set[str] = set()
     for f in findings:
         if f.verdict == "confounded":
-            out.append(f"{f.effect} cannot be told from {', '.join(f.rivals)} here: {'; '.join(f.apart)}")
+            new = [line for line in f.apart if line not in said] or f.apart
+            out.append(f"{f.effect} cannot be told from {', '.join(f.rivals)} here: {'; '.join(new)}")
+            said |= set(f.apart)
     if unexplained.only_inside:
         out.append(f"what was found does not explain how |a| moves inside the poses: {unexplained.towards}")
     elif unexplained.significant and not (unexplained.or_spoiled or unexplained.or_named):

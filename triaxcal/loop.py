@@ -30,6 +30,7 @@ from triaxcal.runs import by_run
 from triaxcal.search import FAMILYWISE, NO_LOWER, Search, coincidence, coincidence_of_spoiled, compared
 from triaxcal.search.candidates import Ground, faults_of, still_conditions
 from triaxcal.unexplained import (
+    NAMELESS,
     Unexplained,
     beyond_noise,
     hints_of,
@@ -166,10 +167,9 @@ class _Made:
 
     @property
     def untested(self) -> dict[str, float]:
-        """What was not put to the test, in words, each with its coincidence."""
-        chances = {e.name: chance for e, chance in zip(self.adopted, self.chances, strict=True)}
-        chances["a spoiled pose"] = self.spoiled_by_chance
-        return {name: chance for name, chance in chances.items() if chance >= FAMILYWISE}
+        """The effects that were not put to the test, each with its coincidence."""
+        chances = zip(self.adopted, self.chances, strict=True)
+        return {e.name: chance for e, chance in chances if chance >= FAMILYWISE}
 
     @property
     def aside(self) -> list[PoseResult]:
@@ -222,17 +222,18 @@ def _unexplained(made: _Made) -> Unexplained:
 def _named_or_none(made: _Made) -> Unexplained | None:
     """Where effects explain all there is, but need not be what it is; None where they were put to the test."""
     search, spoiled = made.search, [made.given.poses[i].at for i in made.found.spoiled]
-    if not (made.untested or spoiled):
-        return None
-    sure = [] if spoiled else [e for e in made.adopted if e.name not in made.untested]
-    if made.spoiled_by_chance >= FAMILYWISE:
-        unknown = tuple(sorted(search.left_out.unknown(made.adopted)))
-        before = replace(made.quiet, aside=unknown).tried(sure) or made.quiet.fit(())
-        p = before.residual.lack_of_fit_p
-    else:
+    in_doubt = made.aside if made.spoiled_by_chance >= FAMILYWISE else []
+    if made.untested or spoiled:
+        sure = [] if spoiled else [e for e in made.adopted if e.name not in made.untested]
         before = made.quiet.tried(sure) or made.quiet.fit(())
         p = search.anything_p(search.model(sure) or search.linear)
-    return or_named(before, p, made.untested, spoiled, moving_inside(search))
+        left = or_named(before, p, made.untested, spoiled, moving_inside(search))
+        return spoiled_or(before, p, in_doubt, [NAMELESS], left) if in_doubt else left
+    unknown = tuple(sorted(search.left_out.unknown(made.adopted)))
+    whole = replace(made.quiet, aside=unknown).tried(made.adopted) if in_doubt else None
+    if whole is None:
+        return None
+    return spoiled_or(whole, whole.residual.lack_of_fit_p, in_doubt, [NAMELESS])
 
 
 def _spoiled_instead(made: _Made) -> dict[str, Calibration]:
@@ -259,6 +260,6 @@ def _again(made: _Made) -> list[str]:
     advice = f"take again {the_poses([p.pose.at for p in made.aside])}: left out as spoiled"
     if made.rivals:
         advice += f", but {' or '.join(made.rivals)} would explain as much; {SAME}"
-    elif made.untested:
-        advice += f", beside effects, and one or the other need not be what acts; {SAME}"
+    elif made.untested or made.spoiled_by_chance >= FAMILYWISE:
+        advice += f", but something else may act; {SAME}"
     return [advice]

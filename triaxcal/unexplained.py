@@ -14,6 +14,7 @@ from triaxcal.leads import AGAIN, LEAD, TOWARDS, Lead, clear_patterns
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.search import FAMILYWISE, NEAR, Nearest, Search
 
+NAMELESS = "something in no catalogue"
 UNTESTED = "whatever acts, one effect or another would explain these poses as well with a probability of {}"
 MORE = "take more poses, or where the error is small hold them for longer"
 HINT = 0.05
@@ -59,14 +60,18 @@ def unexplained_of(
 
 
 def spoiled_or(
-    whole: Calibration, p: float, spoiled: Sequence[PoseResult], names: Sequence[str], left: Unexplained
+    whole: Calibration,
+    p: float | None,
+    spoiled: Sequence[PoseResult],
+    names: Sequence[str],
+    left: Unexplained | None = None,
 ) -> Unexplained:
     """What the poses leave where those that are ``spoiled`` explain it no better than the effects of these ``names``
     would. ``whole`` is the fit to all poses, ``p`` the probability of what it leaves, which is significant; ``left`` is
     what the others leave without those: where that is significant, neither is all there is."""
     off = " and ".join(f"the pose at {s.pose.at} ({micro_g(s.residual_g, '+')})" for s in spoiled)
     doubt = f"spoiled, or it is {' or '.join(names)}, which would explain as much"
-    if left.significant:
+    if left is not None and left.significant:
         return replace(left, lead=f"{left.lead}; besides, left out is {off}: {doubt}")
     return Unexplained(True, p, _size(whole), f"most of it is {off}: {doubt}", or_spoiled=True)
 
@@ -83,7 +88,7 @@ def or_named(
     times are ``spoiled`` would do as well. ``moving`` is what they leave inside the poses."""
     why = []
     if untested:
-        chance = UNTESTED.format(probability(max(untested.values())))
+        chance = UNTESTED.format(" and ".join(probability(p) for p in untested.values()))
         why.append(f"it need not be {' or '.join(untested)}: {chance}")
     why += [f"that something spoiled {the_poses(spoiled)} would do as well as any effect"] if spoiled else []
     why += [moving.lead] if moving else []

@@ -44,6 +44,11 @@ def none_could_show(blind_to: Collection[str]) -> bool:
     return {e.name for e in CATALOGUE if set(e.needs) <= {*CLOCKS, *BEFORE}} <= set(blind_to)
 
 
+def without(loop: Loop) -> str:
+    """What the size of what is unexplained is without, where that need not be the cause."""
+    return " without what was found" if loop.unexplained.or_named else ""
+
+
 def nothing_shows(loop: Loop) -> str:
     """What a loop without findings says of the catalogue."""
     certain = " for certain" if loop.unexplained.or_spoiled else ""

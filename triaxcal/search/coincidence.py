@@ -18,43 +18,51 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
     there lie in any direction: small where it has been put to the test.
 
     It has where it explains most by itself, or beside some of the others what these leave, if all of them together are
-    no coincidence.
+    no coincidence; with the poses that were left out for being off as part of the explanation, and without.
     """
     others = [e for e in m.effects if e is not effect]
+    unknown = search.left_out.unknown(m.effects)
     found = 1.0
     for size in range(len(others) + 1):
         for beside in combinations(others, size):
             of_both = [e for e in m.effects if e is effect or e in beside]
             part = m if size == len(others) else search.model(of_both)
-            if part is not None:
-                found = min(found, max(_by_chance(search, part, ()), _by_chance(search, part, beside)))
+            base = search.model(beside) if beside else None
+            if part is not None and (base or not beside):
+                found = min(found, max(_beside(search, part, b, unknown) for b in (search.linear, base) if b))
     return found
 
 
 def coincidence_of_spoiled(search: Worth, m: Model) -> float:
-    """The same of the poses that were left out for being off, beside the effects of the model; 0 where none was."""
-    return _by_chance(search, m, m.effects) if search.left_out.spoiled(m.effects) else 0.0
+    """The same of the poses that were left out for being off, beside the effects of the model: of each beside the
+    others, and of all. 0 where there is none."""
+    left_out, unknown = search.left_out, search.left_out.unknown(m.effects)
+    spoiled = set(left_out.rows) - unknown
+    sets = [{i} for i in spoiled] + [spoiled] * (len(spoiled) > 1)
+    chances = [_chance(search, m, m, len(s), left_out.chi2(m.effects, unknown | spoiled - s)) for s in sets]
+    return max(chances, default=0.0)
 
 
-def _by_chance(search: Worth, m: Model, given: tuple[Effect, ...]) -> float:
-    """Probability that the best candidates, as many as the model has beside those ``given``, would explain as much of
-    what these leave, with as many poses left out, and foretell the trends inside the poses as well where there are any.
-    """
-    base = m if given == m.effects else search.model(given) if given else search.linear
-    if base is None:
-        return 1.0
-    n, spoiled, whole = len(search.poses), search.left_out.spoiled(m.effects), base.chi2
-    if spoiled:
-        whole = max(whole, search.left_out.chi2(given, search.left_out.unknown(m.effects)))
-    rank = parameters(m.effects) - parameters(given)
-    tests = [_as_small(m.chi2, search.left(m.effects), whole, search.left(given) + spoiled)]
+def _beside(search: Worth, m: Model, base: Model, unknown: set[int]) -> float:
+    """Of what a model has more than its base: as if nobody had left out a pose, and with those left out as given."""
+    spoiled = len(set(search.left_out.rows) - unknown)
+    alone = _chance(search, m, base, 0, base.chi2)
+    if not spoiled:
+        return alone
+    return max(alone, _chance(search, m, base, spoiled, search.left_out.chi2(base.effects, unknown)))
+
+
+def _chance(search: Worth, m: Model, base: Model, spoiled: int, whole: float) -> float:
+    """Probability that the best candidates, as many as the model has more than its base, with so many poses left out
+    as ``spoiled``, would explain as much of the ``whole``, and foretell the trends inside the poses as well where there
+    are any."""
+    n, rank = len(search.poses), parameters(m.effects) - parameters(base.effects)
+    left = search.left(m.effects)
+    p = _as_small(m.chi2, left, max(whole, base.chi2), search.left(base.effects) + spoiled)
     if rank and base.foretells and search.trends_p(base) < FAMILYWISE:
-        tests.append(_as_small(m.trends if m.foretells else base.trends, n - rank, base.trends, n))
-    p = tests[0]
-    if len(tests) == 2:  # of a product of two probabilities (Fisher)
-        p = tests[0] * tests[1]
-        p *= 1 - float(np.log(max(p, P_LEAST)))
-    return familywise(p, search.tests ** (len(m.effects) - len(given)) * comb(n + spoiled, spoiled))
+        both = p * _as_small(m.trends if m.foretells else base.trends, n - rank, base.trends, n)
+        p = both * (1 - float(np.log(max(both, P_LEAST))))  # of a product of two probabilities (Fisher)
+    return familywise(p, search.tests ** (len(m.effects) - len(base.effects)) * comb(n + spoiled, spoiled))
 
 
 def _as_small(rest: float, left: int, whole: float, dof: int) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from triaxcal.conditions import of_unknown_history
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
@@ -39,6 +41,7 @@ class LeftOut:
             problem = problem_of(poses, signs=self.signs, reference=self.reference)
             begin = start(problem, poses, self.signs)
             problem = with_history(problem, poses, begin.sensor(problem))
-            return left_by_means(problem, solve(problem, begin, tuple(effects)))
+            chi2 = left_by_means(problem, solve(problem, begin, tuple(effects)))
         except (Refused, EffectFault):
             return 0.0
+        return chi2 if np.isfinite(chi2) else 0.0

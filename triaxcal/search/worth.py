@@ -95,7 +95,7 @@ class Worth:
     def _solved(self, effects: tuple[Effect, ...]) -> Model | None:
         try:
             state = solve(self.problem, self.linear.state, effects)
-        except Refused:
+        except (Refused, EffectFault):
             return None
         found = self._model(effects, state, sum(self.price(e) for e in effects))
         return found if np.isfinite(found.chi2 + found.trends) else None

@@ -20,7 +20,7 @@ from triaxcald.demo import DemoUnit, run_demo
 from triaxcald.documents import number
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
-from triaxcald.remarks import nothing_shows
+from triaxcald.remarks import nothing_shows, without
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.eeprom import keep_eeprom, read_eeprom
 from triaxcald.station.collection import Collection
@@ -126,7 +126,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     if not loop.findings:
         print(f"  {nothing_shows(loop)}")
     if loop.unexplained.significant:
-        print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms; {loop.unexplained.lead}")
+        print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms{without(loop)}; {loop.unexplained.lead}")
     if o.provisioned:
         print(f"  {described(o.provisioned)}")
     if v:

@@ -12,7 +12,7 @@ from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, counted
 from triaxcald.documents import holds_of
-from triaxcald.remarks import assumption, nothing_shows, overlap
+from triaxcald.remarks import assumption, nothing_shows, overlap, without
 from triaxcald.units import ErrorUnit, grouped, in_units_of
 
 
@@ -110,7 +110,7 @@ def show_loop(loop: Loop, choice: Choice) -> None:
         print(nothing_shows(loop))
     if loop.unexplained.significant:
         lead = small.in_words(loop.unexplained.lead)
-        print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms; {lead}")
+        print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms{without(loop)}; {lead}")
         if said := overlap(lead):
             print(f"shares of what is unexplained: {said}")
     for line in loop.advice:

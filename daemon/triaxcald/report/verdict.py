@@ -74,7 +74,7 @@ def _judged(outcome: Outcome, certificate_limits: Mapping[str, float | None], ex
             headline = "Spoiled poses or an effect"
             what = f"something spoiled poses, which were left out, or an effect acts. {_errors(outcome)}"
         elif outcome.unexplained is not None and outcome.unexplained.or_named:
-            headline, what = _effects(outcome), f"what was found need not be what acts. {errors}"
+            headline, what = _effects(outcome), f"what was found need not be the cause. {errors}"
         elif outcome.unexplained is not None and outcome.unexplained.only_inside:
             what = f"what was found does not explain how the magnitude moves inside the poses. {errors}"
         if _spoiled(outcome) or _rejected(outcome):

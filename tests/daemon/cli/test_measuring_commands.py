@@ -186,15 +186,7 @@ def test_diagnose_finds_what_is_hidden_and_judges_it_on_another_recording(
         errors = {axis: held["standard_error"] for axis, held in finding["coefficients"].items()}
         for axis, truth in {"x": 5e-4, "y": -4e-4, "z": 3e-4}.items():
             assert abs(values[axis] - truth) < 5 * errors[axis]
-    assert set(document["unexplained"]) == {
-        "significant",
-        "p_value",
-        "rms_g",
-        "lead",
-        "or_spoiled",
-        "or_named",
-        "only_inside",
-    }
+    assert set(document["unexplained"]) == UNEXPLAINED
     assert document["unexplained"]["significant"] is False
     assert document["after"]["rms_g"] < 0.5 * document["before"]["rms_g"]
     _is_calibration(document["calibration"], effects={"second_order_nonlinearity"})
