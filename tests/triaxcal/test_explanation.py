@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from triaxcal.effects import effect_named
 from triaxcal.explanation import left_out
 from triaxcal.loop import diagnose
 from triaxcal.poses.pose import Pose
@@ -137,3 +138,55 @@ def test_where_the_noise_is_not_known_nothing_is_more_than_it(paper_unit: Sensor
         loop = diagnose(poses, signs=SIGNS)
         assert loop.unexplained.p_value is None
         assert not loop.unexplained.significant
+
+
+def test_what_fourteen_poses_explain_whatever_it_is_is_said_to_be_perhaps_nothing_of_it(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    """Errors of sixty standard errors in random directions: where effects explain them, and poses left out."""
+    named = doubted = 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        ups = fourteen[rng.permutation(14)] + 0.05 * rng.standard_normal((14, 3))
+        poses = noisy_poses(paper_unit, ups / np.linalg.norm(ups, axis=1, keepdims=True), SIGMA, rng)
+        off = [replace(p, mean=p.mean * (1 + 60 * SIGMA * rng.standard_normal())) for p in poses]
+        loop = diagnose(off, signs=SIGNS, empirical=True)
+        assert loop.unexplained.significant
+        named += bool(loop.findings)
+        doubted += loop.unexplained.or_named
+        for f in loop.findings if loop.unexplained.or_named else ():
+            assert f.verdict == "confounded"
+            assert any(
+                a.startswith(f"{f.effect} cannot be told from ") and "in no catalogue here" in a for a in loop.advice
+            )
+            assert "take more poses" in f.apart[-1]
+            assert "empirical: not tried, as the means of the poses are explained" in loop.advice
+            assert loop.unexplained.rms_g > 10 * SIGMA
+            for again in (a for a in loop.advice if "left out as spoiled" in a):
+                assert again.endswith("but something else may act; what comes out the same was not spoiled")
+    assert named == doubted >= 1
+
+
+def test_a_pose_left_out_beside_an_effect_is_in_doubt_by_itself(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    """Sixteen poses, a large effect of the temperature, and a pose that is off by twenty standard errors: the name is
+    earned, and that the pose is spoiled is not."""
+    warmth = effect_named("temperature_bias")
+    sensor = replace(paper_unit, effects=((warmth, np.array([3e-3, -2e-3, 1e-3])),))
+    doubted = 0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        ups = twenty_six[rng.permutation(26)[:16]] + 0.05 * rng.standard_normal((16, 3))
+        ups /= np.linalg.norm(ups, axis=1, keepdims=True)
+        channels = {"temp_c": 25 + 4 * rng.standard_normal(16)}
+        poses = noisy_poses(sensor, ups, SIGMA, rng, channels=channels, channel_reference={"temp_c": 25.0})
+        bad = int(rng.integers(16))
+        poses[bad] = replace(poses[bad], mean=poses[bad].mean * (1 + 20 * SIGMA))
+        loop = diagnose(poses, signs=SIGNS)
+        if loop.unexplained.or_spoiled:
+            doubted += 1
+            assert not loop.unexplained.or_named
+            assert loop.findings[0].coincidence is None
+            assert f"the pose at {10 * bad:.1f} s (" in loop.unexplained.lead
+            assert "spoiled, or it is something in no catalogue" in loop.unexplained.lead
+            assert loop.advice[0].endswith("but something else may act; what comes out the same was not spoiled")
+    assert doubted >= 1

@@ -418,3 +418,21 @@ def test_what_moves_inside_the_poses_and_is_not_foretold_has_a_size(paper_unit: 
     unforetold_g, foretold_g = np.mean(off_g, axis=0)
     assert unforetold_g == pytest.approx(np.sqrt(np.mean(along_g**2) / 12), rel=0.1)
     assert foretold_g < 0.5 * TREND_G / np.sqrt(12)
+
+
+def test_what_moves_inside_the_poses_beside_an_effect_of_the_attitude_is_left(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """Second order explains the means; that a pose turns up and down in its length nothing explains."""
+    rng = np.random.default_rng(9)
+    inside = ((SQUARE, np.array([1e-3, -8e-4, 6e-4])),)
+    poses = moving(replace(paper_unit, effects=inside), twenty_six, rng, inside)
+    for share, only in ((0.0, False), (3e-4, True)):
+        odd = [replace(p, trend=p.trend + share * rng.standard_normal() * p.mean) for p in poses]
+        loop = diagnose(odd, signs=MINUS, empirical=True)
+        assert [f.effect for f in loop.findings] == ["second_order_nonlinearity"]
+        assert (loop.unexplained.significant, loop.unexplained.only_inside) == (only, only)
+        if only:
+            assert loop.unexplained.rms_g == pytest.approx(share / np.sqrt(12), rel=0.4)
+            assert any("does not explain how |a| moves inside the poses: record again" in a for a in loop.advice)
+            assert "empirical: not tried, as the means of the poses are explained" in loop.advice
