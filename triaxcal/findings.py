@@ -81,8 +81,10 @@ def finding_of(
     if spoiled:
         reason += f"; that something spoiled {the_poses(spoiled)} would {'also ' * bool(found)}do as well"
     untested = chance >= FAMILYWISE
-    if untested:
-        reason += f"; {UNTESTED.format(probability(chance))}"
+    if untested and chance < 1:
+        reason += f"; {UNTESTED.format(probability(chance))} (limit {FAMILYWISE:g})"
+    elif untested:
+        reason += "; inside the poses |a| does not move as it foretells"
     apart = dict.fromkeys(telling_apart(search, effect, found)) if found else ()
     floor = pair[1].residual.noise_floor_g
     if not effect.coefficients[0].unit.startswith("g"):

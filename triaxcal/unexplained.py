@@ -15,7 +15,7 @@ from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.search import FAMILYWISE, NEAR, Nearest, Search
 
 NAMELESS = "something in no catalogue"
-UNTESTED = "whatever acts, one effect or another would explain these poses as well with a probability of {}"
+UNTESTED = "of random errors as large as these one effect or another would explain as much with a probability of {}"
 MORE = "take more poses, or where the error is small hold them for longer"
 HINT = 0.05
 """Familywise p up to which an effect that was passed over for it is a hint."""
@@ -88,8 +88,9 @@ def or_named(
     times are ``spoiled`` would do as well. ``moving`` is what they leave inside the poses."""
     why = []
     if untested:
-        chance = UNTESTED.format(" and ".join(probability(p) for p in untested.values()))
-        why.append(f"it need not be {' or '.join(untested)}: {chance}")
+        chances = [probability(p) for p in untested.values() if p < 1]
+        chance = f": {UNTESTED.format(' and '.join(chances))} (limit {FAMILYWISE:g})" if chances else ""
+        why.append(f"it need not be {' or '.join(untested)}{chance}")
     why += [f"that something spoiled {the_poses(spoiled)} would do as well as any effect"] if spoiled else []
     why += [moving.lead] if moving else []
     return Unexplained(True, p, _size(before), "; ".join(why), or_named=True)
@@ -102,10 +103,9 @@ def moving_inside(search: Search) -> Unexplained | None:
         return None
     text = "inside the poses |a| moves too, so it goes with the time or something that changes, not the attitude"
     if search.found.effects:
-        text = (
-            "inside the poses |a| moves otherwise than is explained, with the time or something that changes, or with "
-            "a delay"
-        )
+        quiet = search.trends_p(search.linear) >= LEAD
+        text = "with the time or something that changes, or with a delay"
+        text = f"inside the poses |a| {'does not move as' if quiet else f'moves, {text}, otherwise than'} is foretold"
     rms_g = search.trends.rms_g(search.found.state)
     return Unexplained(True, p, rms_g, text, only_inside=True, towards=TOWARDS[TIME])
 

@@ -436,3 +436,25 @@ def test_what_moves_inside_the_poses_beside_an_effect_of_the_attitude_is_left(
             assert loop.unexplained.rms_g == pytest.approx(share / np.sqrt(12), rel=0.4)
             assert any("does not explain how |a| moves inside the poses: record again" in a for a in loop.advice)
             assert "empirical: not tried, as the means of the poses are explained" in loop.advice
+
+
+def test_an_effect_that_foretells_what_the_poses_do_not_do_inside_is_in_question(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """What goes from pose to pose as the temperature does, and not inside them, is hardly the temperature."""
+    rng = np.random.default_rng(0)
+    quiet = moving(paper_unit, twenty_six, rng)
+    means = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),))
+    for share, verdict in ((0.0, "adopted"), (0.5, "confounded")):
+        poses = [
+            replace(p, trend=q.trend, rates={"temp_c": share * p.rates["temp_c"]})
+            for p, q in zip(means, quiet, strict=True)
+        ]
+        loop = diagnose(poses, signs=MINUS)
+        (finding,) = loop.findings
+        assert (finding.effect, finding.verdict) == ("temperature_bias", verdict)
+        assert loop.unexplained.or_named == (verdict == "confounded")
+    assert finding.coincidence == 1.0
+    assert finding.reason.endswith("; inside the poses |a| does not move as it foretells")
+    assert loop.unexplained.lead == "it need not be temperature_bias; inside the poses |a| does not move as is foretold"
+    assert loop.unexplained.rms_g > 1e-4

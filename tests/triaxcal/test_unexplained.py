@@ -107,8 +107,8 @@ def test_what_is_named_may_be_none_of_it_where_others_would_do_as_well(fitted: F
     poses = or_named(before, 1e-9, {}, ["70.0 s", "80.0 s"])
     assert (chance.significant, chance.or_named, chance.p_value) == (True, True, 1e-9)
     assert chance.rms_g == unexplained_of(before, {}).rms_g
-    assert chance.lead.startswith("it need not be warm_up or bias_step: whatever acts, ")
-    assert chance.lead.endswith(" with a probability of 0.08 and 0.02; inside the poses |a| moves")
+    assert chance.lead.startswith("it need not be warm_up or bias_step: of random errors as large as these ")
+    assert chance.lead.endswith(" with a probability of 0.08 and 0.02 (limit 0.01); inside the poses |a| moves")
     assert (
         poses.lead == "that something spoiled the pose at 70.0 s and the pose at 80.0 s would do as well as any effect"
     )

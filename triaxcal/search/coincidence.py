@@ -18,7 +18,8 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
     there lie in any direction: small where it has been put to the test.
 
     It has where it explains most by itself, or beside some of the others what these leave, if all of them together are
-    no coincidence; with the poses that were left out for being off as part of the explanation, and without.
+    no coincidence; with the poses that were left out for being off as part of the explanation, and without. 1 where it
+    has failed: inside the poses |a| stays, and should not.
     """
     others = [e for e in m.effects if e is not effect]
     unknown = search.left_out.unknown(m.effects)
@@ -57,9 +58,11 @@ def _chance(search: Worth, m: Model, base: Model, spoiled: int, whole: float) ->
     as ``spoiled``, would explain as much of the ``whole``, and foretell the trends inside the poses as well where there
     are any."""
     n, rank = len(search.poses), parameters(m.effects) - parameters(base.effects)
-    left = search.left(m.effects)
+    left, moves = search.left(m.effects), search.trends_p(base) < FAMILYWISE
+    if not moves and search.trends_p(m) < FAMILYWISE:
+        return 1.0
     p = _as_small(m.chi2, left, max(whole, base.chi2), search.left(base.effects) + spoiled)
-    if rank and base.foretells and search.trends_p(base) < FAMILYWISE:
+    if rank and base.foretells and moves:
         both = p * _as_small(m.trends if m.foretells else base.trends, n - rank, base.trends, n)
         p = both * (1 - float(np.log(max(both, P_LEAST))))  # of a product of two probabilities (Fisher)
     return familywise(p, search.tests ** (len(m.effects) - len(base.effects)) * comb(n + spoiled, spoiled))

@@ -350,7 +350,7 @@ def test_effects_that_may_be_none_of_what_acts_are_said_to_be_in_question(bare: 
     assert "Effect found, cause uncertain" in text
     assert "What was found need not be the cause." in text
     assert "or something in no catalogue – these poses cannot tell which" in text
-    assert "would explain these poses as well with a probability of 0.080" in text
+    assert "one effect or another would explain as much with a probability of 0.080" in text
     assert "Would tell them apart" in text
     assert "More is left than noise accounts for" not in text
     assert "It need not be" in text

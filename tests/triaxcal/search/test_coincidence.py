@@ -88,7 +88,9 @@ def test_trends_that_are_as_foretold_make_it_less_of_a_coincidence_and_others_do
     assert said(20.0) < said(40.0) < said(60.0)
     quiet = replace(search.linear, trends=14.0)
     search.linear = quiet
-    assert said(20.0) == said(60.0) == pytest.approx(np.mean(by_means < 150 / 900), rel=0.05)
+    assert said(20.0) == pytest.approx(np.mean(by_means < 150 / 900), rel=0.05)
+    assert said(60.0) == 1.0  # it should have moved |a| inside the poses
+    assert said(60.0, foretells=False) == said(20.0)
 
 
 def test_each_of_several_effects_is_put_to_the_test_by_itself(
