@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,14 +24,17 @@ from triaxcal.effects.contract import (
 )
 from triaxcal.figures import plain
 from triaxcal.plan.directions import directions, spiral
+from triaxcal.problem import linearise
 from triaxcal.search.search import Search
 from triaxcal.search.worth import Model
 
 SPHERE = 400
-APART_DEG = 40.0
-POSES = 3
-TOLD = 3.0
-"""Two models are told apart by poses in which they differ by so many of their standard errors, all together."""
+APART_DEG = 30.0
+POSES, POSES_MOST = 3, 12
+TOLD = 5.0
+"""Two models are told apart by poses in which they differ by so many of their standard errors, all together: then the
+wrong one is worse by 10 (`triaxcal.search.alternatives.NEAR`) in nineteen of twenty recordings."""
+DECIMALS = 6
 
 FROM_OTHER_SIDES = "come to the same poses from other sides: another order, or the same backwards"
 UNSHAKEN = "record again with what shakes the stand switched off"
@@ -89,32 +93,43 @@ def goes_with(effect: Effect) -> str:
 
 
 def _directions(search: Search, mine: Model, other: Model, name: str) -> str:
+    """The poses in which the other model is off by most of what it is sure of, should this one be right."""
     up = np.concatenate([[v for _, v in directions()], spiral(SPHERE)])
-    off, error = _difference(search, mine, other, up)
+    off, by_theta, error = _difference(search, mine, other, up)
+
+    def told(rows: list[int]) -> float:
+        """By how much chi-square rises, though the other model is fitted again."""
+        noise = error**2 * np.eye(len(rows)) + by_theta[rows] @ by_theta[rows].T
+        return float(off[rows] @ np.linalg.solve(noise, off[rows]))
+
     chosen: list[int] = []
-    for i in np.argsort(-np.abs(off), kind="stable"):
-        if all(abs(float(up[i] @ up[k])) < np.cos(np.radians(APART_DEG)) for k in chosen):
-            chosen.append(int(i))
-        if len(chosen) == POSES:
+    near = np.abs(up @ up.T) > np.cos(np.radians(APART_DEG))
+    while len(chosen) < POSES_MOST and (len(chosen) < POSES or told(chosen) < TOLD**2):
+        far: list[int] = np.flatnonzero(~near[:, chosen].any(axis=1)).tolist()
+        if not far:
             break
+        # A processor's rounding must not decide between two that tell as much.
+        chosen.append(max(far, key=lambda i: (round(told([*chosen, i]), DECIMALS), -i)))
+    enough = told(chosen) >= TOLD**2
     # A hair's breadth of one direction from another must not change the words from processor to processor.
-    where = ", ".join("(" + ", ".join(f"{v + 0.0:+.1f}" for v in np.round(up[i], 1)) + ")" for i in chosen)
-    sigma = abs(off[chosen[0]]) / error
-    times = int(np.ceil((TOLD / max(sigma, 1e-9)) ** 2))
-    how = {1: "one such pose"}.get(times, f"{times} such poses" if times <= 100 else f"only {times:.0e} such poses")
-    return (
-        f"add poses with up at {where}: there it differs from {name} by up to "
-        f"{plain(abs(off[chosen[0]]) * 1e6, 2)} µg, so that {how} would tell"
-    )
+    shown = chosen if enough else chosen[:POSES]
+    where = ", ".join("(" + ", ".join(f"{v + 0.0:+.1f}" for v in np.round(up[i], 1)) + ")" for i in shown)
+    end = "which would tell" if enough else f"of which even {len(chosen)} would hardly tell"
+    largest = plain(float(np.max(np.abs(off[shown]))) * 1e6, 2)
+    return f"add poses with up at {where}: there it differs from {name} by up to {largest} µg, {end}"
 
 
-def _difference(search: Search, mine: Model, other: Model, up: Floats) -> tuple[Floats, float]:
-    """|a| − reference (m,) under the other model of what the first says the outputs are, all over the sphere; and the
-    standard error of a pose (rms)."""
+def _difference(search: Search, mine: Model, other: Model, up: Floats) -> tuple[Floats, Floats, float]:
+    """|a| − reference (m,) under the other model of what the first says the outputs are, all over the sphere; its
+    derivatives by what the poses leave open in the other model (m,p), in standard errors; and that of a pose (rms)."""
     problem = search.problem
     held = at_reference(problem.channel_reference, len(up))
-    first, second = mine.state.sensor(problem), other.state.sensor(problem)
-    length, _ = second.magnitude(first.output(up * problem.reference, held), held)
-    _, by_u = first.magnitude(problem.u, problem.conditions)
-    error = np.sqrt(np.mean(np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)))
-    return length - problem.reference, float(error)
+    outputs = mine.state.sensor(problem).output(up * problem.reference, held)
+    channels = {n: problem.channel_reference[n] + values for n, values in held.items()}
+    there = replace(problem, u=outputs, covariance=np.zeros((len(up), 3, 3)), channels=channels, further=None)
+    off, by_theta, _ = linearise(there, other.state)
+    _, J, s = linearise(problem, other.state)
+    size = np.maximum(np.linalg.norm(J / s[:, None], axis=0), 1e-300)
+    _, singular, axes = np.linalg.svd(J / s[:, None] / size, full_matrices=False)
+    open_ = axes.T / np.maximum(singular, singular[0] * 1e-12)
+    return off, by_theta / size @ open_, float(np.sqrt(np.mean(s**2)))
