@@ -84,7 +84,7 @@ def finding_of(
     if untested and chance < 1:
         reason += f"; {UNTESTED.format(probability(chance))} (limit {FAMILYWISE:g})"
     elif untested:
-        reason += "; inside the poses |a| does not move as it foretells"
+        reason += "; inside the poses |a| does not move as what was found foretells"
     apart = dict.fromkeys(telling_apart(search, effect, found)) if found else ()
     floor = pair[1].residual.noise_floor_g
     if not effect.coefficients[0].unit.startswith("g"):

@@ -103,7 +103,7 @@ def moving_inside(search: Search) -> Unexplained | None:
         return None
     text = "inside the poses |a| moves too, so it goes with the time or something that changes, not the attitude"
     if search.found.effects:
-        quiet = search.trends_p(search.linear) >= LEAD
+        quiet = search.contradicted(search.found)
         text = "with the time or something that changes, or with a delay"
         text = f"inside the poses |a| {'does not move as' if quiet else f'moves, {text}, otherwise than'} is foretold"
     rms_g = search.trends.rms_g(search.found.state)

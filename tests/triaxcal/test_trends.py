@@ -455,6 +455,6 @@ def test_an_effect_that_foretells_what_the_poses_do_not_do_inside_is_in_question
         assert (finding.effect, finding.verdict) == ("temperature_bias", verdict)
         assert loop.unexplained.or_named == (verdict == "confounded")
     assert finding.coincidence == 1.0
-    assert finding.reason.endswith("; inside the poses |a| does not move as it foretells")
+    assert finding.reason.endswith("; inside the poses |a| does not move as what was found foretells")
     assert loop.unexplained.lead == "it need not be temperature_bias; inside the poses |a| does not move as is foretold"
     assert loop.unexplained.rms_g > 1e-4

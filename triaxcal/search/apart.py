@@ -26,15 +26,16 @@ from triaxcal.figures import plain
 from triaxcal.plan.directions import directions, spiral
 from triaxcal.problem import linearise
 from triaxcal.search.search import Search
-from triaxcal.search.worth import Model
+from triaxcal.search.worth import Model, deviance
 
 SPHERE = 400
 APART_DEG = 30.0
 POSES, POSES_MOST = 3, 12
-TOLD = 5.0
-"""Two models are told apart by poses in which they differ by so many of their standard errors, all together: then the
-wrong one is worse by 10 (`triaxcal.search.alternatives.NEAR`) in nineteen of twenty recordings."""
-DECIMALS = 6
+OUT = 10.0
+"""A model is out where it is worse by so much in deviance and price (`triaxcal.search.alternatives.NEAR`)."""
+ONE_OF_TWENTY = 1.645
+"""Chi-square that rises by δ² on average rises by δ² − 2 δ times this at least, but in one recording of twenty."""
+DIGITS = 6
 
 FROM_OTHER_SIDES = "come to the same poses from other sides: another order, or the same backwards"
 UNSHAKEN = "record again with what shakes the stand switched off"
@@ -94,27 +95,39 @@ def goes_with(effect: Effect) -> str:
 
 def _directions(search: Search, mine: Model, other: Model, name: str) -> str:
     """The poses in which the other model is off by most of what it is sure of, should this one be right."""
-    up = np.concatenate([[v for _, v in directions()], spiral(SPHERE)])
-    off, by_theta, error = _difference(search, mine, other, up)
+    # As they are told: a tenth is what a hand can do.
+    up = np.round(np.concatenate([[v for _, v in directions()], spiral(SPHERE)]), 1) + 0.0
+    off, by_theta, error = _difference(search, mine, other, up / np.linalg.norm(up, axis=1, keepdims=True))
 
-    def told(rows: list[int]) -> float:
+    def rise(rows: list[int]) -> float:
         """By how much chi-square rises, though the other model is fitted again."""
         noise = error**2 * np.eye(len(rows)) + by_theta[rows] @ by_theta[rows].T
-        return float(off[rows] @ np.linalg.solve(noise, off[rows]))
+        return float(f"{off[rows] @ np.linalg.solve(noise, off[rows]):.{DIGITS}g}")
+
+    def enough(rows: list[int]) -> bool:
+        """Whether the other model is out then, in nineteen of twenty recordings."""
+        k, risen = len(rows), rise(rows)
+        unlucky = max(risen - 2 * ONE_OF_TWENTY * np.sqrt(risen), 0.0)
+        theirs = deviance(np.array(other.chi2 + k + unlucky), search.left(other.effects) + k) + other.price
+        own = deviance(np.array(mine.chi2 + k), search.left(mine.effects) + k) + mine.price
+        return bool(theirs - own >= OUT)
 
     chosen: list[int] = []
-    near = np.abs(up @ up.T) > np.cos(np.radians(APART_DEG))
-    while len(chosen) < POSES_MOST and (len(chosen) < POSES or told(chosen) < TOLD**2):
-        far: list[int] = np.flatnonzero(~near[:, chosen].any(axis=1)).tolist()
+    size = np.linalg.norm(up, axis=1)
+    near = np.abs(up @ up.T) > np.cos(np.radians(APART_DEG)) * np.outer(size, size)
+    known = np.isfinite(off) & np.isfinite(by_theta).all(axis=1)
+    while len(chosen) < POSES_MOST and (len(chosen) < POSES or not enough(chosen)):
+        far: list[int] = np.flatnonzero(known & ~near[:, chosen].any(axis=1)).tolist()
         if not far:
             break
         # A processor's rounding must not decide between two that tell as much.
-        chosen.append(max(far, key=lambda i: (round(told([*chosen, i]), DECIMALS), -i)))
-    enough = told(chosen) >= TOLD**2
-    # A hair's breadth of one direction from another must not change the words from processor to processor.
-    shown = chosen if enough else chosen[:POSES]
-    where = ", ".join("(" + ", ".join(f"{v + 0.0:+.1f}" for v in np.round(up[i], 1)) + ")" for i in shown)
-    end = "which would tell" if enough else f"of which even {len(chosen)} would hardly tell"
+        chosen.append(max(far, key=lambda i: (rise([*chosen, i]), -i)))
+    if not chosen:
+        return "add poses in further directions"
+    told = enough(chosen)
+    shown = chosen if told else chosen[:POSES]
+    where = ", ".join("(" + ", ".join(f"{v:+.1f}" for v in up[i]) + ")" for i in shown)
+    end = "which would tell" if told else f"of which even {len(chosen)} would hardly tell"
     largest = plain(float(np.max(np.abs(off[shown]))) * 1e6, 2)
     return f"add poses with up at {where}: there it differs from {name} by up to {largest} µg, {end}"
 
@@ -130,6 +143,7 @@ def _difference(search: Search, mine: Model, other: Model, up: Floats) -> tuple[
     off, by_theta, _ = linearise(there, other.state)
     _, J, s = linearise(problem, other.state)
     size = np.maximum(np.linalg.norm(J / s[:, None], axis=0), 1e-300)
-    _, singular, axes = np.linalg.svd(J / s[:, None] / size, full_matrices=False)
+    _, singular, axes = np.linalg.svd(J / s[:, None] / size)
+    singular = np.pad(singular, (0, len(axes) - len(singular)))
     open_ = axes.T / np.maximum(singular, singular[0] * 1e-12)
     return off, by_theta / size @ open_, float(np.sqrt(np.mean(s**2)))

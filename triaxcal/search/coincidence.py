@@ -12,18 +12,21 @@ from triaxcal.effects.contract import Effect
 from triaxcal.search.familywise import familywise
 from triaxcal.search.worth import FAMILYWISE, P_LEAST, Model, Worth, parameters
 
+FAILED, MOST = 1.0, 0.99
+"""Of a test that was failed; and at most of any other."""
+
 
 def coincidence(search: Worth, effect: Effect, m: Model) -> float:
     """Probability that the best of all candidates would explain as much as an effect of the model does, did what is
     there lie in any direction: small where it has been put to the test.
 
     It has where it explains most by itself, or beside some of the others what these leave, if all of them together are
-    no coincidence; with the poses that were left out for being off as part of the explanation, and without. 1 where it
-    has failed: inside the poses |a| stays, and should not.
+    no coincidence; with the poses that were left out for being off as part of the explanation, and without. `FAILED`
+    where it has failed: inside the poses |a| stays, and should not.
     """
     others = [e for e in m.effects if e is not effect]
     unknown = search.left_out.unknown(m.effects)
-    found = 1.0
+    found = FAILED if search.contradicted(m) else MOST
     for size in range(len(others) + 1):
         for beside in combinations(others, size):
             of_both = [e for e in m.effects if e is effect or e in beside]
@@ -59,13 +62,14 @@ def _chance(search: Worth, m: Model, base: Model, spoiled: int, whole: float) ->
     are any."""
     n, rank = len(search.poses), parameters(m.effects) - parameters(base.effects)
     left, moves = search.left(m.effects), search.trends_p(base) < FAMILYWISE
-    if not moves and search.trends_p(m) < FAMILYWISE:
-        return 1.0
+    if search.contradicted(m):
+        return FAILED
     p = _as_small(m.chi2, left, max(whole, base.chi2), search.left(base.effects) + spoiled)
     if rank and base.foretells and moves:
         both = p * _as_small(m.trends if m.foretells else base.trends, n - rank, base.trends, n)
         p = both * (1 - float(np.log(max(both, P_LEAST))))  # of a product of two probabilities (Fisher)
-    return familywise(p, search.tests ** (len(m.effects) - len(base.effects)) * comb(n + spoiled, spoiled))
+    tries = search.tests ** (len(m.effects) - len(base.effects)) * comb(n + spoiled, spoiled)
+    return min(familywise(p, tries), MOST)
 
 
 def _as_small(rest: float, left: int, whole: float, dof: int) -> float:

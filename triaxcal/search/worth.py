@@ -25,6 +25,8 @@ from triaxcal.trends import Trends, left_by_means, left_by_trends, trends_p
 
 FAMILYWISE = 0.01
 """Probability of any false finding on data with nothing inside."""
+WORSE = 10.0
+"""Trends that are further off by so much in chi-square contradict what foretells them."""
 P_LEAST = 1e-300
 DECIMALS = 7
 """Of a deviance, of which a tenth matters."""
@@ -125,6 +127,11 @@ class Worth:
             return 1.0
         n = len(self.poses)
         return float(f_sf(m.trends / n, n, self.pure))
+
+    def contradicted(self, m: Model) -> bool:
+        """Whether |a| stays inside the poses, where the model foretells that it moves."""
+        worse = m.trends - self.linear.trends > WORSE
+        return worse and self.trends_p(m) < FAMILYWISE <= self.trends_p(self.linear)
 
     def price(self, effect: Effect) -> float:
         """What a model pays for an effect: Schwarz's for its coefficients, and the choice among all that was tried."""
