@@ -59,7 +59,7 @@ class Explanation:
     def price(self) -> float:
         """Of the poses left out."""
         n = len(self.search.poses) + len(self.aside)
-        spoiled = self.search.left_out.spoiled(self.adopted)
+        spoiled = len(self.search.left_out.spoiled(self.adopted))
         return len(self.aside) * float(np.log(n)) + spoiled * 2 * float(np.log(1 / SPOILED - 1))
 
 

@@ -25,14 +25,13 @@ from triaxcal.effects.contract import (
 from triaxcal.figures import plain
 from triaxcal.plan.directions import directions, spiral
 from triaxcal.problem import linearise
+from triaxcal.search.alternatives import NEAR
 from triaxcal.search.search import Search
 from triaxcal.search.worth import Model, deviance
 
 SPHERE = 400
 APART_DEG = 30.0
 POSES, POSES_MOST = 3, 12
-OUT = 10.0
-"""A model is out where it is worse by so much in deviance and price (`triaxcal.search.alternatives.NEAR`)."""
 ONE_OF_TWENTY = 1.645
 """Chi-square that rises by δ² on average rises by δ² − 2 δ times this at least, but in one recording of twenty."""
 DIGITS = 6
@@ -110,7 +109,7 @@ def _directions(search: Search, mine: Model, other: Model, name: str) -> str:
         unlucky = max(risen - 2 * ONE_OF_TWENTY * np.sqrt(risen), 0.0)
         theirs = deviance(np.array(other.chi2 + k + unlucky), search.left(other.effects) + k) + other.price
         own = deviance(np.array(mine.chi2 + k), search.left(mine.effects) + k) + mine.price
-        return bool(theirs - own >= OUT)
+        return bool(theirs - own >= NEAR)
 
     chosen: list[int] = []
     size = np.linalg.norm(up, axis=1)

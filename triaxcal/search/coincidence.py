@@ -25,7 +25,6 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
     where it has failed: inside the poses |a| stays, and should not.
     """
     others = [e for e in m.effects if e is not effect]
-    unknown = search.left_out.unknown(m.effects)
     found = FAILED if search.contradicted(m) else MOST
     for size in range(len(others) + 1):
         for beside in combinations(others, size):
@@ -33,7 +32,7 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
             part = m if size == len(others) else search.model(of_both)
             base = search.model(beside) if beside else None
             if part is not None and (base or not beside):
-                found = min(found, max(_beside(search, part, b, unknown) for b in (search.linear, base) if b))
+                found = min(found, max(_beside(search, part, b, m.effects) for b in (search.linear, base) if b))
     return found
 
 
@@ -41,19 +40,21 @@ def coincidence_of_spoiled(search: Worth, m: Model) -> float:
     """The same of the poses that were left out for being off, beside the effects of the model: of each beside the
     others, and of all. 0 where there is none."""
     left_out, unknown = search.left_out, search.left_out.unknown(m.effects)
-    spoiled = set(left_out.rows) - unknown
+    spoiled = left_out.spoiled(m.effects)
     sets = [{i} for i in spoiled] + [spoiled] * (len(spoiled) > 1)
     chances = [_chance(search, m, m, len(s), left_out.chi2(m.effects, unknown | spoiled - s)) for s in sets]
     return max(chances, default=0.0)
 
 
-def _beside(search: Worth, m: Model, base: Model, unknown: set[int]) -> float:
-    """Of what a model has more than its base: as if nobody had left out a pose, and with those left out as given."""
-    spoiled = len(set(search.left_out.rows) - unknown)
+def _beside(search: Worth, m: Model, base: Model, effects: tuple[Effect, ...]) -> float:
+    """Of what a model has more than its base: as if nobody had left out a pose, and with those left out as they are
+    beside all ``effects``."""
+    left_out = search.left_out
+    spoiled = len(left_out.spoiled(effects))
     alone = _chance(search, m, base, 0, base.chi2)
     if not spoiled:
         return alone
-    return max(alone, _chance(search, m, base, spoiled, search.left_out.chi2(base.effects, unknown)))
+    return max(alone, _chance(search, m, base, spoiled, left_out.chi2(base.effects, left_out.unknown(effects))))
 
 
 def _chance(search: Worth, m: Model, base: Model, spoiled: int, whole: float) -> float:

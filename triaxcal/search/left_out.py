@@ -30,9 +30,9 @@ class LeftOut:
         """Those left out because the effects need what was before them, which is not known."""
         return set(self.rows) & set(of_unknown_history(self.poses, effects))
 
-    def spoiled(self, effects: Sequence[Effect]) -> int:
-        """How many are left out for being off."""
-        return len(self.rows) - len(self.unknown(effects))
+    def spoiled(self, effects: Sequence[Effect]) -> set[int]:
+        """Those left out for being off."""
+        return set(self.rows) - self.unknown(effects)
 
     def chi2(self, effects: Sequence[Effect], but: set[int]) -> float:
         """What effects leave of all poses ``but`` some; zero where these cannot carry them."""
