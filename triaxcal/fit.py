@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from triaxcal.arrays import Floats, Ints
+from triaxcal.arrays import Floats
+from triaxcal.aside import of_another_history, spoiled_among, with_aside, with_faulty, with_rivals
 from triaxcal.beyond import Beyond, in_words
-from triaxcal.calibration import SPOILED, UNKNOWN_HISTORY, Calibration, PoseResult, Residual
+from triaxcal.calibration import Calibration, PoseResult, Residual
 from triaxcal.conditions import of_unknown_history
 from triaxcal.cross_validation import cross_validated
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.outliers import Spoiled, not_as_foretold, spoiled
+from triaxcal.outliers import Spoiled
 from triaxcal.plan.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import (
@@ -29,15 +30,14 @@ from triaxcal.problem import (
     parameters_by_theta,
     solve,
 )
-from triaxcal.pure_error import lack_of_fit_p, of_both, pose_dof, pure_error_dof, raised_dof
+from triaxcal.pure_error import lack_of_fit_p, pure_error_dof, raised_dof
 from triaxcal.shapes import shape_errors
-from triaxcal.start import DILUTION_LIMIT, problem_of, start, with_history
+from triaxcal.start import DILUTION_LIMIT, begun
 from triaxcal.trends import left_of, trends_p, with_trends
 
 DILUTION_WARNING = 10.0
 SPREAD_WARNING = 15.0
 """Dilution times the root of the number of poses: about 5 where they are all over the sphere, 25 over half of it."""
-SPOILED_ROUNDS = 4
 SIGNIFICANT = 0.05
 CONTRADICTED = 0.01
 """p of the trends inside the poses below which the coefficients are left to the means."""
@@ -64,9 +64,7 @@ def fit(
         among = None if aside is None else [k for k, i in enumerate(sound) if i in aside]
         kept = [poses[i] for i in sound]
         return with_faulty(fit(kept, signs=signs, reference=reference, effects=effects, aside=among), poses)
-    whole = problem_of(poses, signs=signs, reference=reference)
-    begin = start(whole, poses, signs)
-    whole = with_history(whole, poses, begin.sensor(whole))
+    whole, begin = begun(poses, signs=signs, reference=reference)
     missing = {n for e in effects for n in e.needs if n not in whole.channel_reference}
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
@@ -75,31 +73,22 @@ def fit(
     unknown: tuple[int, ...] = ()
     if aside is None and len(poses) > 9 + sum(len(e.coefficients) for e in effects):
         by_means = solve(whole, begin, tuple(effects))
-        verdict = _spoiled(whole, by_means, poses)
-        unknown = _of_another_history(whole, by_means, poses, verdict.rows)
+        verdict = spoiled_among(whole, by_means, poses)
+        unknown = of_another_history(whole, by_means, poses, verdict.rows)
         if set(verdict.rows) <= set(of_unknown_history(poses, effects)):
             verdict = replace(verdict, doubtful=False)  # that it is off says nothing of how well poses come back
     found = tuple(sorted((*verdict.rows, *unknown)))
     kept, problem = list(poses), whole
     if found:
         kept = [p for i, p in enumerate(poses) if i not in found]
-        problem = problem_of(kept, signs=signs, reference=reference)
-        begin = start(problem, kept, signs)
-        problem = with_history(problem, kept, begin.sensor(problem))
+        problem, begin = begun(kept, signs=signs, reference=reference)
         by_means = None
     # What may be no worse than the others shows by how much all come back less well than their noise.
     judged = whole.only(np.setdiff1d(np.arange(len(poses)), unknown)) if verdict.doubtful else None
     calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, judged)
     if found:
-        calibration = _with_aside(calibration, poses, found, verdict)
-    if verdict.rivals:
-        sets = " or ".join(" and ".join(poses[i].at for i in rows) for rows in verdict.rivals)
-        warning = (
-            f"the residuals look as if poses were spoiled ({sets}: these cannot be told from each other), or as if "
-            "something else acts; none is left out"
-        )
-        calibration = replace(calibration, warnings=(warning, *calibration.warnings))
-    return calibration
+        calibration = with_aside(calibration, poses, found, verdict)
+    return with_rivals(calibration, poses, verdict)
 
 
 def _solved(
@@ -125,91 +114,6 @@ def _solved(
     if len(state.theta) > len(poses) - contradicted:
         raise Refused(f"{len(poses)} poses cannot carry {len(state.theta)} parameters")
     return problem, state
-
-
-def _spoiled(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
-    """Indices of spoiled poses, from the fit to all. Sought anew without those found, until the same are found again:
-    a pose spoiled by a thousand times its noise bends the fit so far that linear reckoning is off.
-
-    What the others show beside their noise, all are taken to have: by the noise alone the quietest would look spoiled.
-    """
-    own, together = pose_dof(poses), pure_error_dof(poses)
-    dof, pure, judged, found = own, together, problem, Spoiled()
-    for _ in range(SPOILED_ROUNDS):
-        r, J, s = linearise(judged, state)
-        again = spoiled(r / s, J / s[:, None], dof, pure)
-        if again.rows == found.rows:
-            return again
-        found = again
-        rest: Ints = np.delete(np.arange(len(poses)), found.rows)
-        others, left = problem.only(rest), len(rest) - len(state.theta)
-        state = solve(others, state, state.effects)
-        judged = replace(problem, excess=Beyond.shown(linearise(others, state), len(rest), left, together).excess_g)
-        share = judged.excess**2 / linearise(judged, state)[2] ** 2
-        dof, pure = of_both(share, left, own), float(of_both(share.mean(), left, together))
-    return found
-
-
-def _of_another_history(
-    problem: Problem, state: State, poses: Sequence[Pose], aside: tuple[int, ...]
-) -> tuple[int, ...]:
-    """Poses, besides those ``aside``, that are not as if the unit had rested there before; what was is not known."""
-    if not (unknown := set(of_unknown_history(poses, state.effects)) - set(aside)):
-        return ()
-    rest: Ints = np.delete(np.arange(len(poses)), aside)
-    problem = problem.only(rest)
-    r, J, s = linearise(problem, solve(problem, state, state.effects))
-    rows = [k for k, i in enumerate(rest) if i in unknown]
-    found = not_as_foretold(r / s, J / s[:, None], pure_error_dof([poses[i] for i in rest]), rows)
-    return tuple(int(rest[k]) for k in found)
-
-
-def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
-    """A calibration from the sound ones of ``poses`` with the faulty ones among its results, and a warning."""
-    faulty = tuple(i for i, p in enumerate(poses) if p.fault)
-    if not faulty:
-        return calibration
-    faults = ", ".join(f"the pose at {poses[i].at} ({poses[i].fault})" for i in faulty)
-    warning = f"left out, as the outputs did not follow the acceleration: {faults}"
-    results, _ = _among(calibration, poses, {i: poses[i].fault for i in faulty})
-    return replace(calibration, poses=results, warnings=(warning, *calibration.warnings))
-
-
-def _among(
-    calibration: Calibration, poses: Sequence[Pose], reasons: Mapping[int, str]
-) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
-    """The results of a calibration with those of further poses left out among them, by rows of all; and these."""
-    u = np.array([p.mean for p in poses])
-    conditioned = calibration.conditions_of(poses)
-    length, by_u = calibration.sensor.magnitude(u, conditioned)
-    a = calibration.sensor.specific_force(u, conditioned)
-    results, added = list(calibration.poses), []
-    for i, reason in sorted(reasons.items()):
-        noise = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
-        error = float(np.hypot(noise, calibration.excess_g))
-        miss = float(length[i] - calibration.reference)
-        added.append(PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, noise, miss / error, 0.0, reason, error))
-        results.insert(i, added[-1])
-    return tuple(results), added
-
-
-def _with_aside(calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: Spoiled) -> Calibration:
-    """The calibration with the poses left out among its results, in order of time, and warnings that name them."""
-    unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects])
-    results, added = _among(calibration, poses, {i: UNKNOWN_HISTORY if i in unknown else SPOILED for i in rows})
-    names = [(p.left_out, f"the pose at {p.pose.at} ({p.studentized:+.0f} standard errors)") for p in added]
-    excused, others = (", ".join(n for why, n in names if why == reason) for reason in (UNKNOWN_HISTORY, SPOILED))
-    warnings = [f"left out, as what was before it is not known: {excused}"] if excused else []
-    warning = f"left out as spoiled: {others}"
-    if verdict.doubtful:
-        warning += (
-            "; the noise inside the poses says so, while the other residuals leave it open whether all poses come "
-            "back less well than that: the standard errors allow for both"
-        )
-        if calibration.excess_g:
-            warning += f", {in_words(calibration)}"
-    warnings += [warning] if others else []
-    return replace(calibration, poses=results, warnings=(*warnings, *calibration.warnings))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from triaxcal.aside import with_faulty
 from triaxcal.calibration import SPOILED, Calibration, PoseResult
 from triaxcal.conditions import channels_of
 from triaxcal.creep import with_creep_left, without_creep
@@ -22,7 +23,7 @@ from triaxcal.errors import Refused
 from triaxcal.explanation import Explanation, explained, left_out
 from triaxcal.figures import the_poses
 from triaxcal.findings import Finding, advice_of, description_of, finding_of, why_not_shown
-from triaxcal.fit import fit, with_faulty
+from triaxcal.fit import fit
 from triaxcal.held_out import HeldOut, better_of, held_out
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import LACK_OF_FIT

@@ -93,6 +93,13 @@ def with_history(problem: Problem, poses: Sequence[Pose], sensor: Sensor) -> Pro
     return problem.with_channels(with_scale(problem.channels, poses, sensor.scale_factor, sensor.bias))
 
 
+def begun(poses: Sequence[Pose], *, signs: Sequence[float], reference: float) -> tuple[Problem, State]:
+    """The problem with the history of its poses, and where the fit begins. Raises as `problem_of` and `start` do."""
+    problem = problem_of(poses, signs=signs, reference=reference)
+    state = start(problem, poses, signs)
+    return with_history(problem, poses, state.sensor(problem)), state
+
+
 def _count(a: Floats) -> str:
     return f"{len(a)} poses in {distinct(a)} distinct directions"
 

@@ -13,7 +13,7 @@ from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
-from triaxcal.start import problem_of, start, with_history
+from triaxcal.start import begun
 from triaxcal.trends import left_by_means
 
 
@@ -38,9 +38,7 @@ class LeftOut:
         """What effects leave of all poses ``but`` some; zero where these cannot carry them."""
         poses = [p for i, p in enumerate(self.poses) if i not in but]
         try:
-            problem = problem_of(poses, signs=self.signs, reference=self.reference)
-            begin = start(problem, poses, self.signs)
-            problem = with_history(problem, poses, begin.sensor(problem))
+            problem, begin = begun(poses, signs=self.signs, reference=self.reference)
             chi2 = left_by_means(problem, solve(problem, begin, tuple(effects)))
         except (Refused, EffectFault):
             return 0.0
