@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.calibration import Calibration
-from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, rate_of
+from triaxcal.effects.contract import SCATTER, TIME, Effect, channel_of, is_derived, rate_of
 from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import package_of
 from triaxcal.figures import micro_g, probability, the_poses
-from triaxcal.search import FAMILYWISE, Search, alternatives, compared, telling_apart
+from triaxcal.leads import TOWARDS
+from triaxcal.search import FAILED, FAMILYWISE, Search, alternatives, compared, telling_apart
 from triaxcal.search.alternatives import instead_of
 from triaxcal.unexplained import MORE, NAMELESS, UNTESTED, Unexplained
 
@@ -81,10 +82,11 @@ def finding_of(
     if spoiled:
         reason += f"; that something spoiled {the_poses(spoiled)} would {'also ' * bool(found)}do as well"
     untested = chance >= FAMILYWISE
-    if untested and chance < 1:
+    if untested and chance < FAILED:
         reason += f"; {UNTESTED.format(probability(chance))} (limit {FAMILYWISE:g})"
     elif untested:
         reason += "; inside the poses |a| does not move as what was found foretells"
+    more = [MORE if chance < FAILED else TOWARDS[TIME]] if untested else []
     apart = dict.fromkeys(telling_apart(search, effect, found)) if found else ()
     floor = pair[1].residual.noise_floor_g
     if not effect.coefficients[0].unit.startswith("g"):
@@ -98,7 +100,7 @@ def finding_of(
         reason=reason,
         remedy=effect.advice(_largest(after, effect), floor),
         step=step,
-        apart=(*([f"take {the_poses(spoiled)} again"] if spoiled else []), *apart, *([MORE] if untested else [])),
+        apart=(*([f"take {the_poses(spoiled)} again"] if spoiled else []), *apart, *more),
         spoiled=tuple(spoiled),
         coincidence=chance if untested else None,
         instead={name: model.effects for name, model in found.items()},

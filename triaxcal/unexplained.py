@@ -12,7 +12,7 @@ from triaxcal.effects.contract import TIME
 from triaxcal.figures import micro_g, probability, the_poses
 from triaxcal.leads import AGAIN, LEAD, TOWARDS, Lead, clear_patterns
 from triaxcal.pure_error import LACK_OF_FIT
-from triaxcal.search import FAMILYWISE, NEAR, Nearest, Search
+from triaxcal.search import FAILED, FAMILYWISE, NEAR, Nearest, Search
 
 NAMELESS = "something in no catalogue"
 UNTESTED = "of random errors as large as these one effect or another would explain as much with a probability of {}"
@@ -88,7 +88,7 @@ def or_named(
     times are ``spoiled`` would do as well. ``moving`` is what they leave inside the poses."""
     why = []
     if untested:
-        chances = [probability(p) for p in untested.values() if p < 1]
+        chances = [probability(p) for p in untested.values() if p < FAILED]
         chance = f": {UNTESTED.format(' and '.join(chances))} (limit {FAMILYWISE:g})" if chances else ""
         why.append(f"it need not be {' or '.join(untested)}{chance}")
     why += [f"that something spoiled {the_poses(spoiled)} would do as well as any effect"] if spoiled else []
@@ -103,7 +103,7 @@ def moving_inside(search: Search) -> Unexplained | None:
         return None
     text = "inside the poses |a| moves too, so it goes with the time or something that changes, not the attitude"
     if search.found.effects:
-        quiet = search.contradicted(search.found)
+        quiet = search.trends_p(search.linear) >= LEAD
         text = "with the time or something that changes, or with a delay"
         text = f"inside the poses |a| {'does not move as' if quiet else f'moves, {text}, otherwise than'} is foretold"
     rms_g = search.trends.rms_g(search.found.state)

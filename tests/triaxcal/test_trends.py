@@ -458,3 +458,34 @@ def test_an_effect_that_foretells_what_the_poses_do_not_do_inside_is_in_question
     assert finding.reason.endswith("; inside the poses |a| does not move as what was found foretells")
     assert loop.unexplained.lead == "it need not be temperature_bias; inside the poses |a| does not move as is foretold"
     assert loop.unexplained.rms_g > 1e-4
+    poses[5] = replace(poses[5], mean=1.2 * poses[5].mean)
+    loop = diagnose(poses, signs=MINUS)
+    assert [p.left_out for p in loop.after.poses if not p.used] == ["spoiled"]
+    assert "spoiled" not in loop.unexplained.lead  # whatever the temperature's effect may be, that pose was off
+
+
+def test_an_effect_that_foretells_what_the_poses_do_not_do_inside_is_in_question_beside_one_that_does(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    rng = np.random.default_rng(3)
+    poses = []
+    for p in moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),)):
+        off_v = 0.3 * rng.standard_normal()
+        poses.append(
+            replace(
+                p,
+                mean=p.mean + paper_unit.scale_factor * SENSITIVITY * off_v,
+                channels={**p.channels, "supply_v": 5 + off_v},
+                rates={**p.rates, "supply_v": 0.02 * rng.standard_normal()},
+                rate_errors={**p.rate_errors, "supply_v": 0.0},
+                bends={**p.bends, "supply_v": 0.0},
+                bend_errors={**p.bend_errors, "supply_v": 0.0},
+            )
+        )
+    found = {f.effect: f for f in diagnose(poses, signs=MINUS).findings}
+    assert {n: f.verdict for n, f in found.items()} == {
+        "temperature_bias": "adopted",
+        "channel_bias:supply_v": "confounded",
+    }
+    assert found["temperature_bias"].coincidence is None
+    assert found["channel_bias:supply_v"].coincidence == 1.0

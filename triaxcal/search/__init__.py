@@ -2,13 +2,14 @@
 
 from triaxcal.search.alternatives import NEAR, alternatives
 from triaxcal.search.apart import telling_apart
-from triaxcal.search.coincidence import coincidence, coincidence_of_spoiled
+from triaxcal.search.coincidence import FAILED, coincidence, coincidence_of_spoiled
 from triaxcal.search.comparison import NO_LOWER, compared
 from triaxcal.search.left_out import LeftOut
 from triaxcal.search.search import Nearest, Search
 from triaxcal.search.worth import FAMILYWISE, Model, deviance
 
 __all__ = [
+    "FAILED",
     "FAMILYWISE",
     "NEAR",
     "NO_LOWER",

@@ -22,18 +22,21 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
 
     It has where it explains most by itself, or beside some of the others what these leave, if all of them together are
     no coincidence; with the poses that were left out for being off as part of the explanation, and without. `FAILED`
-    where it has failed: inside the poses |a| stays, and should not.
+    where it has failed: inside the poses |a| is as the others foretell, and not as they do with it.
     """
     others = [e for e in m.effects if e is not effect]
-    found = FAILED if search.contradicted(m) else MOST
+    without = search.model(others) if others else search.linear
+    if without and search.contradicted(m, without):
+        return FAILED
+    found = []
     for size in range(len(others) + 1):
         for beside in combinations(others, size):
             of_both = [e for e in m.effects if e is effect or e in beside]
             part = m if size == len(others) else search.model(of_both)
             base = search.model(beside) if beside else None
             if part is not None and (base or not beside):
-                found = min(found, max(_beside(search, part, b, m.effects) for b in (search.linear, base) if b))
-    return found
+                found.append(max(_beside(search, part, b, m.effects) for b in (search.linear, base) if b))
+    return min(found, default=MOST)
 
 
 def coincidence_of_spoiled(search: Worth, m: Model) -> float:
@@ -61,10 +64,10 @@ def _chance(search: Worth, m: Model, base: Model, spoiled: int, whole: float) ->
     """Probability that the best candidates, as many as the model has more than its base, with so many poses left out
     as ``spoiled``, would explain as much of the ``whole``, and foretell the trends inside the poses as well where there
     are any."""
+    if search.contradicted(m, base):
+        return FAILED
     n, rank = len(search.poses), parameters(m.effects) - parameters(base.effects)
     left, moves = search.left(m.effects), search.trends_p(base) < FAMILYWISE
-    if search.contradicted(m):
-        return FAILED
     p = _as_small(m.chi2, left, max(whole, base.chi2), search.left(base.effects) + spoiled)
     if rank and base.foretells and moves:
         both = p * _as_small(m.trends if m.foretells else base.trends, n - rank, base.trends, n)

@@ -128,10 +128,11 @@ class Worth:
         n = len(self.poses)
         return float(f_sf(m.trends / n, n, self.pure))
 
-    def contradicted(self, m: Model) -> bool:
-        """Whether |a| stays inside the poses, where the model foretells that it moves."""
-        worse = m.trends - self.linear.trends > WORSE
-        return worse and self.trends_p(m) < FAMILYWISE <= self.trends_p(self.linear)
+    def contradicted(self, m: Model, base: Model) -> bool:
+        """Whether inside the poses |a| is as the base foretells (nothing, where that is the linear model), and not as
+        the model does."""
+        worse = m.trends - base.trends > WORSE
+        return worse and self.trends_p(m) < FAMILYWISE <= self.trends_p(base)
 
     def price(self, effect: Effect) -> float:
         """What a model pays for an effect: Schwarz's for its coefficients, and the choice among all that was tried."""
