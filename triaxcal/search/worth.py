@@ -26,7 +26,7 @@ from triaxcal.trends import Trends, left_by_means, left_by_trends, trends_p
 FAMILYWISE = 0.01
 """Probability of any false finding on data with nothing inside."""
 WORSE = 10.0
-"""Trends that are further off by so much in chi-square contradict what foretells them."""
+"""A model that foretells the trends worse by so much in deviance is contradicted by them."""
 P_LEAST = 1e-300
 DECIMALS = 7
 """Of a deviance, of which a tenth matters."""
@@ -129,10 +129,9 @@ class Worth:
         return float(f_sf(m.trends / n, n, self.pure))
 
     def contradicted(self, m: Model, base: Model) -> bool:
-        """Whether inside the poses |a| is as the base foretells (nothing, where that is the linear model), and not as
-        the model does."""
-        worse = m.trends - base.trends > WORSE
-        return worse and self.trends_p(m) < FAMILYWISE <= self.trends_p(base)
+        """Whether |a| does not go inside the poses as a model foretells, and goes more as its base does."""
+        worse = self.against_trends(m) - self.against_trends(base) > WORSE
+        return worse and self.trends_p(m) < FAMILYWISE
 
     def price(self, effect: Effect) -> float:
         """What a model pays for an effect: Schwarz's for its coefficients, and the choice among all that was tried."""

@@ -86,6 +86,7 @@ def test_trends_that_are_as_foretold_make_it_less_of_a_coincidence_and_others_do
     assert said(20.0) == pytest.approx(np.mean(product < passed), rel=0.1)
     assert said(60.0) == said(20.0, foretells=False)
     assert said(20.0) < said(40.0) < said(60.0)
+    assert said(70.0) < 1.0 == said(130.0)  # |a| moves, and should have gone another way
     quiet = replace(search.linear, trends=14.0)
     search.linear = quiet
     assert said(20.0) == pytest.approx(np.mean(by_means < 150 / 900), rel=0.05)
