@@ -22,7 +22,7 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
 
     It has where it explains most by itself, or beside some of the others what these leave, if all of them together are
     no coincidence; with the poses that were left out for being off as part of the explanation, and without. `FAILED`
-    where it has failed: inside the poses |a| does not go as foretold, and would go more so without it.
+    where it has failed: |a| goes inside the poses otherwise than foretold, and more so with the effect than without.
     """
     others = [e for e in m.effects if e is not effect]
     without = search.model(others) if others else search.linear

@@ -129,7 +129,7 @@ class Worth:
         return float(f_sf(m.trends / n, n, self.pure))
 
     def contradicted(self, m: Model, base: Model) -> bool:
-        """Whether |a| does not go inside the poses as a model foretells, and goes more as its base does."""
+        """Whether |a| goes inside the poses otherwise than a model foretells, its base being nearer to it."""
         worse = self.against_trends(m) - self.against_trends(base) > WORSE
         return worse and self.trends_p(m) < FAMILYWISE
 
