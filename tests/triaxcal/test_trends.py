@@ -489,3 +489,17 @@ def test_an_effect_that_foretells_what_the_poses_do_not_do_inside_is_in_question
     }
     assert found["temperature_bias"].coincidence is None
     assert found["channel_bias:supply_v"].coincidence == 1.0
+
+
+def test_an_effect_of_the_attitude_is_not_blamed_for_what_another_foretells(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    rng = np.random.default_rng(1)
+    square = (SQUARE, np.array([4e-4, -4e-4, 4e-4]))
+    quiet = moving(paper_unit, twenty_six, rng, (square,))
+    means = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY), square))
+    loop = diagnose([replace(p, trend=q.trend) for p, q in zip(means, quiet, strict=True)], signs=MINUS)
+    assert {f.effect: f.coincidence for f in loop.findings} == {
+        "temperature_bias": 1.0,
+        "second_order_nonlinearity": None,
+    }

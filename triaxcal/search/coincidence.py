@@ -22,13 +22,11 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
 
     It has where it explains most by itself, or beside some of the others what these leave, if all of them together are
     no coincidence; with the poses that were left out for being off as part of the explanation, and without. `FAILED`
-    where it has failed: |a| goes inside the poses otherwise than foretold, and more so with the effect than without.
+    where |a| goes inside the poses otherwise than foretold because of it.
     """
-    others = [e for e in m.effects if e is not effect]
-    without = search.model(others) if others else search.linear
-    if without and search.contradicted(m, without):
+    if _failed(search, effect, m):
         return FAILED
-    found = []
+    others, found = [e for e in m.effects if e is not effect], [MOST]
     for size in range(len(others) + 1):
         for beside in combinations(others, size):
             of_both = [e for e in m.effects if e is effect or e in beside]
@@ -36,7 +34,17 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
             base = search.model(beside) if beside else None
             if part is not None and (base or not beside):
                 found.append(max(_beside(search, part, b, m.effects) for b in (search.linear, base) if b))
-    return min(found, default=MOST)
+    return min(found)
+
+
+def _failed(search: Worth, effect: Effect, m: Model) -> bool:
+    """Whether a model foretells the trends inside the poses worse than it does without the effect, or worse than the
+    linear model does, and so does the effect by itself."""
+    others, alone = [e for e in m.effects if e is not effect], search.model([effect])
+    without = search.model(others) if others else search.linear
+    if without is not None and search.contradicted(m, without):
+        return True
+    return alone is not None and all(search.contradicted(x, search.linear) for x in (m, alone))
 
 
 def coincidence_of_spoiled(search: Worth, m: Model) -> float:
@@ -64,8 +72,6 @@ def _chance(search: Worth, m: Model, base: Model, spoiled: int, whole: float) ->
     """Probability that the best candidates, as many as the model has more than its base, with so many poses left out
     as ``spoiled``, would explain as much of the ``whole``, and foretell the trends inside the poses as well where there
     are any."""
-    if search.contradicted(m, base):
-        return FAILED
     n, rank = len(search.poses), parameters(m.effects) - parameters(base.effects)
     left, moves = search.left(m.effects), search.trends_p(base) < FAMILYWISE
     p = _as_small(m.chi2, left, max(whole, base.chi2), search.left(base.effects) + spoiled)

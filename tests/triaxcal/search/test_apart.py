@@ -9,11 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.effects import effect_named
-from triaxcal.effects.contract import Effect
-from triaxcal.effects.part import Part
 from triaxcal.loop import diagnose
 from triaxcal.poses.pose import Pose
-from triaxcal.search import NEAR, Model, Search, telling_apart
+from triaxcal.search import Model, Search, telling_apart
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
@@ -34,12 +32,8 @@ def advised(line: str) -> tuple[np.ndarray, str]:
     return up / np.linalg.norm(up, axis=1, keepdims=True), found[2]
 
 
-def best_of(search: Search, effect: Effect) -> Model:
-    return min((m for m in search.singles_from(search.linear) if m.effects[0].name == effect.name), key=search.score)
-
-
 def test_the_poses_that_are_asked_for_tell_two_nonlinearities_apart(paper_unit: Sensor, fourteen: np.ndarray) -> None:
-    """In nineteen of twenty recordings, whichever of the two is right."""
+    """In nineteen of twenty recordings."""
     told = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -56,25 +50,6 @@ def test_the_poses_that_are_asked_for_tell_two_nonlinearities_apart(paper_unit: 
             told.append(not {finding.effect, name} <= listed)
     assert len(told) >= 3
     assert sum(told) >= len(told) - 1
-
-
-def test_they_tell_the_wrong_one_though_it_may_take_another_form(
-    paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, searched: Searched
-) -> None:
-    """Of seven products of the axes few show in 14 poses, and others in those that come later."""
-    told = []
-    for seed in range(16):
-        rng = np.random.default_rng(seed)
-        sensor = replace(paper_unit, effects=((ASYMMETRY, 3e-4 * np.eye(3)[seed % 3]),))
-        ups = fourteen + 0.05 * rng.standard_normal((14, 3))
-        poses = recorded(sensor, seed, where=ups / np.linalg.norm(ups, axis=1, keepdims=True))
-        search = searched(poses, [ASYMMETRY, CROSS])
-        search.found = best_of(search, CROSS)
-        (line,) = telling_apart(search, search.found.effects[0], {ASYMMETRY.name: best_of(search, ASYMMETRY)})
-        more, _ = advised(line)
-        search = searched([*poses, *recorded(sensor, 100 + seed, where=more)], [ASYMMETRY, CROSS])
-        told.append(search.score(best_of(search, CROSS)) > search.score(best_of(search, ASYMMETRY)) + NEAR)
-    assert sum(told) >= 0.85 * len(told)
 
 
 def test_poses_are_asked_for_where_the_other_model_has_more_parameters_than_there_are_poses(
@@ -94,15 +69,14 @@ def test_how_many_it_takes_goes_by_what_the_other_model_can_still_make_of_them(
     paper_unit: Sensor, fourteen: np.ndarray, recorded: Recorded, searched: Searched
 ) -> None:
     asked = []
-    for size in (3e-3, 8e-4, 2e-5):
+    for size in (3e-3, 6e-4, 2e-5):
         sensor = replace(paper_unit, effects=((SQUARE, np.array([size, 0.0, 0.0])),))
         search = searched(recorded(sensor, 0, where=fourteen), [SQUARE, ASYMMETRY])
-        square, asymmetry = (Part.of(e, "x") for e in (SQUARE, ASYMMETRY))
-        found, other = search.model([square]), search.model([asymmetry])
+        found, other = search.model([SQUARE]), search.model([ASYMMETRY])
         assert found is not None
         assert other is not None
         search.found = found
-        (line,) = telling_apart(search, square, {ASYMMETRY.name: other})
+        (line,) = telling_apart(search, SQUARE, {ASYMMETRY.name: other})
         asked.append(np.inf if line.endswith("hardly tell") else len(advised(line)[0]))
     assert asked[0] == 3
     assert 3 < asked[1] <= 12
