@@ -43,7 +43,8 @@ class Finding:
     spoiled: tuple[str, ...] = ()
     """When poses began that would do as well as any effect, were they spoiled."""
     coincidence: float | None = None
-    """Probability that one effect or another would have explained as much, whatever it was; None where it is small."""
+    """Probability that one effect or another would have explained as much, whatever it was, 1 where |a| goes inside the
+    poses otherwise because of this one; None where it is small."""
     instead: Mapping[str, tuple[Effect, ...]] = field(default_factory=dict, repr=False)
     """The effects of the model with each alternative in its place, by name."""
 

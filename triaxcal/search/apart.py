@@ -23,6 +23,7 @@ from triaxcal.effects.contract import (
     rate_of,
 )
 from triaxcal.effects.plugins import EffectFault
+from triaxcal.errors import Refused
 from triaxcal.figures import plain
 from triaxcal.plan.directions import directions, spiral
 from triaxcal.problem import linearise
@@ -100,7 +101,7 @@ def _directions(search: Search, mine: Model, other: Model, name: str) -> str:
     up = np.round(np.concatenate([[v for _, v in directions()], spiral(SPHERE)]), 1) + 0.0
     try:
         off, by_theta, error = _difference(search, mine, other, up / np.linalg.norm(up, axis=1, keepdims=True))
-    except EffectFault:  # it is not known everywhere
+    except (EffectFault, Refused):  # it does not hold everywhere
         return FURTHER
 
     def rises(sets: Ints) -> Floats:

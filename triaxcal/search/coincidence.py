@@ -38,13 +38,14 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
 
 
 def _failed(search: Worth, effect: Effect, m: Model) -> bool:
-    """Whether a model foretells the trends inside the poses worse than it does without the effect, or worse than the
-    linear model does, and so does the effect by itself."""
-    others, alone = [e for e in m.effects if e is not effect], search.model([effect])
-    without = search.model(others) if others else search.linear
-    if without is not None and search.contradicted(m, without):
+    """Whether the trends inside the poses contradict what an effect makes in a model: they are nearer to what the rest
+    of it foretells, or nearer to nothing than to the whole and to the effect alone. Nothing is fitted again: without an
+    effect that is there the others would take its part, and it would bear the blame."""
+    others = [e for e in m.effects if e is not effect]
+    without = search.in_part(m, others) if others else search.linear
+    if search.contradicted(m, without):
         return True
-    return alone is not None and all(search.contradicted(x, search.linear) for x in (m, alone))
+    return bool(others) and all(search.contradicted(x, search.linear) for x in (m, search.in_part(m, [effect])))
 
 
 def coincidence_of_spoiled(search: Worth, m: Model) -> float:

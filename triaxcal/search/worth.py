@@ -128,6 +128,14 @@ class Worth:
         n = len(self.poses)
         return float(f_sf(m.trends / n, n, self.pure))
 
+    def in_part(self, m: Model, effects: Sequence[Effect]) -> Model:
+        """A model with nothing fitted again, in which only some of its effects act: what these foretell."""
+        if self.trends is None or not m.foretells:
+            return m
+        acts = [np.full(len(e.coefficients), any(e is kept for kept in effects)) for e in m.effects]
+        theta = m.state.theta * np.concatenate([np.ones(9), *acts])
+        return self._model(m.effects, State(theta, m.effects), m.price)
+
     def contradicted(self, m: Model, base: Model) -> bool:
         """Whether |a| goes inside the poses otherwise than a model foretells, its base being nearer to it."""
         worse = self.against_trends(m) - self.against_trends(base) > WORSE
