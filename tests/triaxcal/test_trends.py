@@ -507,3 +507,27 @@ def test_an_effect_is_not_blamed_for_what_another_foretells(paper_unit: Sensor, 
         ]
         found = {f.effect: f.coincidence for f in diagnose(poses, signs=MINUS, catalogue=catalogue).findings}
         assert found == {"temperature_bias": 1.0, "second_order_nonlinearity" if seed % 2 else "bias_drift": None}
+
+
+def test_a_drift_is_not_blamed_for_a_temperature_that_rises_along_with_it(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    """The temperature acts on the means alone, and along the same axes: inside the poses both foretell nearly alike."""
+    t = (np.arange(26) + 0.5) * HOLD_S
+    rise_k, rate = 5 * t / t[-1] + 0.6 * np.sin(t / 20), 5 / t[-1] + 0.03 * np.cos(t / 20)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        along = rng.choice([-1, 1], 3)
+        mean_g = np.outer(3e-4 * rise_k + 1.5e-3 * t / t[-1], along)
+        poses = [
+            replace(
+                p,
+                mean=p.mean + paper_unit.scale_factor * off,
+                trend=p.trend + paper_unit.scale_factor * along * 1.5e-3 / t[-1] * HOLD_S,
+                channels={"temp_c": 25 + rise_k[i]},
+                rates={"temp_c": rate[i]},
+            )
+            for i, (p, off) in enumerate(zip(moving(paper_unit, twenty_six, rng), mean_g, strict=True))
+        ]
+        loop = diagnose(poses, signs=MINUS, catalogue=[TEMPERATURE, effect_named("bias_drift")])
+        assert {f.effect: f.coincidence for f in loop.findings} == {"temperature_bias": 1.0, "bias_drift": None}

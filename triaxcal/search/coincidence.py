@@ -10,7 +10,7 @@ import numpy as np
 from triaxcal.distributions import beta_cdf
 from triaxcal.effects.contract import Effect
 from triaxcal.search.familywise import familywise
-from triaxcal.search.worth import FAMILYWISE, P_LEAST, Model, Worth, parameters
+from triaxcal.search.worth import FAMILYWISE, P_LEAST, WORSE, Model, Worth, parameters
 
 FAILED, MOST = 1.0, 0.99
 """Of a test that was failed; and at most of any other."""
@@ -39,13 +39,22 @@ def coincidence(search: Worth, effect: Effect, m: Model) -> float:
 
 def _failed(search: Worth, effect: Effect, m: Model) -> bool:
     """Whether the trends inside the poses contradict what an effect makes in a model: they are nearer to what the rest
-    of it foretells, or nearer to nothing than to the whole and to the effect alone. Nothing is fitted again: without an
-    effect that is there the others would take its part, and it would bear the blame."""
+    of it foretells, or nearer to nothing than to the whole and to the effect alone; and no part of the model is nearer
+    with it than all are without it. Nothing is fitted again: without an effect that is there the others would take its
+    part, and it would bear the blame."""
     others = [e for e in m.effects if e is not effect]
-    without = search.in_part(m, others) if others else search.linear
-    if search.contradicted(m, without):
-        return True
-    return bool(others) and all(search.contradicted(x, search.linear) for x in (m, search.in_part(m, [effect])))
+    if not others:
+        return search.contradicted(m, search.linear)
+
+    def acting(*effects: Effect) -> Model:
+        return search.in_part(m, effects) if effects else search.linear
+
+    by_itself = all(search.contradicted(x, search.linear) for x in (m, acting(effect)))
+    if not by_itself and not search.contradicted(m, acting(*others)):
+        return False
+    sets = [s for size in range(len(others) + 1) for s in combinations(others, size)]
+    without, best = (min(search.against_trends(acting(*one, *s)) for s in sets) for one in ((), (effect,)))
+    return without - best <= WORSE
 
 
 def coincidence_of_spoiled(search: Worth, m: Model) -> float:

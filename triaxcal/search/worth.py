@@ -134,7 +134,10 @@ class Worth:
             return m
         acts = [np.full(len(e.coefficients), any(e is kept for kept in effects)) for e in m.effects]
         theta = m.state.theta * np.concatenate([np.ones(9), *acts])
-        return self._model(m.effects, State(theta, m.effects), m.price)
+        try:
+            return self._model(m.effects, State(theta, m.effects), m.price)
+        except (Refused, EffectFault):
+            return replace(m, trends=self.linear.trends, foretells=False)
 
     def contradicted(self, m: Model, base: Model) -> bool:
         """Whether |a| goes inside the poses otherwise than a model foretells, its base being nearer to it."""
@@ -177,7 +180,7 @@ class Worth:
         """None where the poses cannot carry it."""
         try:
             return fit(self.poses, signs=self.signs, reference=self.reference, effects=effects, aside=())
-        except Refused:
+        except (Refused, EffectFault):
             return None
 
     def p_value(self, before: float, after: float, rank: int, left: int) -> float:
