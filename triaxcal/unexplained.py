@@ -91,6 +91,8 @@ def or_named(
         chances = [probability(p) for p in untested.values() if p < FAILED]
         chance = f": {UNTESTED.format(' and '.join(chances))} (limit {FAMILYWISE:g})" if chances else ""
         why.append(f"it need not be {' or '.join(untested)}{chance}")
+    if not moving and any(p == FAILED for p in untested.values()):
+        why.append("inside the poses |a| does not move as is foretold")
     why += [f"that something spoiled {the_poses(spoiled)} would do as well as any effect"] if spoiled else []
     why += [moving.lead] if moving else []
     return Unexplained(True, p, _size(before), "; ".join(why), or_named=True)

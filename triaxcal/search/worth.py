@@ -26,7 +26,8 @@ from triaxcal.trends import Trends, left_by_means, left_by_trends, trends_p
 FAMILYWISE = 0.01
 """Probability of any false finding on data with nothing inside."""
 WORSE = 10.0
-"""A model that foretells the trends worse by so much in deviance is contradicted by them."""
+"""A model that foretells the trends worse by so much in deviance is contradicted by them. Were it right, chance would
+do that with a probability of 0.08 % at most, however alike the two (`triaxcal.search.alternatives.NEAR`)."""
 P_LEAST = 1e-300
 DECIMALS = 7
 """Of a deviance, of which a tenth matters."""
@@ -141,8 +142,7 @@ class Worth:
 
     def contradicted(self, m: Model, base: Model) -> bool:
         """Whether |a| goes inside the poses otherwise than a model foretells, its base being nearer to it."""
-        worse = self.against_trends(m) - self.against_trends(base) > WORSE
-        return worse and self.trends_p(m) < FAMILYWISE
+        return m.foretells and self.against_trends(m) - self.against_trends(base) > WORSE
 
     def price(self, effect: Effect) -> float:
         """What a model pays for an effect: Schwarz's for its coefficients, and the choice among all that was tried."""

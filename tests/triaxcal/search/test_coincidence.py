@@ -91,6 +91,9 @@ def test_trends_that_are_as_foretold_make_it_less_of_a_coincidence_and_others_do
     search.linear = quiet
     assert said(20.0) == pytest.approx(np.mean(by_means < 150 / 900), rel=0.05)
     assert said(60.0) == 1.0  # it should have moved |a| inside the poses
+    within_chance = Model((WARMTH,), search.linear.state, 150.0, 0.0, trends=29.0)
+    assert search.trends_p(within_chance) > 0.01
+    assert said(29.0) == 1.0  # not all of them together are beyond chance, but they are far nearer to nothing
     assert said(60.0, foretells=False) == said(20.0)
 
 
