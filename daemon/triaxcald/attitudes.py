@@ -13,10 +13,12 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.plan.directions import cube_directions
 from triaxcal.poses.pose import Pose
+from triaxcal_drivers.files import read_whole
 from triaxcald.errors import InputError
 
 VECTOR, TIMES, LABEL = ("x", "y", "z"), ("start_s", "end_s"), "label"
 TOLD_MOST = 30
+TABLE_MOST, ROWS_MOST = 2**20, 10_000  # bytes; a turntable that takes ten thousand poses is at it for days
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ def read_attitudes(path: str) -> list[Row]:
     `#` lines are comments. Raises InputError: file, line, field, what was expected.
     """
     try:
-        text = Path(path).read_text("utf-8-sig")
+        text = read_whole(Path(path), TABLE_MOST, pipe=True).decode("utf-8-sig")
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror}") from e
     except UnicodeDecodeError as e:
@@ -49,6 +51,8 @@ def read_attitudes(path: str) -> list[Row]:
         raise InputError(f"{path}: empty, expected the header x,y,z or label, and start_s,end_s or neither")
     (header_line, header), body = lines[0], lines[1:]
     _check_header(path, header_line, header)
+    if len(body) > ROWS_MOST:
+        raise InputError(f"{path}: {len(body)} attitudes, expected at most {ROWS_MOST}")
     rows = [_row(path, line, header, cells) for line, cells in body]
     if not rows:
         raise InputError(f"{path}: line {header_line}: no attitudes after the header, expected some")

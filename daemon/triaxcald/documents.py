@@ -24,6 +24,8 @@ from triaxcald.units import SMALLEST, ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]
 DIGITS, UNCERTAINTY_DIGITS, PROBABILITY_DIGITS = 10, 6, 4
+REGISTER_DIGITS = 12
+"""So many tell any two float32 apart, and any two integers of a register."""
 LINEAR = ("scale_factor", "misalignment", "bias")
 GRID_G = 1e-11
 """Errors of the magnitude are differences of numbers near 1 g: beyond this they differ from processor to processor. Of

@@ -1,37 +1,121 @@
-"""Files written whole or not at all."""
+"""Files written whole or not at all, and through no symbolic link: whoever can make one shall not choose the file."""
 
 from __future__ import annotations
 
+import errno
 import os
-import tempfile
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
+from typing import BinaryIO
 
+from triaxcald.abort import at_abort
 from triaxcald.errors import InputError
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Through a temporary file beside it; what exists and is no file (a pipe, /dev/null) is written to as it is.
+    """As `write_bytes`, in UTF-8."""
+    try:
+        return write_bytes(path, text.encode())
+    except UnicodeEncodeError as e:
+        raise InputError(f"{path}: cannot be written: {e.object[e.start]!r} is no character") from e
+
+
+def write_bytes(path: Path, data: bytes) -> Path:
+    """Through a temporary file beside it; a pipe or a device (/dev/null, /dev/stdout) is written to as it is.
 
     Raises InputError, one line.
     """
+    require_writable(path)
     try:
-        if path.exists() and not path.is_file():
-            with open(path, "w", encoding="utf-8") as f:
-                f.write(text)
+        if _is_stream(path):
+            path.write_bytes(data)
         else:
-            _replace(path.resolve(), text)
+            replace_bytes(path, data)
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from e
     return path
 
 
-def _replace(path: Path, text: str) -> None:
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+def write_new(folder: Path, stem: str, suffix: str, text: str) -> Path:
+    """To a file that did not exist: ``stem`` gets a number where it did. Raises InputError."""
     try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as f:
-            f.write(text)
-        os.chmod(temporary, 0o644)
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in count(1):
+            path = folder / f"{stem}{f'-{number}' if number > 1 else ''}{suffix}"
+            try:
+                with new_file(path) as f:
+                    f.write(text.encode())
+                    f.flush()
+                    os.fsync(f.fileno())
+            except FileExistsError:
+                continue
+            return path
+    except OSError as e:
+        raise InputError(f"{folder}: cannot be written to: {e.strerror}") from e
+    raise AssertionError("there is always another number")
+
+
+def write_durably(path: Path, text: str) -> None:
+    """Whole or not at all, and on the disk when it returns: it outlives a loss of power. Raises OSError."""
+    replace_bytes(path, text.encode())
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def require_writable(path: Path) -> None:
+    """Raises InputError where ``path`` is a symbolic link to a file, or to nothing."""
+    if path.is_symlink() and not _is_stream(path):
+        raise InputError(f"{path}: cannot be written: a symbolic link, expected a file of its own")
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether it is a pipe or a character device, wherever links lead, or one of the system's own names for whatever
+    a descriptor stands for (/dev/stdout, /dev/fd/3)."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return False
+    folder = os.path.realpath(path.parent)
+    return stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or folder == "/dev" or folder.startswith("/proc/")
+
+
+def replace_bytes(path: Path, data: bytes) -> None:
+    """Through a temporary file beside it. Raises OSError."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    with new_file(temporary) as f:
+        f.write(data)
+        f.flush()
+        os.fsync(f.fileno())
+        f.close()
         os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[BinaryIO]:
+    """A file that was not there before. Nothing of it is left where the context does not come to its end.
+
+    Raises FileExistsError and other OSError.
+    """
+    taken = os.path.lexists(path)
+
+    def remove(_: float = 0.0) -> None:
+        if not taken:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+
+    with at_abort(remove):
+        try:
+            with open(path, "xb") as f:
+                yield f
+        except BaseException:
+            remove()
+            raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,6 +19,8 @@ from triaxcal.quality import QualityDetector, untrusted_poses
 from triaxcal.stillness.detector import StillnessDetector, Windows
 from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
+from triaxcal_drivers.files import read_whole
+from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
 from triaxcald.doubts import TIME_UNIT
 from triaxcald.errors import InputError, RecordingError
@@ -27,6 +30,7 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, Phase
 from triaxcald.station.config import parse_station
 
+DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
 PROFILE = "profile.toml"
 """Name under which a recording carries the profile; the files it names stand beside it under ``profile/``."""
 STATION_FILE = "station.toml"
@@ -172,19 +176,36 @@ def bundle_of(recording: Recording) -> Bundle:
 def read_document(path: str) -> Mapping[str, Any]:
     """A JSON document. Raises InputError with the line at fault."""
     try:
-        text = Path(path).read_text("utf-8")
+        return parse_document(read_whole(Path(path), DOCUMENT_MOST, pipe=True), where=path)
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
-    except UnicodeDecodeError as e:
-        raise InputError(f"{path}: not UTF-8 text (byte {e.start})") from e
+
+
+def parse_document(data: bytes, *, where: str) -> Mapping[str, Any]:
+    """An object of JSON in which no key is given twice. Raises InputError with the line at fault."""
     try:
-        document = json.loads(text)
+        text = data.decode()
+        document = json.loads(text, object_pairs_hook=_each_key_once)
+        if "\\u" in text:
+            json.dumps(document, ensure_ascii=False).encode()
     except json.JSONDecodeError as e:
-        raise InputError(f"{path}, line {e.lineno}: not JSON: {e.msg}") from e
+        raise InputError(f"{where}, line {e.lineno}: not JSON: {e.msg}") from e
     except RecursionError as e:
-        raise InputError(f"{path}: not JSON: nested too deeply") from e
-    except ValueError as e:  # a number of thousands of digits
-        raise InputError(f"{path}: not JSON that can be read: {e}") from e
+        raise InputError(f"{where}: not JSON: nested too deeply") from e
+    except UnicodeDecodeError as e:
+        raise InputError(f"{where}: not UTF-8 text (byte {e.start})") from e
+    except UnicodeEncodeError as e:
+        raise InputError(f"{where}: half of a surrogate pair, which is no character") from e
+    except ValueError as e:  # a number of thousands of digits, a key given twice
+        raise InputError(f"{where}: not JSON that can be read: {e}") from e
     if not isinstance(document, dict):
-        raise InputError(f"{path}: expected a JSON object")
+        raise InputError(f"{where}: expected a JSON object")
     return document
+
+
+def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    held = dict(pairs)
+    if len(held) < len(pairs):
+        twice = next(k for k, count in Counter(k for k, _ in pairs).items() if count > 1)
+        raise ValueError(f"the key '{clipped(twice)}' is given twice")
+    return held

@@ -83,11 +83,11 @@ def shape_in(calibration: Mapping[str, Any]) -> Shape | None:
     try:
         k, m = (np.array(calibration[name], dtype=float) for name in ("scale_factor", "misalignment"))
         errors = [calibration["standard_error"][name] for name in ("scale_factor", "misalignment")]
-        variance = np.concatenate([np.array(e, dtype=float).reshape(3) for e in errors]) ** 2
+        error = np.concatenate([np.array(e, dtype=float).reshape(3) for e in errors])
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     with np.errstate(all="ignore"):  # numbers out of a file may be any
-        shape = Shape.of(k, m, np.diag(variance), np.inf)
+        shape = Shape.of(k, m, np.diag(error**2), np.inf)
     return shape if np.isfinite([*shape.values, *shape.covariance.flat]).all() else None
 
 

@@ -8,6 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, cast
 
 from triaxcal_drivers.errors import DriverMissing
+from triaxcal_drivers.nearest import clipped
 
 if TYPE_CHECKING:
     from triaxcal_drivers.interface import Driver
@@ -36,7 +37,7 @@ def driver_named(name: str, *, where: str = "") -> Driver:
     if name not in points:
         close = difflib.get_close_matches(name, points, n=1)
         hint = f"; did you mean '{close[0]}'?" if close else f"; installed: {', '.join(sorted(points)) or 'none'}"
-        raise DriverMissing(f"{lead}no driver named '{name}'{hint}")
+        raise DriverMissing(f"{lead}no driver named '{clipped(name)}'{hint}")
     try:
         return cast("Driver", points[name].load()())
     except Exception as e:

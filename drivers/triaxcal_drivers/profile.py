@@ -6,26 +6,30 @@ to its transport. An unknown key is an error that names the nearest right one.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import json
-import re
-import tomllib
-import types
-import typing
+import os
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.files import inside, read_whole, size
+from triaxcal_drivers.nearest import clipped, nearest
+from triaxcal_drivers.toml_text import SIZE_MOST
+from triaxcal_drivers.toml_text import parse_toml as parse_toml
+from triaxcal_drivers.validation import validate as validate
 
 AXES = ("x", "y", "z")
 READINGS, CORRECTED = "readings", "corrected"
-M = TypeVar("M", bound=BaseModel)
+FILE_MOST = 16 * 2**20
+"""Bytes of a DBC or EDS file; the DBC of a whole vehicle, comments and all, has some ten million."""
+STREAMS_MOST, CHANNELS_MOST = 16, 256  # ours have two of six channels; a Modbus reply has room for 125
+STEPS_MOST = 100  # of a sequence; ours have at most three
 
 
 class Strict(BaseModel):
@@ -67,8 +71,8 @@ class Output(Strict):
 
 class Sampling(Strict):
     rate_hz: Annotated[float, Field(gt=0, description="samples a second that the device delivers")]
-    silence_timeout_s: Annotated[float, Field(gt=0)] = 2.0
-    reply_timeout_s: Annotated[float, Field(gt=0)] = 1.0
+    silence_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 2.0
+    reply_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 1.0
 
 
 RawType = Literal["int16", "uint16", "int24", "uint24", "int32", "uint32", "int64", "uint64", "float32", "float64"]
@@ -106,6 +110,9 @@ class Register(Strict):
 class WriteStep(Strict):
     write: Annotated[str, Field(description="register to write")]
     value: Annotated[int | float, Field(description="value in the register's unit")]
+    timeout_s: Annotated[
+        float | None, Field(gt=0, le=120, description="how long its reply may take, where longer than any other")
+    ] = None
 
 
 class WaitStep(Strict):
@@ -125,15 +132,16 @@ class ReconnectStep(Strict):
 
 
 Step = WriteStep | WaitStep | PollStep | ReconnectStep
+Steps = Annotated[tuple[Step, ...], Field(max_length=STEPS_MOST), FailFast()]  # a step has a dozen faults at once
 
 
 class Sequences(Strict):
     """What to do before writing, to make it permanent, after writing, and to start the device afresh."""
 
-    unlock: tuple[Step, ...] = ()
-    store: tuple[Step, ...] = ()
-    lock: tuple[Step, ...] = ()
-    reset: tuple[Step, ...] = ()
+    unlock: Steps = ()
+    store: Steps = ()
+    lock: Steps = ()
+    reset: Steps = ()
 
 
 class Crc(Strict):
@@ -178,9 +186,9 @@ class Profile(Strict):
             named += [("crc", n) for n in (self.crc.register_name, *self.crc.over)]
         for where, name in named:
             if name not in self.registers:
-                raise ValueError(f"{where}: no register named '{name}'{_nearest(name, self.registers)}")
-        roles = [r.role for r in self.registers.values() if r.role]
-        for role in sorted({r for r in roles if roles.count(r) > 1}):
+                raise ValueError(f"{where}: no register named '{name}'{nearest(name, self.registers)}")
+        roles = Counter(r.role for r in self.registers.values() if r.role)
+        for role in sorted(r for r, count in roles.items() if count > 1):
             raise ValueError(f"registers: role '{role}' is given twice")
         return self
 
@@ -234,134 +242,40 @@ def parse_bundle(text: bytes, files: Mapping[str, bytes] | None, *, where: str, 
         raise ProfileError(f'{where}: driver: expected the name of a driver, as in driver = "can"')
     model = driver_named(name, where=where).profile_model
     profile = validate(model, data, text, where=where)
-    held: dict[str, bytes] = {}
-    for file in profile.files():
-        if files is not None:
-            if file not in files:
-                raise ProfileError(f"{where}: the file '{file}' that it names is missing")
-            held[file] = files[file]
-        elif folder is not None:
-            try:
-                held[file] = (folder / file).read_bytes()
-            except OSError as e:
-                raise ProfileError(f"{where}: the file '{file}' that it names: {e.strerror}") from e
-    return Bundle(profile, text, held)
+    return Bundle(profile, text, {file: _held(file, files, folder, where) for file in profile.files()})
+
+
+def _held(file: str, files: Mapping[str, bytes] | None, folder: Path | None, where: str) -> bytes:
+    """Raises ProfileError."""
+    try:
+        if files is None and folder is not None:
+            return read_whole(inside(folder, file), FILE_MOST)
+        data = (files or {})[file]
+    except KeyError:
+        raise ProfileError(f"{where}: the file '{clipped(file)}' that it names is missing") from None
+    except OSError as e:
+        raise ProfileError(f"{where}: the file '{clipped(file)}' that it names: {e.strerror}") from e
+    if len(data) > FILE_MOST:
+        raise ProfileError(f"{where}: the file '{clipped(file)}' that it names: larger than {size(FILE_MOST)}")
+    return data
 
 
 def load_bundle(path: Path) -> Bundle:
     """The profile at ``path``, or a built-in one where ``path`` is a bare name such as ``triax-ref-can``."""
     if "\0" in str(path):
         raise ProfileError(f"{str(path)!r}: no file has such a name")
-    if not path.exists() and path.suffix in ("", ".toml") and path.parent == Path():
+    if not os.path.exists(path) and path.suffix in ("", ".toml") and path.parent == Path():
         built_in = BUILT_IN / (path.stem + ".toml")
-        if built_in.exists():
+        if os.path.exists(built_in):
             path = built_in
     try:
-        text = path.read_bytes()
-    except OSError as e:
+        text = read_whole(path, SIZE_MOST)
+    except FileNotFoundError as e:
         known = sorted(p.stem for p in BUILT_IN.glob("*.toml"))
         raise ProfileError(f"{path}: {e.strerror}; built-in profiles: {', '.join(known)}") from e
+    except OSError as e:
+        raise ProfileError(f"{path}: {e.strerror}") from e
     return parse_bundle(text, None, where=str(path), folder=path.parent)
 
 
 BUILT_IN = Path(__file__).parent / "profiles"
-
-
-def parse_toml(text: bytes, *, where: str) -> dict[str, Any]:
-    """Raises ProfileError with the line at fault."""
-    try:
-        return tomllib.loads(text.decode("utf-8"))
-    except UnicodeDecodeError as e:
-        raise ProfileError(f"{where}: not UTF-8 text (byte {e.start})") from e
-    except tomllib.TOMLDecodeError as e:
-        raise ProfileError(f"{where}: not TOML: {e}") from e
-
-
-def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str) -> M:
-    """``data`` as ``model``; the first fault as a ProfileError of one line."""
-    try:
-        # As JSON, because strict mode takes a TOML array for a tuple only there.
-        return model.model_validate_json(json.dumps(data, default=str))
-    except ValidationError as e:
-        errors = e.errors()
-        first = next((x for x in errors if x["type"] == "extra_forbidden"), errors[0])
-        path = [str(p) for p in first["loc"] if not _is_tag(p, data, first["loc"])]
-        line = _line_of(text, path)
-        message = first["msg"].removeprefix("Value error, ")
-        if first["type"] == "extra_forbidden":
-            message = f"unknown key{_nearest(path[-1], _keys_at(model, first['loc'][:-1]))}"
-        elif first["type"] == "missing":
-            message = "missing"
-        else:
-            given = first.get("input")
-            if isinstance(given, (str, int, float, bool)):
-                message += f", not {given!r}"
-        at = f", line {line}" if line else ""
-        field = f"{'.'.join(path)}: " if path else ""
-        raise ProfileError(f"{where}{at}: {field}{message[0].lower()}{message[1:]}") from e
-
-
-def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:
-    """Whether a part of pydantic's location is the name of a union member rather than a key of the data."""
-    at = data
-    for p in loc:
-        inside = (isinstance(at, Mapping) and p in at) or (
-            isinstance(at, (list, tuple)) and isinstance(p, int) and p < len(at)
-        )
-        if p is part and not inside:
-            return p is not loc[-1]
-        if inside:
-            at = at[p]
-    return False
-
-
-def _nearest(name: str, known: Any) -> str:
-    close = difflib.get_close_matches(name, [str(k) for k in known], n=1, cutoff=0.5)
-    if close:
-        return f"; did you mean '{close[0]}'?"
-    names = sorted(str(k) for k in known)
-    return f"; known: {', '.join(names[:12])}" if names else ""
-
-
-def _keys_at(annotation: Any, loc: tuple[int | str, ...]) -> set[str]:
-    """The keys that ``annotation`` allows at ``loc``, all union members together."""
-    if typing.get_origin(annotation) is Annotated:
-        return _keys_at(typing.get_args(annotation)[0], loc)
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return set().union(*(_keys_at(a, loc) for a in typing.get_args(annotation)))
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        fields = {f.alias or n: f.annotation for n, f in annotation.model_fields.items()}
-        if not loc:
-            return set(fields)
-        if loc[0] in fields:
-            return _keys_at(fields[str(loc[0])], loc[1:])
-        return _keys_at(annotation, loc[1:])  # a union member's tag
-    arguments = typing.get_args(annotation)
-    if arguments and loc:
-        return _keys_at(arguments[-1] if arguments[-1] is not Ellipsis else arguments[0], loc[1:])
-    return set()
-
-
-def _line_of(text: bytes, path: list[str]) -> int | None:
-    """The line of the last key of ``path`` that the text shows, found by table headers and keys."""
-    table: list[str] = []
-    best: tuple[int, int] | None = None
-    counts: dict[str, int] = {}
-    for number, line in enumerate(text.decode("utf-8", "replace").splitlines(), 1):
-        bare = line.strip()
-        if header := re.match(r"\[(\[?)([^\]]+)\]", bare):
-            table = [p.strip().strip("\"'") for p in header[2].split(".")]
-            if header[1]:
-                counts[header[2]] = counts.get(header[2], -1) + 1
-                table.append(str(counts[header[2]]))
-            keys = table
-        elif assigned := re.match(r"([A-Za-z0-9_.\"'-]+)\s*=", bare):
-            keys = table + [p.strip("\"'") for p in assigned[1].split(".")]
-        else:
-            continue
-        depth = len(keys)
-        if keys == path[:depth]:
-            inline = sum(1 for p in path[depth:] if re.search(rf"\b{re.escape(p)}\b", bare))
-            if best is None or depth + inline > best[0]:
-                best = (depth + inline, number)
-    return best[1] if best else None

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from triaxcald.errors import InputError
-from triaxcald.files import write_text
+from triaxcald.files import new_file, write_text
 
 
 def test_a_file_is_written_as_utf8_and_readable_by_all(tmp_path: Path) -> None:
@@ -30,7 +30,7 @@ def test_an_existing_file_is_replaced_and_nothing_stays_beside_it(tmp_path: Path
 def test_a_text_that_cannot_be_encoded_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text("old")
-    with pytest.raises(UnicodeEncodeError):
+    with pytest.raises(InputError, match="is no character"):
         write_text(path, "\ud800")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
@@ -66,10 +66,38 @@ def test_a_full_device_is_an_error_of_one_line(tmp_path: Path) -> None:
     assert path.is_symlink()
 
 
-def test_a_link_stays_a_link_and_its_file_is_written(tmp_path: Path) -> None:
-    target, link = tmp_path / "target.json", tmp_path / "link.json"
-    target.write_text("old")
+@pytest.mark.parametrize("target", ["target.json", "nothing", "link.json", "folder"])
+def test_no_symbolic_link_is_followed(tmp_path: Path, target: str) -> None:
+    (tmp_path / "target.json").write_text("old")
+    (tmp_path / "folder").mkdir()
+    link = tmp_path / "link.json"
     link.symlink_to(target)
-    write_text(link, "new")
+    with pytest.raises(InputError, match=r"link\.json: cannot be written: a symbolic link, expected a file of its own"):
+        write_text(link, "new")
     assert link.is_symlink()
-    assert target.read_text() == "new"
+    assert (tmp_path / "target.json").read_text() == "old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder", "link.json", "target.json"]
+
+
+def test_a_link_in_a_folder_that_is_one_is_the_folders_affair(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "folder").symlink_to("real")
+    write_text(tmp_path / "folder" / "a.json", "text")
+    assert (tmp_path / "real" / "a.json").read_text() == "text"
+
+
+def test_the_systems_names_of_a_descriptor_are_written_to(tmp_path: Path) -> None:
+    with open(tmp_path / "out", "w") as file:
+        write_text(Path(f"/dev/fd/{file.fileno()}"), "through")
+    assert (tmp_path / "out").read_text() == "through"
+    write_text(Path("/dev/null"), "away")
+
+
+def test_a_file_that_is_new_file_is_gone_after_a_failure_and_never_replaces_one(tmp_path: Path) -> None:
+    path = tmp_path / "new"
+    with pytest.raises(TypeError), new_file(path) as file:
+        file.write("half" + 1)  # type: ignore[operator]
+    assert list(tmp_path.iterdir()) == []
+    path.symlink_to("nothing")
+    with pytest.raises(FileExistsError), new_file(path):
+        pass

@@ -15,7 +15,7 @@ from triaxcal.plan.directions import spiral
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import SyntheticUnit, Tumble
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.inputs import VERIFICATION, bundle_of, measure, read_document
+from triaxcald.inputs import VERIFICATION, bundle_of, measure, parse_document, read_document
 from triaxcald.recording.reader import Recording
 
 
@@ -199,3 +199,22 @@ def test_a_slow_logger_that_rests_for_nights_and_is_carried_about_between_is_ask
     measured = measure(_written(tmp_path / "nights.csv", np.arange(len(readings)) * 1.0, readings))
     assert sum(p.end_s - p.start_s > 2000 for p in measured.poses) == 3
     assert not [line for line in measured.data_quality if line.startswith("time_unit")]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"a": 1, "b": {"c": 1, "c": 2}}', "the key 'c' is given twice"),
+        ('{"a": "\\ud800"}', "half of a surrogate pair"),
+        ('{"a": ' + "9" * 5000 + "}", "not JSON that can be read"),
+        ('{"a": ' * 100_000, "nested too deeply"),
+        ("[1]", "expected a JSON object"),
+    ],
+)
+def test_a_document_that_json_would_let_pass_or_choke_on_is_refused(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=f"^a.json: .*{words}"):
+        parse_document(text.encode(), where="a.json")
+
+
+def test_a_whole_surrogate_pair_is_a_character() -> None:
+    assert parse_document(b'{"a": "\\ud83d\\ude00"}', where="a.json") == {"a": "\U0001f600"}

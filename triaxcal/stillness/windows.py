@@ -110,9 +110,9 @@ class WindowCutter:
         channels = {n: np.concatenate([p[2][n] for p in self._pending]) for n in self._pending[0][2]}
         before = self._last_ns if self._last_ns is not None else int(time_ns[0]) - int(self._period_ns)
         gaps = np.flatnonzero(np.diff(time_ns, prepend=before) > GAP * self._period_ns)
-        start = 0
+        start, torn = 0, set(gaps.tolist())
         for stop in (*gaps[gaps > 0], len(time_ns)):
-            if start in gaps:
+            if start in torn:
                 self._broken = True
             whole = (stop - start) // self._size
             if whole:

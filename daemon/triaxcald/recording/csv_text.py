@@ -15,14 +15,23 @@ from typing import BinaryIO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from triaxcal_drivers.files import open_file
+from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
 
 REQUIRED = ("t_s", "ux", "uy", "uz")
 _BLOCK = 2**22
 _LINE_LIMIT = 2**20  # bytes; no line of numbers is that long
+_VALUE_LIMIT = 1e100  # squares of values, and sums of them, have to be numbers too
 _TIME_LIMIT_S = 9.2e9  # beyond, nanoseconds do not fit 64 bits
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_COMMENT = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
+_FIELDS_MOST = 1000  # a table of numbers has some ten
+_NUMBER_MOST = 400  # characters of a number; those of the longest are its zeros, 308 of them
+_EXPANSION_MOST = 200
+"""So many times what is read of it may a gzip file unpack to, and one block. Text of numbers comes to a third or a
+tenth, with two hundred columns that never change to a hundredth; nothing but one and the same, to a thousandth."""
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_COMMENTS = re.compile(r"^(?:[ \t]*#[^\n]*(?:\n|\Z))++", re.MULTILINE)
+_NOTHING = re.compile(r"(?:[ \t\r]*(?:#[^\n]*)?\n)*+")
 
 
 @dataclass(frozen=True)
@@ -49,10 +58,11 @@ def read_csv(source: Path | str | BinaryIO, name: str | None = None) -> CsvSampl
         return _Parse(name or "standard input").run(sys.stdin.buffer)
     label = name or str(source)
     try:
-        with open(source, "rb") as file:
-            if str(source).endswith(".gz"):
+        packed = str(source).endswith(".gz")
+        with open_file(Path(source), pipe=not packed) as file:
+            if packed:
                 with gzip.GzipFile(fileobj=file) as unzipped:
-                    return _Parse(label).run(unzipped)
+                    return _Parse(label, file).run(unzipped)
             return _Parse(label).run(file)
     except OSError as e:
         raise InputError(f"{label}: cannot be read: {e.strerror or e}") from e
@@ -61,8 +71,10 @@ def read_csv(source: Path | str | BinaryIO, name: str | None = None) -> CsvSampl
 class _Parse:
     """One reading of one file: where it is, and what it has found."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, packed: BinaryIO | None = None) -> None:
         self._name = name
+        self._packed = packed
+        self._unpacked = 0  # bytes
         self._line = 0  # lines done with
         self._fields: list[str] = []
         self._before: NDArray[np.float64] | None = None  # the last row
@@ -108,11 +120,15 @@ class _Parse:
 
     def _read(self, stream: BinaryIO | gzip.GzipFile) -> bytes:
         try:
-            return stream.read(_BLOCK)
+            block = stream.read(_BLOCK)
         except EOFError:
             raise InputError(f"{self._name}: the gzip data end too early, expected a whole file") from None
         except (gzip.BadGzipFile, zlib.error) as e:
             raise InputError(f"{self._name}: not readable as gzip: {e}") from e
+        self._unpacked += len(block)
+        if self._packed is not None and self._unpacked > _EXPANSION_MOST * self._packed.tell() + _BLOCK:
+            raise InputError(f"{self._name}: unpacks to more than {_EXPANSION_MOST} times its size")
+        return block
 
     def _decode(self, data: bytes) -> str:
         nul = data.find(b"\0")
@@ -139,16 +155,14 @@ class _Parse:
 
     def _header(self, text: str) -> str:
         """Takes the header off; what follows it."""
-        at = 0
-        while at < len(text):
-            end = text.find("\n", at) + 1 or len(text)
-            line = text[at:end].strip()
-            at = end
-            self._line += 1
-            if line and not line.startswith("#"):
-                self._fields = self._check_header([field.strip() for field in line.split(",")])
-                break
-        return text[at:]
+        skipped = _NOTHING.match(text)
+        at = skipped.end() if skipped else 0
+        end = text.find("\n", at) + 1 or len(text)
+        line = text[at:end].strip()
+        self._line += text.count("\n", 0, at) + (at < len(text))
+        if line and not line.startswith("#"):
+            self._fields = self._check_header([field.strip() for field in line.split(",")])
+        return text[end:]
 
     def _check_header(self, fields: list[str]) -> list[str]:
         expected = f"expected the header {','.join(REQUIRED)} and any further names"
@@ -158,24 +172,26 @@ class _Parse:
             if i >= len(fields) or fields[i] != name:
                 found = f"'{fields[i][:40]}'" if i < len(fields) else "nothing"
                 self._fail(self._line, f"field {i + 1} of the header is {found} instead of '{name}', {expected}")
+        if len(fields) > _FIELDS_MOST:
+            self._fail(self._line, f"{len(fields)} fields in the header, expected at most {_FIELDS_MOST}")
         for i, field in enumerate(fields):
             if not field:
                 self._fail(self._line, f"field {i + 1} of the header has no name, {expected}")
             if field in fields[:i]:
-                self._fail(self._line, f"'{field}' is in the header twice, expected each name once")
+                self._fail(self._line, f"'{field[:40]}' is in the header twice, expected each name once")
         return fields
 
     def _fast(self, text: str) -> NDArray[np.float64] | None:
         """The rows, or None where anything at all is out of the ordinary."""
         if "#" in text:
-            text = _COMMENT.sub("", text)
+            text = _COMMENTS.sub("", text)
         if not text or text.isspace():
             return np.empty((0, len(self._fields)))
         try:
             rows = np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2, comments=None)
         except ValueError:
             return None
-        usual = rows.shape[1] == len(self._fields) and np.isfinite(rows).all()
+        usual = rows.shape[1] == len(self._fields) and (np.abs(rows) < _VALUE_LIMIT).all()
         return rows if usual and (np.abs(rows[:, 0]) < _TIME_LIMIT_S).all() else None
 
     def _slow(self, text: str) -> tuple[NDArray[np.float64], list[int]]:
@@ -192,17 +208,18 @@ class _Parse:
     def _row(self, number: int, line: str) -> list[float]:
         texts = line.split(",")
         if len(texts) != len(self._fields):
-            self._fail(number, f"{len(texts)} fields, expected {len(self._fields)} ({','.join(self._fields)})")
+            names = ",".join(self._fields)
+            self._fail(number, f"{len(texts)} fields, expected {len(self._fields)} ({clipped(names)})")
         row = []
         for field, text in zip(self._fields, map(str.strip, texts), strict=True):
             if not text:
-                self._fail(number, f"field {field}: empty, expected a number")
-            value = float(text) if _NUMBER.fullmatch(text) else float("nan")
-            if not np.isfinite(value):
-                self._fail(number, f"field {field}: '{text[:40]}', expected a finite number")
+                self._fail(number, f"field {clipped(field)}: empty, expected a number")
+            value = float(text) if len(text) <= _NUMBER_MOST and _NUMBER.fullmatch(text) else float("nan")
+            if not abs(value) < _VALUE_LIMIT:
+                self._fail(number, f"field {clipped(field)}: '{text[:40]}', expected a finite number")
             row.append(value)
         if abs(row[0]) >= _TIME_LIMIT_S:
-            self._fail(number, f"field t_s: {texts[0].strip()}, expected seconds below {_TIME_LIMIT_S:g}")
+            self._fail(number, f"field t_s: {texts[0].strip()[:40]}, expected seconds below {_TIME_LIMIT_S:g}")
         return row
 
     def _keep(self, rows: NDArray[np.float64], text: str, lines: list[int] | None) -> None:

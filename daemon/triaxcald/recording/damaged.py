@@ -19,6 +19,7 @@ from triaxcald.recording.frames import (
     CutShort,
     Damage,
     Frame,
+    Unpacked,
     check_magic,
     chunk_data,
     footer_fits,
@@ -29,6 +30,9 @@ from triaxcald.recording.frames import (
 )
 
 _SEARCH_BLOCK = 2**20
+_TRIED_MOST, _TRIED_LEAST, _TRY = 8, 16 * 2**20, 256
+"""What looks like a record may be tried for so many times the file, and for so many bytes in any case, each try
+counting for its length and so many bytes more. In a file of ours, hardly any of its bytes look like one."""
 # Chunk, attachment, metadata or end of data, shorter than 4 GiB: its type and the upper half of its length.
 _RECORD_START = re.compile(rb"[\x06\x09\x0c\x0f](?=[\s\S]{4}\x00\x00\x00\x00)")
 
@@ -50,11 +54,13 @@ class DamagedFile:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._source = source
+        self._tried = 0
         self.size = size_of(source)
         try:
             check_magic(source, name)
         except CutShort:
             self.size = 0
+        self._unpacked = Unpacked(name, self.size)
         self._look_ahead()
 
     def pieces(self) -> Iterator[Frame | Stretch]:
@@ -106,8 +112,12 @@ class DamagedFile:
         return self.size
 
     def _proves_itself(self, offset: int) -> bool:
+        self._tried += _TRY
+        if self._tried > _TRIED_MOST * self.size + _TRIED_LEAST:
+            raise RecordingError(f"{self.name}: too much of it looks like records and is none")
         try:
             frame = frame_at(self._source, self.name, offset, self.size)
+            self._tried += len(frame.body)
             if frame.opcode == Opcode.CHUNK:
                 chunk_data(frame, self.name)
             else:
@@ -123,6 +133,8 @@ class DamagedFile:
         for piece in self.pieces():
             if not isinstance(piece, Frame):
                 continue
+            if piece.opcode == Opcode.CHUNK:
+                self._unpacked.chunk(piece)
             record = parse(piece, self.name) if piece.opcode in (Opcode.HEADER, Opcode.METADATA) else None
             if isinstance(record, Header):
                 profile = record.profile

@@ -40,9 +40,24 @@ from triaxcald.errors import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length
-CHUNK_LIMIT = 256 * 2**20  # bytes, before and after compression; ours are about 1 MiB
+CHUNK_LIMIT = 16 * 2**20
+"""Bytes, before and after compression. Ours are about 1 MiB, those of other tools 4; 8192 of the longest records, the
+most that one message of ours has, are 2."""
+ATTACHMENT_LIMIT = 32 * 2**20  # a report is some MiB, the DBC of a whole vehicle ten
+INDEX_LIMIT = 8 * 2**20  # of the messages in one chunk
+RECORD_LIMIT = 2**20  # of all others; the longest of ours is the index of a chunk
+EXPANSION_MOST = 64
+"""So many times the file may unpack to, and one chunk: raw records come to a fifth or a tenth."""
+INDEX_ENTRY, UNINDEXED_MOST = 16, 4096
+"""Bytes of the file that each message has in an index, uncompressed. Those of a last chunk may have none."""
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _KNOWN = frozenset(int(code) for code in Opcode)
+_LIMITS: Mapping[int, int] = {
+    Opcode.CHUNK: CHUNK_LIMIT,
+    Opcode.ATTACHMENT: ATTACHMENT_LIMIT,
+    Opcode.MESSAGE_INDEX: INDEX_LIMIT,
+}
 
 
 class Damage(RecordingError):
@@ -101,9 +116,14 @@ def frame_at(stream: BinaryIO, name: str, offset: int, size: int) -> Frame:
         raise Damage(name, offset, f"unknown record type 0x{opcode:02x}")
     if length > size - offset - HEAD.size:
         raise CutShort(name, offset, "the file ends, not finished, in the record")
-    if opcode == Opcode.CHUNK and length > CHUNK_LIMIT:
-        raise Damage(name, offset, f"chunk of {length} bytes, expected at most {CHUNK_LIMIT},")
+    limit = _LIMITS.get(opcode, RECORD_LIMIT)
+    if length > limit:
+        raise Damage(name, offset, f"{_kind(opcode)} record of {length} bytes, expected at most {limit},")
     return Frame(offset, opcode, stream.read(length))
+
+
+def _kind(opcode: int) -> str:
+    return Opcode(opcode).name.lower().replace("_", " ")
 
 
 def walk(stream: BinaryIO, name: str, size: int) -> Iterator[Frame]:
@@ -117,6 +137,13 @@ def walk(stream: BinaryIO, name: str, size: int) -> Iterator[Frame]:
             return
 
 
+def _index(stream: ReadDataStream) -> MessageIndex:
+    """Its entries, of which nothing here makes use, stay bytes: as numbers they would take ten times the memory."""
+    channel_id = stream.read2()
+    stream.read(stream.read4())
+    return MessageIndex(channel_id, [])
+
+
 _READERS: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT: Attachment.read,
     Opcode.CHANNEL: Channel.read,
@@ -127,7 +154,7 @@ _READERS: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.SCHEMA: Schema.read,
     Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
     Opcode.CHUNK_INDEX: ChunkIndex.read,
-    Opcode.MESSAGE_INDEX: MessageIndex.read,
+    Opcode.MESSAGE_INDEX: _index,
     Opcode.METADATA_INDEX: MetadataIndex.read,
     Opcode.STATISTICS: Statistics.read,
     Opcode.SUMMARY_OFFSET: SummaryOffset.read,
@@ -136,7 +163,7 @@ _READERS: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
 
 def parse(frame: Frame, name: str) -> McapRecord:
     """The record in ``frame``, which must be as long as it says; chunks are for `chunk_data`. Raises Damage."""
-    kind = Opcode(frame.opcode).name.lower().replace("_", " ")
+    kind = _kind(frame.opcode)
     read = _READERS.get(frame.opcode)
     if read is None:
         raise Damage(name, frame.offset, f"a {kind} record out of place")
@@ -149,7 +176,7 @@ def parse(frame: Frame, name: str) -> McapRecord:
         raise Damage(name, frame.offset, f"{kind} record of the wrong length")
     if isinstance(record, Attachment):
         (crc,) = struct.unpack("<I", frame.body[-4:])
-        if crc not in (0, zlib.crc32(frame.body[:-4])):
+        if crc not in (0, zlib.crc32(memoryview(frame.body)[:-4])):
             raise Damage(name, frame.offset, f"attachment '{record.name}' fails its CRC")
     return record
 
@@ -216,25 +243,53 @@ def unpack_part(chunk: Chunk) -> bytes:
     """The records of a chunk that was cut off, as far as its bytes go; no CRC can vouch for them."""
     if chunk.compression != "zstd":
         return chunk.data
-    source = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(chunk.data))
+    source = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT).stream_reader(io.BytesIO(chunk.data))
     try:
         return source.read(chunk.uncompressed_size)
     except zstandard.ZstdError:
         return b""
 
 
+class Unpacked:
+    """Counts what a file's chunks unpack to, which has to stay in proportion to the file: a few bytes of compressed
+    nothing keep a reader busy for as long as they like. Raises RecordingError where it does not."""
+
+    def __init__(self, name: str, size: int) -> None:
+        self._name = name
+        self._bytes = EXPANSION_MOST * size + CHUNK_LIMIT
+        self._records = size // INDEX_ENTRY + UNINDEXED_MOST
+
+    def chunk(self, frame: Frame) -> None:
+        found = chunk_head(frame.body)
+        self._bytes -= found[0].uncompressed_size if found else 0
+        if self._bytes < 0:
+            raise RecordingError(f"{self._name}: its chunks unpack to more than {EXPANSION_MOST} times the file")
+
+    def record(self) -> None:
+        self._records -= 1
+        if self._records < 0:
+            raise RecordingError(f"{self._name}: more messages than a file of its size has")
+
+
 def chunk_records(data: bytes) -> Iterator[Schema | Channel | Message]:
-    """The whole records in ``data``; a last one that is cut off is left out."""
+    """The whole records in ``data``; a last one that is cut off is left out. Raises Damage, by its place in ``data``.
+
+    A chunk holds nothing but schemas, channels and messages.
+    """
     at = 0
     while at + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, at)
-        body = data[at + HEAD.size : at + HEAD.size + length]
-        if len(body) < length:
+        start = at + HEAD.size
+        end = start + length
+        if end > len(data):
             return
-        if opcode == Opcode.MESSAGE and length >= 22:
-            yield Message.read(ReadDataStream(io.BytesIO(body)), length)
+        if opcode == Opcode.MESSAGE and length >= _MESSAGE_HEAD.size:
+            channel_id, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(data, start)
+            yield Message(channel_id, log_time, data[start + _MESSAGE_HEAD.size : end], publish_time, sequence)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record = parse(Frame(at, opcode, body), "chunk")
+            record = parse(Frame(at, opcode, data[start:end]), "chunk")
             assert isinstance(record, Schema | Channel)
             yield record
-        at += HEAD.size + length
+        else:
+            raise Damage("chunk", at, f"a record of type 0x{opcode:02x} and {length} bytes, in a chunk")
+        at = end

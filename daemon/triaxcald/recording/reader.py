@@ -9,8 +9,9 @@ from types import TracebackType
 from typing import BinaryIO, NamedTuple, Self, TypeVar
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata
+from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
 
+from triaxcal_drivers.files import open_file
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
@@ -19,6 +20,7 @@ from triaxcald.recording.frames import (
     CutShort,
     Damage,
     Frame,
+    Unpacked,
     check_magic,
     chunk_data,
     chunk_records,
@@ -30,6 +32,8 @@ from triaxcald.recording.frames import (
 )
 
 T = TypeVar("T")
+METADATA_MOST = 2**20  # bytes; ours has some hundred
+ATTACHMENTS_MOST = 1000  # a run leaves a dozen
 
 
 class TopicMessage(NamedTuple):
@@ -79,6 +83,7 @@ class Recording:
         self._stream = stream
         self._chunks: list[int] = []
         self._topics: dict[int, str] = {}
+        self._said = 0  # bytes of metadata
         self.size = size_of(stream)
         if not self.size:
             raise RecordingError(f"{name}: the file is empty; nothing was recorded")
@@ -96,7 +101,7 @@ class Recording:
     @classmethod
     def open(cls, path: Path, *, unfinished: bool = False) -> Recording:
         try:
-            stream = open(path, "rb")  # noqa: SIM115 -- the recording closes it
+            stream = open_file(path)
         except OSError as e:
             raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
         try:
@@ -132,9 +137,14 @@ class Recording:
         """All raw records with their phase."""
         return ((phase, batch) for _, phase, batch in self._decoded(schema.RAW, schema.decode_raw))
 
+    @property
+    def ends_with(self) -> str:
+        """The format of the document that the whole recording ends with; empty where it ends with none."""
+        return self.metadata[schema.FORMAT_RECORD].get(schema.ENDS_WITH, "")
+
     def raw_digest(self) -> schema.RawDigest:
         """Of all raw records; the metadata record ``raw`` says what it was when they were written."""
-        digest = schema.RawDigest()
+        digest = schema.RawDigest(self.ends_with)
         for phase, batch in self.raw_batches():
             digest.update(phase, batch)
         return digest
@@ -151,14 +161,24 @@ class Recording:
     def messages(self) -> Iterator[TopicMessage]:
         """Every message with its topic, undecoded, in the order of the file."""
         topics = dict(self._topics)
+        unpacked = Unpacked(self.name, self.size)
         for offset in self._chunks:
-            for record in chunk_records(chunk_data(self.frame(offset), self.name)):
+            for record in self._records(offset):
+                unpacked.record()
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Message):
                     if record.channel_id not in topics:
                         raise Damage(self.name, offset, f"message on unknown channel {record.channel_id}")
                     yield TopicMessage(topics[record.channel_id], record)
+
+    def _records(self, offset: int) -> Iterator[Schema | Channel | Message]:
+        """Of the chunk at ``offset``."""
+        data = chunk_data(self.frame(offset), self.name)
+        try:
+            yield from chunk_records(data)
+        except Damage as e:
+            raise Damage(self.name, offset, e.what) from e
 
     def frame(self, offset: int) -> Frame:
         try:
@@ -177,7 +197,10 @@ class Recording:
     def _survey(self) -> None:
         """Notes where everything is and checks the two CRCs that together cover every byte."""
         crc = zlib.crc32(MAGIC)
+        unpacked = Unpacked(self.name, self.size)
         for frame in walk(self._stream, self.name, self.size):
+            if frame.opcode == Opcode.CHUNK:
+                unpacked.chunk(frame)
             self._note(frame)
             if frame.opcode == Opcode.DATA_END:
                 self._check_data(frame, crc)
@@ -198,8 +221,13 @@ class Recording:
                 f" '{record.profile}', expected '{schema.PROFILE}'"
             )
         if isinstance(record, Metadata):
+            self._said += len(frame.body)
+            if self._said > METADATA_MOST:
+                raise RecordingError(f"{self.name}: more than {METADATA_MOST} bytes of metadata")
             self.metadata.setdefault(record.name, {}).update(record.metadata)
         elif isinstance(record, Attachment):
+            if len(self.attachments) >= ATTACHMENTS_MOST:
+                raise RecordingError(f"{self.name}: more than {ATTACHMENTS_MOST} attachments")
             self.attachments.add(frame.offset, record)
         elif isinstance(record, Channel):
             self._topics[record.id] = record.topic

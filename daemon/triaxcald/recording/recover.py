@@ -12,7 +12,9 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer as McapWriter
 
 from triaxcal.errors import Refused
+from triaxcal_drivers.files import open_file
 from triaxcald.errors import RecordingError
+from triaxcald.files import new_file
 from triaxcald.recording import schema
 from triaxcald.recording.damaged import DamagedFile, Stretch
 from triaxcald.recording.frames import (
@@ -21,6 +23,7 @@ from triaxcald.recording.frames import (
     MAGIC,
     Damage,
     Frame,
+    Unpacked,
     chunk_data,
     chunk_head,
     chunk_records,
@@ -70,7 +73,7 @@ def recover(path: Path, out: Path) -> Recovery:
     written; Refused: ``path`` holds neither a whole message nor an attachment. Nothing of ``out`` is left behind.
     """
     try:
-        with open(path, "rb") as source:
+        with open_file(path) as source:
             damaged = DamagedFile(source, str(path))
             return _write(damaged, path.name, out)
     except FileExistsError:
@@ -80,16 +83,11 @@ def recover(path: Path, out: Path) -> Recovery:
 
 
 def _write(damaged: DamagedFile, name: str, out: Path) -> Recovery:
-    sink = open(out, "xb")  # noqa: SIM115 -- closed below, before it is deleted where that must be
-    try:
-        with sink:
-            recovery = _Mending(damaged, McapWriter(sink, enable_data_crcs=True)).run(name)
+    with new_file(out) as sink:
+        recovery = _Mending(damaged, McapWriter(sink, enable_data_crcs=True)).run(name)
         if not (recovery.messages or recovery.attachments):
             raise Refused(f"{damaged.name}: nothing to recover, as there is no whole message or attachment in it")
         return recovery
-    except BaseException:
-        out.unlink()
-        raise
 
 
 class _Mending:
@@ -104,6 +102,7 @@ class _Mending:
         self._raw_end = 0  # running index after the last record known of
         self._written: dict[str, str] = {}  # the metadata record `raw`, where the writer came to its end
         self._located = False  # damage has been met
+        self._unpacked = Unpacked(damaged.name, damaged.size)
 
     def run(self, name: str) -> Recovery:
         self._mcap.start(profile=schema.PROFILE)
@@ -146,6 +145,8 @@ class _Mending:
             return
         if record.name != schema.FORMAT_RECORD:  # a wrong byte in it would make the new file unreadable
             self._mcap.add_metadata(record.name, record.metadata)
+        elif record.metadata.get(schema.ENDS_WITH):
+            self._digest.ends_with = record.metadata[schema.ENDS_WITH]
 
     def _stretch(self, stretch: Stretch) -> None:
         """Keeps what a chunk of the wrong length or one that was cut off still holds."""
@@ -168,11 +169,15 @@ class _Mending:
     def _records(self, data: bytes) -> int:
         """Carries over a chunk's records; the number of messages among them that were kept."""
         kept = 0
-        for record in chunk_records(data):
-            if isinstance(record, Message):
-                kept += self._message(record)
-            else:
-                self._damaged.declare(record)
+        try:
+            for record in chunk_records(data):
+                self._unpacked.record()
+                if isinstance(record, Message):
+                    kept += self._message(record)
+                else:
+                    self._damaged.declare(record)
+        except Damage:  # what follows is no record; the CRC, where there is one, says that it was written so
+            self._recovery.chunks_failed += 1
         self._recovery.messages += kept
         return kept
 
@@ -242,7 +247,8 @@ class _Mending:
         recovery.raw_missing = max(by_index, believed - recovery.raw_records, 0)
 
     def _write_end(self, name: str) -> None:
-        self._mcap.add_metadata(schema.FORMAT_RECORD, {"format": schema.FORMAT})
+        ends_with = {schema.ENDS_WITH: self._digest.ends_with} if self._digest.ends_with else {}
+        self._mcap.add_metadata(schema.FORMAT_RECORD, {"format": schema.FORMAT} | ends_with)
         raw = {"records": str(self._digest.records), "sha256": self._digest.hexdigest()}
         self._mcap.add_metadata(schema.RAW_RECORD, raw)
         story = {"of": name, **{key: str(value).lower() for key, value in asdict(self._recovery).items()}}

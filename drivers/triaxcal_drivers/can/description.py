@@ -1,79 +1,78 @@
-"""Messages out of DBC and EDS files: the only place that reads either."""
+"""The messages of a stream, out of the DBC or EDS file that it names: the only place that reads an EDS."""
 
 from __future__ import annotations
 
 import configparser
 import io
 import logging
+import re
 from collections.abc import Mapping
+from functools import lru_cache
 
-import cantools
-import cantools.database
 from canopen import ObjectDictionary
 from canopen.objectdictionary import datatypes
 from canopen.objectdictionary.eds import import_eds
-from cantools.database.can import Database
 
+from triaxcal_drivers.can.dbc import dbc_messages
 from triaxcal_drivers.can.layout import Layout, Message, Signal, arrange
 from triaxcal_drivers.can.model import CanStream, DbcStream
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.files import size
+from triaxcal_drivers.nearest import clipped
 
 logging.getLogger("canopen").addHandler(logging.NullHandler())  # what it logs comes back as exceptions too
 
+EDS_MOST, LINES_MOST = 2**20, 30_000
+"""Bytes and lines; a drive of three thousand objects comes near. canopen takes a second for so many."""
+_COMMENT = re.compile(r"(?:^|\s)[;#].*")
+_BLANKS = re.compile(r"\s+")
+_ENTRY = re.compile(r"\[[^\]]+\]$|[^=:\[][^=:]*[=:]")
 _EXTENDED, _UNUSED = 1 << 29, 1 << 31  # bits of a PDO's COB-ID (CiA 301)
 
 
 def stream_layout(stream: CanStream, files: Mapping[str, bytes], *, where: str) -> Layout:
     """The layout of a stream in the file it names. Raises ProfileError."""
-    data = files[stream.file]
-    place = f"{stream.file} ({where})"
-    if isinstance(stream, DbcStream):
-        messages = dbc_messages(data, base_node_id=stream.base_node_id, where=stream.file)
-    else:
-        messages = pdo_messages(object_dictionary(data, node_id=0, where=stream.file), where=stream.file)
-    return arrange(messages, stream, where=place)
+    node_id = stream.base_node_id if isinstance(stream, DbcStream) else None
+    messages = _messages(files[stream.file], isinstance(stream, DbcStream), node_id, stream.file)
+    return arrange(messages, stream, where=f"{stream.file} ({where})")
 
 
-def dbc_messages(data: bytes, *, base_node_id: int | None, where: str) -> list[Message]:
-    """Every message of a DBC file; multiplexed signals, which only some frames hold, are left out."""
-    try:
-        # Overlapping signals elsewhere in a vehicle's DBC are none of our business: strict is off.
-        database = cantools.database.load_string(data.decode("cp1252", "replace"), "dbc", strict=False)
-    except cantools.Error as e:
-        raise ProfileError(f"{where}: not a DBC file: {' '.join(str(e).split())}") from e
-    assert isinstance(database, Database)  # the other kind is for CDD files
-    messages = []
-    for m in database.messages:
-        signals = {
-            s.name: Signal(
-                s.name, s.start, s.length, s.byte_order == "big_endian", s.is_signed, s.conversion.is_float,
-                float(s.conversion.scale), float(s.conversion.offset),
-            )
-            for s in m.signals
-            if not s.multiplexer_ids
-        }  # fmt: skip
-        for signal in signals.values():
-            _check(signal, m.name, m.length, where)
-        identifier = m.frame_id - (base_node_id or 0)
-        messages.append(Message(m.name, identifier, signals, m.is_extended_frame, base_node_id is not None))
-    return messages
-
-
-def _check(signal: Signal, message: str, length: int, where: str) -> None:
-    if signal.is_float and signal.length not in (16, 32, 64):
-        raise ProfileError(f"{where}: signal '{signal.name}' is a float of {signal.length} bits")
-    if not 1 <= signal.length <= 64 or signal.size > length:
-        raise ProfileError(f"{where}: signal '{signal.name}' does not fit the {length} bytes of message '{message}'")
+@lru_cache(maxsize=4)
+def _messages(data: bytes, dbc: bool, base_node_id: int | None, where: str) -> list[Message]:
+    """A file is read once for all streams that it lays out, and once for all units of a station."""
+    if dbc:
+        return dbc_messages(data, base_node_id=base_node_id, where=where)
+    return pdo_messages(object_dictionary(data, node_id=0, where=where), where=where)
 
 
 def object_dictionary(data: bytes, *, node_id: int, where: str) -> ObjectDictionary:
     """An EDS file's objects; ``$NODEID`` in it becomes ``node_id``. Raises ProfileError."""
-    text = io.StringIO(data.decode("utf-8", "replace"))
+    text = _entries(data, where)
     try:
-        objects: ObjectDictionary = import_eds(text, node_id)  # type: ignore[no-untyped-call]
+        objects: ObjectDictionary = import_eds(io.StringIO(text), node_id)  # type: ignore[no-untyped-call]
+    except configparser.MissingSectionHeaderError as e:  # its message shows what is there instead
+        raise ProfileError(f"{where}: not an EDS file: line {e.lineno}: expected [section]") from e
     except (configparser.Error, ValueError, KeyError, TypeError, AttributeError) as e:
-        raise ProfileError(f"{where}: not an EDS file: {' '.join(str(e).split())}") from e
+        raise ProfileError(f"{where}: not an EDS file: {clipped(' '.join(str(e).split()), 200)}") from e
     return objects
+
+
+def _entries(data: bytes, where: str) -> str:
+    """The file's text without comments, blanks single. Raises ProfileError where a line is none of an EDS.
+
+    Of such lines, and of long runs of blanks, configparser takes their square, and its message shows what they hold.
+    """
+    if len(data) > EDS_MOST:
+        raise ProfileError(f"{where}: larger than the {size(EDS_MOST)} that an EDS file may have")
+    if data.count(b"\n") > LINES_MOST:
+        raise ProfileError(f"{where}: more than the {LINES_MOST} lines that an EDS file may have")
+    lines = []
+    for number, line in enumerate(data.decode("utf-8", "replace").split("\n"), 1):
+        bare = _BLANKS.sub(" ", _COMMENT.sub("", line)).strip()
+        if bare and not _ENTRY.match(bare):
+            raise ProfileError(f"{where}: not an EDS file: line {number}: expected [section] or key=value")
+        lines.append(bare)
+    return "\n".join(lines)
 
 
 def pdo_messages(objects: ObjectDictionary, *, where: str) -> list[Message]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from triaxcal_drivers.can.model import CanStream, Scaling
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.nearest import nearest
 
 NODES = 127
 SHORTEST_COUNTER = 4
@@ -68,7 +68,8 @@ class Signal:
         return bits
 
     def values(self, data: NDArray[np.uint8]) -> NDArray[np.float64]:
-        scaled: NDArray[np.float64] = self.raw(data).astype(np.float64) * self.scale + self.offset
+        with np.errstate(over="ignore", invalid="ignore"):  # a scale may be any
+            scaled: NDArray[np.float64] = self.raw(data).astype(np.float64) * self.scale + self.offset
         return scaled
 
 
@@ -99,14 +100,6 @@ class Layout:
         return self.counters[0].length if self.counters else 0
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """A hint for an error message."""
-    names = sorted(set(known))
-    if close := difflib.get_close_matches(name, names, n=1, cutoff=0.5):
-        return f"; did you mean '{close[0]}'?"
-    return f"; known: {', '.join(names[:12])}" if names else ""
-
-
 def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> Layout:
     """The layout of ``stream`` in a file's messages.
 
@@ -114,7 +107,8 @@ def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> La
     Raises ProfileError (one line: ``where``, the name, the nearest right one).
     """
     wanted = stream.wanted()
-    holders = {name: _holders(messages, reference, where) for name, (reference, _) in wanted.items()}
+    index = _Index(messages)
+    holders = {name: index.holders(reference, where) for name, (reference, _) in wanted.items()}
     needed = {h[0][0] for h in holders.values() if len(h) == 1}
     chosen: dict[str, tuple[int, Signal]] = {}
     for name, (reference, scaling) in wanted.items():
@@ -131,18 +125,30 @@ def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> La
     return layout
 
 
-def _holders(messages: Sequence[Message], reference: str, where: str) -> list[tuple[int, Signal]]:
-    """Which messages hold the signal: ``Signal``, or ``Message.Signal``."""
-    within, _, name = reference.rpartition(".")
-    if within and within not in [m.name for m in messages]:
-        raise ProfileError(f"{where}: no message '{within}'{nearest(within, [m.name for m in messages])}")
-    pool = [(i, m) for i, m in enumerate(messages) if within in ("", m.name)]
-    found = [(i, m.signals[name]) for i, m in pool if name in m.signals]
-    if not found:
-        at = f" in message '{within}'" if within else ""
-        known = [s for _, m in pool for s in m.signals]
-        raise ProfileError(f"{where}: no signal '{name}'{at}{nearest(name, known)}")
-    return found
+class _Index:
+    """Finds signals by name, in files of thousands of messages too."""
+
+    def __init__(self, messages: Sequence[Message]) -> None:
+        self._messages = messages
+        self._of: dict[str, list[int]] = {}  # numbers of the messages of that name
+        self._with: dict[str, list[int]] = {}  # of those that hold a signal of that name
+        for i, m in enumerate(messages):
+            self._of.setdefault(m.name, []).append(i)
+            for name in m.signals:
+                self._with.setdefault(name, []).append(i)
+
+    def holders(self, reference: str, where: str) -> list[tuple[int, Signal]]:
+        """Which messages hold the signal: ``Signal``, or ``Message.Signal``."""
+        within, _, name = reference.rpartition(".")
+        if within and within not in self._of:
+            raise ProfileError(f"{where}: no message '{within}'{nearest(within, self._of)}")
+        inside = self._of.get(within, range(len(self._messages)))
+        found = [(i, self._messages[i].signals[name]) for i in self._with.get(name, []) if i in inside]
+        if not found:
+            at = f" in message '{within}'" if within else ""
+            known = (s for i in inside for s in self._messages[i].signals)
+            raise ProfileError(f"{where}: no signal '{name}'{at}{nearest(name, known)}")
+        return found
 
 
 def _scaled(signal: Signal, scaling: Scaling) -> Signal:

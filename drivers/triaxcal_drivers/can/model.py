@@ -8,7 +8,9 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from triaxcal_drivers import registers as codec
-from triaxcal_drivers.profile import AXES, Profile, Register, Strict
+from triaxcal_drivers.can.claim import claim_on_can
+from triaxcal_drivers.claim import Claim
+from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
 
 READING_CHANNELS = tuple("u" + axis for axis in AXES)
 
@@ -70,7 +72,9 @@ class DbcStream(Strict):
     file: str
     base_node_id: Annotated[int | None, Field(ge=1, le=127)] = None
     counter: str | None = None
-    channels: Mapping[str, Annotated[DbcChannel, _named("signal", DbcChannel)]]
+    channels: Annotated[
+        Mapping[str, Annotated[DbcChannel, _named("signal", DbcChannel)]], Field(max_length=CHANNELS_MOST)
+    ]
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -88,7 +92,9 @@ class PdoStream(Strict):
     layout: Literal["pdo"]
     eds: str
     counter: ObjectName | None = None
-    channels: Mapping[str, Annotated[PdoChannel, _named("object", PdoChannel)]]
+    channels: Annotated[
+        Mapping[str, Annotated[PdoChannel, _named("object", PdoChannel)]], Field(max_length=CHANNELS_MOST)
+    ]
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -116,8 +122,12 @@ class CanRegister(Register):
 class CanProfile(Profile):
     """A device on CAN. With registers, or streams laid out by an EDS, it is taken for a CANopen node."""
 
-    streams: Mapping[str, CanStream]
+    streams: Annotated[Mapping[str, CanStream], Field(max_length=STREAMS_MOST)]
     registers: Mapping[str, CanRegister] = {}
+    busy_codes: Annotated[
+        tuple[int, ...], Field(description="SDO abort codes by which a read is refused for now, and may be repeated")
+    ] = (0x08000022,)
+    """By default "because of the present device state"; a write refused by it may as well be locked."""
 
     @property
     def canopen(self) -> bool:
@@ -149,3 +159,6 @@ class CanBus(Strict):
 
     def __str__(self) -> str:
         return f"node {self.node_id} on {self.interface} {self.channel}"
+
+    def claim(self) -> Claim:
+        return claim_on_can(self.interface, self.channel, self.node_id, self.options)

@@ -124,10 +124,11 @@ class ModbusDecoder:
             )
         )
         kept = records[placed.new]
-        values = {
-            name: self._value(kept, channel).astype(np.float64) * channel.scale + channel.offset
-            for name, channel in stream.channels.items()
-        }
+        with np.errstate(over="ignore", invalid="ignore"):  # a scale may be any
+            values = {
+                name: self._value(kept, channel).astype(np.float64) * channel.scale + channel.offset
+                for name, channel in stream.channels.items()
+            }
         return SampleBlock(
             placed.time_ns,
             placed.counter,

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from triaxcal_drivers.claim import Claim, canonical_port
 from triaxcal_drivers.modbus.protocol import (
     MAX_READ_WORDS,
     MAX_WRITE_WORDS,
@@ -14,7 +15,7 @@ from triaxcal_drivers.modbus.protocol import (
     SerialLine,
     TcpAddress,
 )
-from triaxcal_drivers.profile import AXES, Profile, Register, Strict
+from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
 from triaxcal_drivers.registers import SIZES
 
 READING_CHANNELS = tuple("u" + axis for axis in AXES)
@@ -71,7 +72,10 @@ class _Stream(Strict):
     table: Table = "input"
     address: Address
     poll_period_s: Annotated[float, Field(ge=0, le=60)]
-    channels: Annotated[dict[str, Channel], Field(description="ux, uy and uz; any further ones by their names")]
+    channels: Annotated[
+        dict[str, Channel],
+        Field(max_length=CHANNELS_MOST, description="ux, uy and uz; any further ones by their names"),
+    ]
     counter: Counter | None = None
     time_stamp: TimeStamp | None = None
 
@@ -167,12 +171,16 @@ class ModbusRegister(Register):
 class ModbusProfile(Profile):
     """A Modbus device. Orders: "big" is most significant first, of words in a value, of bytes in a word."""
 
-    streams: dict[str, Stream]
+    streams: Annotated[dict[str, Stream], Field(max_length=STREAMS_MOST)]
     registers: dict[str, ModbusRegister] = Field(default_factory=dict)
     word_order: Order = "big"
     byte_order: Order = "big"
     max_read_words: Annotated[int, Field(ge=1, le=MAX_READ_WORDS)] = MAX_READ_WORDS
     max_write_words: Annotated[int, Field(ge=1, le=MAX_WRITE_WORDS)] = MAX_WRITE_WORDS
+    busy_codes: Annotated[
+        tuple[int, ...],
+        Field(description="exception codes by which a request is refused for now, and may be repeated"),
+    ] = (5, 6)
     single_write: Annotated[bool, Field(description="write registers of one word with function 6, not 16")] = False
 
     @model_validator(mode="after")
@@ -218,3 +226,10 @@ class ModbusBus(Strict):
         if self.serial_port is not None:
             return SerialLine(self.serial_port, self.baudrate, self.parity, self.stopbits)
         return TcpAddress(self.host or "", self.port)
+
+    def claim(self) -> Claim:
+        """A serial line is one process's; a gateway's units may be different processes'."""
+        if self.serial_port is not None:
+            port = canonical_port(self.serial_port)
+            return Claim(f"Modbus unit {self.unit_id} on {port}", serial_port=port)
+        return Claim(f"Modbus unit {self.unit_id}, TCP port {self.port}", host=self.host)

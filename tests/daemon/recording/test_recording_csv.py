@@ -174,3 +174,21 @@ def test_the_measured_recordings_are_read() -> None:
         found = read_csv(path)
         assert len(found.time_ns) + found.duplicates == lines - 1
         assert (np.diff(found.time_ns) > 0).all()
+
+
+def test_a_table_of_two_hundred_constant_columns_is_no_gzip_bomb(tmp_path: Path) -> None:
+    path = tmp_path / "wide.csv.gz"
+    names, rest = "".join(f",c{i}" for i in range(200)), ",0.000" * 200
+    rng = np.random.default_rng(1)
+    rows = "".join(
+        f"{i / 100},{x:.6f},{y:.6f},{z:.6f}{rest}\n" for i, (x, y, z) in enumerate(rng.normal(size=(5000, 3)))
+    )
+    path.write_bytes(gzip.compress(f"t_s,ux,uy,uz{names}\n{rows}".encode()))
+    assert len(read_csv(path).time_ns) == 5000
+
+
+def test_a_gzip_file_that_unpacks_to_a_thousand_times_its_size_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.csv.gz"
+    path.write_bytes(gzip.compress(b"t_s,ux,uy,uz\n" + b"0,1,2,3\n" * 2**20))
+    with pytest.raises(InputError, match="unpacks to more than 200 times its size"):
+        read_csv(path)

@@ -1,0 +1,155 @@
+"""The messages of a DBC file: the only place that reads one.
+
+Of a DBC it takes what a stream can need: messages, their signals, and which of these are floats. Comments, value
+tables and whatever else somebody put there are passed over unread, so that a vehicle's DBC takes a fraction of a second
+and a hostile one no longer.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import NoReturn
+
+from triaxcal_drivers.can.layout import Message, Signal
+from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.nearest import clipped
+
+ENTRIES_MOST = 100_000  # messages and signals; a vehicle has tens of thousands
+TOKENS_MOST = 1_000_000  # statements and quoted texts; a vehicle's value tables have some hundred thousand
+
+_TOKEN = re.compile(
+    rb'"(?:[^"\\]++|\\"?+)*+"?|^[ \t]*(?P<kind>BO_|SG_|SIG_VALTYPE_)[ \t]+(?P<rest>[^"\r\n]{0,1000})'
+    rb"|^(?P<word>[A-Za-z]\w*)",
+    re.MULTILINE,
+)
+_KEYWORDS = frozenset(
+    b"BA_ BA_DEF_ BA_DEF_DEF_ BA_DEF_DEF_REL_ BA_DEF_REL_ BA_DEF_SGTYPE_ BA_REL_ BA_SGTYPE_ BO_ BO_TX_BU_ BS_ BU_"
+    b" BU_BO_REL_ BU_EV_REL_ BU_SG_REL_ CAT_ CAT_DEF_ CM_ ENVVAR_DATA_ EV_ EV_DATA_ FILTER NS_ NS_DESC_ SG_ SG_MUL_VAL_"
+    b" SGTYPE_ SGTYPE_VAL_ SIG_GROUP_ SIG_TYPE_REF_ SIG_VALTYPE_ SIGTYPE_VALTYPE_ VAL_ VAL_TABLE_ VERSION".split()
+)
+_NUMBER = rb"([-+]?(?:\d{1,400}(?:\.\d{0,400})?|\.\d{1,400})(?:[eE][-+]?\d{1,3})?)"
+_MESSAGE = re.compile(rb"(\d{1,10})\s+(\w+)\s*:\s*(\d{1,10})\s")
+_SIGNAL = re.compile(
+    rb"(\w+)\s*(?:\s(M|m\d{1,10}M?)\s*)?:\s*(\d{1,10})\s*\|\s*(\d{1,10})\s*@\s*([01])\s*([-+])"
+    rb"\s*\(\s*" + _NUMBER + rb"\s*,\s*" + _NUMBER + rb"\s*\)"
+)
+_VALUE_TYPE = re.compile(rb"(\d{1,10})\s+(\w+)\s*:?\s*([0-3])\b")
+_LONG_NAME = re.compile(
+    rb'^[ \t]*BA_\s+"System(?:Signal|Message)LongSymbol"\s+(?:BO_|SG_)\s+(\d{1,10})(?:\s+(\w+))?\s*"(\w+)"',
+    re.MULTILINE,
+)
+_EXTENDED = 1 << 31
+_NO_MESSAGE = 0xC0000000  # what Vector's tools keep signals under that belong to no message
+
+
+@dataclass
+class _Described:
+    """A message as the file has it."""
+
+    number: int
+    name: str
+    length: int
+    signals: dict[str, Signal] = field(default_factory=dict)
+
+
+def dbc_messages(data: bytes, *, base_node_id: int | None, where: str) -> list[Message]:
+    """Every message of a DBC file; multiplexed signals, which only some frames hold, are left out.
+
+    Raises ProfileError.
+    """
+    found = _File(data, where).messages()
+    if not found:
+        raise ProfileError(f"{where}: not a DBC file: there is no message in it (BO_)")
+    long = {(int(m[1]), m[2]): m[3].decode() for m in _LONG_NAME.finditer(data)}
+    messages = []
+    for m in found:
+        signals = {}
+        for signal in m.signals.values():
+            name = long.get((m.number, signal.name.encode()), signal.name)
+            signals[name] = replace(signal, name=name) if name != signal.name else signal
+            _check(signal, m, where)
+        extended = bool(m.number & _EXTENDED)
+        identifier = m.number & ~_EXTENDED
+        if identifier > (0x1FFFFFFF if extended else 0x7FF):
+            raise ProfileError(f"{where}: message '{clipped(m.name)}' has the identifier {m.number}, which CAN has not")
+        name = long.get((m.number, None), m.name)
+        messages.append(Message(name, identifier - (base_node_id or 0), signals, extended, base_node_id is not None))
+    return messages
+
+
+class _File:
+    """One reading of one file."""
+
+    def __init__(self, data: bytes, where: str) -> None:
+        self._data, self._where = data, where
+
+    def messages(self) -> list[_Described]:
+        messages: list[_Described] = []
+        floats: set[tuple[int, str]] = set()
+        entries = 0
+        for kind, rest, at in self._statements():
+            entries += kind != b"SIG_VALTYPE_"
+            if entries > ENTRIES_MOST:
+                self._fail(at, f"more than {ENTRIES_MOST} messages and signals")
+            if kind == b"BO_":
+                messages.append(self._message(rest, at))
+            elif kind == b"SIG_VALTYPE_":
+                floats |= self._float(rest, at)
+            elif not messages:
+                self._fail(at, "a signal (SG_) of no message")
+            else:
+                messages[-1].signals |= self._signal(rest, at)
+        for m in messages:
+            for name, signal in m.signals.items():
+                if (m.number, name) in floats:
+                    m.signals[name] = replace(signal, is_float=True)
+        return [m for m in messages if m.number != _NO_MESSAGE]
+
+    def _statements(self) -> Iterator[tuple[bytes, bytes, int]]:
+        for count, token in enumerate(_TOKEN.finditer(self._data)):
+            if count >= TOKENS_MOST:
+                self._fail(token.start(), f"more than {TOKENS_MOST} statements and texts")
+            if token["word"] and token["word"] not in _KEYWORDS:
+                self._fail(token.start(), "expected a keyword of DBC (VERSION, BO_, CM_ …)")
+            if token["kind"]:
+                yield token["kind"], token["rest"], token.start("kind")
+
+    def _message(self, rest: bytes, at: int) -> _Described:
+        m = _MESSAGE.match(rest + b" ")
+        if m is None:
+            self._fail(at, "expected BO_ identifier name: bytes sender")
+        return _Described(int(m[1]), m[2].decode(), int(m[3]))
+
+    def _signal(self, rest: bytes, at: int) -> dict[str, Signal]:
+        m = _SIGNAL.match(rest)
+        if m is None:
+            self._fail(at, "expected SG_ name : start|length@order sign (scale,offset) […")
+        name, multiplexed = m[1].decode(), (m[2] or b"").startswith(b"m")
+        scale, offset = float(m[7]), float(m[8])
+        if not (math.isfinite(scale) and math.isfinite(offset)):
+            self._fail(at, f"signal '{clipped(name)}': expected a finite scale and offset")
+        signal = Signal(name, int(m[3]), int(m[4]), m[5] == b"0", m[6] == b"-", False, scale, offset)
+        return {} if multiplexed else {name: signal}
+
+    def _float(self, rest: bytes, at: int) -> set[tuple[int, str]]:
+        m = _VALUE_TYPE.match(rest)
+        if m is None:
+            self._fail(at, "expected SIG_VALTYPE_ identifier name : type;")
+        return {(int(m[1]), m[2].decode())} if m[3] in b"12" else set()
+
+    def _fail(self, at: int, what: str) -> NoReturn:
+        line = self._data.count(b"\n", 0, at) + 1
+        raise ProfileError(f"{self._where}: not a DBC file: line {line}: {what}")
+
+
+def _check(signal: Signal, message: _Described, where: str) -> None:
+    if signal.is_float and signal.length not in (16, 32, 64):
+        raise ProfileError(f"{where}: signal '{clipped(signal.name)}' is a float of {signal.length} bits")
+    if not 1 <= signal.length <= 64 or signal.size > message.length:
+        raise ProfileError(
+            f"{where}: signal '{clipped(signal.name)}' does not fit the {message.length} bytes of message"
+            f" '{clipped(message.name)}'"
+        )

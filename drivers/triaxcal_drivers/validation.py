@@ -1,0 +1,99 @@
+"""Data as a model: the first fault of a profile, station or device file as one line, with the line it is in."""
+
+from __future__ import annotations
+
+import json
+import re
+import types
+import typing
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.nearest import clipped, nearest
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str) -> M:
+    """``data`` as ``model``; the first fault as a ProfileError of one line."""
+    try:
+        # As JSON, because strict mode takes a TOML array for a tuple only there.
+        return model.model_validate_json(json.dumps(data, default=str))
+    except ValidationError as e:
+        errors = e.errors()
+        first = next((x for x in errors if x["type"] == "extra_forbidden"), errors[0])
+        path = [str(p) for p in first["loc"] if not _is_tag(p, data, first["loc"])]
+        line = _line_of(text, path)
+        message = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "extra_forbidden":
+            message = f"unknown key{nearest(path[-1], _keys_at(model, first['loc'][:-1]))}"
+        elif first["type"] == "missing":
+            message = "missing"
+        else:
+            given = first.get("input")
+            if isinstance(given, (str, int, float, bool)):
+                message += f", not {clipped(repr(given))}"
+        at = f", line {line}" if line else ""
+        field = f"{'.'.join(map(clipped, path))}: " if path else ""
+        raise ProfileError(f"{where}{at}: {field}{message[0].lower()}{message[1:]}") from e
+
+
+def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:
+    """Whether a part of pydantic's location is the name of a union member rather than a key of the data."""
+    at = data
+    for p in loc:
+        inside = (isinstance(at, Mapping) and p in at) or (
+            isinstance(at, (list, tuple)) and isinstance(p, int) and p < len(at)
+        )
+        if p is part and not inside:
+            return p is not loc[-1]
+        if inside:
+            at = at[p]
+    return False
+
+
+def _keys_at(annotation: Any, loc: tuple[int | str, ...]) -> set[str]:
+    """The keys that ``annotation`` allows at ``loc``, all union members together."""
+    if typing.get_origin(annotation) is Annotated:
+        return _keys_at(typing.get_args(annotation)[0], loc)
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return set().union(*(_keys_at(a, loc) for a in typing.get_args(annotation)))
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        fields = {f.alias or n: f.annotation for n, f in annotation.model_fields.items()}
+        if not loc:
+            return set(fields)
+        if loc[0] in fields:
+            return _keys_at(fields[str(loc[0])], loc[1:])
+        return _keys_at(annotation, loc[1:])  # a union member's tag
+    arguments = typing.get_args(annotation)
+    if arguments and loc:
+        return _keys_at(arguments[-1] if arguments[-1] is not Ellipsis else arguments[0], loc[1:])
+    return set()
+
+
+def _line_of(text: bytes, path: list[str]) -> int | None:
+    """The line of the last key of ``path`` that the text shows, found by table headers and keys."""
+    table: list[str] = []
+    best: tuple[int, int] | None = None
+    counts: dict[str, int] = {}
+    for number, line in enumerate(text.decode("utf-8", "replace").splitlines(), 1):
+        bare = line.strip()
+        if header := re.match(r"\[(\[?)([^\]]+)\]", bare):
+            table = [p.strip().strip("\"'") for p in header[2].split(".")]
+            if header[1]:
+                counts[header[2]] = counts.get(header[2], -1) + 1
+                table.append(str(counts[header[2]]))
+            keys = table
+        elif assigned := re.match(r"([A-Za-z0-9_.\"'-]+)\s*=", bare):
+            keys = table + [p.strip("\"'") for p in assigned[1].split(".")]
+        else:
+            continue
+        depth = len(keys)
+        if keys == path[:depth]:
+            inline = sum(1 for p in path[depth:] if re.search(rf"\b{re.escape(p)}\b", bare))
+            if best is None or depth + inline > best[0]:
+                best = (depth + inline, number)
+    return best[1] if best else None

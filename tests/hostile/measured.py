@@ -1,0 +1,62 @@
+"""Runs commands one after the other, each in a process of its own, and says what each took: the program is imported
+once and each command is a fork of it, so that a row of the table takes what its command takes and no more.
+
+Reads a JSON list of [folder, words] on standard input; writes a JSON list of what came of each.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+from typing import Any
+
+DEADLINE_S = 60  # of processor time; a command that takes so long is ended by the system
+
+
+def main() -> None:
+    from triaxcald.cli import commands
+
+    commands.parser()
+    before = resource.getrusage(resource.RUSAGE_SELF)
+    import_s = before.ru_utime + before.ru_stime
+    sys.stdout.write(json.dumps([{**_run(*row), "import_s": import_s} for row in json.load(sys.stdin)]))
+
+
+def _run(folder: str, words: list[str]) -> dict[str, Any]:
+    child = os.fork()
+    if child == 0:
+        _be(folder, words)
+    _, status, used = os.wait4(child, 0)
+    with open(os.path.join(folder, ".err"), encoding="utf-8", errors="replace") as err:
+        told = err.read()
+    return {
+        "code": os.waitstatus_to_exitcode(status),
+        "told": told,
+        "seconds": used.ru_utime + used.ru_stime,
+        "bytes": used.ru_maxrss * 1024,
+    }
+
+
+def _be(folder: str, words: list[str]) -> None:
+    from triaxcald.cli.commands import main as command
+
+    code = 99
+    try:
+        os.chdir(folder)
+        for name, descriptor in ((".out", 1), (".err", 2)):
+            os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT), descriptor)
+        resource.setrlimit(resource.RLIMIT_CPU, (DEADLINE_S, DEADLINE_S + 1))
+        signal.alarm(5 * DEADLINE_S)
+        code = command(words)
+    except BaseException:  # noqa: BLE001 - what the interpreter would do, and no further
+        sys.excepthook(*sys.exc_info())
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    main()
