@@ -25,6 +25,7 @@ from mcap.writer import Writer
 from triaxcald.cli.commands import main
 from triaxcald.simulation.bench import load_device, physics_of, simulate
 from triaxcald.simulation.unit import Faults, ReferenceUnit
+from triaxcald.station.lock import FOLDER_VARIABLE
 
 FIXTURE = {"poses": 14, "hold_s": 2.0, "move_s": 0.8}
 PLAN = {"poses": 14, "hold_s": 1.0, "check_poses": 3}
@@ -167,6 +168,14 @@ class Workshop:
                 with contextlib.suppress(RuntimeError):  # it has come to its end by itself
                     box["loop"].call_soon_threadsafe(box["stop"].set)
             thread.join()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _locks_of_this_test_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Apart from those of other test runs on this machine, whose stations have the same places."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(FOLDER_VARIABLE, str(tmp_path_factory.mktemp("locks")))
+        yield
 
 
 @pytest.fixture

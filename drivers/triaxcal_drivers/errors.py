@@ -40,5 +40,9 @@ class RegisterRefused(DriverError):
         self.code = code
 
 
+class DeviceBusy(RegisterRefused):
+    """The device refuses for now: it is at work, and the same request may be taken later."""
+
+
 class RegisterValueError(DriverError):
     """A value does not fit the register's type or limits; nothing was sent."""

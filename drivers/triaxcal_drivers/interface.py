@@ -112,18 +112,25 @@ class Device(Protocol):
     def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
         """Raw records of the named streams until the iterator is closed.
 
+        Nothing is among them that was sampled before the call, in a device's FIFO or a receive buffer: an operator
+        starts a recording, and what the unit did before is no pose.
+
         Raises DeviceSilent when nothing has come for the profile's ``silence_timeout_s``.
         """
 
     async def read(self, register: str) -> bytes:
-        """Raises RegisterRefused, DeviceSilent."""
+        """One request. Raises RegisterRefused (DeviceBusy among them), DeviceSilent, BusError."""
 
-    async def write(self, register: str, raw: bytes) -> None:
-        """Raises RegisterRefused, DeviceSilent."""
+    async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
+        """One request; ``timeout_s`` takes the place of the profile's ``reply_timeout_s``. Raises as `read` does."""
 
 
 class Driver(Protocol):
-    """What an entry point of group ``triaxcal.drivers`` names: a class with these."""
+    """What an entry point of group ``triaxcal.drivers`` names: a class with these.
+
+    A ``bus_model`` says by a method ``claim`` what one process has for itself while it works with a unit (see
+    `triaxcal_drivers.claim`); without it all settings together name the device.
+    """
 
     profile_model: type[Profile]
     bus_model: type[BaseModel]

@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import AsyncIterator
+import os
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, FailFast, Field, model_validator
 
 from triaxcal.effects import CATALOGUE
 from triaxcal.gravity import local_gravity_g
 from triaxcal.uncertainty import Stated
 from triaxcal_drivers.catalogue import driver_named
+from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, Bundle, Strict, load_bundle, parse_toml, validate
+from triaxcal_drivers.toml_text import SIZE_MOST
 from triaxcald.errors import InputError
+from triaxcald.provision.identity import same_serial
+from triaxcald.station.lock import locked
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
+UNITS_MOST = 128  # as many nodes as a CAN bus has
 
 
 class Plan(Strict):
@@ -47,6 +55,10 @@ class Limits(Strict):
 
 class Provisioning(Strict):
     write: Annotated[bool, Field(description="write the result to the device")] = True
+    power_cycle: Annotated[
+        bool,
+        Field(description="have the operator switch the supply off and on where nothing else shows what is stored"),
+    ] = False
 
 
 class Unit(Strict):
@@ -91,7 +103,7 @@ class StationFile(Strict):
     plan: Plan = Plan()
     limits: Limits = Limits()
     provisioning: Provisioning = Provisioning()
-    units: Annotated[tuple[Unit, ...], Field(min_length=1)]
+    units: Annotated[tuple[Unit, ...], Field(min_length=1, max_length=UNITS_MOST), FailFast()]
 
     @property
     def reference(self) -> float:
@@ -157,14 +169,18 @@ class Place:
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Device]:
-        """The device, open until the context ends. Raises BusError, DeviceAbsent."""
+        """The device, open and nobody else's until the context ends. Raises DeviceInUse, BusError, DeviceAbsent.
+
+        Whoever closes it and opens it again in between, as a reset does, keeps it.
+        """
         device = self.device()
-        try:
-            await device.open()
-            yield device
-        finally:
-            with suppress(DriverError):
-                await device.close()
+        async with locked(claim_of(self.bus)):
+            try:
+                await device.open()
+                yield device
+            finally:
+                with suppress(DriverError):
+                    await device.close()
 
     @property
     def signs(self) -> tuple[int, int, int]:
@@ -202,14 +218,17 @@ def parse_station(text: bytes, *, where: str) -> StationFile:
 def load_station(path: Path) -> Station:
     """Opens no bus. Raises InputError, ProfileError, DriverMissing: one line with file, line and field."""
     try:
-        text = path.read_bytes()
+        text = read_whole(path, SIZE_MOST, pipe=True)
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
     file = parse_station(text, where=str(path))
+    bundles: dict[str, Bundle] = {}
     places = []
     for i, unit in enumerate(file.units):
-        beside = path.parent / unit.profile
-        bundle = load_bundle(beside if beside.exists() else Path(unit.profile))
+        if unit.profile not in bundles:
+            beside = path.parent / unit.profile
+            bundles[unit.profile] = load_bundle(beside if os.path.exists(beside) else Path(unit.profile))
+        bundle = bundles[unit.profile]
         driver = driver_named(bundle.profile.driver, where=str(path))
         bus = validate(driver.bus_model, unit.bus, text, where=f"{path}: units.{i}.bus")
         if file.limits.verification_rms_g is not None and CORRECTED not in bundle.profile.streams:
@@ -219,7 +238,26 @@ def load_station(path: Path) -> Station:
         _check_roles(bundle, where=f"{path}: units.{i}.profile")
         places.append(Place(unit, bundle, bus))
         places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
+    _check_distinct(places, where=str(path))
     return Station(path, text, file, tuple(places))
+
+
+def _check_distinct(places: Sequence[Place], *, where: str) -> None:
+    """No two units are one device. Raises InputError with the field of the later one."""
+    for (_, a), (i, b) in combinations(enumerate(places), 2):
+        if claim_of(a.bus) == claim_of(b.bus):
+            raise InputError(
+                f"{where}: units.{i}.bus: unit {b.unit.name} is in the place of unit {a.unit.name} ({a.address})"
+            )
+        if (
+            a.unit.serial is not None
+            and b.unit.serial is not None
+            and same_serial(a.unit.serial.strip(), b.unit.serial)
+        ):
+            raise InputError(
+                f"{where}: units.{i}.serial: unit {b.unit.name} has the serial number of unit {a.unit.name}, "
+                f"{a.unit.serial}"
+            )
 
 
 _OTHER_ROLES = ("reference_temperature", "calibration_date", "calibration_crc", "serial_number", "write_counter")

@@ -14,12 +14,13 @@ import canopen
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from triaxcal_drivers.can.bus import open_bus
-from triaxcal_drivers.can.layout import Layout, nearest
+from triaxcal_drivers.can.bus import close_bus, opened_bus
+from triaxcal_drivers.can.layout import Layout
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
 from triaxcal_drivers.can.receive import FrameQueue, Identifier
-from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, ProfileError, RegisterRefused
+from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, ProfileError, RegisterRefused
 from triaxcal_drivers.interface import RawBatch, RawFlag
+from triaxcal_drivers.nearest import nearest
 
 T = TypeVar("T")
 
@@ -58,7 +59,7 @@ class CanDevice:
     async def open(self) -> None:
         """Raises BusError, DeviceAbsent."""
         await self.close()
-        bus = await asyncio.to_thread(open_bus, self._settings)
+        bus = await opened_bus(self._settings)
         network = canopen.Network(bus)
         frames = FrameQueue(asyncio.get_running_loop())
         notifier = can.Notifier(bus, [frames, *network.listeners], _POLL_S)
@@ -75,9 +76,8 @@ class CanDevice:
     async def close(self) -> None:
         connection, self._connection = self._connection, None
         if connection is not None:
-            await asyncio.to_thread(connection.notifier.stop)
-            await asyncio.to_thread(connection.bus.shutdown)
             self._dropped += connection.frames.dropped
+            await close_bus(connection.bus, connection.notifier)
 
     def _connected(self) -> _Connection:
         if self._connection is None:
@@ -88,7 +88,6 @@ class CanDevice:
         node = self._settings.node_id
         nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
         client = SdoClient(0x600 + node, 0x580 + node, nothing_known)  # type: ignore[no-untyped-call]
-        client.RESPONSE_TIMEOUT = self._profile.sampling.reply_timeout_s
         client.network = network
         network.subscribe(client.tx_cobid, client.on_response)
         return client
@@ -151,19 +150,26 @@ class CanDevice:
     async def read(self, register: str) -> bytes:
         """Least significant byte first. Raises RegisterRefused, DeviceSilent, BusError."""
         address = object_address(self._profile.registers[register].object)
-        return await self._transfer(register, lambda sdo: bytes(sdo.upload(*address)))
+        try:
+            return await self._transfer(register, lambda sdo: bytes(sdo.upload(*address)))
+        except RegisterRefused as e:
+            if e.code not in self._profile.busy_codes:
+                raise
+            raise DeviceBusy(str(e), register=register, code=e.code) from e
 
-    async def write(self, register: str, raw: bytes) -> None:
+    async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
         """``raw`` least significant byte first. Raises RegisterRefused, DeviceSilent, BusError."""
         address = object_address(self._profile.registers[register].object)
-        await self._transfer(register, lambda sdo: sdo.download(*address, raw))
+        await self._transfer(register, lambda sdo: sdo.download(*address, raw), timeout_s)
 
-    async def _transfer(self, register: str, transfer: Callable[[SdoClient], T]) -> T:
+    async def _transfer(self, register: str, transfer: Callable[[SdoClient], T], timeout_s: float | None = None) -> T:
         connection = self._connected()
         place = f"register {register} ({self._profile.registers[register].object}) of {self._settings}"
+        patience_s = self._profile.sampling.reply_timeout_s if timeout_s is None else timeout_s
 
         def locked() -> T:
             with self._sdo_lock:
+                connection.sdo.RESPONSE_TIMEOUT = patience_s
                 return transfer(connection.sdo)
 
         try:
@@ -173,7 +179,7 @@ class CanDevice:
             raise RegisterRefused(f"{place}: refused, 0x{e.code:08X} {reason}", register=register, code=e.code) from e
         except (SdoCommunicationError, struct.error) as e:  # the latter: an answer cut short
             connection.frames.check()
-            raise DeviceSilent(f"{place}: no valid answer within {self._profile.sampling.reply_timeout_s:g} s") from e
+            raise DeviceSilent(f"{place}: no valid answer within {patience_s:g} s") from e
         except (can.CanError, OSError) as e:
             raise BusError(f"{place}: {e}") from e
 

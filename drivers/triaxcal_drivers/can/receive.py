@@ -107,13 +107,17 @@ class FrameQueue(can.Listener):
             self._frames.append((time_ns, msg.arbitration_id, flags, data))
             waiting = len(self._frames)
         if waiting in (1, BATCH_FRAMES):
-            self._loop.call_soon_threadsafe((self._some if waiting == 1 else self._enough).set)
+            self._tell(self._some if waiting == 1 else self._enough)
 
     def on_error(self, exc: Exception) -> None:
         """Called in python-can's thread when receiving fails, which ends the thread: it would try for ever."""
         self._failure = exc
-        self._loop.call_soon_threadsafe(self._some.set)
+        self._tell(self._some)
         raise SystemExit  # which a thread ends by without a trace back
+
+    def _tell(self, event: asyncio.Event) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended, and nobody is left to be told
+            self._loop.call_soon_threadsafe(event.set)
 
     def check(self) -> None:
         """Raises BusError when receiving has failed."""
@@ -125,15 +129,16 @@ class FrameQueue(can.Listener):
 
         Raises BusError when receiving has failed.
         """
-        if not self._some.is_set():
-            try:
-                await asyncio.wait_for(self._some.wait(), timeout_s)
-            except TimeoutError:
-                return None
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._some.wait()
+        except TimeoutError:
+            return None
         if not self._frames:
             self.check()
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._enough.wait(), BATCH_S)
+            async with asyncio.timeout(BATCH_S):
+                await self._enough.wait()
         with self._lock:
             taken = [self._frames.popleft() for _ in range(min(BATCH_FRAMES, len(self._frames)))]
             left = len(self._frames)

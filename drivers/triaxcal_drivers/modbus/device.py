@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from triaxcal_drivers.errors import (
     BusError,
     DeviceAbsent,
+    DeviceBusy,
     DeviceSilent,
     ProfileError,
     RegisterRefused,
@@ -29,6 +31,11 @@ from triaxcal_drivers.registers import SIZES
 
 _BATCH_REPLIES = 32
 """A stream hands out what it has after so many replies, though more may be waiting in the device."""
+_DISCARD_S = 60.0
+"""A FIFO that does not say how much is in it is read for so long until it is empty: it may fill as fast as it is read.
+4096 records of 20 bytes take 48 s at 19200 baud."""
+
+_EMPTY = "it answers, but its FIFO stays empty"
 
 Record = tuple[int, int, int, bytes]
 
@@ -52,7 +59,7 @@ class ModbusDevice:
     """One unit on one connection. Register access and polling share it, one request at a time.
 
     Registers go most significant byte first, whatever the word order of the profile. ``now_ns`` is the host's
-    clock, for the receive times.
+    clock, for the receive times. ``discarded`` counts the records that were in FIFOs before streams were opened.
     """
 
     def __init__(self, profile: ModbusProfile, bus: ModbusBus, *, now_ns: Callable[[], int] = time.time_ns) -> None:
@@ -60,6 +67,7 @@ class ModbusDevice:
         self._bus = bus
         self._now_ns = now_ns
         self._client: ModbusClient | None = None
+        self.discarded = 0
 
     async def open(self) -> None:
         await self.close()
@@ -106,7 +114,7 @@ class ModbusDevice:
 
     async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
         """Replies of the named streams, polled in turn. A failed request is a record too: an exception's code,
-        a malformed reply as it came, nothing for a missing reply.
+        a malformed reply as it came, nothing for a missing reply. What FIFOs hold by now is discarded first.
 
         Raises DeviceSilent, BusError; ProfileError where the profile has no such stream.
         """
@@ -114,19 +122,50 @@ class ModbusDevice:
         for name in names:
             if name not in self._profile.streams:
                 raise ProfileError(f"profile {self._profile.name}: no stream named '{name}'")
-        now_s = loop.time()
-        polled = [_Polled(name, self._profile.streams[name], now_s, now_s) for name in names]
+        for name in names:
+            await self._discard(self._polled(name))
+        polled = [self._polled(name) for name in names]
         while polled:
             await asyncio.sleep(min(p.due_s for p in polled) - loop.time())
             for p in [p for p in polled if p.due_s <= loop.time()]:
                 p.due_s = max(p.due_s + p.stream.poll_period_s, loop.time())
                 records = await self._drain(p)
                 yield RawBatch.of(records)
-                silent_s = loop.time() - p.heard_s
-                if silent_s >= self._profile.sampling.silence_timeout_s:
-                    raise DeviceSilent(
-                        f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
-                    )
+                self._check_heard(p)
+
+    def _check_heard(self, p: _Polled) -> None:
+        """Raises DeviceSilent."""
+        silent_s = asyncio.get_running_loop().time() - p.heard_s
+        if silent_s >= self._profile.sampling.silence_timeout_s:
+            raise DeviceSilent(
+                f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
+            )
+
+    def _polled(self, name: str) -> _Polled:
+        now_s = asyncio.get_running_loop().time()
+        return _Polled(name, self._profile.streams[name], now_s, now_s)
+
+    async def _discard(self, p: _Polled) -> None:
+        """Takes out of a stream's FIFO what it held at the first reply; whole windows. Raises DeviceSilent."""
+        if not isinstance(p.stream, FifoStream):
+            return
+        loop = asyncio.get_running_loop()
+        counted = p.stream.header.remaining is not None
+        deadline_s = math.inf if counted else loop.time() + _DISCARD_S
+        left: float = math.inf
+        while left > 0 and loop.time() < deadline_s:
+            flags, data = await self._request(p)
+            taken, remaining = self._held(p.stream, data) if not flags else (0, math.inf)
+            if taken > p.stream.record_capacity:  # no count of this device's
+                taken, remaining = 0, math.inf
+            left = min(left - taken, remaining) if counted else remaining
+            self.discarded += taken
+            if taken:
+                p.heard_s = loop.time()
+            elif left > 0:
+                p.trouble = p.trouble if flags else _EMPTY
+                self._check_heard(p)
+                await asyncio.sleep(p.stream.poll_period_s)
 
     async def _drain(self, p: _Polled) -> list[Record]:
         """One read of a stream, or reads until its FIFO is empty, but not for ever."""
@@ -138,7 +177,7 @@ class ModbusDevice:
             if taken:
                 p.heard_s = asyncio.get_running_loop().time()
             elif not flags:
-                p.trouble = "it answers, but its FIFO stays empty"
+                p.trouble = _EMPTY
             if not remaining:
                 return records
         p.due_s = 0.0  # more is waiting: come back at once
@@ -181,7 +220,7 @@ class ModbusDevice:
             raise BusError(f"register {register}: {e}") from e
         return self._ordered(entry, raw)
 
-    async def write(self, register: str, raw: bytes) -> None:
+    async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
         """Raises RegisterValueError where ``raw`` is not as long as the register; nothing is sent then."""
         entry = self._register(register)
         if len(raw) != SIZES[entry.type]:
@@ -192,7 +231,7 @@ class ModbusDevice:
             raise RegisterValueError(f"register {register}: an input register cannot be written")
         single = self._profile.single_write and _words(entry) == 1
         try:
-            await self._connected().write(entry.address, self._ordered(entry, raw), single=single)
+            await self._connected().write(entry.address, self._ordered(entry, raw), single=single, timeout_s=timeout_s)
         except ModbusRefusal as e:
             raise self._refused(register, "written", e.code, str(e)) from e
         except MalformedReply as e:
@@ -200,7 +239,8 @@ class ModbusDevice:
 
     def _refused(self, register: str, done: str, code: int, reason: str) -> RegisterRefused:
         where = f"{self._connected().where}: register {register} (0x{self._register(register).address:04X})"
-        return RegisterRefused(f"{where} cannot be {done}: {reason}", register=register, code=code)
+        kind = DeviceBusy if code in self._profile.busy_codes else RegisterRefused
+        return kind(f"{where} cannot be {done}: {reason}", register=register, code=code)
 
     def _register(self, name: str) -> ModbusRegister:
         if name not in self._profile.registers:

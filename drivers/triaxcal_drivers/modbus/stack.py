@@ -160,10 +160,10 @@ class ModbusClient:
             )
         return pdu[2:]
 
-    async def write(self, address: int, data: bytes, *, single: bool = False) -> None:
+    async def write(self, address: int, data: bytes, *, single: bool = False, timeout_s: float | None = None) -> None:
         """Register bytes, most significant of each word first; ``single`` writes one word with function 6.
 
-        Raises as `read` does.
+        ``timeout_s`` takes the place of the client's time-out. Raises as `read` does.
         """
         words = list(struct.unpack(f">{len(data) // 2}H", data))
         request: ModbusPDU
@@ -173,11 +173,12 @@ class ModbusClient:
         else:
             request = WriteMultipleRegistersRequest(address=address, registers=words)
             echo = bytes([WRITE_MULTIPLE]) + struct.pack(">HH", address, len(words))
-        pdu = await self._transact(request)
+        pdu = await self._transact(request, timeout_s)
         if pdu != echo:
             raise MalformedReply(f"{self.where}: reply to a write at 0x{address:04X}: {pdu.hex(' ')}", pdu)
 
-    async def _transact(self, request: ModbusPDU) -> bytes:
+    async def _transact(self, request: ModbusPDU, timeout_s: float | None = None) -> bytes:
+        patience_s = self._reply_timeout_s if timeout_s is None else timeout_s
         async with self._lock:
             if self._link.transport is None:
                 raise BusError(f"{self.where}: the connection is closed")
@@ -189,10 +190,10 @@ class ModbusClient:
             pdu = bytes([request.function_code]) + request.encode()
             self._link.send(self._unit_id, self._transaction, pdu)
             try:
-                async with asyncio.timeout(self._reply_timeout_s):
+                async with asyncio.timeout(patience_s):
                     reply: bytes = await expected
             except TimeoutError as e:
-                raise DeviceSilent(f"{self.where}: no reply in {self._reply_timeout_s:g} s") from e
+                raise DeviceSilent(f"{self.where}: no reply in {patience_s:g} s") from e
             finally:
                 self._expected = None
                 if not expected.done() or expected.cancelled():
@@ -247,7 +248,6 @@ async def serve_tcp(handler: Handler, address: TcpAddress, *, unit_id: int) -> A
         server.close()
         for link in list(links):
             link.close()
-        await server.wait_closed()
 
 
 @asynccontextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,35 @@ def test_a_fault_is_said_with_file_line_and_field(tmp_path: Path, old: str, new:
     assert "\n" not in message
     assert "profile: give" not in message
     assert "triax-ref-cna" in message or message.startswith(str(path))
+
+
+TCP = {"host": "127.0.0.1", "port": 1502}
+RTU = {"serial_port": "/dev/ttyUSB0", "parity": "N"}
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "words"),
+    [
+        ({"bus": TCP}, {"bus": {**TCP, "host": "LOCALHOST"}},
+         "units.1.bus: unit b is in the place of unit a (host=127.0.0.1, port=1502)"),
+        ({"bus": RTU}, {"bus": {**RTU, "unit_id": 1}}, "units.1.bus: unit b is in the place of unit a (serial_port="),
+        ({"bus": TCP, "serial": "0815"}, {"bus": RTU, "serial": " 00815"},
+         "units.1.serial: unit b has the serial number of unit a, 0815"),
+    ],
+)  # fmt: skip
+def test_two_units_that_are_one_device_are_refused(
+    workshop: Any, a: dict[str, Any], b: dict[str, Any], words: str
+) -> None:
+    third = {"name": "c", "bus": {**TCP, "unit_id": 3}, "serial": "9"}
+    path = workshop.station({"name": "a", **a}, {"name": "b", **b}, third)
+    with pytest.raises(InputError, match=rf"^{path}: {re.escape(words)}"):
+        load_station(path)
+
+
+def test_units_of_one_gateway_and_of_one_line_are_different_places(workshop: Any) -> None:
+    buses = [TCP, {**TCP, "unit_id": 2}, {**TCP, "port": 1503}, RTU, {**RTU, "unit_id": 2}]
+    units = [{"name": f"u{i}", "bus": bus, "serial": str(i)} for i, bus in enumerate(buses, 1)]
+    assert len(load_station(workshop.station(*units)).places) == 5
 
 
 def test_no_unit_at_all_is_a_fault(tmp_path: Path) -> None:

@@ -93,6 +93,19 @@ async def test_an_overflow_is_counted_and_flagged_on_the_next_frame_kept() -> No
     assert second.payload == bytes.fromhex("0500 0600")
 
 
+@pytest.mark.parametrize("turns", range(8))
+async def test_a_cancellation_is_heeded_also_while_a_frame_arrives(turns: int) -> None:
+    frames = await opened()
+    waiting = asyncio.create_task(frames.batch(5.0))
+    await asyncio.sleep(0)
+    frames.on_message_received(frame())
+    for _ in range(turns):  # of the event loop, on the frame's way to whoever waits for it
+        await asyncio.sleep(0)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+
+
 async def test_frames_from_another_thread_all_arrive_in_order() -> None:
     frames = await opened(capacity=100_000)
     sender = threading.Thread(target=lambda: [frames.on_message_received(frame(n)) for n in range(20_000)], daemon=True)
@@ -147,3 +160,28 @@ def test_without_a_stamp_the_hosts_time_is_taken() -> None:
     assert clock.time_ns(0.0) == now_ns[0]
     now_ns[0] += 5_000_000
     assert clock.time_ns(0.0) == now_ns[0]
+
+
+@pytest.mark.parametrize("turns", range(6))
+async def test_no_cancellation_is_lost_that_comes_with_a_frame(turns: int) -> None:
+    """As many turns of the event loop after it, down to the very one in which the waiting ends."""
+    frames = await opened()
+    frames.on_message_received(frame())
+    await frames.batch(1.0)
+    task = asyncio.create_task(frames.batch(10.0))
+    await asyncio.sleep(0)
+    for number in range(BATCH_FRAMES):
+        frames.on_message_received(frame(number))
+    for _ in range(turns):
+        await asyncio.sleep(0)
+    if task.cancel():
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+
+async def test_a_frame_that_comes_when_the_event_loop_has_ended_is_nobodys() -> None:
+    loop = asyncio.new_event_loop()
+    frames = FrameQueue(loop)
+    frames.open(WANTED)
+    loop.close()
+    frames.on_message_received(frame())

@@ -239,20 +239,106 @@ async def test_failed_requests_are_records_with_flags(bundle, tcp_device):
     assert {int(b.source[0]) for b in batches} == {0x0003_006B}
 
 
+ASK_FIFO = "0000 0006 11 04 0020 000A"
+
+
+def window(transaction: str, count: str, remaining: str, *counters: str) -> tuple[str, str]:
+    """A read of the FIFO's window and its reply, with records 1, 2, 3 and their counter."""
+    records = "".join(f"0001 0002 0003 {c}" for c in counters) + "0000" * 4 * (2 - len(counters))
+    return f"{transaction} {ASK_FIFO}", f"{transaction} 0000 0017 11 04 14 {count} {remaining} {records}"
+
+
 async def test_a_fifo_is_read_again_at_once_while_records_remain(bundle, tcp_device):
-    ask = "0000 0006 11 04 0020 000A"
-    full = "0000 0017 11 04 14 0002 {} 0001 0002 0003 0000 0001 0002 0003 0001"
     exchanges = [
         PROBE,
-        (f"0002 {ask}", "0002" + full.format("0002")),
-        (f"0003 {ask}", "0003" + full.format("0000")),
+        window("0002", "0000", "0000"),
+        window("0003", "0002", "0002", "0000", "0001"),
+        window("0004", "0002", "0000", "0002", "0003"),
     ]
     async with tcp_device(*exchanges) as heard:
         device = await opened(bundle(("poll_period_s = 0.001", "poll_period_s = 60.0")), heard)
         (batch,) = await first_batches(device, "queue", 1)
         await device.close()
-    assert len(heard) == 3
+    assert len(heard) == 4
     np.testing.assert_array_equal(batch.length, [20, 20])
+
+
+async def test_what_the_fifo_holds_when_a_stream_is_opened_is_discarded_by_its_count(bundle, tcp_device):
+    """Five records at the first reply; new ones keep coming, so that it is never empty."""
+    exchanges = [
+        PROBE,
+        window("0002", "0002", "0003", "0001", "0002"),
+        window("0003", "0002", "0002", "0003", "0004"),
+        window("0004", "0002", "0003", "0005", "0006"),
+        window("0005", "0002", "0000", "0007", "0008"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        (batch,) = await first_batches(device, "queue", 1)
+        assert device.discarded == 6
+        await device.close()
+    assert batch.payload.hex().endswith("00010002000300070001000200030008")
+    assert len(batch) == 1
+
+
+async def test_a_fifo_that_does_not_say_what_remains_is_emptied_first(bundle, tcp_device):
+    exchanges = [
+        PROBE,
+        window("0002", "0002", "FFFF", "0001", "0002"),
+        window("0003", "0002", "FFFF", "0003", "0004"),
+        window("0004", "0001", "FFFF", "0005"),
+        window("0005", "0001", "FFFF", "0006"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle((", remaining = 1", "")), heard)
+        (batch,) = await first_batches(device, "queue", 1)
+        assert device.discarded == 5
+        await device.close()
+    assert batch.payload.hex().endswith("0001000200030006" + "0000" * 4)
+
+
+async def test_a_fifo_that_fills_as_fast_as_it_is_read_is_not_discarded_for_ever(bundle, tcp_device, monkeypatch):
+    monkeypatch.setattr("triaxcal_drivers.modbus.device._DISCARD_S", 0.05)
+    full = [window(f"{i:04X}", "0002", "FFFF", "0001", "0002") for i in range(2, 2000)]
+    async with tcp_device(PROBE, *full) as heard:
+        device = await opened(bundle((", remaining = 1", "")), heard)
+        (batch,) = await first_batches(device, "queue", 1)
+        assert device.discarded + 2 * len(batch) == 2 * (len(heard) - 1)
+        await device.close()
+
+
+async def test_a_request_that_fails_while_discarding_is_tried_again(bundle, tcp_device):
+    exchanges = [
+        PROBE,
+        (f"0002 {ASK_FIFO}", "0002 0000 0003 11 84 06"),  # an exception: busy
+        window("0003", "0009", "FFFF", "0001", "0002"),  # more than a window holds
+        window("0004", "0002", "0002", "0001", "0002"),
+        (f"0005 {ASK_FIFO}", "0005 0000 0003 11 84 06"),
+        window("0006", "0002", "0000", "0003", "0004"),
+        window("0007", "0001", "0000", "0005"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        (batch,) = await first_batches(device, "queue", 1)
+        assert device.discarded == 4
+        await device.close()
+    assert batch.payload.hex().endswith("0001000200030005" + "0000" * 4)
+
+
+@pytest.mark.parametrize(
+    ("reply", "words"),
+    [
+        ("0003 11 84 04", r"exception 0x04"),
+        ("0017 11 04 14 0000 0005" + "0000" * 8, "its FIFO stays empty"),  # though it says that records remain
+    ],
+)
+async def test_a_device_that_gives_nothing_to_discard_is_silent(bundle, tcp_device, reply, words):
+    never = [(f"{i:04X} {ASK_FIFO}", f"{i:04X} 0000 {reply}") for i in range(2, 2000)]
+    async with tcp_device(PROBE, *never) as heard:
+        device = await opened(bundle(hasty=True), heard)
+        with pytest.raises(DeviceSilent, match=rf"stream queue has been silent .*{words}"):
+            await first_batches(device, "queue", 1)
+        await device.close()
 
 
 async def test_a_stream_that_fails_for_long_is_silent_and_says_why(bundle, tcp_device):
