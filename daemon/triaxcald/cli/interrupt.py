@@ -1,52 +1,84 @@
-"""Ctrl-C, SIGTERM and SIGHUP: the first cancels the work, which then puts things in order; more change nothing."""
+"""Work in an event loop that stop signals cancel."""
 
 from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Coroutine
+import socket
+from collections.abc import Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
-from triaxcald.cli.console import say
+from triaxcald.cli.signals import StopSignals, stop_signals
 
 T = TypeVar("T")
-SIGNALS = [s for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None)) is not None]
 
 
 class Interrupted(Exception):
-    """The work was cancelled; ``notes`` are what it left to say, such as the state of a device."""
+    """The work was cancelled by a signal, ``number`` the first; ``notes`` are what it left to say, such as the state
+    of a device."""
 
-    def __init__(self, notes: tuple[str, ...]) -> None:
+    def __init__(self, number: int, notes: tuple[str, ...]) -> None:
         super().__init__("; ".join(("interrupted", *notes)))
-        self.notes = notes
+        self.number, self.notes = number, notes
 
 
 def run_interruptible(work: Coroutine[Any, Any, T]) -> T:
-    """Runs ``work`` in an event loop. Raises Interrupted where it was cancelled and did not make a result of that."""
-    return asyncio.run(_guarded(work))
+    """Runs ``work`` in an event loop. Raises Interrupted where it was cancelled and did not make a result of that.
+
+    What it still has running in threads goes on, and is not waited for.
+    """
+    with stop_signals() as signals:
+        return asyncio.run(_guarded(work, signals))
 
 
-async def _guarded(work: Coroutine[Any, Any, T]) -> T:
-    task = asyncio.ensure_future(work)
-    caught: list[int] = []
-
-    def stop(number: int) -> None:
-        if caught:
-            say("triaxcal: putting things in order, please wait")
-        else:
-            task.cancel()
-        caught.append(number)
-
+async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals) -> T:
     loop = asyncio.get_running_loop()
-    heeded = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]  # as by nohup
-    for number in heeded:
-        loop.add_signal_handler(number, stop, number)
-    try:
-        return await task
-    except asyncio.CancelledError as e:
-        if caught:
-            raise Interrupted(tuple(getattr(e, "__notes__", ()))) from None
-        raise
-    finally:
-        for number in heeded:
-            loop.remove_signal_handler(number)
+    loop.set_default_executor(_Unawaited())
+    task = asyncio.ensure_future(work)
+
+    def cancel() -> None:
+        with suppress(RuntimeError):  # the loop has ended, and the work with it
+            loop.call_soon_threadsafe(task.cancel)
+
+    with _woken(loop):
+        signals.cancel_by(cancel)
+        try:
+            return await task
+        except asyncio.CancelledError as e:
+            if signals.caught:
+                raise Interrupted(signals.caught[0], _notes(e)) from None
+            raise
+
+
+class _Unawaited(ThreadPoolExecutor):
+    """A computation or a bus driver that has been given up may take long; the loop's end does not wait for it."""
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        super().shutdown(wait=False, cancel_futures=cancel_futures)
+
+
+@contextmanager
+def _woken(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
+    """Signals wake the loop. Their handlers alone do not, where one strikes as the loop is about to fall asleep."""
+    near, far = socket.socketpair()
+    with near, far:
+        near.setblocking(False)
+        far.setblocking(False)
+        loop.add_reader(near, near.recv, 4096)
+        before = signal.set_wakeup_fd(far.fileno(), warn_on_full_buffer=False)
+        try:
+            yield
+        finally:
+            signal.set_wakeup_fd(before)
+            loop.remove_reader(near)
+
+
+def _notes(e: BaseException | None) -> tuple[str, ...]:
+    """Of the exception and of those that it took the place of: a second cancellation replaces the first."""
+    notes: dict[str, None] = {}
+    while e is not None:
+        notes |= dict.fromkeys(getattr(e, "__notes__", ()))
+        e = e.__cause__ or e.__context__
+    return tuple(notes)

@@ -5,18 +5,21 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
+from triaxcald.provision.restore import restore as put_back
+from triaxcald.provision.state import Evidence
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
-from triaxcald.station.write_back import RESTORED, UNCERTAIN
-from triaxcald.station.write_back import restore as put_back
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())
@@ -43,7 +46,12 @@ def _a_signal_that_nobody_heeds_does_not_end_the_tests() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _short_wait_for_a_dead_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcald.provision.restore.RECONNECT_S", 0.3)
+    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 0.3)
+
+
+async def _long() -> None:
+    async with asyncio.timeout(DEADLINE_S):
+        await asyncio.Event().wait()
 
 
 def _holds_old(served: Any) -> None:
@@ -55,8 +63,9 @@ def test_work_that_nobody_interrupts_gives_its_result_and_leaves_the_signals_alo
     async def work() -> int:
         return 7
 
+    before = [signal.getsignal(number) for number in (INT, TERM, HUP)]
     assert run_interruptible(work()) == 7
-    assert signal.getsignal(INT) is signal.default_int_handler
+    assert [signal.getsignal(number) for number in (INT, TERM, HUP)] == before
 
 
 @pytest.mark.parametrize("number", [INT, TERM, HUP])
@@ -64,31 +73,73 @@ def test_the_first_signal_cancels_the_work_and_what_it_left_to_say_is_passed_on(
     async def work() -> None:
         try:
             signal.raise_signal(number)
-            await asyncio.wait_for(asyncio.Event().wait(), DEADLINE_S)
+            await _long()
         except asyncio.CancelledError as e:
             e.add_note("everything is back")
             raise
 
     with pytest.raises(Interrupted) as interrupted:
         run_interruptible(work())
-    assert interrupted.value.notes == ("everything is back",)
+    assert (interrupted.value.number, interrupted.value.notes) == (number, ("everything is back",))
     assert str(interrupted.value) == "interrupted; everything is back"
 
 
-def test_further_signals_do_not_disturb_who_puts_things_in_order(capsys: pytest.CaptureFixture[str]) -> None:
-    async def work() -> str:
+def test_a_second_signal_cancels_again_and_says_that_things_are_put_in_order(capfd: pytest.CaptureFixture[str]) -> None:
+    async def work() -> None:
+        with suppress(asyncio.CancelledError):  # as where a cancellation gets lost
+            signal.raise_signal(TERM)
+            await _long()
+        signal.raise_signal(HUP)
+        await _long()
+
+    with pytest.raises(Interrupted) as interrupted:
+        run_interruptible(work())
+    assert interrupted.value.number == TERM
+    assert capfd.readouterr().err == (
+        "triaxcal: putting things in order, please wait; a third signal ends it at once\n"
+    )
+
+
+def test_what_the_work_had_to_say_is_not_lost_when_a_second_signal_strikes_later() -> None:
+    async def work() -> None:
         try:
             signal.raise_signal(INT)
-            await asyncio.wait_for(asyncio.Event().wait(), DEADLINE_S)
-        except asyncio.CancelledError:
-            for number in (INT, TERM, HUP):
-                signal.raise_signal(number)
-                for _ in range(5):
-                    await asyncio.sleep(0)
-        return "in order"
+            try:
+                await _long()
+            except asyncio.CancelledError as e:
+                e.add_note("NOT restored: it is dead")
+                raise
+        finally:
+            signal.raise_signal(INT)
+            await _long()
 
-    assert run_interruptible(work()) == "in order"
-    assert capsys.readouterr().err == 3 * "triaxcal: putting things in order, please wait\n"
+    with pytest.raises(Interrupted) as interrupted:
+        run_interruptible(work())
+    assert interrupted.value.notes == ("NOT restored: it is dead",)
+
+
+def test_work_that_was_through_when_the_signal_came_gives_its_result() -> None:
+    async def work() -> int:
+        signal.raise_signal(INT)
+        return 7
+
+    assert run_interruptible(work()) == 7
+
+
+def test_a_computation_that_nobody_waits_for_any_more_does_not_hold_up_the_end() -> None:
+    stop, ended = threading.Event(), []
+
+    def compute() -> None:
+        signal.raise_signal(INT)
+        ended.append(stop.wait(DEADLINE_S))
+
+    async def work() -> None:
+        await asyncio.to_thread(compute)
+
+    with pytest.raises(Interrupted):
+        run_interruptible(work())
+    assert ended == []
+    stop.set()
 
 
 def test_who_asked_to_be_spared_hanging_up_is_spared() -> None:
@@ -105,10 +156,8 @@ def test_who_asked_to_be_spared_hanging_up_is_spared() -> None:
     assert signal.getsignal(HUP) is signal.SIG_IGN
 
 
-def _strike_in(
-    monkeypatch: pytest.MonkeyPatch, phase: str, number: int, then: Callable[[], None] = lambda: None
-) -> None:
-    """Raises the signal with the third batch of the phase; ``then`` is done at once after it."""
+def _strike_in(monkeypatch: pytest.MonkeyPatch, phase: str, number: int) -> None:
+    """Raises the signal with the third batch of the phase."""
     raw, batches = RecordingWriter.raw, []
 
     def striking(self: RecordingWriter, of: Any, batch: Any) -> bool:
@@ -116,7 +165,6 @@ def _strike_in(
             batches.append(batch)
             if len(batches) == 3:
                 signal.raise_signal(number)
-                then()
         return raw(self, of, batch)
 
     monkeypatch.setattr(RecordingWriter, "raw", striking)
@@ -128,7 +176,7 @@ def test_a_recording_is_finished_and_the_device_left_alone(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, command: str, number: int
 ) -> None:
     _strike_in(monkeypatch, "calibration", number)
-    with workshop.serve(workshop.device(**QUICK)) as served:
+    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
         station = workshop.station({"bus": served.bus}, plan=PLAN)
         path = workshop.folder / "rec.mcap"
         output = ["--json"] if command == "run" else ["-o", path, "--seconds", "60"]
@@ -155,55 +203,75 @@ def test_two_signals_in_the_check_poses_do_not_keep_the_old_calibration_away(
 ) -> None:
     began, ended = [], []
 
-    async def striking(*arguments: Any, **options: Any) -> None:
+    async def striking(*arguments: Any, **options: Any) -> Evidence:
         began.append(served.unit.eeprom)
         signal.raise_signal(second)
-        await put_back(*arguments, **options)
+        shown = await put_back(*arguments, **options)
         ended.append(served.unit.eeprom)
+        return shown
 
-    monkeypatch.setattr("triaxcald.station.write_back.restore", striking)
+    monkeypatch.setattr("triaxcald.provision.procedure.restore", striking)
     _strike_in(monkeypatch, "verification", first)
-    with workshop.serve(workshop.device(**QUICK)) as served:
+    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
         done = triaxcal("run", workshop.station({"bus": served.bus}, plan=PLAN), "--json")
         _holds_old(served)
     assert [Stored.from_image(image).calibration == OLD.calibration for image in (*began, *ended)] == [False, True]
     assert done.code == 130
     (unit,) = done.json["units"]
-    assert (unit["exit_code"], unit["device_state"]) == (130, RESTORED)
-    assert unit["error"] == f"unit unit0: interrupted; {RESTORED}"
-    assert "triaxcal: putting things in order, please wait" in done.err.splitlines()
+    assert (unit["exit_code"], unit["outcome"]["device_state"]) == (130, "old")
+    assert unit["error"] == f"unit unit0: interrupted; {unit['device_state']}"
     assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
-    with Recording.open(unit["recording"]) as recording:
+    with Recording.open(Path(unit["recording"])) as recording:
         assert recording.finished
         assert "registers-before.json" in recording.attachments
+
+
+def test_a_signal_while_a_calibration_that_failed_its_verification_is_put_back_is_heeded_after_it(
+    workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def striking(*arguments: Any, **options: Any) -> Evidence:
+        signal.raise_signal(TERM)
+        return await put_back(*arguments, **options)
+
+    monkeypatch.setattr("triaxcald.provision.procedure.restore", striking)
+    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
+        station = workshop.station({"bus": served.bus}, plan=PLAN, limits={"verification_rms_g": 1e-9})
+        done = triaxcal("run", station, "--json")
+        _holds_old(served)
+    assert done.code == 130
+    (unit,) = done.json["units"]
+    assert (unit["outcome"]["device_state"], unit["report"]) == ("old", None)
 
 
 def test_a_device_that_could_not_be_put_back_after_an_interruption_is_4_and_said(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def dies() -> None:
+    async def dead(*arguments: Any, **options: Any) -> Evidence:
         served.unit._died_s = 0.0
+        return await put_back(*arguments, **options)
 
-    _strike_in(monkeypatch, "verification", INT, dies)
-    with workshop.serve(workshop.device(**QUICK)) as served:
+    monkeypatch.setattr("triaxcald.provision.procedure.restore", dead)
+    _strike_in(monkeypatch, "verification", INT)
+    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
         done = triaxcal("run", workshop.station(unit, plan=PLAN), "--json")
     assert done.code == 4
     (unit,) = done.json["units"]
     assert unit["exit_code"] == 4
-    assert unit["device_state"].startswith(UNCERTAIN)
-    assert unit["error"] == f"unit unit0: interrupted; {unit['device_state']}"
+    assert (unit["outcome"]["verdict"], unit["outcome"]["device_state"]) == ("aborted", "new_verified")
+    assert unit["error"].startswith(f"unit unit0: interrupted; {unit['device_state']}; to settle: ")
+    assert Path(unit["outcome"]["journal"]).exists()
     assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
 
 
-@pytest.mark.parametrize(("dead", "code", "state"), [(False, 130, RESTORED), (True, 4, UNCERTAIN)])
+@pytest.mark.parametrize(("dead", "code", "state"), [(False, 130, "old"), (True, 4, "unknown")])
 def test_provision_interrupted_says_what_the_device_holds(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, dead: bool, code: int, state: str
 ) -> None:
     write = ModbusDevice.write
 
-    async def striking(self: ModbusDevice, register: str, raw: bytes) -> None:
-        await write(self, register, raw)
+    async def striking(self: ModbusDevice, register: str, raw: bytes, **options: Any) -> None:
+        await write(self, register, raw, **options)
         if register == "bias_x" and not struck:
             struck.append(register)
             signal.raise_signal(TERM)
@@ -212,8 +280,9 @@ def test_provision_interrupted_says_what_the_device_holds(
 
     struck: list[str] = []
     monkeypatch.setattr(ModbusDevice, "write", striking)
-    with workshop.serve(workshop.device(**QUICK)) as served:
+    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
         station = workshop.station({"bus": served.bus, "profile": workshop.impatient_profile()})
         done = triaxcal("provision", workshop.write("cal.json", json.dumps(CAL)), station, "--json")
         assert Stored.from_image(served.unit.eeprom).calibration == OLD.calibration
-    done.failed(code, f"triaxcal: interrupted; {state}")
+    assert (done.code, done.json["outcome"]["device_state"]) == (code, state)
+    assert done.err.splitlines()[-1].startswith("triaxcal: interrupted; ")

@@ -1,0 +1,67 @@
+"""SIGINT, SIGTERM and SIGHUP from the first line of the program to its last.
+
+Work that runs in an event loop is cancelled by the first signal, which has it put things in order, and again by the
+second; the third ends the process at once. Before and without such work the first one does, as there is nothing to put
+in order. No signal raises an exception: at a random place that would come out as a trace back, or not at all.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from triaxcald.abort import STOP_SIGNALS, abort, tell
+
+
+class StopSignals:
+    """Counts the signals that came, and does what each asks for."""
+
+    def __init__(self) -> None:
+        self.caught: list[int] = []
+        self._cancel: Callable[[], object] | None = None
+
+    def heed(self) -> dict[int, Any]:
+        """From now on; gives the handlers that were there. SIGTERM and SIGHUP stay ignored where they are (`nohup`)."""
+        heeded = [n for n in STOP_SIGNALS if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
+        return {number: signal.signal(number, self._strike) for number in heeded}
+
+    def cancel_by(self, cancel: Callable[[], object]) -> None:
+        """From now on the first signal calls ``cancel``, and the second again; also once the work has ended."""
+        self._cancel = cancel
+
+    def _strike(self, number: int, _: object) -> None:
+        self.caught.append(number)
+        if self._cancel is None:
+            abort("interrupted")
+        if len(self.caught) > 2:
+            abort("interrupted; ended at once")
+        self._cancel()
+        if len(self.caught) == 2:
+            tell("triaxcal: putting things in order, please wait; a third signal ends it at once")
+
+
+_process: StopSignals | None = None
+
+
+def heed_stop_signals() -> None:
+    """To the end of the process."""
+    global _process
+    _process = StopSignals()
+    _process.heed()
+
+
+@contextmanager
+def stop_signals() -> Iterator[StopSignals]:
+    """The process's own; where another program runs the work, such as a test, some for as long as it takes."""
+    if _process is not None:
+        yield _process
+        return
+    signals = StopSignals()
+    before = signals.heed()
+    try:
+        yield signals
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

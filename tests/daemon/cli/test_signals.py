@@ -1,0 +1,213 @@
+"""Stop signals in a process of its own: one line, the right exit code, and nothing half-done, whenever they strike."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.recover import recover
+
+INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+WAIT = "triaxcal: putting things in order, please wait; a third signal ends it at once\n"
+AT_ONCE = "triaxcal: interrupted; ended at once"
+START = """
+import asyncio, os, signal, sys, threading, time
+from pathlib import Path
+from signal import SIGINT, SIGTERM, SIGHUP, raise_signal
+from triaxcald.cli.signals import heed_stop_signals
+heed_stop_signals()
+"""
+DEAF = """
+from triaxcald.cli.interrupt import run_interruptible
+
+async def deaf(strike=lambda: raise_signal(SIGTERM)):
+    while True:
+        try:
+            strike()
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            pass
+"""
+RECORDING = """
+from triaxcald.recording.writer import RecordingWriter
+writer = RecordingWriter(Path(sys.argv[1]), metadata={"run": {"name": "a"}})
+writer.event("begun")
+"""
+
+
+def _python(code: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", START + code, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        preexec_fn=lambda: signal.signal(INT, signal.SIG_DFL),  # also in the background of a shell
+    )
+
+
+@pytest.mark.parametrize("number", [INT, TERM, HUP])
+def test_where_nothing_is_to_be_put_in_order_the_first_signal_ends_the_process(number: int) -> None:
+    done = _python(f"raise_signal({number:d})\nprint('still here')")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "triaxcal: interrupted\n")
+
+
+def test_a_file_that_is_being_written_is_taken_away(tmp_path: Path) -> None:
+    code = """
+from triaxcald.files import new_file
+with new_file(Path(sys.argv[1])) as f:
+    f.write(b"half")
+    f.flush()
+    raise_signal(SIGTERM)
+"""
+    assert _python(code, tmp_path / "a.csv").returncode == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_was_there_before_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("old")
+    code = """
+from triaxcald import files
+files.open = lambda *_: raise_signal(SIGTERM)
+with files.new_file(Path(sys.argv[1])): pass
+"""
+    assert _python(code, path).returncode == 130
+    assert path.read_text() == "old"
+
+
+def test_a_third_signal_ends_work_that_does_not_end() -> None:
+    done = _python(DEAF + "run_interruptible(deaf())")
+    assert done.returncode == 130
+    assert done.stderr == f"{WAIT}{AT_ONCE}\n"
+
+
+def test_a_third_signal_ends_work_that_keeps_the_event_loop_from_turning() -> None:
+    code = """
+from triaxcald.cli.interrupt import run_interruptible
+
+def strike():
+    for number in (SIGINT, SIGTERM, SIGHUP):
+        signal.pthread_kill(threading.main_thread().ident, number)
+
+async def stuck():
+    threading.Timer(0, strike).start()
+    threading.Event().wait()
+
+run_interruptible(stuck())
+"""
+    done = _python(code)
+    assert done.returncode == 130
+    assert done.stderr == f"{WAIT}{AT_ONCE}\n"
+
+
+def test_a_signal_that_another_thread_gets_wakes_the_event_loop() -> None:
+    """As one does that strikes just before the loop falls asleep: no system call is broken off by it."""
+    code = """
+from triaxcald.cli.interrupt import Interrupted, run_interruptible
+
+async def asleep():
+    threading.Timer(0.05, lambda: signal.pthread_kill(threading.get_ident(), SIGTERM)).start()
+    await asyncio.Event().wait()
+
+try:
+    run_interruptible(asleep())
+except Interrupted as e:
+    print(e)
+"""
+    done = _python(code)
+    assert (done.stdout, done.stderr) == ("interrupted\n", "")
+
+
+def test_a_third_signal_finishes_the_recording(tmp_path: Path) -> None:
+    path = tmp_path / "rec.mcap"
+    done = _python(DEAF + RECORDING + "run_interruptible(deaf())", path)
+    assert done.returncode == 130
+    assert done.stderr == f"{WAIT}{AT_ONCE}; {path} is finished\n"
+    with Recording.open(path) as recording:
+        assert recording.finished
+        assert [event.kind for event in recording.events()] == ["recording_started", "begun"]
+
+
+def test_a_recording_that_the_disk_holds_up_is_left_for_recovery(tmp_path: Path) -> None:
+    path = tmp_path / "rec.mcap"
+    code = """
+from triaxcald import abort
+abort.CLOSING_S = 0.05
+writer.drain()
+writer._jobs.put(threading.Event().wait)
+run_interruptible(deaf())
+"""
+    done = _python(DEAF + RECORDING + code, path)
+    assert done.returncode == 130
+    assert done.stderr == f"{WAIT}{AT_ONCE}; {path} is not finished; triaxcal log recover mends it\n"
+    assert recover(path, tmp_path / "mended.mcap").messages == 2
+
+
+def test_a_third_signal_while_a_device_is_written_to_is_4_and_says_so() -> None:
+    code = """
+from triaxcald.abort import Left, at_abort
+with at_abort(lambda _: Left("NOT restored: half is written", in_doubt=True)):
+    run_interruptible(deaf())
+"""
+    done = _python(DEAF + code)
+    assert done.returncode == 4
+    assert done.stderr == f"{WAIT}{AT_ONCE}; NOT restored: half is written\n"
+
+
+def test_who_does_not_read_what_is_said_holds_nothing_up() -> None:
+    code = """
+near, far = os.pipe()
+os.dup2(far, 2)
+os.set_blocking(2, False)
+try:
+    while os.write(2, bytes(4096)): pass
+except BlockingIOError:
+    os.set_blocking(2, True)
+run_interruptible(deaf())
+"""
+    assert _python(DEAF + code).returncode == 130
+
+
+def test_where_standard_error_is_closed_nothing_is_written_into_the_file_that_took_its_place(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    code = """
+os.close(2)
+sys.stderr = None  # as of an interpreter that was started so
+assert os.open(sys.argv[1], os.O_CREAT | os.O_WRONLY) == 2
+raise_signal(SIGTERM)
+"""
+    assert _python(code, path).returncode == 130
+    assert path.read_bytes() == b""
+
+
+def test_a_thread_that_hangs_does_not_hold_up_the_end_and_what_was_said_is_out() -> None:
+    code = """
+from triaxcald.cli import main
+main.LAST_THREADS_S = 0.05
+sys.argv = ["triaxcal", "plan", "--json"]
+threading.Thread(target=threading.Event().wait).start()
+main.entry()
+"""
+    done = _python(code)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.endswith("}\n")
+
+
+@pytest.mark.parametrize("number", [INT, TERM, HUP])
+def test_a_signal_in_the_interpreters_own_end_changes_nothing(number: int) -> None:
+    code = f"""
+import atexit
+from triaxcald.cli import main
+atexit.register(raise_signal, {number:d})
+sys.argv = ["triaxcal", "--version"]
+main.entry()
+"""
+    done = _python(code)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("triaxcal ")
