@@ -347,7 +347,7 @@ EFFECT_LEAVES = {"x", "y", "z"}
 
 
 def documented_keys() -> set[str]:
-    text = (PROJECT / "docs/reference/certificate.md").read_text("utf-8")
+    text = "".join((PROJECT / f"docs/reference/{page}.md").read_text("utf-8") for page in ("certificate", "outcome"))
     return set(re.findall(r"[A-Za-z_0-9]+", " ".join(re.findall(r"`([^`]*)`", text))))
 
 

@@ -60,7 +60,7 @@ def _audit(name: str, recording: Recording) -> Audit:
 
     def replay(phase: Phase, streams: tuple[str, ...]) -> tuple[dict[str, Pipeline], RawDigest]:
         pipelines = {s: Pipeline(bundle, s) for s in streams if s in bundle.profile.streams}
-        digest = RawDigest()
+        digest = RawDigest(recording.ends_with)
         for batch in recording.raw(phase):
             digest.update(phase, batch)
             for pipeline in pipelines.values():

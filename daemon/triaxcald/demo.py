@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from triaxcald.errors import InputError
+from triaxcald.exit_codes import INTERRUPTED
 from triaxcald.files import write_text
+from triaxcald.provision.state import DeviceState
 from triaxcald.simulation.bench import DeviceFile, SimulatedUnit, simulate
 from triaxcald.station.collection import Progress
 from triaxcald.station.config import load_station
-from triaxcald.station.line import INTERRUPTED, Outcome, UnitRun, run_station
-from triaxcald.station.write_back import NEW_VERIFIED
+from triaxcald.station.line import Outcome, UnitRun, run_station
 from triaxcald.verification import Verification
 
 SPEED = 20.0
@@ -102,7 +103,7 @@ def _devices(seed: int, channel: str) -> list[DeviceFile]:
         DeviceFile.model_validate(
             {
                 "format": "triaxcal.device/1",
-                "serial": int(rng.integers(1000, 9999)),
+                "serial": int(rng.integers(1000, 9999)) // 2 * 2 + number,  # no two alike
                 "speed": SPEED,
                 "seed": int(rng.integers(2**31)),
                 "sensor": {"effects": {str(effect): _draw(str(effect), rng)}},
@@ -111,7 +112,7 @@ def _devices(seed: int, channel: str) -> list[DeviceFile]:
             },
             strict=False,
         )
-        for effect, place in zip(effects, places, strict=True)
+        for number, (effect, place) in enumerate(zip(effects, places, strict=True))
     ]
 
 
@@ -148,7 +149,7 @@ async def _after_power_cycle(
 
 
 def _written(outcome: Outcome) -> bool:
-    return outcome.device_state == NEW_VERIFIED
+    return outcome.held.state is DeviceState.NEW_VERIFIED
 
 
 def _kept(check: Verification | None) -> bool:

@@ -21,11 +21,27 @@ class RecordingError(InputError):
     """A recording cannot be read or does not hold what is asked of it."""
 
 
+class DiskError(RecordingError):
+    """The disk failed at work; what was recorded is sound up to the time stated."""
+
+    exit_code = 5
+
+
 class StationError(DaemonError):
     """The station or a device on it failed while at work."""
 
     exit_code = 4
 
 
+class DeviceInUse(StationError):
+    """Another command works with the device, or with the serial port that it is on; the message says which."""
+
+
 class ProvisionError(StationError):
-    """Writing to the device failed; the message says what state it was left in."""
+    """Writing to the device failed."""
+
+
+class Implausible(DaemonError):
+    """What the device holds is no calibration under its profile; nothing was written."""
+
+    exit_code = 3

@@ -48,6 +48,10 @@ class Process:
             self._said[name].append(line)
 
     @property
+    def pid(self) -> int:
+        return self._popen.pid
+
+    @property
     def out(self) -> str:
         return "".join(self._said["out"])
 

@@ -7,7 +7,6 @@ that its maker could give it, so that its error before is that of the fault alon
 from __future__ import annotations
 
 import asyncio
-import json
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AsyncExitStack, contextmanager
@@ -50,23 +49,24 @@ NEAR_NOISE = 3.0
 
 @dataclass(frozen=True)
 class Finished:
-    """What a run leaves: its document's part for the unit, the certificate, and the EEPROM as it was and as it is."""
+    """What a run leaves: its document's part for the unit, what `diagnose` makes of its recording, and the EEPROM as it
+    was and as it is."""
 
     triad: Triad
     document: Mapping[str, Any]
-    certificate: Mapping[str, Any]
+    result: Mapping[str, Any]
     before: bytes
     after: bytes
 
     @property
     def listed(self) -> list[set[str]]:
         """By finding, all that it may be."""
-        return [{f["effect"], *f["alternatives"]} for f in self.certificate["result"]["findings"]]
+        return [{f["effect"], *f["alternatives"]} for f in self.result["findings"]]
 
     @property
     def standard_error(self) -> dict[str, float]:
         """By role, of what was found."""
-        found = self.certificate["result"]["findings"]
+        found = self.result["findings"]
         return {f"{f['effect']}.{x}": c["standard_error"] for f in found for x, c in f["coefficients"].items()}
 
     @property
@@ -94,7 +94,8 @@ def run(workshop: Any, triaxcal: Callable[..., Any]) -> Callable[..., Finished]:
         assert document["exit_code"] == done.code
         after = read_eeprom(path)
         assert after is not None
-        return Finished(triad, document, json.loads(Path(document["certificate"]).read_text()), before, after)
+        result = triaxcal("diagnose", document["recording"], "--json").json
+        return Finished(triad, document, result, before, after)
 
     return go
 
@@ -198,8 +199,8 @@ def test_what_a_part_at_fault_does_is_found_written_and_gone_from_the_output_aft
     unit = run(*faults, seed=31)
     assert len(unit.listed) == len(effects)
     assert all(any(effect in may_be for may_be in unit.listed) for effect in effects)
-    assert unit.certificate["result"]["unexplained"]["significant"] is False
-    assert unit.document["device_state"] == "the device holds the new calibration, verified"
+    assert unit.result["unexplained"]["significant"] is False
+    assert unit.document["outcome"]["device_state"] == "new_verified"
     assert unit.document["exit_code"] == 0
 
     held = _held(unit.triad, unit.after)
@@ -228,10 +229,11 @@ def test_what_no_register_takes_is_named_and_left_to_the_host_and_the_unit_gets_
     unit = run(uneven_stage, seed=31)
     (may_be,) = unit.listed
     assert "scale_factor_asymmetry" in may_be
-    assert unit.certificate["registers"]["left_to_host"] == ["scale_factor_asymmetry"]
+    assert unit.document["outcome"]["measured"]["left_to_host"] == ["scale_factor_asymmetry"]
     assert unit.document["after"]["rms_g"] < LIMIT_G  # so it was tried
     assert unit.document["verification"]["verdict"] == "outside limits"
-    assert unit.document["device_state"] == "old calibration restored and verified"
+    assert unit.document["outcome"]["device_state"] == "old"
+    assert unit.document["certificate"] is None
     assert unit.document["exit_code"] == 1
     assert _same_calibration(unit)
     assert _error_g(unit.triad, unit.after) == _error_g(unit.triad, unit.before)
@@ -239,12 +241,12 @@ def test_what_no_register_takes_is_named_and_left_to_the_host_and_the_unit_gets_
 
 def test_what_no_catalogue_has_stays_unexplained_and_the_unit_as_it_was(run: Callable[..., Finished]) -> None:
     unit = run(uneven_ladder, seed=31)
-    result = unit.certificate["result"]
+    result = unit.result
     assert result["findings"] == []
     assert result["unexplained"]["significant"] is True
     assert result["unexplained"]["rms_g"] > LIMIT_G
     assert any(line.startswith("something is left that no candidate explains") for line in result["advice"])
-    (why,) = unit.certificate["outside"]
+    (why,) = unit.document["outcome"]["outside"]
     assert why.startswith("rms_g ")
     assert unit.document["registers_written"] == []
     assert unit.document["exit_code"] == 1

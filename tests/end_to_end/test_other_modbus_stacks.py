@@ -43,7 +43,8 @@ async def mbpoll(served: ModbusUnit, *arguments: str) -> str:
     process = await asyncio.create_subprocess_exec(
         str(MBPOLL), *place, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
     )
-    out, _ = await asyncio.wait_for(process.communicate(), 20)
+    async with asyncio.timeout(20):
+        out, _ = await process.communicate()
     return out.decode()
 
 

@@ -10,6 +10,7 @@ from typing import NoReturn
 
 from triaxcal.gravity import HEIGHTS_M
 from triaxcald.errors import InputError
+from triaxcald.files import require_writable
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -86,6 +87,12 @@ def seed(text: str) -> int:
     return int(text)
 
 
+def add_force(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--force", metavar="REASON", help="write though what the device holds is implausible; the reason is recorded"
+    )
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
 
@@ -126,8 +133,11 @@ def add_uncertainty(parser: argparse.ArgumentParser) -> None:
 
 def writable(path: Path | None) -> None:
     """Fail before the work, not after it, where a result could not be written. Raises InputError."""
-    if path is not None and not path.parent.is_dir():
+    if path is None:
+        return
+    if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
+    require_writable(path)
 
 
 def keep_apart(chosen: argparse.Namespace) -> None:

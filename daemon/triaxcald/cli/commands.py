@@ -9,14 +9,13 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-from triaxcal.errors import InvalidData, Refused
-from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
+from triaxcal.errors import Refused, TriaxcalError
+from triaxcal_drivers.errors import DriverError, RegisterValueError
 from triaxcald.cli.arguments import OneLineParser, keep_apart, parsed
 from triaxcald.cli.console import say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import DaemonError
-
-DONE, OUTSIDE, BAD_INPUT, REFUSED, DEVICE, INTERRUPTED = 0, 1, 2, 3, 4, 130
+from triaxcald.exit_codes import BAD_INPUT, DONE, INTERRUPTED, REFUSED, exit_code_of
 
 ROOMS = {
     "line": ("demo", "run", "sim", "record"),
@@ -24,7 +23,8 @@ ROOMS = {
     "fitting": ("fit", "diagnose"),
     "framing": ("frame",),
     "planning": ("plan",),
-    "devices": ("provision", "registers", "devices"),
+    "provisioning": ("provision", "restore"),
+    "devices": ("registers", "devices"),
     "recordings": ("audit", "log"),
 }
 """The modules beside this one and their commands. Only what is asked for is imported: all would take longer than most
@@ -63,20 +63,12 @@ def main(arguments: Sequence[str]) -> int:
     except RegisterValueError as e:
         say(f"triaxcal: refused: {e}; nothing was written")
         return REFUSED
-    except (InvalidData, ProfileError, DriverMissing) as e:
+    except (TriaxcalError, DriverError, DaemonError) as e:
         say(f"triaxcal: {e}")
-        return BAD_INPUT
-    except DriverError as e:
-        say(f"triaxcal: {e}")
-        return DEVICE
-    except DaemonError as e:
-        say(f"triaxcal: {e}")
-        return e.exit_code
+        return exit_code_of(e)
     except Interrupted as e:
-        from triaxcald.station.write_back import UNCERTAIN
-
         say(f"triaxcal: {e}")
-        return DEVICE if any(note.startswith(UNCERTAIN) for note in e.notes) else INTERRUPTED
+        return INTERRUPTED
     except KeyboardInterrupt:
         say("triaxcal: interrupted")
         return INTERRUPTED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -11,6 +12,12 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from triaxcald.abort import add_action, discard_action, tell
+
+LINE_MOST = 4000  # characters of a line; the longest of ours list a thousand poses' labels
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 if TYPE_CHECKING:  # every command says something, few show poses
     from triaxcald.recording.schema import Phase
@@ -23,9 +30,15 @@ def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
 
 
 def say(text: str) -> None:
-    """A line to standard error; nowhere, where that has been closed: no work may fail for it."""
+    """A line to standard error; nowhere, where that has been closed: no work may fail for it.
+
+    What a file holds may be quoted in it: that can neither begin a second line nor steer the terminal.
+    """
+    line = _CONTROL.sub(lambda c: c[0].encode("unicode_escape").decode(), text)
+    if len(line) > LINE_MOST:
+        line = f"{line[: LINE_MOST // 2]} … {line[-LINE_MOST // 2 :]}"
     with suppress(OSError, ValueError):
-        sys.stderr.write(text + "\n")
+        sys.stderr.write(line + "\n")
         sys.stderr.flush()
 
 
@@ -57,6 +70,9 @@ class _Shown(Console):
         self.quiet = True
 
 
+SHOW_CURSOR = "\x1b[?25h"
+
+
 class Bars:
     """Progress bars, one a unit; plain lines where standard error is no terminal."""
 
@@ -75,12 +91,19 @@ class Bars:
         self._said: dict[str, str] = {}
 
     def __enter__(self) -> Bars:
+        add_action(self, self._show_cursor_at_abort)
         self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         with suppress(OSError):
             self._progress.stop()
+        discard_action(self)
+
+    def _show_cursor_at_abort(self, _: float) -> None:
+        """The bars hide it. Anything else of theirs could wait for a lock that the main thread holds."""
+        if self._console.is_terminal:
+            tell(SHOW_CURSOR)
 
     def _task(self, unit: str) -> TaskID:
         if unit not in self._tasks:

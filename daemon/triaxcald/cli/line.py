@@ -8,26 +8,26 @@ import signal
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from triaxcal_drivers.profile import READINGS
-from triaxcald.cli.arguments import add_json, positive, seed, writable
+from triaxcald import text
+from triaxcald.cli.arguments import add_force, add_json, positive, seed, writable
 from triaxcald.cli.console import Bars, emit, micro, say, table
-from triaxcald.cli.devices import described
-from triaxcald.cli.interrupt import run_interruptible
+from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
-from triaxcald.demo import DemoUnit, run_demo
 from triaxcald.documents import number
+from triaxcald.exit_codes import SEVEREST
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
 from triaxcald.remarks import nothing_shows, without
-from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
-from triaxcald.simulation.eeprom import keep_eeprom, read_eeprom
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import load_station
-from triaxcald.station.line import Outcome, UnitRun, run_station
 
-SEVEREST = (4, 130, 3, 2, 1, 0)
+if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
+    from triaxcald.demo import DemoUnit
+    from triaxcald.simulation.bench import SimulatedUnit
+    from triaxcald.station.line import Outcome, UnitRun
 
 
 def register(commands: Any) -> None:
@@ -38,6 +38,7 @@ def register(commands: Any) -> None:
     p.set_defaults(run=demo_command)
     p = commands.add_parser("run", help="the whole line on the devices of a station file")
     p.add_argument("station", metavar="STATION.toml", type=Path)
+    add_force(p)
     add_json(p)
     p.set_defaults(run=run_command)
     p = commands.add_parser("sim", help="serve a simulated unit on a bus until stopped")
@@ -53,8 +54,10 @@ def register(commands: Any) -> None:
 
 def run_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
+    from triaxcald.station.line import run_station
+
     with Bars() as bars:
-        outcomes = run_interruptible(run_station(station, bars))
+        outcomes = run_interruptible(run_station(station, bars, force=a.force))
     with suppress(OSError):  # where nobody reads standard output, the exit code is the outcomes' all the same
         if a.json:
             emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
@@ -88,6 +91,8 @@ def _document(o: Outcome) -> dict[str, Any]:
         "choices": result["choices"] if result else [],
         "registers_written": list(o.provisioned.written) if o.provisioned else [],
         "device_state": o.device_state,
+        "outcome": o.document,
+        "outcome_file": str(o.outcome) if o.outcome else None,
         "records_lost": o.lost,
         "verification": o.verification,
     }
@@ -101,6 +106,7 @@ def say_errors(outcomes: Sequence[Outcome]) -> None:
 
 def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     """The before / after table of one unit, and where its papers are."""
+
     assert o.certified is not None
     loop, v = o.certified.loop, o.verification
     b, f = loop.before.residual, loop.after.residual
@@ -128,26 +134,29 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     if loop.unexplained.significant:
         print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms{without(loop)}; {loop.unexplained.lead}")
     if o.provisioned:
-        print(f"  {described(o.provisioned)}")
+        print(f"  {text.provisioned(o.provisioned)}")
     if v:
         left_out = sum(not p["used"] for p in v["poses"])
         poses = f"; {counted(len(v['poses']), left_out, 'check poses')}" if left_out else ""
         print(f"  verified by physics: {v['verdict']}{poses}")
-    if o.device_state:
-        print(f"  {o.device_state}")
-    elif o.certified.document["not_written"]:
+    if not o.provisioned and o.certified.document["not_written"]:
         print(f"  no registers written: {o.certified.document['not_written']}")
     if o.lost:
         print(f"  {o.lost} records were lost between bus and disk")
+    print(f"  verdict: {o.document['verdict']}: {o.document['reason']}")
     for line in o.certified.document["outside"]:
         print(f"  outside limits: {line}")
     for line in loop.after.warnings:
         print(f"  warning: {line}")
-    for what, path in (("recording", o.recording), ("certificate", o.certificate), ("report", o.report)):
-        print(f"  {what:<12}{path}")
+    papers = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
+    for what, path in papers.items():
+        if path is not None:
+            print(f"  {what:<12}{path}")
 
 
 def demo_command(a: argparse.Namespace) -> int:
+    from triaxcald.demo import run_demo
+
     with Bars() as bars:
         units = run_interruptible(run_demo(a.out, a.seed, bars))
     if a.json:
@@ -184,30 +193,39 @@ def _show_demo(u: DemoUnit) -> None:
 
 
 def sim_command(a: argparse.Namespace) -> int:
+    from triaxcald.simulation.bench import load_device, simulate
+    from triaxcald.simulation.eeprom import read_eeprom
+
     device = load_device(a.device)
     eeprom = a.device.parent / device.eeprom if device.eeprom else None
     simulated = simulate(device, where=str(a.device), stored=read_eeprom(eeprom) if eeprom else None)
-    asyncio.run(_serve(simulated, eeprom))
+    try:
+        run_interruptible(_serve(simulated, eeprom))
+    except Interrupted as e:
+        if e.number == signal.SIGINT:
+            raise
+        say("triaxcal: stopped")
     return 0
 
 
 async def _serve(simulated: SimulatedUnit, eeprom: Path | None) -> None:
-    stop = asyncio.Event()
-    for caught in (signal.SIGTERM, signal.SIGHUP):
-        asyncio.get_running_loop().add_signal_handler(caught, stop.set)
+    from triaxcald.simulation.eeprom import keep_eeprom
+
     async with simulated.serve() as server:
         name, device = simulated.bundle.profile.name, simulated.device
         bus = {**device.bus, **({"port": server.bus.port} if "port" in device.bus else {})}
         settings = ", ".join(f"{k}={v}" for k, v in bus.items())
         say(f"serving {name}, serial {device.serial:04d}, on {settings}; Ctrl-C stops it")
         async with keep_eeprom(simulated.unit, eeprom):
-            await stop.wait()
+            await asyncio.Event().wait()
 
 
 def record_command(a: argparse.Namespace) -> int:
     writable(a.output)
     station = load_station(a.station)
     place = station.place(a.unit)
+    from triaxcald.station.line import UnitRun
+
     with Bars() as bars:
         run_interruptible(_record(UnitRun(station, place, bars), a.output, a.seconds))
     return 0
@@ -217,7 +235,7 @@ async def _record(run: UnitRun, path: Path, seconds: float | None) -> None:
     async with run.place.opened() as device:
         identity = await run.identify(device)
         collection = Collection(CALIBRATION, run.place.bundle, run.place.address)
-        writer = run.writer(path, identity)
+        writer = run.writer(path, identity, ends_with="")
         try:
             with writer:
                 run.progress.stage(run.name, "recording")

@@ -3,19 +3,44 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+import time
+from typing import NoReturn
+
+from triaxcald.abort import STOP_SIGNALS
+from triaxcald.cli.signals import heed_stop_signals
+
+LAST_THREADS_S = 1.0
+"""Time to end for threads that have nothing to do, or are about to close a bus."""
 
 
-def entry() -> None:
+def entry() -> NoReturn:
     """Console script. Needs the extra ``station``; says so where it is not installed."""
+    heed_stop_signals()
     try:
         from triaxcald.cli.commands import main
 
         code = main(sys.argv[1:])
     except ModuleNotFoundError as e:
         sys.stderr.write(f"triaxcal: the module {e.name} is missing; pip install 'triaxcal[station]' brings it\n")
-        sys.exit(2)
+        code = 2
     _leave_nothing_unsaid()
+    _end(code)
+
+
+def _end(code: int) -> NoReturn:
+    """The interpreter's own end gives signals back to the system, which would spoil the exit code, and waits for every
+    thread, one that hangs in a bus driver or reckons what nobody wants any more too."""
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    others = [t for t in threading.enumerate() if t is not threading.current_thread() and not t.daemon]
+    until_s = time.monotonic() + LAST_THREADS_S
+    for thread in others:
+        thread.join(max(0.0, until_s - time.monotonic()))
+    if any(thread.is_alive() for thread in others):
+        os._exit(code)
     sys.exit(code)
 
 

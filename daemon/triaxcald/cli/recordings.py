@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import io
 import sys
 from pathlib import Path
 from typing import Any
 
 from triaxcal_drivers.profile import READINGS
-from triaxcald.audit import audit
 from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
+from triaxcald.files import new_file
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.export import write_csv
@@ -46,6 +47,8 @@ def register(commands: Any) -> None:
 
 
 def audit_command(a: argparse.Namespace) -> int:
+    from triaxcald.audit import audit  # the whole line, which no `log` needs
+
     audits = [audit(path) for path in a.recordings]
     if a.json:
         emit({"format": "triaxcal.audit/1", "audits": [dataclasses.asdict(x) for x in audits]})
@@ -101,7 +104,7 @@ def export_command(a: argparse.Namespace) -> int:
             rows = write_csv(sys.stdout, blocks)
         else:
             try:
-                with a.output.open("x", encoding="utf-8") as out:
+                with new_file(a.output) as file, io.TextIOWrapper(file, "utf-8") as out:
                     rows = write_csv(out, blocks)
             except OSError as e:
                 raise InputError(f"{a.output}: cannot be written: {e.strerror}") from e

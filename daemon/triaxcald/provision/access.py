@@ -1,31 +1,66 @@
-"""Every register access told to a recorder, by standing between the caller and the device."""
+"""Register access with patience: requests that may be repeated are, a busy device is waited for, all is recorded."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
-from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError
 from triaxcal_drivers.interface import Device, RawBatch
+from triaxcal_drivers.profile import Profile, WriteStep
+from triaxcald.errors import DaemonError
+from triaxcald.provision.pace import REAL_PACE, Pace
+
+T = TypeVar("T")
+Kind = Literal["read", "write"]
+
+RETRIES = 2
+"""A lost request in a hundred then fails one request in a million."""
+BUSY_S = 6.0
+"""So long a busy device is waited for: longer than any EEPROM takes, and short enough that a provisioning and its
+undoing, with a reconnection each, end within 30 s."""
+BUSY_PAUSE_S = 0.02
+NO_CONTACT = (BusError, DeviceAbsent, DeviceSilent)
+"""Nothing came back; unlike a refusal, that says nothing about what the device did."""
 
 
 @dataclass(frozen=True)
 class RegisterAccess:
     """``raw`` as on the wire, written or read (empty where a read failed); ``error`` the driver's message."""
 
-    kind: Literal["read", "write"]
+    kind: Kind
     register: str
     raw: bytes
     error: str | None = None
 
 
-class RecordedDevice:
-    """A Device that passes everything on and tells ``record`` of each register access once it has ended."""
+class RegisterLink:
+    """A Device whose register requests are repeated where that is safe.
 
-    def __init__(self, device: Device, record: Callable[[RegisterAccess], None]) -> None:
+    Reads, and writes of calibration registers and keys, are repeated up to `RETRIES` times where no answer came,
+    over a new connection where the old one was lost, and for `BUSY_S` where the device is busy. What a store or
+    reset sequence writes is sent once. Once a kind of request has failed for good, no more patience is spent on
+    that kind until one succeeds, or until `refresh`. ``record`` is told of every request that has ended.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        profile: Profile,
+        record: Callable[[RegisterAccess], None] | None = None,
+        *,
+        pace: Pace = REAL_PACE,
+    ) -> None:
+        steps = (*profile.sequences.store, *profile.sequences.reset)
+        self.pace = pace
         self._device = device
-        self._record = record
+        self._record = record or (lambda access: None)
+        self._once = {step.write for step in steps if isinstance(step, WriteStep)}
+        self._tired: set[Kind] = set()
+        self.touched: set[str] = set()
+        """Registers that somebody has tried to write."""
 
     async def open(self) -> None:
         await self._device.open()
@@ -36,7 +71,64 @@ class RecordedDevice:
     def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
         return self._device.stream(names)
 
+    def refresh(self) -> None:
+        """Be as patient as at first."""
+        self._tired.clear()
+
+    def go_on_unrecorded(self) -> None:
+        """From now on no failure to record a request stops the work: putting a device in order weighs more."""
+        record = self._record
+
+        def lenient(access: RegisterAccess) -> None:
+            with suppress(DaemonError):
+                record(access)
+
+        self._record = lenient
+
     async def read(self, register: str) -> bytes:
+        return await self._patiently("read", lambda: self._read(register))
+
+    async def read_once(self, register: str) -> bytes:
+        """For a caller that repeats by itself."""
+        return await self._read(register)
+
+    async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
+        if register in self._once:
+            await self._write(register, raw, timeout_s)
+        else:
+            await self._patiently("write", lambda: self._write(register, raw, timeout_s))
+
+    async def renew(self) -> None:
+        """A new connection, where one is to be had."""
+        with suppress(*NO_CONTACT):
+            await self._device.close()
+            await self._device.open()
+
+    async def _patiently(self, kind: Kind, request: Callable[[], Awaitable[T]]) -> T:
+        left, busy_since_s = RETRIES, None
+        while True:
+            failure: DriverError
+            try:
+                answer = await request()
+            except DeviceBusy as e:
+                failure, now_s = e, self.pace.clock_s()
+                busy_since_s = now_s if busy_since_s is None else busy_since_s
+                patient = now_s - busy_since_s < BUSY_S
+            except NO_CONTACT as e:
+                failure, patient = e, left > 0
+                left -= 1
+            else:
+                self._tired.discard(kind)
+                return answer
+            if kind in self._tired or not patient:
+                self._tired.add(kind)
+                raise failure
+            if isinstance(failure, DeviceBusy):
+                await self.pace.sleep(BUSY_PAUSE_S)
+            elif not isinstance(failure, DeviceSilent):
+                await self.renew()
+
+    async def _read(self, register: str) -> bytes:
         try:
             raw = await self._device.read(register)
         except DriverError as e:
@@ -45,9 +137,11 @@ class RecordedDevice:
         self._record(RegisterAccess("read", register, raw))
         return raw
 
-    async def write(self, register: str, raw: bytes) -> None:
+    async def _write(self, register: str, raw: bytes, timeout_s: float | None) -> None:
+        self.touched.add(register)
+        given = {} if timeout_s is None else {"timeout_s": timeout_s}  # a driver may know nothing of it
         try:
-            await self._device.write(register, raw)
+            await self._device.write(register, raw, **given)
         except DriverError as e:
             self._record(RegisterAccess("write", register, raw, str(e)))
             raise

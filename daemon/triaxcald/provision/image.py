@@ -76,6 +76,17 @@ def build_image(profile: Profile, coefficients: Mapping[str, float], *, date_day
     return RegisterImage(tuple(words), tuple(role for role in coefficients if role not in roles))
 
 
+def image_of(profile: Profile, raw: Mapping[str, bytes]) -> RegisterImage:
+    """The image whose raw bytes are known. Raises ProfileError for a register that the profile has not."""
+    words = []
+    for name, data in raw.items():
+        if name not in profile.registers:
+            raise ProfileError(f"profile {profile.name}: no register named '{name}'")
+        register, value = profile.registers[name], profile.decode(name, data)
+        words.append(Word(name, register.role or "", data, value, value, register.unit, codec.step(register, value)))
+    return RegisterImage(tuple(words), ())
+
+
 def _refuse_gaps(roles: set[str], coefficients: Mapping[str, float]) -> None:
     """Zero is a fair value for an effect that is absent, but not for these."""
     missing = [role for role in sorted(roles) if role.startswith("scale_factor.") and role not in coefficients]

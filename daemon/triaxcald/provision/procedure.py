@@ -1,158 +1,337 @@
-"""Writes a calibration to a device so that it ends in one of two states: the new one verified, or the old."""
+"""Writes a calibration to a device so that it ends with the new one or with the old one, and says with which."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
 
-from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.interface import Device
+from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle
-from triaxcald.errors import ProvisionError, StationError
-from triaxcald.provision.access import RecordedDevice, RegisterAccess
-from triaxcald.provision.identity import IdentityRead, WrongUnit, check_identity
+from triaxcald.errors import InputError, ProvisionError, StationError
+from triaxcald.provision.access import NO_CONTACT, RegisterLink
+from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.provision.image import RegisterImage
-from triaxcald.provision.restore import lock_quietly, restore
-from triaxcald.provision.sequence import REAL_PACE, Label, Pace, run_sequence
+from triaxcald.provision.journal import Entry, Journal, Step
+from triaxcald.provision.plausible import Doubt, doubts, fits_its_checksum
+from triaxcald.provision.proof import show_restart
+from triaxcald.provision.restore import restore
+from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
+from triaxcald.provision.state import DeviceState, Evidence, Held
 
-
-@dataclass(frozen=True)
-class ProvisionReport:
-    """What was done. ``differing``: registers in which the device differed from the image; ``written`` are the
-    same unless it was a dry run; ``unchanged`` the others. ``after`` was read after the restart. ``steps`` in
-    words, in order."""
-
-    identity: IdentityRead
-    before: Snapshot
-    differing: tuple[str, ...]
-    written: tuple[str, ...]
-    unchanged: tuple[str, ...]
-    after: Snapshot
-    stored: bool
-    steps: tuple[str, ...]
+T = TypeVar("T")
 
 
 @dataclass
-class _Run:
-    """One run of the procedure: with what, and how far it has come."""
+class Provisioning:
+    """One device on its way to a new calibration: `examine`, then `write`, and `undo` where it must not stay.
 
-    device: Device
+    ``folder`` is the station's, where the journal lies; ``started`` a time in words for it. ``held`` says at any
+    moment what the device holds, whatever has been raised. ``found`` is what the device held at first; ``before`` is
+    what an undoing brings back: the same, or, where an earlier provisioning was cut short, what the device held
+    before that one. ``after`` was read last. ``differing`` are the registers in which the device differed from the
+    image, ``written`` those that were written, ``steps`` what was done, in order.
+    """
+
+    link: RegisterLink
     bundle: Bundle
     image: RegisterImage
-    pace: Pace
-    before: Snapshot | None = None
+    unit: str
+    folder: Path
+    expected_serial: str | None
+    where: str
+    started: str = ""
+    power_cycle: Callable[[], Awaitable[bool]] | None = None
+    """Has the supply switched off and on, where nothing else shows what is stored; whether that was seen."""
+    held: Held = field(default_factory=Held)
+    doubts: list[Doubt] = field(default_factory=list)
+    differing: tuple[str, ...] = ()
     written: list[str] = field(default_factory=list)
-    unlocked: bool = False
-    store_asked: bool = False
     steps: list[str] = field(default_factory=list)
+    stored: bool = False
+    carried: bool = False
+    """Whether an earlier provisioning was cut short."""
+    undoing_failed: str | None = None
+    _restarted: bool = False
+    _journaled: bool = False
+    _unlocked: bool = False
+    _store_asked: bool = False
+    _decided: bool = False
 
-    async def sequence(self, label: Label) -> None:
-        self.steps.append(label)
-        await run_sequence(self.device, self.bundle, label, self.pace)
+    identity: IdentityRead = field(init=False)
+    journal: Journal = field(init=False)
+    found: Snapshot = field(init=False)
+    before: Snapshot = field(init=False)
+    after: Snapshot = field(init=False)
 
-    async def read(self, step: str) -> Snapshot:
-        self.steps.append(step)
-        return await take_snapshot(self.device, self.bundle)
+    @property
+    def resets(self) -> bool:
+        """Whether the device can be restarted by a command."""
+        return bool(self.bundle.profile.sequences.reset)
 
+    @property
+    def stores(self) -> bool:
+        """Whether what is written takes a store to last; else every write lasts."""
+        return bool(self.bundle.profile.sequences.store)
 
-async def provision(
-    device: Device,
-    bundle: Bundle,
-    image: RegisterImage,
-    *,
-    expected_serial: str | None,
-    record: Callable[[RegisterAccess], None] | None = None,
-    dry_run: bool = False,
-    where: str | None = None,
-    pace: Pace = REAL_PACE,
-) -> ProvisionReport:
-    """Write ``image`` to the opened ``device``, make it permanent, restart the device and verify.
+    async def examine(self, *, restart: bool = True) -> None:
+        """Who is there, and what it holds. Nothing is written.
 
-    Only registers that differ are written, the checksum last; a device that holds the image already is
-    restarted and read, and not written. A dry run reads only. ``record`` is told of every register access.
+        A device that holds the image already is restarted, where ``restart`` allows: what is in use may be the image,
+        and what is stored another. Raises WrongUnit, InputError (the journal), DriverError, SequenceStalled.
+        """
+        self.steps.append("identity")
+        self.identity = await check_identity(self.link, self.bundle, self.expected_serial, where=self.where)
+        self.journal = Journal.of(self.folder, self.unit, self.identity.serial)
+        self.found = await self._read("reading the old calibration")
+        if restart and self.resets and not self.found.differing(self.image.raw):
+            self._restarted = await self._sequence("reset")
+            self.found = await self._read("reading the stored calibration")
+        self.before = self.after = self.found
+        self.differing = self.found.differing(self.image.raw)
+        if (entry := self.journal.read()) is not None and self._is_cut_short(entry):
+            self.carried, self.before = True, Snapshot(entry.before, self.identity.serial)
+            if self.differing and self.found.differing(entry.before):
+                self.held.now(DeviceState.MIXED, Evidence.READ_BACK)
+        else:
+            self.doubts = doubts(self.bundle.profile, self.found, self.image)
 
-    Raises WrongUnit (nothing was written) and ProvisionError, which says what failed at which step, and in
-    what state the device is: the old calibration untouched, restored and verified, or not restored. A
-    cancellation, like any other exception, goes on only once the old calibration is back. All but WrongUnit
-    have that state as a note.
-    """
-    run = _Run(RecordedDevice(device, record) if record else device, bundle, image, pace)
-    try:
-        return await _provision(run, expected_serial, where, dry_run)
-    except (DriverError, StationError) as e:
-        if isinstance(e, WrongUnit) and not run.unlocked:
-            raise
-        state = await to_its_end(_undo(run))
-        failed = ProvisionError(f"provisioning failed at {run.steps[-1]}: {e}; {state}")
-        failed.add_note(state)
-        raise failed from e
-    except (Exception, asyncio.CancelledError, KeyboardInterrupt) as e:
-        e.add_note(await to_its_end(_undo(run)))
-        raise
+    async def write(self) -> None:
+        """Write what differs, store it, restart the device, and read it back.
 
-
-async def _provision(run: _Run, expected_serial: str | None, where: str | None, dry_run: bool) -> ProvisionReport:
-    run.steps.append("identity")
-    identity = await check_identity(run.device, run.bundle, expected_serial, where=where)
-    before = await run.read("reading the old calibration")
-    if not dry_run and not before.differing(run.image.raw):
-        await run.sequence("reset")  # what is in use may be the image and what is stored another
-        before = await run.read("reading the stored calibration")
-    run.before = after = before
-    differing = before.differing(run.image.raw)
-    if differing and not dry_run:
-        await _write(run, differing)
-        await run.sequence("store")
-        await run.sequence("lock")
-        await run.sequence("reset")
-        run.steps.append("identity after the reset")
-        await check_identity(run.device, run.bundle, identity.serial, where=where)
-        after = await run.read("reading back after the reset")
-        _require(run.image.raw, after)
-    unchanged = tuple(name for name in before.raw if name not in differing)
-    return ProvisionReport(
-        identity, before, differing, tuple(run.written), unchanged, after, run.store_asked, tuple(run.steps)
-    )
-
-
-async def _write(run: _Run, names: tuple[str, ...]) -> None:
-    run.unlocked = True
-    await run.sequence("unlock")
-    for name in names:
-        run.steps.append(f"writing {name}")
-        run.written.append(name)
-        await run.device.write(name, run.image.raw[name])
-    _require(run.image.raw, await run.read("reading back"))
-    run.store_asked = True
-
-
-def _require(expected: Mapping[str, bytes], held: Snapshot) -> None:
-    for name in held.differing(expected):
-        raise ProvisionError(f"register {name} holds {held.raw[name].hex()}, expected {expected[name].hex()}")
-
-
-async def _undo(run: _Run) -> str:
-    """Back to the old calibration; says in what state the device is."""
-    if run.before is None or not run.written:
-        if run.unlocked:
-            await lock_quietly(run.device, run.bundle, run.pace)
-        return "old calibration untouched"
-    try:
-        await restore(run.device, run.bundle, run.before, stored=run.store_asked, pace=run.pace)
-    except StationError as e:
-        stored = "either calibration may be stored" if run.store_asked else "the stored calibration is the old one"
-        return f"NOT restored: {e}; {stored}"
-    return "old calibration restored and verified"
-
-
-async def to_its_end(work: Coroutine[object, object, str]) -> str:
-    """Awaits ``work`` and does not let a further cancellation stop it half-way."""
-    task = asyncio.ensure_future(work)
-    while True:
+        Raises ProvisionError that says what failed at which step, WrongUnit, DiskError. A cancellation, like any other
+        exception, goes on only once the old calibration is back. ``held`` then says whether it is.
+        """
         try:
-            return await asyncio.shield(task)
-        except asyncio.CancelledError:
-            if task.done():
+            if self.differing:
+                await self._write()
+                await self._store()
+                await self._prove()
+            elif self._restarted:
+                self.held.now(DeviceState.NEW_VERIFIED, Evidence.RESTART)
+            else:
+                self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
+                await self._prove_by_power_cycle()
+        except (DriverError, StationError) as e:
+            await to_its_end(self._give_up())
+            if not self.written and isinstance(e, ProvisionError):
                 raise
+            raise ProvisionError(f"provisioning failed at {self.steps[-1]}: {e}") from e
+        except BaseException:
+            self._decided = self.held.state is DeviceState.NEW_VERIFIED
+            await to_its_end(self._give_up())
+            raise
+
+    async def undo(self) -> None:
+        """The old calibration back in the device, by whatever it takes; ``held`` says whether it is."""
+        await to_its_end(self._undo())
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to be cleared up."""
+        return self.held.settled and (self.undoing_failed is None or self.held.state is DeviceState.OLD)
+
+    def finish(self) -> None:
+        """The journal goes where nothing is left to be cleared up. Raises DiskError."""
+        if self.settled and (self.held.state is not DeviceState.UNTOUCHED or self._journaled):
+            self.journal.remove()
+
+    # Forwards.
+
+    async def _write(self) -> None:
+        await self._same_unit("identity before the unlock")
+        self._note("writing")
+        self._unlocked = True
+        await self._sequence("unlock")
+        for name in self.differing:
+            self.steps.append(f"writing {name}")
+            self.written.append(name)
+            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+            await self.link.write(name, self.image.raw[name])
+        self.after = await self._read("reading back")
+        self._require_image()
+
+    async def _store(self) -> None:
+        await self._same_unit("identity before the store")
+        if self.stores:
+            self._note("storing")
+            count = await self._times_stored()
+            self._store_asked = True
+            self.stored = await self._sequence("store")
+            if not self.stored:
+                await self._reach()
+                self._by_counter(count, await self._times_stored())
+        else:
+            self.stored = True
+        if self.stored and self.held.state is not DeviceState.NEW_UNVERIFIED:
+            self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
+        if self.stored:
+            self._note("stored")
+        self.steps.append("lock")
+        await lock_quietly(self.link, self.bundle)
+
+    async def _prove(self) -> None:
+        self._decided = True  # whatever happens now, writing more would not make it any surer
+        if self.resets:
+            await self._prove_by_restart()
+        if self.held.state is not DeviceState.NEW_VERIFIED:
+            await self._prove_by_power_cycle()
+        if self.held.state is DeviceState.UNKNOWN:
+            raise ProvisionError("the store went unanswered, and no read decides what it did")
+
+    async def _prove_by_power_cycle(self) -> None:
+        if self.power_cycle is None:
+            return
+        self.steps.append("power cycle")
+        if await self.power_cycle():
+            await self._decide(Evidence.POWER_CYCLE)
+
+    async def _prove_by_restart(self) -> None:
+        try:
+            acknowledged = await self._sequence("reset")
+        except RegisterRefused:
+            if self.power_cycle is None:
+                raise
+            return
+        self.steps.append("identity after the reset")
+        await self._decide(Evidence.RESTART if acknowledged else Evidence.READ_BACK)
+        if not acknowledged and self.stores and self.held.state is not DeviceState.OLD:
+            self.steps.append("showing the restart")
+            if await show_restart(self.link, self.bundle, self.image.raw, self.found.raw, self.differing):
+                await self._decide(Evidence.RESTART)
+
+    async def _decide(self, evidence: Evidence) -> None:
+        """What the device holds, by reading it. Raises ProvisionError where that is not the image."""
+        try:
+            self.after = await self._look()
+        except NO_CONTACT:
+            await self._reach()
+            self.after = await self._look()
+        if not self.after.differing(self.image.raw):
+            if evidence is not Evidence.READ_BACK:
+                self.held.now(DeviceState.NEW_VERIFIED, evidence)
+            return
+        if not self.after.differing(self.before.raw):
+            # Read from what is stored: what was in use before the restart was the image.
+            self.held.now(DeviceState.OLD, Evidence.RESTART if evidence is Evidence.READ_BACK else evidence)
+            raise ProvisionError("after the restart the registers hold the old calibration: nothing was stored")
+        self._decided = False
+        self._require_image()
+
+    # Backwards.
+
+    async def _give_up(self) -> None:
+        if self._decided:
+            return
+        if self.written:
+            await self._undo()
+        elif self._unlocked:
+            await lock_quietly(self.link, self.bundle)
+
+    async def _undo(self) -> None:
+        lasting = self._store_asked or not self.stores or self.carried
+        was = self.held.state, self.held.evidence
+        self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+        self.link.refresh()
+        self.link.go_on_unrecorded()
+        self.link.touched.clear()
+        try:
+            self.held.now(DeviceState.OLD, await restore(self.link, self.bundle, self.before, stored=lasting))
+        except StationError as e:
+            self.undoing_failed = str(e)
+            if not self.link.touched & set(self.before.raw):
+                self.held.now(*was)
+            with suppress(DriverError, StationError):
+                await self._judge(lasting)
+
+    async def _judge(self, lasting: bool) -> None:
+        """What an undoing that failed has left. Raises DriverError, StationError."""
+        restarted = self.resets and await run_sequence(self.link, self.bundle, "reset")
+        held = self.after = await self._look()
+        evidence = Evidence.RESTART if restarted else Evidence.READ_BACK
+        if not held.differing(self.before.raw):
+            state = DeviceState.OLD if restarted or not lasting else DeviceState.UNKNOWN
+        elif not held.differing(self.image.raw):
+            state = DeviceState.NEW_VERIFIED if restarted else DeviceState.NEW_UNVERIFIED
+        else:
+            state = DeviceState.MIXED
+        self.held.now(state, evidence)
+
+    # Steps of both.
+
+    async def _sequence(self, label: Label) -> bool:
+        self.steps.append(label)
+        return await run_sequence(self.link, self.bundle, label)
+
+    async def _read(self, step: str) -> Snapshot:
+        self.steps.append(step)
+        return await take_snapshot(self.link, self.bundle)
+
+    async def _same_unit(self, step: str) -> None:
+        self.steps.append(step)
+        await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)
+
+    async def _look(self) -> Snapshot:
+        await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)
+        return await take_snapshot(self.link, self.bundle)
+
+    async def _reach(self) -> None:
+        self.link.refresh()
+        await reconnect(self.link, self.bundle.profile)
+
+    async def _times_stored(self) -> bytes | None:
+        name = self.bundle.profile.by_role("write_counter")
+        return None if name is None else await self.link.read(name)
+
+    def _by_counter(self, before: bytes | None, after: bytes | None) -> None:
+        """What came of a store that went unanswered, where the device counts its stores."""
+        if before is not None and before != after:
+            self.stored = True
+            self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.WRITE_COUNTER)
+        elif before is not None and not self.resets:
+            raise ProvisionError("the store went unanswered, and by its counter the device has not stored")
+
+    def _require_image(self) -> None:
+        for name in self.after.differing(self.image.raw):
+            raise ProvisionError(
+                f"register {name} holds {self.after.raw[name].hex()}, expected {self.image.raw[name].hex()}"
+            )
+
+    def _note(self, step: Step) -> None:
+        self._journaled = True
+        self.journal.write(
+            Entry(
+                unit=self.unit,
+                serial=self.identity.serial,
+                profile_sha256=self.bundle.digest(),
+                started=self.started,
+                before=self.before.raw,
+                wanted={word.register: word.raw for word in self.image.words},
+                step=step,
+            )
+        )
+
+    def _is_cut_short(self, entry: Entry) -> bool:
+        """Whether the device still is as that provisioning left it, and not as somebody has made it since."""
+        if set(entry.before) != set(self.found.raw):
+            raise InputError(f"{self.journal.path}: its registers are not those of profile {self.bundle.profile.name}")
+        if not self.found.differing(entry.before):
+            return False
+        as_wanted = not self.found.differing(entry.wanted)
+        return as_wanted or not fits_its_checksum(self.bundle.profile, self.found)
+
+
+async def to_its_end(work: Coroutine[object, object, T]) -> T:
+    """The result of ``work``, which no cancellation stops half-way or hides.
+
+    A caller that has more to do afterwards looks whether it was cancelled meanwhile (`asyncio.Task.cancelling`).
+    """
+    task = asyncio.ensure_future(work)
+    while not task.done():
+        with suppress(asyncio.CancelledError):
+            await asyncio.wait([task])
+    return task.result()

@@ -2,92 +2,92 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from triaxcal_drivers.errors import DriverError, RegisterRefused
-from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Bundle, PollStep, WaitStep
 from triaxcald.errors import ProvisionError, StationError
+from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import check_identity
-from triaxcald.provision.sequence import NO_CONTACT, REAL_PACE, Pace, reconnect, run_sequence, run_steps
+from triaxcald.provision.sequence import lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
-
-RECONNECT_S = 5.0
-FAILURES = (DriverError, StationError)
+from triaxcald.provision.state import Evidence
 
 
-async def restore(
-    device: Device, bundle: Bundle, snapshot: Snapshot, *, stored: bool = True, pace: Pace = REAL_PACE
-) -> None:
-    """Make the device hold ``snapshot``, also permanently where ``stored`` says that it may be overwritten.
+async def restore(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, *, stored: bool = True) -> Evidence:
+    """Make the device hold ``snapshot``, also permanently where ``stored`` says that it may have been overwritten.
 
     First a restart, since that brings back whatever is stored without writing; then, only where it is not the
-    snapshot, the registers that differ. Returns once every register reads back as the snapshot's raw bytes
-    (with ``stored``: after a restart). Raises ProvisionError that says why not; WrongUnit, with nothing
-    written, where another unit answers.
+    snapshot, the registers that differ. Returns once every register reads back as the snapshot's raw bytes, and what
+    shows it: with ``stored`` a restart, where the device has one. Raises ProvisionError that says why not; WrongUnit,
+    with nothing written, where another unit answers.
     """
     try:
-        await _contact(device, bundle, snapshot, pace)
+        await _contact(link, bundle, snapshot)
         if stored:
-            await _let_a_store_end(device, bundle, pace)
-        await _restart(device, bundle, pace)
-        if await _differing(device, bundle, snapshot):
-            await _write_back(device, bundle, snapshot, stored, pace)
+            await let_a_store_end(link, bundle)
+        restarted = await _restart(link, bundle)
+        if await differing(link, bundle, snapshot):
+            restarted = await _write_back(link, bundle, snapshot, stored)
     except DriverError as e:
         raise ProvisionError(str(e)) from e
+    if not stored:
+        return Evidence.NOTHING_STORED
+    return Evidence.RESTART if restarted else Evidence.READ_BACK
 
 
-async def lock_quietly(device: Device, bundle: Bundle, pace: Pace) -> None:
-    """Lock if the device will. A restart locks it too; what it holds does not depend on it."""
-    try:
-        await run_sequence(device, bundle, "lock", pace)
-    except FAILURES:
-        return
+async def let_a_store_end(link: RegisterLink, bundle: Bundle) -> None:
+    """A restart in the middle of a store could spoil the stored copy. What came of it shows after the restart."""
+    waits = [step for step in bundle.profile.sequences.store if isinstance(step, (WaitStep, PollStep))]
+    with suppress(DriverError, StationError):
+        await run_steps(link, bundle, "store", waits)
 
 
-async def _contact(device: Device, bundle: Bundle, snapshot: Snapshot, pace: Pace) -> None:
+async def differing(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> tuple[str, ...]:
+    """The registers in which the snapshot's own unit differs from it. Raises WrongUnit, DriverError."""
+    await check_identity(link, bundle, snapshot.serial)
+    return snapshot.differing((await take_snapshot(link, bundle, snapshot.raw)).raw)
+
+
+async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> None:
     """A device that had its power cut is back after a moment, on a new connection."""
     try:
-        await check_identity(device, bundle, snapshot.serial)
+        await check_identity(link, bundle, snapshot.serial)
     except NO_CONTACT:
-        await reconnect(device, bundle.profile, RECONNECT_S, pace)
+        await reconnect(link, bundle.profile)
 
 
-async def _let_a_store_end(device: Device, bundle: Bundle, pace: Pace) -> None:
-    """A restart in the middle of a store could spoil the stored copy."""
-    waits = [step for step in bundle.profile.sequences.store if isinstance(step, (WaitStep, PollStep))]
+async def _restart(link: RegisterLink, bundle: Bundle) -> bool:
+    """Whether the device is known to have restarted."""
+    if not bundle.profile.sequences.reset:
+        return False
+    await lock_quietly(link, bundle)
     try:
-        await run_steps(device, bundle, "store", waits, pace)
-    except FAILURES:
-        return  # what came of the store shows after the restart
-
-
-async def _restart(device: Device, bundle: Bundle, pace: Pace) -> None:
-    await lock_quietly(device, bundle, pace)
-    try:
-        await run_sequence(device, bundle, "reset", pace)
+        return await run_sequence(link, bundle, "reset")
     except RegisterRefused:
-        return  # writing back may still do
+        return False  # writing back may still do
 
 
-async def _differing(device: Device, bundle: Bundle, snapshot: Snapshot) -> tuple[str, ...]:
-    await check_identity(device, bundle, snapshot.serial)
-    return snapshot.differing((await take_snapshot(device, bundle, snapshot.raw)).raw)
-
-
-async def _write_back(device: Device, bundle: Bundle, snapshot: Snapshot, stored: bool, pace: Pace) -> None:
+async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, stored: bool) -> bool:
+    acknowledged = True
     try:
-        await run_sequence(device, bundle, "unlock", pace)
-        for name in await _differing(device, bundle, snapshot):
-            await device.write(name, snapshot.raw[name])
-        await _require_equal(device, bundle, snapshot)  # before anything wrong is made permanent
+        await run_sequence(link, bundle, "unlock")
+        for name in await differing(link, bundle, snapshot):
+            await link.write(name, snapshot.raw[name])
+        await _require_equal(link, bundle, snapshot)  # before anything wrong is made permanent
         if stored:
-            await run_sequence(device, bundle, "store", pace)
+            acknowledged = await run_sequence(link, bundle, "store")
     finally:
-        await lock_quietly(device, bundle, pace)
-    if stored:
-        await run_sequence(device, bundle, "reset", pace)
-        await _require_equal(device, bundle, snapshot)
+        await lock_quietly(link, bundle)
+    if not stored:
+        return False
+    restarted = bool(bundle.profile.sequences.reset) and await run_sequence(link, bundle, "reset")
+    await _require_equal(link, bundle, snapshot)
+    if not acknowledged and not restarted:
+        raise ProvisionError("the store of the old calibration went unanswered, and no read decides what it did")
+    return restarted
 
 
-async def _require_equal(device: Device, bundle: Bundle, snapshot: Snapshot) -> None:
-    if wrong := await _differing(device, bundle, snapshot):
+async def _require_equal(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> None:
+    if wrong := await differing(link, bundle, snapshot):
         raise ProvisionError(f"of the old calibration, {', '.join(wrong)} will not come back")

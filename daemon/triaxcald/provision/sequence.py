@@ -2,99 +2,108 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import Literal
 
-from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent
-from triaxcal_drivers.interface import Device
+from triaxcal_drivers.errors import BusError, DeviceBusy, DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle, PollStep, Profile, ReconnectStep, Step, WaitStep, WriteStep
 from triaxcald.errors import StationError
+from triaxcald.provision.access import NO_CONTACT, RegisterLink
 
 Label = Literal["unlock", "store", "lock", "reset"]
 POLL_S, RETRY_S = 0.02, 0.1
-NO_CONTACT = (BusError, DeviceAbsent, DeviceSilent)
-"""Nothing came back; unlike a refusal, it says nothing about what the device did."""
+RECONNECT_S = 5.0
+"""A device that lost its power is back after so long, or somebody has to look after it."""
 
 
 class SequenceStalled(StationError):
     """A register did not take the value that the sequence waits for."""
 
 
-@dataclass(frozen=True)
-class Pace:
-    """How time passes: ``sleep`` for so many seconds, ``clock_s`` monotonic."""
+async def run_sequence(link: RegisterLink, bundle: Bundle, label: Label) -> bool:
+    """Carry out ``label``'s steps in order; none where the profile gives none. Whether every write was acknowledged.
 
-    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
-    clock_s: Callable[[], float] = time.monotonic
-
-
-REAL_PACE = Pace()
-
-
-async def run_sequence(device: Device, bundle: Bundle, label: Label, pace: Pace = REAL_PACE) -> None:
-    """Carry out ``label``'s steps in order; none where the profile gives none.
-
-    A device that restarts need not acknowledge the write that makes it: silence there is no error where a
-    reconnect follows. Raises RegisterRefused, DeviceSilent, DeviceAbsent, BusError, SequenceStalled.
+    A store may go unanswered or be answered by "busy", and so may a write by which the device restarts (a wait or a
+    reconnect follows): nothing is sent twice, and what came of it is for a read to decide. Any other write raises.
+    Raises RegisterRefused, DeviceSilent, DeviceAbsent, BusError, SequenceStalled.
     """
-    await run_steps(device, bundle, label, getattr(bundle.profile.sequences, label), pace)
+    return await run_steps(link, bundle, label, getattr(bundle.profile.sequences, label))
 
 
-async def run_steps(device: Device, bundle: Bundle, label: Label, steps: Sequence[Step], pace: Pace) -> None:
+async def run_steps(link: RegisterLink, bundle: Bundle, label: Label, steps: Sequence[Step]) -> bool:
+    acknowledged = True
     for step, following in zip(steps, (*steps[1:], None), strict=False):
         match step:
             case WriteStep():
-                try:
-                    await device.write(step.write, bundle.profile.encode(step.write, step.value))
-                except DeviceSilent:
-                    if not isinstance(following, ReconnectStep):
-                        raise
+                restarts = isinstance(following, (WaitStep, ReconnectStep)) and label == "reset"
+                acknowledged &= await _written(link, bundle, step, open_ended=label == "store" or restarts)
             case WaitStep():
-                await pace.sleep(step.wait_s)
+                await link.pace.sleep(step.wait_s)
             case PollStep():
-                await _poll(device, bundle.profile, label, step, pace)
+                await _poll(link, bundle.profile, label, step)
             case ReconnectStep():
-                await reconnect(device, bundle.profile, step.timeout_s, pace)
+                await reconnect(link, bundle.profile, step.timeout_s)
+    return acknowledged
 
 
-async def _poll(device: Device, profile: Profile, label: Label, step: PollStep, pace: Pace) -> None:
-    deadline_s = pace.clock_s() + step.timeout_s
+async def lock_quietly(link: RegisterLink, bundle: Bundle) -> None:
+    """Lock if the device will. A restart locks it too; what it holds does not depend on it."""
+    with suppress(DriverError, StationError):
+        await run_sequence(link, bundle, "lock")
+
+
+async def _written(link: RegisterLink, bundle: Bundle, step: WriteStep, *, open_ended: bool) -> bool:
+    """Whether the write was acknowledged; ``open_ended`` where that need not be known."""
+    raw = bundle.profile.encode(step.write, step.value)
+    try:
+        await link.write(step.write, raw, timeout_s=step.timeout_s)
+    except (*NO_CONTACT, DeviceBusy) as e:
+        if not open_ended:
+            raise
+        if isinstance(e, BusError):
+            await link.renew()
+        return False
+    return True
+
+
+async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollStep) -> None:
+    deadline_s = link.pace.clock_s() + step.timeout_s
     while True:
         try:
-            value = profile.decode(step.poll, await device.read(step.poll))
-            if step.mask is not None:
-                value = int(value) & step.mask
+            held = profile.decode(step.poll, await link.read_once(step.poll))
+            value = held if step.mask is None else int(held) & step.mask
             late: Exception = SequenceStalled(
                 f"{label}: register {step.poll} holds {value:g} after {step.timeout_s:g} s, expected {step.until:g}"
             )
             if value == step.until:
                 return
-        except DeviceSilent as e:  # a device may be too busy to answer
+        except (*NO_CONTACT, RegisterRefused) as e:  # a device at work may be silent, or refuse for now
             late = e
-        if pace.clock_s() >= deadline_s:
+        if link.pace.clock_s() >= deadline_s:
             raise late
-        await pace.sleep(POLL_S)
+        await link.pace.sleep(POLL_S)
 
 
-async def reconnect(device: Device, profile: Profile, timeout_s: float, pace: Pace) -> None:
-    """Close and open until the device answers. Raises DeviceAbsent, DeviceSilent, BusError at the deadline."""
-    deadline_s = pace.clock_s() + timeout_s
+async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | None = None) -> None:
+    """Close and open until the device answers, for `RECONNECT_S` where nothing else is said.
+
+    Raises DeviceAbsent, DeviceSilent, BusError at the deadline.
+    """
+    deadline_s = link.pace.clock_s() + (RECONNECT_S if timeout_s is None else timeout_s)
     while True:
-        await device.close()
+        await link.close()
         try:
-            await device.open()
-            if probe := _probe(profile):
-                await device.read(probe)
+            await link.open()
+            if register := probe(profile):
+                await link.read_once(register)
             return
-        except NO_CONTACT:
-            if pace.clock_s() >= deadline_s:
+        except (*NO_CONTACT, DeviceBusy):
+            if link.pace.clock_s() >= deadline_s:
                 raise
-        await pace.sleep(RETRY_S)
+        await link.pace.sleep(RETRY_S)
 
 
-def _probe(profile: Profile) -> str | None:
+def probe(profile: Profile) -> str | None:
     """A register by which a device shows that it is there: opening may succeed on the bus alone."""
     return profile.identity.serial_register or next(iter(profile.identity.expect), None)

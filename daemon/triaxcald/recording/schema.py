@@ -22,7 +22,8 @@ from google.protobuf.message_factory import GetMessageClass
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 
 FORMAT = "triaxcal.recording/1"
-FORMAT_RECORD = "recording"  # the metadata record that holds FORMAT
+FORMAT_RECORD = "recording"  # the metadata record that holds FORMAT, and ENDS_WITH where it is of a run
+ENDS_WITH = "ends_with"  # the key there that says in which document a whole recording ends
 RAW_RECORD = "raw"  # the metadata record with count and digest, written at the end
 RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
 PROFILE = "triaxcal"  # in the header of the MCAP file
@@ -181,11 +182,16 @@ def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
 def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
     """(running index of the first record, phase, batch). Raises ValueError where ``data`` is none."""
     message = _parse("RawBatch", data)
+    if len(message.time_ns) > MAX_RECORDS:
+        raise ValueError(f"{len(message.time_ns)} records in one message, expected at most {MAX_RECORDS}")
+    length = np.array(message.length, dtype=np.uint32)
+    if np.any(length > np.iinfo(np.uint16).max):
+        raise ValueError(f"a record of {length.max()} bytes, expected at most {np.iinfo(np.uint16).max}")
     batch = RawBatch(
         np.array(message.time_ns, dtype=np.uint64).astype(np.int64),
         np.array(message.source, dtype=np.uint32),
         np.frombuffer(message.flags, dtype=np.uint8),
-        np.array(message.length, dtype=np.uint16),
+        length.astype(np.uint16),
         message.payload,
     )
     return int(message.first), str(message.phase), batch
@@ -240,13 +246,16 @@ def cut(batch: RawBatch, records: int = MAX_RECORDS) -> Iterator[RawBatch]:
 class RawDigest:
     """SHA-256 over raw records, the same however they are cut into batches and the phases interleaved.
 
-    Each phase has two running hashes, over the records' fixed-width columns and over their payloads.
+    Each phase has two running hashes, over the records' fixed-width columns and over their payloads. ``ends_with`` is
+    what the recording says that it ends with: the digest is of it too, so that nobody can take the end away and leave
+    a recording that looks like an older one.
     """
 
     _RECORD = np.dtype([("time_ns", "<i8"), ("source", "<u4"), ("flags", "u1"), ("length", "<u2")])
 
-    def __init__(self) -> None:
+    def __init__(self, ends_with: str = "") -> None:
         self.records = 0
+        self.ends_with = ends_with
         self._phases: dict[str, tuple[hashlib._Hash, hashlib._Hash]] = {}
 
     def update(self, phase: str, batch: RawBatch) -> None:
@@ -261,7 +270,7 @@ class RawDigest:
         self.records += len(batch)
 
     def hexdigest(self) -> str:
-        whole = hashlib.sha256()
+        whole = hashlib.sha256(self.ends_with.encode())
         for phase in sorted(self._phases):
             columns, payloads = self._phases[phase]
             whole.update(hashlib.sha256(phase.encode()).digest() + columns.digest() + payloads.digest())

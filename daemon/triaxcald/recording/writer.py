@@ -18,8 +18,10 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer as McapWriter
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
-from triaxcald.errors import RecordingError
+from triaxcald.abort import Left, add_action, discard_action
+from triaxcald.errors import DiskError, RecordingError
 from triaxcald.recording import schema
+from triaxcald.recording.inventory import Document, Inventory
 
 CHUNK_NS = 1_000_000_000  # no record waits longer than this for the operating system to have it
 
@@ -30,7 +32,8 @@ class RecordingWriter:
     ``metadata`` are named records of strings (run, station, unit, software). ``clock_ns`` is the host's time
     since the epoch; chunks close by it. At most ``queue_batches`` raw batches and preview blocks wait for the
     disk; what comes when the queue is full is dropped, counted in `losses` and noted in the file. Registers,
-    events and attachments are few and never dropped.
+    events and attachments are few and never dropped. ``ends_with`` is the format of the document that `seal` will be
+    given.
 
     Raises RecordingError, here and from every method: the file exists already or the disk has failed.
     """
@@ -45,6 +48,7 @@ class RecordingWriter:
         preview_hz: float = 20.0,
         clock_ns: Callable[[], int] = time.time_ns,
         queue_batches: int = 256,
+        ends_with: str = "",
     ) -> None:
         self.path = path
         self.losses: dict[str, int] = {}
@@ -52,7 +56,9 @@ class RecordingWriter:
         self._preview_fields = dict(zip(preview_channels, schema.preview_fields(preview_channels), strict=True))
         self._preview = schema.preview_schema(preview_channels)
         self._decimators = {topic: schema.Decimator(preview_hz) for topic in schema.PREVIEWS}
-        self._digest = schema.RawDigest()
+        self.ends_with = ends_with
+        self._digest = schema.RawDigest(ends_with)
+        self._inventory = Inventory()
         self._offered = 0
         self._attached: set[str] = set()
         self._unreported: list[tuple[str, int, int]] = []  # topic, first, records
@@ -74,6 +80,7 @@ class RecordingWriter:
         # A caller that dies without closing must not be kept alive by it; `log recover` finishes the file.
         self._thread = threading.Thread(target=self._run, name=f"recording {path.name}", daemon=True)
         self._thread.start()
+        add_action(self, self._finish_at_abort)
 
     def raw(self, phase: schema.Phase, batch: RawBatch) -> bool:
         """Whether there was room for the batch."""
@@ -110,6 +117,18 @@ class RecordingWriter:
         self._attached.add(name)
         self._jobs.put(partial(self._write_attachment, self._clock_ns(), name, media_type, data))
 
+    def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
+        """The last attachment, made from the inventory of all that is in the file before it; closes the recording."""
+        self._check()
+        time_ns = self._clock_ns()
+
+        def write() -> None:
+            self._report_losses()
+            self._write_attachment(time_ns, name, media_type, make(self._inventory.document()))
+
+        self._jobs.put(write)
+        self.close()
+
     def drain(self) -> None:
         """Waits until the operating system has all that was given before."""
         self._check()
@@ -130,8 +149,17 @@ class RecordingWriter:
             self._closed = True
             self._jobs.put(None)
         self._thread.join()
+        discard_action(self)
         if self._failure is not None:
             raise self._failure
+
+    def _finish_at_abort(self, until_s: float) -> Left:
+        self._closed = True
+        self._jobs.put(None)
+        self._thread.join(max(0.0, until_s - time.monotonic()))
+        if self._thread.is_alive():
+            return Left(f"{self.path} is not finished; triaxcal log recover mends it")
+        return Left(str(self._failure) if self._failure else f"{self.path} is finished")
 
     def __enter__(self) -> Self:
         return self
@@ -176,7 +204,7 @@ class RecordingWriter:
             self._write_end()
             ended = True
         except OSError as e:
-            self._failure = RecordingError(f"{self.path}: writing failed: {e.strerror or e}")
+            self._failure = DiskError(f"{self.path}: writing failed: {e.strerror or e}")
         finally:
             if not ended and self._failure is None:
                 self._failure = RecordingError(f"{self.path}: the writer stopped on a fault of its own")
@@ -215,7 +243,9 @@ class RecordingWriter:
 
     def _write_head(self, metadata: Mapping[str, dict[str, str]], unit: str) -> None:
         self._mcap.start(profile=schema.PROFILE)
-        for name, record in {schema.FORMAT_RECORD: {"format": schema.FORMAT}, **metadata}.items():
+        own = {"format": schema.FORMAT} | ({schema.ENDS_WITH: self.ends_with} if self.ends_with else {})
+        for name, record in {schema.FORMAT_RECORD: own, **metadata}.items():
+            self._inventory.metadata(name, record)
             self._mcap.add_metadata(name, record)
         self._channel_ids = _declare(self._mcap, self._preview, unit)
         self._write(schema.EVENTS, schema.Event(self._clock_ns(), "recording_started", "{}"))
@@ -240,12 +270,14 @@ class RecordingWriter:
         self._add(topic, value.time_ns, schema.encode(value))
 
     def _write_attachment(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
+        self._inventory.attachment(name, media_type, time_ns, data)
         self._mcap.add_attachment(time_ns, time_ns, name, media_type, data)
         self._flush()
 
     def _add(self, topic: str, time_ns: int, data: bytes) -> None:
         if self._flushed_ns is None:
             self._flushed_ns = self._clock_ns()
+        self._inventory.message(topic, time_ns, time_ns, data)
         self._mcap.add_message(self._channel_ids[topic], time_ns, data, time_ns)
 
     def _write_end(self) -> None:

@@ -20,8 +20,10 @@ from triaxcal.sensor import Sensor
 from triaxcal.synthetic import CONDITIONS, Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.catalogue import driver_named
+from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.profile import Bundle, Strict, load_bundle, parse_toml, validate
+from triaxcal_drivers.toml_text import SIZE_MOST
 from triaxcald.errors import InputError
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.modbus_unit import ModbusUnit
@@ -87,7 +89,7 @@ class SyntheticPhysics:
 def load_device(path: Path) -> DeviceFile:
     """Raises InputError, ProfileError."""
     try:
-        text = path.read_bytes()
+        text = read_whole(path, SIZE_MOST, pipe=True)
     except OSError as e:
         raise InputError(f"{path}: {e.strerror}") from e
     return validate(DeviceFile, parse_toml(text, where=str(path)), text, where=str(path))

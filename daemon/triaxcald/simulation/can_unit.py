@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,7 +16,7 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 from numpy.typing import NDArray
 
-from triaxcal_drivers.can.bus import open_bus
+from triaxcal_drivers.can.bus import close_bus, opened_bus
 from triaxcal_drivers.can.description import object_dictionary
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
 from triaxcal_drivers.errors import BusError
@@ -80,7 +81,8 @@ class _Requests(can.Listener):
         self._received = received
 
     def on_message_received(self, msg: can.Message) -> None:
-        self._loop.call_soon_threadsafe(self._received, msg)
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._received, msg)
 
     def on_error(self, exc: Exception) -> None:
         self.failure = exc
@@ -114,7 +116,7 @@ class CanUnit:
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
-        self._bus = await asyncio.to_thread(open_bus, self._settings)
+        self._bus = await opened_bus(self._settings)
         node = self._node_id
         self._bus.set_filters([{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x000, 0x600 + node)])
         self._requests = _Requests(asyncio.get_running_loop(), self._received)
@@ -125,11 +127,12 @@ class CanUnit:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await asyncio.to_thread(self._notifier.stop)
         assert self._task is not None
         self._task.cancel()
-        outcome = (await asyncio.gather(self._task, return_exceptions=True))[0]
-        await asyncio.to_thread(self._bus.shutdown)
+        try:
+            outcome = (await asyncio.gather(self._task, return_exceptions=True))[0]
+        finally:
+            await close_bus(self._bus, self._notifier)
         if isinstance(outcome, (can.CanError, OSError)):
             raise BusError(f"simulated unit, {self._settings}: {outcome}") from outcome
         if isinstance(outcome, Exception):

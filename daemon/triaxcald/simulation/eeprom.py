@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
+from triaxcal_drivers.files import read_whole
+from triaxcald.abort import at_abort
 from triaxcald.errors import InputError
+from triaxcald.files import require_writable, write_bytes
 from triaxcald.simulation.unit import ReferenceUnit
 
 LOOK_S = 0.05
+EEPROM_MOST = 4096
+"""Bytes; the unit's has 90. What is longer is somebody's file, and not to be written over."""
 
 
 def read_eeprom(path: Path) -> bytes | None:
-    """None where there is no such file yet. Raises InputError."""
+    """None where there is no such file yet; it must be one that can be written. Raises InputError."""
+    require_writable(path)
     try:
-        return path.read_bytes()
+        return read_whole(path, EEPROM_MOST)
     except FileNotFoundError:
         return None
     except OSError as e:
@@ -26,12 +31,7 @@ def read_eeprom(path: Path) -> bytes | None:
 
 def write_eeprom(path: Path, image: bytes) -> None:
     """Whole or not at all. Raises InputError."""
-    temporary = path.with_name(f".{path.name}.new")
-    try:
-        temporary.write_bytes(image)
-        os.replace(temporary, path)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror}") from e
+    write_bytes(path, image)
 
 
 @asynccontextmanager
@@ -40,14 +40,19 @@ async def keep_eeprom(unit: ReferenceUnit, path: Path | None) -> AsyncIterator[N
     if path is None:
         yield
         return
+
+    def keep(_: float) -> None:
+        with suppress(InputError):
+            write_eeprom(path, unit.eeprom)
+
     task = asyncio.create_task(_follow(unit, path))
-    try:
-        yield
-    finally:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-        write_eeprom(path, unit.eeprom)
+    with at_abort(keep):
+        try:
+            yield
+        finally:
+            if not task.cancel():
+                task.result()
+            write_eeprom(path, unit.eeprom)
 
 
 async def _follow(unit: ReferenceUnit, path: Path) -> None:

@@ -36,15 +36,17 @@ class Progress(Protocol):
 class Collection:
     """``pipelines`` by stream: the readings, and the corrected output where the device has one.
 
-    ``where`` says where the unit is, for messages.
+    ``where`` says where the unit is, for messages; ``ends_with`` is what the recording ends with.
     """
 
     phase: Phase
     bundle: Bundle
     where: str
-    digest: RawDigest = field(default_factory=RawDigest)
+    ends_with: str = ""
+    digest: RawDigest = field(init=False)
 
     def __post_init__(self) -> None:
+        self.digest = RawDigest(self.ends_with)
         streams = [s for s in (READINGS, CORRECTED) if s in self.bundle.profile.streams]
         self.pipelines = {s: Pipeline(self.bundle, s) for s in streams}
 
@@ -145,11 +147,14 @@ class Collection:
 
 
 class _Watch:
-    """Sees that one stream goes on; a device may go on sending another and never this one."""
+    """Sees that one stream goes on; a device may go on sending another and never this one.
+
+    The time counts from the first look: before that the driver may have been discarding what was sampled earlier.
+    """
 
     def __init__(self, pipeline: Pipeline, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
         self._pipeline, self._stream, self._timeout_s, self._clock_s = pipeline, stream, timeout_s, clock_s
-        self._samples, self._heard_s = pipeline.counts["samples"], clock_s()
+        self._samples, self._heard_s = -1, 0.0
 
     def look(self) -> None:
         """Raises DeviceSilent."""

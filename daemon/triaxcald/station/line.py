@@ -3,38 +3,55 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from triaxcal.errors import Refused, TriaxcalError
-from triaxcal_drivers.errors import DriverError, RegisterValueError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
+from triaxcald import text
+from triaxcald.abort import Left, at_abort
 from triaxcald.certificate import Certified, certify, software
 from triaxcald.documents import Document, to_text
-from triaxcald.errors import DaemonError, InputError, RecordingError
+from triaxcald.errors import InputError, RecordingError
+from triaxcald.exit_codes import DISK, DONE, OUTSIDE
 from triaxcald.files import write_text
 from triaxcald.inputs import CALIBRATION, PROFILE, STATION_FILE, VERIFICATION
+from triaxcald.outcome import (
+    ATTACHMENT,
+    FORMAT,
+    Ending,
+    Papers,
+    Verdict,
+    digest_of,
+    latest_of,
+    measured_in,
+    outcome_document,
+    registers_told,
+)
 from triaxcald.pipeline import Pipeline
+from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
-from triaxcald.provision.procedure import ProvisionReport
+from triaxcald.provision.image import RegisterImage
+from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.state import Held
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.page import render_report
 from triaxcald.report.stream import overview_of
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, Station
-from triaxcald.station.write_back import NEW_UNCHECKED, NEW_UNJUDGED, NEW_VERIFIED, UNCERTAIN, WriteBack, corrected
-from triaxcald.verification import Verification
+from triaxcald.station.endings import aborted
+from triaxcald.station.serials import SerialsSeen
+from triaxcald.station.write_back import WriteBack, corrected
+from triaxcald.verification import OUTSIDE as VERIFIED_OUTSIDE
+from triaxcald.verification import WORSE, Verification
 
-CERTIFICATE = "certificate.json"
-INTERRUPTED, FAILED = 130, 4
+CERTIFICATE, REPORT = "certificate.json", "report.html"
 
 _DRAWING = threading.Lock()
 """The pictures' style is the process's own: one report is drawn at a time."""
@@ -44,18 +61,21 @@ _DRAWING = threading.Lock()
 class Outcome:
     """How one unit's run ended. ``exit_code`` as the command line owes it; ``error`` one line where it failed.
 
-    ``device_state`` says in words what the device holds, None where nothing was written. ``lost`` counts records that
-    did not get to the disk.
+    ``document`` is the `triaxcal.outcome/1`. ``device_state`` says in words what the device holds, None where nothing
+    was to be written. ``lost`` counts records that did not get to the disk.
     """
 
     unit: str
     exit_code: int
+    document: Document
+    held: Held
     recording: Path | None = None
     certificate: Path | None = None
     report: Path | None = None
+    outcome: Path | None = None
     certified: Certified | None = None
     verification: Document | None = None
-    provisioned: ProvisionReport | None = None
+    provisioned: Provisioning | None = None
     device_state: str | None = None
     error: str | None = None
     wanted: tuple[str, ...] = ()
@@ -63,80 +83,161 @@ class Outcome:
 
 
 class UnitRun:
-    """The whole line for one unit of a station."""
+    """The whole line for one unit of a station. ``force`` is the reason to write in spite of doubts."""
 
     def __init__(
-        self, station: Station, place: Place, progress: Progress, *, clock_ns: Callable[[], int] = time.time_ns
+        self,
+        station: Station,
+        place: Place,
+        progress: Progress,
+        *,
+        serials: SerialsSeen | None = None,
+        clock_ns: Callable[[], int] = time.time_ns,
+        force: str | None = None,
     ) -> None:
-        self.station, self.place, self.progress, self.clock_ns = station, place, progress, clock_ns
+        self.station, self.place, self.progress, self.clock_ns, self.force = station, place, progress, clock_ns, force
+        self.serials = serials or SerialsSeen()
         self.name = place.unit.name
         self.profile = place.bundle.profile
+        self._serial: str | None = None
         self._recording: Path | None = None
-        self._certificate: Path | None = None
-        self._page: Path | None = None
+        self._papers: dict[str, str] = {}
+        self._paths: dict[str, Path] = {}
         self._certified: Certified | None = None
         self._write_back: WriteBack | None = None
+        self._document: Document | None = None
         self._lost = 0
 
     async def run(self) -> Outcome:
         """Raises nothing, not even when it is cancelled: it says everything in the outcome."""
+        ending: Ending | None = None
         try:
             async with self.place.opened() as device:
                 identity = await self.identify(device)
+                self._serial = identity.serial
                 self._recording = self.recording_path(identity)
                 with self.writer(self._recording, identity) as writer:
-                    try:
-                        code = await self._line(device, identity, writer)
-                    except (TriaxcalError, DriverError, DaemonError) as e:
-                        with suppress(RecordingError):
-                            writer.event("failed", {"error": str(e)})
-                        raise
-                    finally:
-                        self._lost = sum(writer.losses.values())
-        except asyncio.CancelledError:
-            return self._outcome(INTERRUPTED, "interrupted")
-        except Refused as e:
-            return self._outcome(3, str(e), e.wanted)
-        except (TriaxcalError, RegisterValueError) as e:
-            return self._outcome(3, str(e))
-        except DriverError as e:
-            return self._outcome(FAILED, str(e))
-        except DaemonError as e:
-            return self._outcome(e.exit_code, str(e))
-        except Exception as e:  # noqa: BLE001 - the one place that supervises: other units must go on
-            with suppress(OSError, ValueError):  # a closed standard error
-                traceback.print_exc(file=sys.stderr)
-            return self._outcome(FAILED, f"internal error: {e!r}")
-        return self._outcome(code)
+                    ending = await self._ending(device, identity, writer)
+                    self._seal(writer, ending)
+        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
+            if self._document is None:  # what is sealed stays said
+                ending = aborted(e, self._provisioning)
+        assert ending is not None
+        try:
+            self._write_papers()
+        except InputError as e:
+            ending = replace(ending, reason=str(e), exit_code=DISK)
+        return self._outcome(ending)
 
-    def _outcome(self, code: int, error: str | None = None, wanted: tuple[str, ...] = ()) -> Outcome:
-        """With what there is by now. Once writing has begun, an error also says what the device holds."""
+    async def _ending(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
+        try:
+            return await self._line(device, identity, writer)
+        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - likewise: the recording is to be sealed
+            ending = aborted(e, self._provisioning)
+            with suppress(RecordingError):
+                writer.event("failed", {"error": ending.reason})
+            return ending
+        finally:
+            self._lost = sum(writer.losses.values())
+
+    def left(self, _: float) -> Left | None:
+        """What the end at once would leave behind."""
+        p = self._provisioning
+        return None if p is None else Left(f"unit {self.name}: {text.left(p, self.station.path)}", not p.settled)
+
+    @property
+    def _provisioning(self) -> Provisioning | None:
+        return self._write_back.provisioning if self._write_back else None
+
+    @property
+    def _held(self) -> Held:
+        return self._provisioning.held if self._provisioning else Held()
+
+    def _seal(self, writer: RecordingWriter, ending: Ending) -> None:
+        """The outcome as the last attachment, with the inventory of all that is before it; closes the recording."""
+        made: list[Document] = []
+
+        def make(contents: Document) -> bytes:
+            made.append(self._outcome_document(ending, contents))
+            return to_text(made[0]).encode()
+
+        writer.seal(ATTACHMENT, "application/json", make)
+        self._document = made[0]
+
+    def _outcome_document(self, ending: Ending, contents: Document | None) -> Document:
+        certificate = self._certified.document if self._certified else None
         back = self._write_back
-        state = back.state if back else None
-        if error is not None:
-            if state is not None and state not in error:
-                error = f"{error}; {state}"
-            if state is not None and (code != INTERRUPTED or state.startswith(UNCERTAIN)):
-                code = FAILED
-            error = f"unit {self.name}: {error}"
+        return outcome_document(
+            ending,
+            self._held,
+            Papers(
+                measured=measured_in(certificate) if certificate else None,
+                verification=back.verification if back else None,
+                registers=registers_told(back.provisioning) if back and back.provisioning else None,
+                limits=self.station.file.limits.model_dump(),
+                outside=certificate["outside"] if certificate else (),
+                digests={name: digest_of(self._papers[name].encode()) for name in sorted(self._papers)},
+                contents=contents,
+            ),
+            unit=self.name,
+            serial=self._serial,
+            station=self.station.file.name,
+            ended=datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds"),
+            software=software(),
+            supersedes=latest_of(self.station.folder, self._serial),
+            journal=self._journal,
+            forced=self.force if back and back.doubts else None,
+        )
+
+    @property
+    def _journal(self) -> str | None:
+        """Where it is still needed."""
+        p = self._provisioning
+        return None if p is None or p.settled else str(p.journal.path)
+
+    def _write_papers(self) -> None:
+        """The files beside the recording, once it is closed: certificate and report, the outcome last."""
+        if self._recording is None:
+            return
+        papers = dict(self._papers)
+        if self._document is not None:
+            papers[ATTACHMENT] = to_text(self._document)
+        for name, content in papers.items():
+            self._paths[name] = write_text(self._recording.with_suffix(f".{name}"), content)
+
+    def _outcome(self, ending: Ending) -> Outcome:
+        back, held = self._write_back, self._held
+        state = text.held(held) if back else None
+        error = None
+        if ending.verdict is Verdict.ABORTED or ending.exit_code == DISK:
+            told = [ending.reason, *([state] if state and state not in ending.reason else [])]
+            if back and back.provisioning and (settle := text.settling(back.provisioning, self.station.path)):
+                told.append(settle)
+            error = f"unit {self.name}: {'; '.join(told)}"
         return Outcome(
             unit=self.name,
-            exit_code=code,
+            exit_code=ending.exit_code,
+            document=self._document or self._outcome_document(ending, None),
+            held=held,
             recording=self._recording,
-            certificate=self._certificate,
-            report=self._page,
+            certificate=self._paths.get(CERTIFICATE),
+            report=self._paths.get(REPORT),
+            outcome=self._paths.get(ATTACHMENT),
             certified=self._certified,
             verification=back.verification if back else None,
-            provisioned=back.report if back else None,
+            provisioned=back.provisioning if back else None,
             device_state=state,
             error=error,
-            wanted=wanted,
+            wanted=ending.wanted,
             lost=self._lost,
         )
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")
-        return await check_identity(device, self.place.bundle, self.place.unit.serial, where=self.place.address)
+        link, where = RegisterLink(device, self.profile), self.place.address
+        identity = await check_identity(link, self.place.bundle, self.place.unit.serial, where=where)
+        self.serials.add(identity.serial, self.name, where)
+        return identity
 
     def recording_path(self, identity: IdentityRead) -> Path:
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
@@ -147,7 +248,7 @@ class UnitRun:
             raise InputError(f"{folder}: no folder for recordings: {e.strerror}") from e
         return folder / f"{self.name}-{identity.serial or 'unknown'}-{stamp}.mcap"
 
-    def writer(self, path: Path, identity: IdentityRead) -> RecordingWriter:
+    def writer(self, path: Path, identity: IdentityRead, *, ends_with: str = FORMAT) -> RecordingWriter:
         unit = {"name": self.name, "serial": identity.serial or "", "signs": ",".join(map(str, self.place.signs))}
         writer = RecordingWriter(
             path,
@@ -159,6 +260,7 @@ class UnitRun:
             preview_channels=self._channels(),
             preview_unit=self.profile.output.unit,
             clock_ns=self.clock_ns,
+            ends_with=ends_with,
         )
         writer.attach(STATION_FILE, "application/toml", self.station.text)
         writer.attach(PROFILE, "application/toml", self.place.bundle.text)
@@ -172,33 +274,56 @@ class UnitRun:
             names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
         return list(names)
 
-    async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> int:
-        """The exit code that the figures owe."""
-        assert self._recording is not None
-        plan, stem = self.station.file.plan, self._recording.with_suffix("")
-        tumble = Collection(CALIBRATION, self.place.bundle, self.place.address)
+    async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
+        plan = self.station.file.plan
+        tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, writer.ends_with)
         await self._collect(device, writer, tumble, READINGS, plan.poses)
         self.progress.stage(self.name, "fitting")
         poses = tumble.pipelines[READINGS].finish()
         certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
-        writer.attach(CERTIFICATE, "application/json", to_text(certified.document).encode())
-        self._certificate = write_text(Path(f"{stem}.certificate.json"), to_text(certified.document))
-        code = 0 if certified.within_limits else 1
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
-
-            async def collect(check: Collection) -> None:
-                self.progress.stage(self.name, "verifying by physics")
-                await self._collect(device, writer, check, CORRECTED, plan.check_poses)
-
-            self.progress.stage(self.name, "writing the registers")
-            back = self._write_back = WriteBack(self.place, self.station.file, writer, collect)
-            await back.run(device, certified.image, identity.serial, tumble)
-            code = 0 if back.state in (NEW_VERIFIED, NEW_UNJUDGED, NEW_UNCHECKED) else 1
+            await self._write(device, writer, certified.image, identity, tumble)
+        ending = self._judged(certified)
         self.progress.stage(self.name, "writing the report")
-        page = await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS])
-        writer.attach("report.html", "text/html", page.encode())
-        self._page = write_text(Path(f"{stem}.report.html"), page)
-        return code
+        papers = {REPORT: await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS])}
+        if ending.verdict is not Verdict.FAIL:
+            papers[CERTIFICATE] = to_text(certified.document)
+        for name, media_type in ((CERTIFICATE, "application/json"), (REPORT, "text/html")):
+            if name in papers:
+                writer.attach(name, media_type, papers[name].encode())
+        self._papers = papers
+        return ending
+
+    async def _write(
+        self, device: Device, writer: RecordingWriter, image: RegisterImage, identity: IdentityRead, tumble: Collection
+    ) -> None:
+        async def collect(check: Collection) -> None:
+            self.progress.stage(self.name, "verifying by physics")
+            await self._collect(device, writer, check, CORRECTED, self.station.file.plan.check_poses)
+
+        self.progress.stage(self.name, "writing the registers")
+        self._write_back = WriteBack(
+            self.place,
+            self.station,
+            writer,
+            collect,
+            ask=lambda what: self.progress.stage(self.name, what),
+            started=datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="seconds"),
+            force=self.force,
+        )
+        await self._write_back.run(device, image, identity.serial, tumble)
+
+    def _judged(self, certified: Certified) -> Ending:
+        """The verdict on the figures: on those of the fit, and on the device's own output where it was written."""
+        back, limits = self._write_back, self.station.file.limits
+        if not certified.within_limits:
+            return Ending(Verdict.FAIL, "; ".join(certified.document["outside"]), OUTSIDE)
+        if back and back.verification and back.verdict in (VERIFIED_OUTSIDE, WORSE):
+            return Ending(Verdict.FAIL, text.verification_failed(back.verification), OUTSIDE)
+        checked = limits.verification_rms_g is not None and back is not None and back.verification is not None
+        if limits.rms_g is None and limits.cross_validated_rms_g is None and not checked:
+            return Ending(Verdict.NOT_JUDGED, "the station has no limit for what was measured", DONE)
+        return Ending(Verdict.PASS, text.passed(back.verification if back else None), DONE)
 
     def _certify(self, tumble: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
         return certify(
@@ -242,7 +367,7 @@ class UnitRun:
         if self._write_back and self._write_back.verification:
             papers["verification"] = self._write_back.verification
         if self._write_back:
-            papers["device"] = self._write_back.state
+            papers["device"] = text.held(self._held)
         overview = overview_of(pipeline.windows, pipeline.poses(), self.profile.output.unit)
         with _DRAWING:
             return render_report(
@@ -253,16 +378,21 @@ class UnitRun:
             )
 
 
-async def run_station(station: Station, progress: Progress) -> list[Outcome]:
+async def run_station(station: Station, progress: Progress, *, force: str | None = None) -> list[Outcome]:
     """All units of a station at once; one that fails does not stop the others.
 
-    When it is cancelled, every unit is put in order first; the outcomes then say 130.
+    When it is cancelled, every unit is, again each time, and put in order first; the outcomes then say 130.
     """
-    units = [asyncio.ensure_future(UnitRun(station, place, progress).run()) for place in station.places]
-    try:
-        await asyncio.wait(units)
-    except asyncio.CancelledError:
-        for unit in units:
-            unit.cancel()
-        await asyncio.wait(units)
-    return [unit.result() for unit in units]
+    serials = SerialsSeen()
+    runs = [UnitRun(station, place, progress, serials=serials, force=force) for place in station.places]
+    with ExitStack() as stack:
+        for run in runs:
+            stack.enter_context(at_abort(run.left))
+        units = [asyncio.ensure_future(run.run()) for run in runs]
+        while not all(unit.done() for unit in units):
+            try:
+                await asyncio.wait(units)
+            except asyncio.CancelledError:
+                for unit in units:
+                    unit.cancel()
+        return [unit.result() for unit in units]

@@ -2,93 +2,144 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from triaxcal.arrays import Floats
 from triaxcal.errors import Refused, TriaxcalError
+from triaxcal.poses.pose import Pose
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import CORRECTED
+from triaxcal_drivers.profile import CORRECTED, READINGS
+from triaxcald import text
 from triaxcald.documents import Document, to_text
-from triaxcald.errors import DaemonError, RecordingError, StationError
+from triaxcald.errors import DaemonError, DiskError, Implausible, StationError
 from triaxcald.inputs import VERIFICATION
-from triaxcald.provision.access import RecordedDevice, RegisterAccess
+from triaxcald.provision.access import RegisterAccess, RegisterLink
+from triaxcald.provision.corrected import LEAST, departure_g, doubt_of_departure
 from triaxcald.provision.image import RegisterImage
-from triaxcald.provision.procedure import ProvisionReport, provision, to_its_end
-from triaxcald.provision.restore import restore
-from triaxcald.provision.snapshot import Snapshot
+from triaxcald.provision.plausible import Doubt, is_blank
+from triaxcald.provision.power import power_cycled
+from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.state import DeviceState
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.collection import Collection
-from triaxcald.station.config import Place, StationFile
-from triaxcald.verification import OUTSIDE, UNJUDGED, WITHIN, WORSE, Verification, verification_document, verified
+from triaxcald.station.config import Place, Station
+from triaxcald.verification import OUTSIDE, UNJUDGED, WORSE, Verification, verification_document, verified
 
 VERIFICATION_FILE = "verification.json"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
-UNTOUCHED, RESTORED = "old calibration untouched", "old calibration restored and verified"
-NEW_VERIFIED = "the device holds the new calibration, verified"
-NEW_UNJUDGED = "the device holds the new calibration, read back; its output is not judged, as the station has no limit"
-NEW_UNCHECKED = "the device holds the new calibration, not verified by physics: it has no corrected stream"
-UNCERTAIN = "NOT restored"
-"""What a state begins with where nobody can vouch for what the device holds."""
+FIRST_POSES = 4
+"""Of so many poses at the start of either stream at least one is in the other stream too."""
+REGISTERS_EARLIER = "registers-earlier.json"
+"""What the device held before an earlier provisioning that was cut short: what an undoing brings back."""
 
 
 @dataclass
 class WriteBack:
-    """``state`` says in words what the device holds, None while nothing was tried. ``collect`` fetches check poses."""
+    """``collect`` fetches check poses, ``ask`` shows the operator what to do; ``force`` is the reason to go on in spite
+    of `doubts`. ``verdict`` is the one on the device's own output, None before it is judged."""
 
     place: Place
-    file: StationFile
+    station: Station
     writer: RecordingWriter
     collect: Callable[[Collection], Awaitable[None]]
-    state: str | None = None
-    report: ProvisionReport | None = field(default=None, init=False)
+    ask: Callable[[str], None]
+    started: str
+    force: str | None = None
     verification: Document | None = field(default=None, init=False)
+    verdict: str | None = field(default=None, init=False)
+    doubts: Sequence[Doubt] = field(default=(), init=False)
+    provisioning: Provisioning | None = field(default=None, init=False)
 
     async def run(self, device: Device, image: RegisterImage, serial: str | None, tumble: Collection) -> None:
-        """Whatever is raised on the way, the old calibration has been put back before, or `state` says why not."""
+        """Whatever is raised on the way, the old calibration has been put back before, or `held` says what is not.
+
+        Raises Implausible, with nothing written, ProvisionError, StationError, DiskError.
+        """
+        link = RegisterLink(device, self.place.bundle.profile, _recorder(self.writer))
+        p = Provisioning(
+            link,
+            self.place.bundle,
+            image,
+            unit=self.place.unit.name,
+            folder=self.station.folder,
+            expected_serial=serial,
+            where=self.place.address,
+            started=self.started,
+            power_cycle=self._power_cycle(link) if self.station.file.provisioning.power_cycle else None,
+        )
+        await p.examine()
+        self.provisioning = p
+        self.doubts = [*p.doubts, *self._doubts_of_output(tumble)]
+        if self.doubts and self.force is None:
+            raise Implausible(text.doubted(self.doubts))
+        self._attach(REGISTERS_BEFORE, p.found.raw)
+        if p.carried:
+            self._attach(REGISTERS_EARLIER, p.before.raw)
         try:
-            report = self.report = await provision(
-                device,
-                self.place.bundle,
-                image,
-                expected_serial=serial,
-                record=_Recorder(self.writer),
-                where=self.place.address,
-            )
-        except BaseException as e:
-            self.state = getattr(e, "__notes__", [UNTOUCHED])[-1]
+            await p.write()
+            await self._finish(p, tumble)
+        finally:
+            p.finish()
+
+    async def _finish(self, p: Provisioning, tumble: Collection) -> None:
+        try:
+            self._attach(REGISTERS_AFTER, p.after.raw)
+            self.writer.event("provisioned", {"written": list(p.written)})
+            self.verdict = await self._verify(tumble)
+        except DiskError:
+            await p.undo()
             raise
-        self.state = f"{UNCERTAIN}: the new calibration is stored and not verified"
-        try:
-            self.writer.attach(REGISTERS_BEFORE, "application/json", _snapshot_text(report.before))
-            self.writer.attach(REGISTERS_AFTER, "application/json", _snapshot_text(report.after))
-            self.writer.event("provisioned", {"written": list(report.written)})
-            verdict = await self._verify(tumble)
         except (DriverError, DaemonError, TriaxcalError) as e:
-            await self._undo(device, report)
+            await p.undo()
             raise StationError(f"verification failed: {e}") from e
         except BaseException:
-            await self._undo(device, report)
+            await p.undo()
             raise
-        if verdict in (OUTSIDE, WORSE):
-            await self._undo(device, report)
-            self.writer.event("restored", {"state": self.state})
-            if self.state != RESTORED:
-                raise StationError(f"verification {verdict}")
+        if self.verdict in (OUTSIDE, WORSE):
+            await p.undo()
+            self.writer.event("restored", {"state": p.held.state.value})
+            if p.held.state is not DeviceState.OLD:
+                raise StationError(f"verification {self.verdict}, and the old calibration could not be put back")
+            if (task := asyncio.current_task()) and task.cancelling():
+                raise asyncio.CancelledError
+
+    def _power_cycle(self, link: RegisterLink) -> Callable[[], Awaitable[bool]]:
+        async def asked() -> bool:
+            self.ask(text.SWITCH_SUPPLY)
+            return await power_cycled(link, self.place.bundle.profile, self.station.file.plan.patience_s)
+
+        return asked
+
+    def _doubts_of_output(self, tumble: Collection) -> list[Doubt]:
+        assert self.provisioning is not None
+        if CORRECTED not in tumble.pipelines or is_blank(self.provisioning.found) or self.provisioning.carried:
+            return []
+        profile, found = self.place.bundle.profile, self.provisioning.found
+        readings, outputs = tumble.pipelines[READINGS].poses(), tumble.pipelines[CORRECTED].poses()
+        departures = [
+            off_g
+            for pairs in _alignments(readings, outputs)
+            if (off_g := departure_g(profile, found, *_paired(pairs))) is not None
+        ]
+        return doubt_of_departure(min(departures, default=None))
 
     async def _verify(self, tumble: Collection) -> str:
         """What the device's own output is judged to be."""
         if CORRECTED not in self.place.bundle.profile.streams:
-            self.state = NEW_UNCHECKED
             return UNJUDGED
-        check = Collection(VERIFICATION, self.place.bundle, self.place.address)
+        check = Collection(VERIFICATION, self.place.bundle, self.place.address, self.writer.ends_with)
         await self.collect(check)
-        found = corrected(check, self.file.reference)
+        found, reference = corrected(check, self.station.file.reference), self.station.file.reference
         document = self.verification = verification_document(
-            corrected(tumble, self.file.reference),
+            corrected(tumble, reference),
             found,
-            limit_g=self.file.limits.verification_rms_g,
+            limit_g=self.station.file.limits.verification_rms_g,
             raw_sha256=check.digest.hexdigest(),
         )
         self.writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
@@ -96,21 +147,11 @@ class WriteBack:
             faults = ", ".join(dict.fromkeys(p.fault for p in found.untrusted))
             why = f"no check pose can be trusted: {len(found.poses)} left out ({faults})"
             raise Refused(why if found.poses else "there is no check pose")
-        verdict = str(document["verdict"])
-        self.state = {WITHIN: NEW_VERIFIED, UNJUDGED: NEW_UNJUDGED}.get(verdict, self.state)
-        return verdict
+        return str(document["verdict"])
 
-    async def _undo(self, device: Device, report: ProvisionReport) -> None:
-        recorded = RecordedDevice(device, _Recorder(self.writer, lenient=True))
-
-        async def put_back() -> str:
-            try:
-                await restore(recorded, self.place.bundle, report.before, stored=True)
-            except (DriverError, StationError) as e:
-                return f"{UNCERTAIN}: {e}"
-            return RESTORED
-
-        self.state = await to_its_end(put_back())
+    def _attach(self, name: str, raw: Mapping[str, bytes]) -> None:
+        held = {register: value.hex() for register, value in raw.items()}
+        self.writer.attach(name, "application/json", (json.dumps(held, indent=2) + "\n").encode())
 
 
 def corrected(collection: Collection, reference: float) -> Verification:
@@ -118,20 +159,29 @@ def corrected(collection: Collection, reference: float) -> Verification:
     return verified(collection.pipelines[CORRECTED], reference)
 
 
-class _Recorder:
-    """Records register accesses; once the disk has failed, silently none, so that the device can be put back."""
+def _alignments(readings: Sequence[Pose], outputs: Sequence[Pose]) -> Iterator[list[tuple[Pose, Pose]]]:
+    """Poses of the two streams that lie over each other, for each way to lay one over the other.
 
-    def __init__(self, writer: RecordingWriter, *, lenient: bool = False) -> None:
-        self._writer, self._lenient = writer, lenient
+    Each stream counts its seconds from its own first sample, and either may have begun some poses later.
+    """
+    (r0, r1), (c0, c1) = (np.array([(p.start_s, p.end_s) for p in s]).reshape(-1, 2).T for s in (readings, outputs))
+    apart_s = np.subtract.outer(r0, c0)
+    for shift_s in np.unique(np.r_[0.0, apart_s[:FIRST_POSES].ravel(), apart_s[:, :FIRST_POSES].ravel()]):
+        shared_s = np.minimum.outer(r1, c1 + shift_s) - np.maximum.outer(r0, c0 + shift_s)
+        over = np.argwhere(shared_s >= 0.5 * np.maximum.outer(r1 - r0, c1 - c0))
+        if len(over) >= LEAST:
+            yield [(readings[i], outputs[j]) for i, j in over]
 
-    def __call__(self, access: RegisterAccess) -> None:
-        try:
-            self._writer.register(access.register, access.kind, access.raw, access.error or "")
-        except RecordingError:
-            if not self._lenient:
-                self._lenient = True
-                raise
+
+def _paired(pairs: Sequence[tuple[Pose, Pose]]) -> tuple[Floats, Floats, dict[str, Floats]]:
+    """Means (n,3) of both streams, and the channels (n,) that every pose has."""
+    names = set.intersection(*(set(r.channels) for r, _ in pairs)) if pairs else set()
+    return (
+        np.array([r.mean for r, _ in pairs]).reshape(-1, 3),
+        np.array([c.mean for _, c in pairs]).reshape(-1, 3),
+        {name: np.array([r.channels[name] for r, _ in pairs]) for name in names},
+    )
 
 
-def _snapshot_text(snapshot: Snapshot) -> bytes:
-    return (json.dumps({name: raw.hex() for name, raw in snapshot.raw.items()}, indent=2) + "\n").encode()
+def _recorder(writer: RecordingWriter) -> Callable[[RegisterAccess], None]:
+    return lambda a: writer.register(a.register, a.kind, a.raw, a.error or "")

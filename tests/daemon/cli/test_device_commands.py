@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import socket
@@ -60,7 +61,9 @@ def test_a_dry_run_shows_what_would_be_written_and_writes_nothing(workshop: Any,
         shown = triaxcal("provision", cal, station, "--dry-run")
         assert served.unit.eeprom == OLD.image()
     assert (done.code, done.err) == (0, "")
-    assert set(done.json) == {"format", "unit", "serial", "dry_run", "written", "differing", "stored", "words"}
+    assert set(done.json) >= {"format", "unit", "serial", "dry_run", "written", "differing", "stored", "words"}
+    assert done.json["outcome"]["device_state"] == "untouched"
+    assert list(workshop.folder.glob("*.outcome.json")) == []
     assert done.json["format"] == "triaxcal.provisioning/1"
     assert done.json["dry_run"] is True
     assert (done.json["written"], done.json["stored"]) == ([], False)
@@ -90,7 +93,11 @@ def test_a_calibration_is_written_and_read_back_and_a_second_time_nothing_differ
     assert rows["bias_y"]["value"] == pytest.approx(-0.003, rel=1e-7)
     assert rows["calibration_crc"]["crc_ok"] is True
     assert held.write_counter == 1
-    assert "held these registers already; nothing was written" in again.out
+    assert "held these values already, and nothing was written" in again.out
+    first, second = sorted(workshop.folder.glob("4711-*.outcome.json"), key=lambda path: path.stat().st_mtime_ns)
+    assert json.loads(first.read_text()) == done.json["outcome"]
+    assert json.loads(second.read_text())["supersedes"] == hashlib.sha256(first.read_bytes()).hexdigest()
+    assert done.json["outcome"]["device_state"] == "new_verified"
 
 
 @pytest.mark.parametrize(
@@ -118,7 +125,12 @@ def test_a_failure_in_writing_is_4_and_leaves_the_old_calibration(workshop: Any,
     with workshop.serve(workshop.device(), faults) as served:
         done = triaxcal("provision", cal, workshop.station({"bus": served.bus}), "--json")
         assert served.unit.eeprom == OLD.image()
-    done.failed(4, "provisioning failed at ", "old calibration restored and verified")
+    assert done.code == 4
+    assert "provisioning failed at " in done.err
+    ended = done.json["outcome"]
+    assert (ended["verdict"], ended["device_state"]) == ("aborted", "old")
+    assert json.loads(Path(done.json["outcome_file"]).read_text()) == ended
+    assert not (workshop.folder / "journal").exists()
 
 
 def test_the_wrong_unit_is_4_for_every_command(workshop: Any, triaxcal: Run) -> None:
@@ -230,7 +242,7 @@ def test_a_recording_goes_to_no_folder_that_is_not_there(workshop: Any, triaxcal
 
 def test_a_unit_that_stops_in_the_middle_of_a_recording_leaves_a_finished_file(workshop: Any, triaxcal: Run) -> None:
     rec = workshop.folder / "rec.mcap"
-    with workshop.serve(workshop.device(), Faults(die_at_s=20.0)) as served:
+    with workshop.serve(workshop.device(speed=10.0), Faults(die_at_s=22.0)) as served:
         station = workshop.station({"bus": served.bus, "profile": workshop.impatient_profile()})
         triaxcal("record", station, "-o", rec).failed(4, "127.0.0.1", "silent")
     assert len(triaxcal("poses", rec, "--json").json["poses"]) >= 5

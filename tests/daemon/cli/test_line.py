@@ -14,6 +14,7 @@ from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.certificate import Certified
 from triaxcald.cli.line import show_outcome
+from triaxcald.provision.state import Held
 from triaxcald.station.line import Outcome
 
 UNIT = Sensor(
@@ -30,7 +31,9 @@ def loop() -> Loop:
 
 def shown(loop: Loop, capsys: pytest.CaptureFixture[str]) -> list[str]:
     document = {"unit": {"serial": "7"}, "not_written": "no registers", "outside": []}
-    show_outcome(Outcome("left", 0, certified=Certified(document, loop, None, True)))
+    show_outcome(
+        Outcome("left", 0, {"verdict": "pass", "reason": ""}, Held(), certified=Certified(document, loop, None, True))
+    )
     return [line.strip() for line in capsys.readouterr().out.splitlines()]
 
 

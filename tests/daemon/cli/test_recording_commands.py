@@ -51,7 +51,7 @@ def test_info_tells_what_is_in_a_recording(finished_run: Any, triaxcal: Run) -> 
     assert info["metadata"]["unit"] == {"name": "can", "serial": "4711", "signs": "-1,-1,-1"}
     assert set(info["attachments"]) == {
         "station.toml", "profile.toml", "profile/triax-ref-can.dbc", "certificate.json", "registers-before.json",
-        "registers-after.json", "verification.json", "report.html",
+        "registers-after.json", "verification.json", "report.html", "outcome.json",
     }  # fmt: skip
     assert "finished: True" in triaxcal("log", "info", finished_run.can).out
 

@@ -16,6 +16,7 @@ import pytest
 
 from triaxcal_drivers.profile import BUILT_IN
 from triaxcald.demo import LIMIT_G, DemoUnit, _kept
+from triaxcald.provision.state import Held
 from triaxcald.simulation.memory import Stored, factory_calibration
 from triaxcald.station.line import Outcome
 from triaxcald.verification import Verification
@@ -212,10 +213,10 @@ def test_a_demo_ends_well_only_if_the_effect_was_found_and_stays_gone_after_a_po
     tmp_path: Path, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, found: bool, kept: bool, code: int
 ) -> None:
     async def done(folder: Path, seed: int, progress: Any) -> list[DemoUnit]:
-        well = DemoUnit({}, Outcome("can", 0), None, True, True)
-        return [well, DemoUnit({}, Outcome("modbus", 0), None, found, kept)]
+        well = DemoUnit({}, Outcome("can", 0, {}, Held()), None, True, True)
+        return [well, DemoUnit({}, Outcome("modbus", 0, {}, Held()), None, found, kept)]
 
-    monkeypatch.setattr("triaxcald.cli.line.run_demo", done)
+    monkeypatch.setattr("triaxcald.demo.run_demo", done)
     shown = triaxcal("demo", "--out", tmp_path, "--json")
     assert shown.code == code
     assert [(u["found"], u["kept"]) for u in shown.json["units"]] == [(True, True), (found, kept)]

@@ -3,15 +3,19 @@
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 
 import pytest
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, Register
+from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.image import build_image
-from triaxcald.provision.procedure import provision
-from triaxcald.provision.sequence import Pace
+from triaxcald.provision.pace import Pace
+from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.state import Held
 from triaxcald.simulation.memory import CALIBRATION, CRC, TABLE, Stored
 from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.unit import Faults, ReferenceUnit, RegisterFault, Status, UnitSilent
@@ -125,7 +129,7 @@ class MemoryDevice:
         await asyncio.sleep(0)
         return raw[::-1] if self.little_endian else raw
 
-    async def write(self, register: str, raw: bytes) -> None:
+    async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
         await self._operate("write", register)
         big = raw[::-1] if self.little_endian else raw
         self._ask(register, lambda: self.unit.write(register, big, self.now_s))
@@ -171,8 +175,9 @@ class MemoryDevice:
 
 @dataclass
 class Bench:
-    """The unit holds ``old``; ``image`` is the new calibration."""
+    """The unit holds ``old``; ``image`` is the new calibration; ``folder`` is the station's."""
 
+    folder: Path
     little_endian: bool = False
     faults: Faults = field(default_factory=Faults)
     serial_number: int = 7
@@ -191,15 +196,49 @@ class Bench:
             faults=self.faults,
         )
         self.device = MemoryDevice(self.unit, little_endian=self.little_endian)
+        self.records: list[RegisterAccess] = []
+        self.link = self.connected()
+        self.provisioning: Provisioning | None = None
+
+    def connected(self) -> RegisterLink:
+        """As a process that has just begun finds the device."""
+        return RegisterLink(self.device, self.profile, self.records.append, pace=self.device.pace)
 
     def _calibration(self, values: dict[str, float], date_days: int) -> dict[str, bytes]:
         raw = build_image(self.profile, values, date_days=date_days).raw
         return {name: raw[name][::-1] if self.little_endian else raw[name] for name in CALIBRATION}
 
-    async def provision(self, *, expected_serial: str | None = "0007", **more):
-        return await provision(
-            self.device, self.bundle, self.image, expected_serial=expected_serial, pace=self.device.pace, **more
+    async def provision(
+        self, *, expected_serial: str | None = "0007", dry_run: bool = False, where: str = "the bench", **more
+    ) -> Provisioning:
+        p = self.provisioning = Provisioning(
+            self.link,
+            self.bundle,
+            self.image,
+            unit="left",
+            folder=self.folder,
+            expected_serial=expected_serial,
+            where=where,
+            **more,
         )
+        await p.examine(restart=not dry_run)
+        if not dry_run:
+            try:
+                await p.write()
+            finally:
+                p.finish()
+        return p
+
+    @property
+    def held(self) -> Held:
+        """What the last provisioning says that the device holds."""
+        assert self.provisioning is not None
+        return self.provisioning.held
+
+    @property
+    def journals(self) -> list[str]:
+        """Files in the station's journal."""
+        return sorted(path.name for path in self.folder.glob("journal/*"))
 
     @property
     def stored(self) -> Stored:
@@ -228,10 +267,10 @@ class Bench:
 
 
 @pytest.fixture
-def make_bench() -> type[Bench]:
-    return Bench
+def make_bench(tmp_path: Path) -> Callable[..., Bench]:
+    return partial(Bench, tmp_path)
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)

@@ -5,6 +5,7 @@ from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.provision.restore import restore
 from triaxcald.provision.snapshot import take_snapshot
+from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.simulation.memory import CALIBRATION, Stored
 from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.unit import Faults, ReferenceUnit
@@ -19,8 +20,9 @@ async def test_a_calibration_is_in_use_and_stored_after_provisioning(make_bench,
     assert report.stored
     assert report.identity.serial == "0007"
     assert dict(report.after.raw) == bench.image.raw
-    assert report.written == report.differing
-    assert set(report.written) | set(report.unchanged) == set(CALIBRATION)
+    assert tuple(report.written) == report.differing
+    assert (report.held.state, report.held.evidence) == (DeviceState.NEW_VERIFIED, Evidence.RESTART)
+    assert bench.journals == []
 
 
 async def test_the_checksum_is_written_last(bench) -> None:
@@ -38,16 +40,15 @@ async def test_only_what_differs_is_written(bench) -> None:
     bench.image = with_one_bias_changed(bench)
     report = await bench.provision()
     assert bench.device.written == ["bias_x", "calibration_crc"]
-    assert report.written == ("bias_x", "calibration_crc")
-    assert len(report.unchanged) == 19
+    assert report.written == ["bias_x", "calibration_crc"]
     bench.assert_holds({**bench.old, **{name: bench.image.raw[name] for name in report.written}})
 
 
 async def test_a_device_that_holds_the_image_is_restarted_and_not_worn(bench) -> None:
     await bench.provision()
     report = await bench.provision()
-    assert report.written == ()
-    assert not report.stored
+    assert report.written == []
+    assert report.held.state is DeviceState.NEW_VERIFIED
     assert bench.stored.write_counter == 4
     assert ("write", "reset") in bench.device.log
     bench.assert_holds(bench.new)
@@ -57,16 +58,16 @@ async def test_an_image_that_is_in_use_but_was_never_stored_gets_stored(bench) -
     bench.image = with_one_bias_changed(bench)
     bench.put_in_ram("bias_x", 0.125)
     report = await bench.provision()
-    assert report.written == ("bias_x", "calibration_crc")
+    assert report.written == ["bias_x", "calibration_crc"]
     bench.assert_stored(bench.image.raw)
 
 
 async def test_a_dry_run_reads_and_says_what_would_be_written(bench) -> None:
     report = await bench.provision(dry_run=True)
     assert {kind for kind, _ in bench.device.log} == {"read"}
-    assert report.written == ()
+    assert report.written == []
     assert "bias_x" in report.differing
-    assert report.after == report.before
+    assert report.held.state is DeviceState.UNTOUCHED
     bench.assert_holds(bench.old)
     assert bench.stored.write_counter == 3
 
@@ -80,33 +81,31 @@ async def test_another_serial_number_is_refused_before_anything_is_written(bench
 
 
 async def test_every_access_is_recorded_with_its_bytes(bench) -> None:
-    accesses = []
-    await bench.provision(record=accesses.append)
-    done = [(a.kind, a.register) for a in accesses]
+    await bench.provision()
+    done = [(a.kind, a.register) for a in bench.records]
     assert done == [entry for entry in bench.device.log if entry[0] != "open"]
-    assert {a.register: a.raw for a in accesses if a.kind == "write" and a.register in CALIBRATION} == {
+    assert {a.register: a.raw for a in bench.records if a.kind == "write" and a.register in CALIBRATION} == {
         name: bench.image.raw[name] for name in bench.device.written
     }
 
 
 async def test_a_refused_access_is_recorded_with_its_error(make_bench) -> None:
-    accesses = []
     bench = make_bench(faults=Faults(refuse_registers=frozenset({"bias_y"})))
     with pytest.raises(ProvisionError):
-        await bench.provision(record=accesses.append)
-    assert [(a.register, a.error) for a in accesses if a.error] == [("bias_y", "register bias_y: locked")]
+        await bench.provision()
+    assert [(a.register, a.error) for a in bench.records if a.error] == [("bias_y", "register bias_y: locked")]
 
 
 async def test_a_station_can_undo_a_whole_provisioning(bench) -> None:
     report = await bench.provision()
-    await restore(bench.device, bench.bundle, report.before, pace=bench.device.pace)
+    await restore(bench.link, bench.bundle, report.before)
     bench.assert_holds(bench.old)
     assert bench.stored.write_counter == 5
 
 
 async def test_restoring_what_is_there_already_does_not_wear_the_device(bench) -> None:
     before = await take_snapshot(bench.device, bench.bundle)
-    await restore(bench.device, bench.bundle, before, pace=bench.device.pace)
+    await restore(bench.link, bench.bundle, before)
     bench.assert_holds(bench.old)
     assert bench.stored.write_counter == 3
     assert bench.device.written == []
@@ -120,7 +119,7 @@ async def test_another_unit_on_the_same_address_is_never_given_the_old_calibrati
     report = await bench.provision()
     bench.device.exchange(another_unit(bench))
     with pytest.raises(WrongUnit, match="serial 0008, expected 0007"):
-        await restore(bench.device, bench.bundle, report.before, pace=bench.device.pace)
+        await restore(bench.link, bench.bundle, report.before)
     assert {kind for kind, _ in bench.device.log} == {"read"}
 
 
@@ -134,7 +133,7 @@ async def test_nor_is_one_that_is_put_there_while_the_unit_restarts(bench) -> No
 
     bench.device.trouble = exchange_on_restart
     with pytest.raises(WrongUnit, match="serial 0008, expected 0007"):
-        await restore(bench.device, bench.bundle, report.before, pace=bench.device.pace)
+        await restore(bench.link, bench.bundle, report.before)
     assert {kind for kind, _ in bench.device.log} == {"open", "read"}
 
 
@@ -148,11 +147,10 @@ async def test_a_unit_exchanged_before_the_last_reading_is_not_taken_for_the_pro
     bench.device.trouble = exchange_on_restart
     with pytest.raises(ProvisionError) as caught:
         await bench.provision()
-    wrong = "the unit on triax-ref-memory is serial 0008, expected 0007"
-    assert str(caught.value) == (
-        f"provisioning failed at identity after the reset: {wrong}; NOT restored: {wrong}; "
-        "either calibration may be stored"
-    )
+    wrong = "the unit on the bench is serial 0008, expected 0007"
+    assert str(caught.value) == f"provisioning failed at identity after the reset: {wrong}"
+    assert bench.held.state is DeviceState.NEW_UNVERIFIED
+    assert bench.journals == ["0007.json"]
     assert {kind for kind, _ in bench.device.log} == {"open", "read"}
 
 
@@ -160,7 +158,7 @@ async def test_what_cannot_be_written_back_is_not_stored_and_is_named(bench) -> 
     report = await bench.provision()
     bench.unit.faults = Faults(corrupt_write={"bias_x": 0x01})
     with pytest.raises(ProvisionError, match="of the old calibration, bias_x will not come back"):
-        await restore(bench.device, bench.bundle, report.before, pace=bench.device.pace)
+        await restore(bench.link, bench.bundle, report.before)
     assert bench.stored.write_counter == 4
     assert ("write", "store") not in bench.device.log[-40:]
 
@@ -169,5 +167,5 @@ async def test_a_restoring_whose_store_is_forgotten_does_not_pass(bench) -> None
     report = await bench.provision()
     bench.unit.faults = Faults(forget_store=True)
     with pytest.raises(ProvisionError, match=r"of the old calibration, .*bias_x.* will not come back"):
-        await restore(bench.device, bench.bundle, report.before, pace=bench.device.pace)
+        await restore(bench.link, bench.bundle, report.before)
     bench.assert_holds(bench.new)

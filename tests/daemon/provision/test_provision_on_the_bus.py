@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,11 +14,12 @@ from triaxcal_drivers.interface import Device
 from triaxcal_drivers.modbus.driver import ModbusDriver
 from triaxcal_drivers.profile import Bundle, load_bundle
 from triaxcald.errors import ProvisionError
-from triaxcald.provision.access import RegisterAccess
+from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.explain import explain
 from triaxcald.provision.image import build_image
-from triaxcald.provision.procedure import provision
+from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.restore import restore
+from triaxcald.provision.state import DeviceState
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.memory import Stored, factory_calibration
 from triaxcald.simulation.modbus_unit import ModbusUnit
@@ -54,25 +56,38 @@ Serve = Callable[[ReferenceUnit], AbstractAsyncContextManager[tuple[Device, Bund
 both = pytest.mark.parametrize("serve", [on_can, on_modbus])
 
 
+def provisioning(device: Device, bundle: Bundle, folder: Path, record: Any = None) -> Provisioning:
+    return Provisioning(
+        RegisterLink(device, bundle.profile, record),
+        bundle,
+        build_image(bundle.profile, COEFFICIENTS, date_days=20_000),
+        unit="left",
+        folder=folder,
+        expected_serial="0007",
+        where="the bench",
+    )
+
+
 def reference_unit(faults: Faults | None = None) -> ReferenceUnit:
     return ReferenceUnit(ConstantPhysics(), serial_number=7, faults=faults)
 
 
 @both
-async def test_a_calibration_arrives_over_the_bus_and_can_be_undone(serve: Serve) -> None:
+async def test_a_calibration_arrives_over_the_bus_and_can_be_undone(tmp_path: Path, serve: Serve) -> None:
     unit = reference_unit()
     async with serve(unit) as (device, bundle):
-        image = build_image(bundle.profile, COEFFICIENTS, date_days=20_000)
-        report = await provision(device, bundle, image, expected_serial="0007")
-        assert dict(report.after.raw) == image.raw
-        rows = {row.register: row for row in explain(bundle, report.after)}
+        p = provisioning(device, bundle, tmp_path)
+        await p.examine()
+        await p.write()
+        assert dict(p.after.raw) == p.image.raw
+        rows = {row.register: row for row in explain(bundle, p.after)}
         assert rows["calibration_crc"].crc_ok
         assert rows["bias_x"].value == pytest.approx(0.0125, rel=1e-7)
         stored = Stored.from_image(unit.eeprom)
         assert stored.valid
         assert stored.write_counter == 1
         assert stored.calibration["reference_temperature"] == bytes.fromhex("41b80000")
-        await restore(device, bundle, report.before)
+        await restore(p.link, bundle, p.before)
     assert Stored.from_image(unit.eeprom).calibration == factory_calibration()
 
 
@@ -82,34 +97,42 @@ async def test_a_calibration_arrives_over_the_bus_and_can_be_undone(serve: Serve
     [
         (Faults(refuse_registers=frozenset({"bias_x"})), "failed at writing bias_x"),
         (Faults(corrupt_write={"bias_x": 4}), "failed at reading back: register bias_x"),
-        (Faults(forget_store=True), "failed at reading back after the reset: register scale_factor_x"),
+        (
+            Faults(forget_store=True),
+            "failed at identity after the reset: after the restart the registers hold the old calibration",
+        ),
     ],
 )
-async def test_a_failure_over_the_bus_ends_with_the_old_calibration(serve: Serve, faults: Faults, failed: str) -> None:
+async def test_a_failure_over_the_bus_ends_with_the_old_calibration(
+    tmp_path: Path, serve: Serve, faults: Faults, failed: str
+) -> None:
     unit = reference_unit(faults)
     async with serve(unit) as (device, bundle):
-        image = build_image(bundle.profile, COEFFICIENTS, date_days=20_000)
-        with pytest.raises(ProvisionError) as caught:
-            await provision(device, bundle, image, expected_serial="0007")
-    assert failed in str(caught.value)
-    assert str(caught.value).endswith("old calibration restored and verified")
+        p = provisioning(device, bundle, tmp_path)
+        await p.examine()
+        with pytest.raises(ProvisionError, match=failed):
+            await p.write()
+    assert p.held.state is DeviceState.OLD
     assert Stored.from_image(unit.eeprom).calibration == factory_calibration()
 
 
 @both
 @pytest.mark.parametrize("last", ["bias_x", "store"])
-async def test_a_cancellation_over_the_bus_ends_with_the_old_calibration(serve: Serve, last: str) -> None:
+async def test_a_cancellation_over_the_bus_ends_with_the_old_calibration(
+    tmp_path: Path, serve: Serve, last: str
+) -> None:
     unit = reference_unit()
     async with serve(unit) as (device, bundle):
-        image = build_image(bundle.profile, COEFFICIENTS, date_days=20_000)
 
         def cancel(access: RegisterAccess) -> None:
             if (access.kind, access.register) == ("write", last) and task.cancelling() == 0:
                 task.cancel()
 
-        task = asyncio.create_task(provision(device, bundle, image, expected_serial="0007", record=cancel))
-        with pytest.raises(asyncio.CancelledError) as caught:
+        p = provisioning(device, bundle, tmp_path, record=cancel)
+        await p.examine()
+        task = asyncio.create_task(p.write())
+        with pytest.raises(asyncio.CancelledError):
             await task
-        assert caught.value.__notes__ == ["old calibration restored and verified"]
+        assert p.held.state is DeviceState.OLD
         assert await device.read("bias_x") == bytes(4)
     assert Stored.from_image(unit.eeprom).calibration == factory_calibration()

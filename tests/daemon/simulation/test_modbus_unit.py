@@ -288,11 +288,16 @@ async def driven(unit, time_base, *, where=LOOPBACK, hasty=False):
         yield device, profile
 
 
-async def gathered(device, profile, samples: int, streams=("readings",)) -> dict[str, list[SampleBlock]]:
-    """Blocks of the streams until each has so many samples."""
+async def gathered(
+    device, profile, samples: int, streams=("readings",), *, time_base=None, seconds=0.0
+) -> dict[str, list[SampleBlock]]:
+    """Blocks of the streams until each has so many samples; ``time_base`` goes on by ``seconds`` once they are open."""
     decoders = {name: ModbusDriver().decoder(profile, name) for name in streams}
     blocks: dict[str, list[SampleBlock]] = {name: [] for name in streams}
     async with aclosing(device.stream(streams)) as batches:
+        if time_base is not None:
+            assert len(decoders[streams[0]].feed(await anext(batches))) == 0
+            await time_base.advance(seconds)
         async for batch in batches:
             for name in streams:
                 blocks[name].append(decoders[name].feed(batch))
@@ -305,13 +310,13 @@ async def gathered(device, profile, samples: int, streams=("readings",)) -> dict
 async def test_the_driver_gets_every_sample_of_both_streams(unit, time_base, where, tmp_path: Path):
     place = TcpAddress("127.0.0.1", 0) if where == "tcp" else SerialLine(f"pty:{tmp_path}/line", 115_200, "N")
     async with driven(unit, time_base, where=place) as (device, profile):
-        await time_base.advance(5.0)
-        blocks = await gathered(device, profile, 501, ("readings", "corrected"))
+        streams = ("readings", "corrected")
+        blocks = await gathered(device, profile, 500, streams, time_base=time_base, seconds=5.0)
     for name, scale in (("readings", 1.0), ("corrected", 1 / -2.4)):
         readings = np.concatenate([b.readings for b in blocks[name]])
         counter = np.concatenate([b.counter for b in blocks[name]])
-        assert counter.tolist() == list(range(501))
-        np.testing.assert_allclose(readings[:, 0], np.arange(501) * 1e-3 * scale, atol=2e-6)
+        assert counter.tolist() == list(range(1, 501))
+        np.testing.assert_allclose(readings[:, 0], np.arange(1, 501) * 1e-3 * scale, atol=2e-6)
         np.testing.assert_allclose(readings[:, 2], -2.4 * scale, atol=2e-6)
         time_ns = np.concatenate([b.time_ns for b in blocks[name]])
         assert (np.diff(time_ns) == 10_000_000).all()
@@ -324,11 +329,32 @@ async def test_a_backlog_is_fetched_without_waiting_for_the_next_poll(unit, time
     async with ModbusUnit(unit, time_base) as served, asyncio.timeout(PATIENCE_S):
         device = ModbusDriver().device(profile, served.bus)
         await device.open()
-        await time_base.advance(20.0)
-        blocks = (await gathered(device, profile, 2001))["readings"]
+        decode, blocks = ModbusDriver().decoder(profile, "readings"), []
+        async with aclosing(device.stream(["corrected", "readings"])) as batches:
+            await anext(batches)  # of the corrected ones; the readings are polled for the first time after it
+            await time_base.advance(20.0)
+            while sum(map(len, blocks)) < 2000:
+                blocks.append(decode.feed(await anext(batches)))
         await device.close()
-    assert sum(map(len, blocks)) == 2001
+    assert sum(map(len, blocks)) == 2000
     assert len(blocks) > 1
+
+
+async def test_what_a_deep_fifo_holds_from_before_is_discarded(unit, time_base):
+    async with driven(unit, time_base) as (device, profile):
+        await time_base.advance(50.0)  # 5001 samples, of which the FIFO keeps 4096
+        blocks = (await gathered(device, profile, 100, time_base=time_base, seconds=1.0))["readings"]
+        assert device.discarded == FIFO_RECORDS
+    assert np.concatenate([b.counter for b in blocks]).tolist() == list(range(5001, 5101))
+    assert sum(b.missing + b.duplicates + b.errors for b in blocks) == 0
+
+
+async def test_a_second_stream_has_nothing_from_before_it_either(unit, time_base):
+    async with driven(unit, time_base) as (device, profile):
+        await gathered(device, profile, 100, time_base=time_base, seconds=1.0)
+        await time_base.advance(5.0)
+        again = await gathered(device, profile, 100, time_base=time_base, seconds=1.0)
+    assert np.concatenate([b.counter for b in again["readings"]]).tolist() == list(range(601, 701))
 
 
 async def test_an_accelerated_unit_loses_nothing_while_registers_are_read(unit):
@@ -380,16 +406,17 @@ async def test_every_calibration_register_is_read_like_its_stored_copy(unit, tim
 
 async def test_a_restart_while_streaming_is_one_jump_in_time(unit, time_base):
     async with driven(unit, time_base, hasty=True) as (device, profile):
-        await time_base.advance(5.0)
         decode = ModbusDriver().decoder(profile, "readings")
         async with aclosing(device.stream(["readings"])) as batches:
+            await anext(batches)
+            await time_base.advance(5.0)
             before = [decode.feed(await anext(batches)) for _ in range(2)]
             unit.power_cycle(time_base.now_s())
             silent = decode.feed(await anext(batches))
             await time_base.advance(1.0)
             after = decode.feed(await anext(batches))
     assert silent.errors == 1
-    assert sum(map(len, before)) == 501
+    assert sum(map(len, before)) == 500
     assert len(after) == 91
     assert after.missing == 0
     assert after.time_ns[0] > before[-2].time_ns[-1]
@@ -399,8 +426,8 @@ async def test_a_restart_while_streaming_is_one_jump_in_time(unit, time_base):
 async def test_a_unit_that_dies_while_streaming_is_silent(time_base):
     unit = ReferenceUnit(Ramp(), serial_number=1, faults=Faults(die_at_s=1.0))
     async with driven(unit, time_base, hasty=True) as (device, profile):
-        await time_base.advance(0.9)
-        assert sum(map(len, (await gathered(device, profile, 91))["readings"])) == 91
+        blocks = await gathered(device, profile, 90, time_base=time_base, seconds=0.9)
+        assert sum(map(len, blocks["readings"])) == 90
         await time_base.advance(0.2)
         with pytest.raises(DeviceSilent, match=r"stream readings has been silent .* no reply"):
             await gathered(device, profile, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +10,17 @@ from typing import Any
 
 import pytest
 
+from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle, load_bundle
 from triaxcald.inputs import CALIBRATION, VERIFICATION
+from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.simulation.can_unit import CanUnit, tpdos
+from triaxcald.simulation.modbus_unit import ModbusUnit
 from triaxcald.simulation.physics import ConstantPhysics
+from triaxcald.simulation.time_base import SteppedTimeBase
 from triaxcald.simulation.unit import ReferenceUnit
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Plan
@@ -29,12 +34,14 @@ OF_READINGS, OF_CORRECTED = (0x185, 0x285), (0x385, 0x485)
 class Bus:
     """A Device that sends a still unit's frames as fast as they are taken; from 5 s on not those of ``stopped``.
 
-    They come back at ``again_s``. Its own time is the host's.
+    They come back at ``again_s``. Its own time is the host's. Before the first
+    batch ``discarding_s`` go by.
     """
 
     stopped: Sequence[int]
     again_s: float = float("inf")
     now_s: float = 0.0
+    discarding_s: float = 0.0
 
     def clock_s(self) -> float:
         return self.now_s
@@ -42,6 +49,7 @@ class Bus:
     async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
         assert list(names) == [READINGS, CORRECTED]
         unit = ReferenceUnit(ConstantPhysics(), serial_number=1)
+        self.now_s += self.discarding_s
         while self.now_s < END_S:
             self.now_s += BATCH_S
             silent = self.stopped if STOP_S <= self.now_s < self.again_s else ()
@@ -112,6 +120,43 @@ async def test_a_pause_shorter_than_the_time_out_ends_nothing(bundle: Bundle, ti
         await collection.for_seconds(device, writer, 20.0, bus.clock_s)
     assert 20.0 <= collection.pipelines[READINGS].seconds < 20.0 + 2 * BATCH_S
     assert collection.pipelines[READINGS].counts["missing"] > 0
+
+
+async def test_the_time_that_a_driver_spends_on_discarding_is_no_silence(
+    bundle: Bundle, timeout_s: float, tmp_path: Path
+) -> None:
+    """Though the first batch holds another stream's samples alone."""
+    discarding_s = STOP_S + 2 * timeout_s
+    bus = Bus(OF_READINGS, again_s=discarding_s + 5 * BATCH_S, discarding_s=discarding_s)
+    device: Any = bus
+    collection = Collection(CALIBRATION, bundle, "node 5")
+    with RecordingWriter(tmp_path / "rec.mcap", metadata={}, preview_channels=["temp_c", "status"]) as writer:
+        await collection.for_seconds(device, writer, 2.0, bus.clock_s)
+    assert collection.pipelines[READINGS].seconds >= 2.0
+
+
+async def test_samples_from_before_the_start_are_no_part_of_the_recording(tmp_path: Path) -> None:
+    """Forty seconds of them are in the unit's FIFO when it is begun: as many poses as a run asks for."""
+    modbus, time_base = load_bundle(Path("triax-ref-modbus")), SteppedTimeBase()
+    driver, path = driver_named("modbus"), tmp_path / "rec.mcap"
+    collection = Collection(CALIBRATION, modbus, "the bench")
+    async with ModbusUnit(ReferenceUnit(ConstantPhysics(), serial_number=1), time_base) as served:
+        device = driver.device(modbus, served.bus)
+        await device.open()
+        await time_base.advance(40.0)
+        with RecordingWriter(path, metadata={}, preview_channels=["temp_c"]) as writer:
+            recording = asyncio.create_task(collection.for_seconds(device, writer, 1.0))
+            while not recording.done():
+                await asyncio.sleep(0.01)
+                if collection.pipelines[READINGS].first_host_ns is not None:  # what was there before has been read
+                    await time_base.advance(0.5)
+            await recording
+        await device.close()
+    with Recording.open(path) as held:
+        decode = driver.decoder(modbus, READINGS)
+        counters = [int(n) for batch in held.raw(CALIBRATION) for n in decode.feed(batch).counter]
+    assert counters[0] == 4001
+    assert len(counters) == collection.pipelines[READINGS].counts["samples"]
 
 
 def test_record_of_so_many_seconds_ends_where_the_readings_stop(

@@ -14,7 +14,7 @@ import pytest
 
 from triaxcal_drivers.profile import BUILT_IN
 from triaxcald.cli.line import _document, show_outcome, worst
-from triaxcald.errors import InputError, RecordingError
+from triaxcald.errors import DiskError, InputError
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.simulation.can_unit import CanUnit
@@ -22,13 +22,13 @@ from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
 from triaxcald.station import line as station_line
 from triaxcald.station.config import load_station
 from triaxcald.station.line import Outcome, UnitRun, run_station
-from triaxcald.station.write_back import NEW_UNCHECKED, NEW_UNJUDGED, RESTORED
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())
 FIXTURE = {"poses": 12, "hold_s": 1.4, "move_s": 0.6}
 QUICK = {"speed": 60.0, "fixture": FIXTURE}
 PLAN = {"poses": 12, "hold_s": 0.6, "check_poses": 2}
+NEW = "the device holds the new calibration, read back after a restart"
 NO_ROOM = "rec.mcap: writing failed: No space left on device"
 PROGRAM = Path(sys.executable).with_name("triaxcal")
 
@@ -74,7 +74,7 @@ def test_a_standard_error_that_is_closed_in_the_check_poses_stops_nothing(worksh
             out, _ = process.communicate(timeout=60)
         assert b"check poses: " in said
         assert process.returncode == 0, out
-        assert NEW_UNJUDGED.encode() in out
+        assert b'"device_state": "new_verified"' in out
         assert Stored.from_image(served.unit.eeprom).calibration != OLD.calibration
 
 
@@ -110,12 +110,12 @@ def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_
 
     def full_attach(self: RecordingWriter, name: str, *more: Any) -> None:
         if name == "report.html":
-            raise RecordingError(NO_ROOM)
+            raise DiskError(NO_ROOM)
         attach(self, name, *more)
 
     def full_close(self: RecordingWriter) -> None:
         close(self)
-        raise RecordingError(NO_ROOM)
+        raise DiskError(NO_ROOM)
 
     def full_write_text(path: Path, text: str) -> Path:
         if path.name.endswith(".report.html"):
@@ -131,12 +131,12 @@ def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_
     with workshop.serve(workshop.device(**QUICK)) as served:
         done = triaxcal("run", workshop.station({"bus": served.bus}, plan=PLAN), "--json")
         assert served.unit.eeprom != OLD.image()
-    assert done.code == 4
+    assert done.code == 5
     (unit,) = done.json["units"]
-    assert (unit["exit_code"], unit["device_state"]) == (4, NEW_UNJUDGED)
+    assert (unit["exit_code"], unit["outcome"]["device_state"]) == (5, "new_verified")
     assert "No space left on device" in unit["error"]
     assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
-    assert unit["error"].endswith(NEW_UNJUDGED)
+    assert unit["error"].endswith(NEW)
 
 
 async def test_the_table_and_the_document_say_that_the_old_calibration_is_back(
@@ -147,13 +147,13 @@ async def test_the_table_and_the_document_say_that_the_old_calibration_is_back(
         _holds_old(served)
     assert worst([outcome]) == 1
     document = _document(outcome)
-    assert (document["exit_code"], document["device_state"], document["error"]) == (1, RESTORED, None)
+    assert (document["exit_code"], document["outcome"]["device_state"], document["error"]) == (1, "old", None)
     assert document["verification"]["verdict"] == "outside limits"
     capsys.readouterr()
     show_outcome(outcome)
     shown = capsys.readouterr().out
     assert "verified by physics: outside limits" in shown
-    assert f"\n  {RESTORED}\n" in shown
+    assert "the device holds the old calibration, read back after a restart" in shown
 
 
 def _without_corrected(workshop: Any) -> str:
@@ -176,13 +176,14 @@ async def test_a_device_without_a_corrected_stream_is_written_and_said_to_be_unv
     with workshop.serve(workshop.device(**QUICK)) as served:
         outcome = await _outcome(workshop, served, profile=_without_corrected(workshop))
         assert served.unit.eeprom != OLD.image()
-    assert (outcome.exit_code, outcome.device_state, outcome.verification) == (0, NEW_UNCHECKED, None)
+    assert (outcome.exit_code, outcome.device_state, outcome.verification) == (0, NEW, None)
+    assert outcome.document["verdict"] == "not_judged"
     capsys.readouterr()
     show_outcome(outcome)
     shown = capsys.readouterr().out
-    assert f"\n  {NEW_UNCHECKED}\n" in shown
+    assert NEW in shown
     assert "  verified by physics: " not in shown
-    assert NEW_UNCHECKED[1:] in Path(str(outcome.report)).read_text()
+    assert NEW[1:] in Path(str(outcome.report)).read_text()
 
 
 def test_an_internal_error_in_one_unit_does_not_disturb_the_other(
@@ -205,7 +206,7 @@ def test_an_internal_error_in_one_unit_does_not_disturb_the_other(
     units = {u["unit"]: u for u in done.json["units"]}
     assert (units["good"]["exit_code"], units["good"]["error"]) == (0, None)
     assert Path(units["good"]["report"]).stat().st_size > 0
-    assert (units["bad"]["exit_code"], units["bad"]["device_state"]) == (4, NEW_UNJUDGED)
+    assert (units["bad"]["exit_code"], units["bad"]["outcome"]["device_state"]) == (4, "new_verified")
     assert units["bad"]["error"].startswith("unit bad: internal error: ValueError('a fault of the program'); ")
     assert units["bad"]["report"] is None
 
@@ -256,7 +257,9 @@ def test_corrected_frames_that_stop_are_found_out_and_the_old_calibration_is_put
     with workshop.serve(device) as served:
         done = triaxcal("run", workshop.station({"bus": bus, "profile": profile}, plan=PLAN))
         _holds_old(served)
-    done.failed(4, "verification failed: ", "stream corrected: the device sends, but no whole sample", RESTORED)
+    done.failed(
+        4, "verification failed: ", "stream corrected: the device sends, but no whole sample", "the old calibration"
+    )
 
 
 class _Stingy:

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from triaxcald.audit import audit
-from triaxcald.errors import RecordingError
+from triaxcald.documents import to_text
+from triaxcald.errors import DiskError
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
@@ -18,12 +19,13 @@ from triaxcald.simulation.unit import Faults
 
 OLD = Stored(factory_calibration())
 QUICK: Mapping[str, Any] = {"speed": 60.0, "fixture": {"poses": 12, "hold_s": 1.4, "move_s": 0.6}}
+BACK = "the device holds the old calibration, read back after a restart"
 PLAN = {"poses": 12, "hold_s": 0.6, "check_poses": 2}
 
 
 @pytest.fixture(autouse=True)
 def _short_wait_for_a_dead_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcald.provision.restore.RECONNECT_S", 0.5)
+    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 0.5)
 
 
 def _holds_old(served: Any) -> None:
@@ -60,6 +62,12 @@ def _events(path: Path) -> list[tuple[str, Any]]:
         return [(e.kind, e.detail) for e in recording.events()]
 
 
+def _outcome(path: Path) -> Any:
+    with Recording.open(path) as recording:
+        assert list(recording.attachments)[-1] == "outcome.json"
+        return json.loads(recording.attachments["outcome.json"])
+
+
 def test_verification_outside_the_limit_brings_the_old_calibration_back(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
@@ -67,8 +75,11 @@ def test_verification_outside_the_limit_brings_the_old_calibration_back(
     assert done.code == 1
     assert "verified by physics: outside limits" in done.out
     _holds_old(served)
-    assert ("restored", {"state": "old calibration restored and verified"}) in _events(path)
-    assert audit(path).differences == ()
+    assert ("restored", {"state": "old"}) in _events(path)
+    ended = _outcome(path)
+    assert (ended["verdict"], ended["device_state"], ended["exit_code"]) == ("fail", "old", 1)
+    assert list(workshop.folder.glob("*.certificate.json")) == []
+    assert _only(workshop.folder, "*.outcome.json").read_bytes() == to_text(ended).encode()
 
 
 def test_a_fit_outside_its_limit_writes_nothing(workshop: Any, triaxcal: Callable[..., Any]) -> None:
@@ -77,7 +88,10 @@ def test_a_fit_outside_its_limit_writes_nothing(workshop: Any, triaxcal: Callabl
     assert "outside limits: rms_g " in done.out
     assert served.unit.eeprom == OLD.image()
     assert "provisioned" not in [kind for kind, _ in _events(path)]
-    assert audit(path).checked == ("certificate.json",)
+    ended = _outcome(path)
+    assert (ended["verdict"], ended["device_state"], ended["evidence"]) == ("fail", "untouched", "nothing_written")
+    assert ended["reason"].startswith("rms_g ")
+    assert list(workshop.folder.glob("*.certificate.json")) == []
 
 
 def test_a_station_that_is_told_not_to_write_does_not(workshop: Any, triaxcal: Callable[..., Any]) -> None:
@@ -90,7 +104,7 @@ def test_a_station_that_is_told_not_to_write_does_not(workshop: Any, triaxcal: C
 
 def test_a_register_that_is_refused_leaves_the_old_calibration(workshop: Any, triaxcal: Callable[..., Any]) -> None:
     done, served, path = _run(workshop, triaxcal, Faults(refuse_registers=frozenset({"misalignment_y"})))
-    done.failed(4, "unit unit0: ", "provisioning failed at writing misalignment_y: ", "old calibration")
+    done.failed(4, "unit unit0: ", "provisioning failed at writing misalignment_y: ", "nothing was stored")
     _holds_old(served)
     assert _events(path)[-1][0] == "failed"
     with Recording.open(path) as recording:
@@ -99,8 +113,11 @@ def test_a_register_that_is_refused_leaves_the_old_calibration(workshop: Any, tr
 
 def test_a_store_that_the_unit_forgets_is_found_after_the_restart(workshop: Any, triaxcal: Callable[..., Any]) -> None:
     done, served, _ = _run(workshop, triaxcal, Faults(forget_store=True))
-    done.failed(4, "provisioning failed at reading back after the reset: register scale_factor_x holds ")
-    assert "old calibration restored and verified" in done.err
+    done.failed(
+        4,
+        "the registers hold the old calibration: nothing was stored",
+        BACK,
+    )
     assert served.unit.eeprom == OLD.image()
     _holds_old(served)
 
@@ -109,14 +126,14 @@ def test_a_unit_that_dies_while_it_is_written_is_not_said_to_be_restored(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
     done, served, _ = _run(workshop, triaxcal, Faults(die_on_write="bias_y"))
-    done.failed(4, "provisioning failed at writing bias_y: ", "NOT restored: ", "the stored calibration is the old one")
+    done.failed(4, "provisioning failed at writing bias_y: ", "unknown", "to settle: 'triaxcal provision --resume ")
     assert served.unit.eeprom == OLD.image()
 
 
 def test_a_unit_that_falls_silent_leaves_a_readable_recording_and_no_result(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
-    device = {"fixture": {"poses": 14, "hold_s": 2.0, "move_s": 0.8}}
+    device = {"speed": 10.0, "fixture": {"poses": 14, "hold_s": 2.0, "move_s": 0.8}}
     done, served, path = _run(workshop, triaxcal, Faults(die_at_s=20.0), device)
     done.failed(4, "unit unit0: ")
     assert served.unit.eeprom == OLD.image()
@@ -126,7 +143,8 @@ def test_a_unit_that_falls_silent_leaves_a_readable_recording_and_no_result(
     assert list(workshop.folder.glob("*.certificate.json")) == []
     assert triaxcal("poses", path, "--json").json["poses"]
     triaxcal("fit", path).failed(3, "refused: ")
-    triaxcal("audit", path).failed(2, str(path), "certificate.json: missing; the recording holds no result")
+    ended = _outcome(path)
+    assert (ended["verdict"], ended["device_state"], ended["measured"]) == ("aborted", "untouched", None)
 
 
 def test_a_unit_that_falls_silent_in_the_verification_is_an_error(
@@ -145,8 +163,11 @@ def test_a_unit_that_falls_silent_in_the_verification_is_an_error(
         monkeypatch.setattr(RecordingWriter, "event", then_die)
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
         done = triaxcal("run", workshop.station(unit, plan=PLAN))
-    done.failed(4, "verification failed: ", "NOT restored: ")
-    assert _events(_only(workshop.folder, "*.mcap"))[-1][0] == "failed"
+    done.failed(4, "verification failed: ", "the device holds the new calibration", "'triaxcal restore ")
+    path = _only(workshop.folder, "*.mcap")
+    assert _events(path)[-1][0] == "failed"
+    assert _outcome(path)["verdict"] == "aborted"
+    assert Path(_outcome(path)["journal"]).exists()
 
 
 @pytest.mark.parametrize("at", ["scale_factor_y", "reset"])
@@ -159,12 +180,12 @@ def test_a_disk_that_fails_while_registers_are_written_does_not_keep_the_old_one
     def full(self: RecordingWriter, name: str, operation: Any, raw: bytes, error: str = "") -> None:
         if failed or (name, operation) == (at, "write"):
             failed.append(name)
-            raise RecordingError("rec.mcap: writing failed: No space left on device")
+            raise DiskError("rec.mcap: writing failed: No space left on device")
         register(self, name, operation, raw, error)
 
     monkeypatch.setattr(RecordingWriter, "register", full)
     done, served, _ = _run(workshop, triaxcal)
-    done.failed(4, "No space left on device", "old calibration restored and verified")
+    done.failed(5, "No space left on device", "the old calibration")
     assert failed[0] == at
     _holds_old(served)
 
@@ -176,12 +197,16 @@ def test_a_disk_that_fails_in_the_verification_brings_the_old_calibration_back(
 
     def full(self: RecordingWriter, phase: Any, batch: Any) -> bool:
         if phase == "verification":
-            raise RecordingError("rec.mcap: writing failed: No space left on device")
+            raise DiskError("rec.mcap: writing failed: No space left on device")
         return raw(self, phase, batch)
 
     monkeypatch.setattr(RecordingWriter, "raw", full)
     done, served, _ = _run(workshop, triaxcal)
-    done.failed(4, "verification failed: ", "No space left on device", "old calibration restored and verified")
+    done.failed(
+        5,
+        "No space left on device",
+        BACK,
+    )
     _holds_old(served)
 
 
@@ -200,7 +225,7 @@ def test_old_registers_that_will_not_come_back_are_an_error(
         monkeypatch.setattr(RecordingWriter, "event", then_refuse)
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
         done = triaxcal("run", workshop.station(unit, plan=PLAN, limits={"verification_rms_g": 1e-9}))
-    done.failed(4, "verification outside limits; NOT restored: ")
+    done.failed(4, "verification outside limits", "could not be put back", "'triaxcal restore ")
 
 
 def test_no_new_pose_for_too_long_is_refused_with_the_poses_that_are_wanted(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,17 +15,18 @@ from triaxcal.errors import Refused
 from triaxcal.poses.pose import Pose
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device
-from triaxcald.errors import ProvisionError, RecordingError, StationError
+from triaxcald.errors import DiskError, ProvisionError, RecordingError, StationError
 from triaxcald.inputs import CALIBRATION as TUMBLE
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.provision.restore import restore
+from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.simulation.memory import CALIBRATION, TABLE, Stored, factory_calibration
 from triaxcald.simulation.unit import Faults
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station, load_station
 from triaxcald.station.line import UnitRun
-from triaxcald.station.write_back import NEW_UNJUDGED, RESTORED, UNCERTAIN, WriteBack
+from triaxcald.station.write_back import WriteBack
 from triaxcald.verification import Verification, verify
 
 OLD = Stored(factory_calibration())
@@ -41,7 +42,7 @@ NO_ROOM = "rec.mcap: writing failed: No space left on device"
 
 @pytest.fixture(autouse=True)
 def _short_wait_for_a_dead_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("triaxcald.provision.restore.RECONNECT_S", 0.3)
+    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 0.3)
 
 
 class Quiet:
@@ -74,13 +75,19 @@ class Bench:
     device: Device
     writer: RecordingWriter
     image: RegisterImage
+    asked: list[str] = field(default_factory=list)
 
     def write_back(self, collect: Callable[[Collection], Awaitable[None]]) -> WriteBack:
-        return WriteBack(self.place, self.station.file, self.writer, collect)
+        return WriteBack(self.place, self.station, self.writer, collect, ask=self.asked.append, started="today")
 
     async def run(self, back: WriteBack) -> None:
         tumble = Collection(TUMBLE, self.place.bundle, self.place.address)
         await back.run(self.device, self.image, "4711", tumble)
+
+
+def _state(back: WriteBack) -> DeviceState:
+    assert back.provisioning is not None
+    return back.provisioning.held.state
 
 
 OpenBench = Callable[..., contextlib.AbstractAsyncContextManager[Bench]]
@@ -118,9 +125,9 @@ async def test_what_no_limit_judges_stays_and_is_not_said_to_be_verified(
     monkeypatch.setattr("triaxcald.station.write_back.corrected", lambda *_: verify([good], 1.0))
     async with open_bench() as bench:
         back = bench.write_back(_no_pose)
-        assert back.state is None
         await bench.run(back)
-        assert back.state == NEW_UNJUDGED
+        assert back.verdict == "not judged"
+        assert _state(back) is DeviceState.NEW_VERIFIED
         assert _stored_bias(bench.served) == pytest.approx(BIAS)
 
 
@@ -132,7 +139,7 @@ async def test_what_no_limit_judges_stays_and_is_not_said_to_be_verified(
         (ValueError("nobody has thought of this"), ValueError),
         (Refused("no new still pose"), StationError),
         (DeviceSilent("the device has sent nothing"), StationError),
-        (RecordingError(NO_ROOM), StationError),
+        (DiskError(NO_ROOM), DiskError),
     ],
 )
 async def test_whatever_stops_the_check_poses_the_old_calibration_is_back(
@@ -146,7 +153,7 @@ async def test_whatever_stops_the_check_poses_the_old_calibration_is_back(
         back = bench.write_back(fails)
         with pytest.raises(raised):
             await bench.run(back)
-        assert back.state == RESTORED
+        assert _state(back) is DeviceState.OLD
         _holds_old(bench.served)
 
 
@@ -155,7 +162,7 @@ async def test_no_number_of_cancellations_stops_the_old_calibration_from_coming_
 ) -> None:
     struck = []
 
-    async def striking(device: Device, *arguments: Any, **options: Any) -> None:
+    async def striking(device: Device, *arguments: Any, **options: Any) -> Evidence:
         read = device.read
 
         async def strike(register: str) -> bytes:
@@ -163,20 +170,20 @@ async def test_no_number_of_cancellations_stops_the_old_calibration_from_coming_
             return await read(register)
 
         monkeypatch.setattr(device, "read", strike)
-        await restore(device, *arguments, **options)
+        return await restore(device, *arguments, **options)
 
     async def collect(check: Collection) -> None:
         task.cancel()
         await asyncio.Event().wait()
 
-    monkeypatch.setattr("triaxcald.station.write_back.restore", striking)
+    monkeypatch.setattr("triaxcald.provision.procedure.restore", striking)
     async with open_bench() as bench:
         back = bench.write_back(collect)
         task = asyncio.ensure_future(bench.run(back))
         await asyncio.wait([task])
         assert task.cancelled()
         assert len(struck) > 3
-        assert back.state == RESTORED
+        assert _state(back) is DeviceState.OLD
         _holds_old(bench.served)
 
 
@@ -197,7 +204,7 @@ async def test_without_a_check_pose_that_can_be_trusted_the_old_calibration_is_b
         back = bench.write_back(_no_pose)
         with pytest.raises(StationError, match=why):
             await bench.run(back)
-        assert back.state == RESTORED
+        assert _state(back) is DeviceState.OLD
         _holds_old(bench.served)
 
 
@@ -216,7 +223,7 @@ async def test_without_a_limit_a_calibration_worse_than_the_old_one_does_not_sta
         await bench.run(back)
         assert back.verification
         assert back.verification["verdict"] == "worse than before"
-        assert back.state == RESTORED
+        assert _state(back) is DeviceState.OLD
         _holds_old(bench.served)
 
 
@@ -229,36 +236,39 @@ async def test_a_unit_that_cannot_be_put_back_is_said_to_be_uncertain(open_bench
         back = bench.write_back(dies)
         with pytest.raises(asyncio.CancelledError):
             await bench.run(back)
-        assert back.state is not None
-        assert back.state.startswith(UNCERTAIN)
-        assert "register serial_number" in back.state or "nothing answers" in back.state
+        assert back.provisioning is not None
+        assert _state(back) is DeviceState.NEW_VERIFIED  # which it is; only that nobody wants it
+        assert not back.provisioning.settled
+        why = str(back.provisioning.undoing_failed)
+        assert "no reply" in why or "nothing answers" in why
+        assert back.provisioning.journal.path.exists()
 
 
 @pytest.mark.parametrize(
     ("faults", "state"),
     [
-        (Faults(refuse_registers=frozenset({"bias_y"})), RESTORED),
-        (Faults(forget_store=True), RESTORED),
-        (Faults(refuse_registers=frozenset({"scale_factor_x"})), RESTORED),
-        (Faults(die_on_write="bias_y"), UNCERTAIN),
-        (Faults(die_on_write="store"), UNCERTAIN),
+        (Faults(refuse_registers=frozenset({"bias_y"})), DeviceState.OLD),
+        (Faults(forget_store=True), DeviceState.OLD),
+        (Faults(refuse_registers=frozenset({"scale_factor_x"})), DeviceState.OLD),
+        (Faults(die_on_write="bias_y"), DeviceState.UNKNOWN),
+        (Faults(die_on_write="store"), DeviceState.UNKNOWN),
     ],
 )
-async def test_writing_that_fails_says_what_the_device_holds(open_bench: OpenBench, faults: Faults, state: str) -> None:
+async def test_writing_that_fails_says_what_the_device_holds(
+    open_bench: OpenBench, faults: Faults, state: DeviceState
+) -> None:
     async with open_bench(faults) as bench:
         back = bench.write_back(_no_pose)
-        with pytest.raises(ProvisionError) as failed:
+        with pytest.raises(ProvisionError):
             await bench.run(back)
-        assert back.state is not None
-        assert back.state.startswith(state)
-        assert back.state in str(failed.value)
+        assert _state(back) is state
         assert Stored.from_image(bench.served.unit.eeprom).calibration == OLD.calibration
 
 
 @pytest.mark.parametrize(
     ("method", "at"),
     [
-        ("attach", "registers-before.json"),
+        ("attach", "registers-after.json"),
         ("attach", "verification.json"),
         ("event", "provisioned"),
     ],
@@ -269,10 +279,10 @@ async def test_a_disk_that_fails_once_the_new_calibration_is_stored_brings_the_o
     failed = _disk_fails(monkeypatch, method, at)
     async with open_bench() as bench:
         back = bench.write_back(_no_pose)
-        with pytest.raises(StationError, match="No space left on device"):
+        with pytest.raises(DiskError, match="No space left on device"):
             await bench.run(back)
         assert failed
-        assert back.state == RESTORED
+        assert _state(back) is DeviceState.OLD
         _holds_old(bench.served)
 
 
@@ -286,7 +296,7 @@ def _disk_fails(monkeypatch: pytest.MonkeyPatch, method: str, at: str) -> list[s
         def call(self: RecordingWriter, first: str = "", *more: Any) -> Any:
             if failed or (name, first) == (method, at):
                 failed.append(name)
-                raise RecordingError(NO_ROOM)
+                raise DiskError(NO_ROOM)
             return real(self, first, *more)
 
         return call
@@ -294,3 +304,15 @@ def _disk_fails(monkeypatch: pytest.MonkeyPatch, method: str, at: str) -> list[s
     for name in ("attach", "event", "register"):
         monkeypatch.setattr(RecordingWriter, name, failing(name))
     return failed
+
+
+async def test_a_disk_that_fails_before_the_first_register_leaves_the_device_untouched(
+    open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _disk_fails(monkeypatch, "attach", "registers-before.json")
+    async with open_bench() as bench:
+        back = bench.write_back(_no_pose)
+        with pytest.raises(DiskError, match="No space left on device"):
+            await bench.run(back)
+        assert _state(back) is DeviceState.UNTOUCHED
+        assert bench.served.unit.eeprom == OLD.image()

@@ -1,0 +1,179 @@
+"""provision, restore."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from triaxcal.errors import Refused
+from triaxcald import text
+from triaxcald.certificate import REFERENCE_TEMPERATURE, roles
+from triaxcald.choices import is_passing
+from triaxcald.cli.arguments import add_force, add_json
+from triaxcald.cli.console import emit, say, table
+from triaxcald.cli.interrupt import run_interruptible
+from triaxcald.documents import REGISTER_DIGITS, number
+from triaxcald.errors import InputError
+from triaxcald.held_sensor import sensor_of
+from triaxcald.inputs import read_document
+from triaxcald.provision.identity import same_serial
+from triaxcald.provision.image import RegisterImage, build_image
+from triaxcald.provision.procedure import Provisioning
+from triaxcald.station.config import Place, load_station
+from triaxcald.station.provisioning import Provisioned, ProvisionRun, put_back, snapshot_in, unit_in
+from triaxcald.station.today import days_since_1970
+
+
+def register(commands: Any) -> None:
+    p = commands.add_parser("provision", help="write a calibration to the device's registers and verify it")
+    p.add_argument("calibration", metavar="CAL.json", nargs="?")
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("--unit", help="where the station has more than one")
+    p.add_argument("--dry-run", action="store_true", help="read and compare, write nothing")
+    p.add_argument("--resume", action="store_true", help="finish a provisioning that was cut short, by its journal")
+    p.add_argument(
+        "--power-cycle", action="store_true", help="have the supply switched off and on where nothing else verifies"
+    )
+    add_force(p)
+    add_json(p)
+    p.set_defaults(run=provision_command)
+    p = commands.add_parser("restore", help="put the registers back that a recording or a journal has kept")
+    p.add_argument("source", metavar="REC|JOURNAL", type=Path)
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("--unit", help="where the station has more than one; by default the one of that name in the source")
+    add_json(p)
+    p.set_defaults(run=restore_command)
+
+
+def provision_command(a: argparse.Namespace) -> int:
+    if a.resume == (a.calibration is not None):
+        raise InputError("provision: give CAL.json, or --resume without one")
+    station = load_station(a.station)
+    place = station.place(a.unit)
+    image, serial = (None, None) if a.resume else image_from(a.calibration, place)
+    ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
+    run = ProvisionRun(station, place, image, serial, dry_run=a.dry_run, force=a.force, ask=ask)
+    done = run_interruptible(run.run())
+    if a.json:
+        emit(_document(done, place, dry_run=a.dry_run))
+    elif done.error is None:
+        _show(done, place)
+    if done.error is not None:
+        say(f"triaxcal: {done.error}")
+    return done.exit_code
+
+
+def _ask(what: str) -> None:
+    say(what)
+
+
+def _document(done: Provisioned, place: Place, *, dry_run: bool) -> dict[str, Any]:
+    p = done.provisioning
+    return {
+        "format": "triaxcal.provisioning/1",
+        "unit": place.unit.name,
+        "serial": p.identity.serial if p else None,
+        "dry_run": dry_run,
+        "written": list(p.written) if p else [],
+        "differing": list(p.differing) if p else [],
+        "stored": bool(p and p.stored),
+        "error": done.error,
+        "words": _words(p) if p else [],
+        "outcome": done.document,
+        "outcome_file": str(done.path) if done.path else None,
+    }
+
+
+def _words(p: Provisioning) -> list[dict[str, Any]]:
+    words = {w.register: w for w in p.image.words}
+    return [
+        {
+            "register": name,
+            "before": raw.hex(),
+            "wanted": words[name].raw.hex() if name in words else None,
+            "after": p.after.raw[name].hex(),
+            "value": number(words[name].value, REGISTER_DIGITS) if name in words else None,
+            "held": number(words[name].held, REGISTER_DIGITS) if name in words else None,
+        }
+        for name, raw in p.found.raw.items()
+    ]
+
+
+def _show(done: Provisioned, place: Place) -> None:
+    p = done.provisioning
+    assert p is not None
+    table(
+        f"unit {place.unit.name}, serial {p.identity.serial}",
+        ["register", "before", "wanted", "after", "value"],
+        [[w["register"], w["before"], w["wanted"], w["after"], w["value"]] for w in _words(p)],
+    )
+    for doubt in p.doubts:
+        say(f"warning: {text.doubt(doubt)}")
+    print(done.document["reason"])
+    if done.path is not None and (journal := done.document["journal"]):
+        print(f"outcome {done.path}, journal {journal}")
+    elif done.path is not None:
+        print(f"outcome {done.path}")
+
+
+def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
+    """The registers that a calibration file asks for, and the serial number of the unit that it is meant for.
+
+    The serial is the station's where the file names none. Raises Refused where file, station and device do not go
+    together: another unit, another unit of the reference vector, other signs, effects that the device cannot hold.
+    """
+    document = read_document(path)
+    sensor, channel_reference, reference = sensor_of(document, where=path)
+    profile = place.bundle.profile
+    if not 0.9 <= reference <= 1.1:
+        raise Refused(f"{path}: the reference is {reference:g}; registers are in units of g")
+    serial = _serial_of(document, path, place)
+    wanted = roles(sensor, channel_reference)
+    passing = {f"{e.name}.{c.name}" for e, _ in sensor.effects if is_passing(e) for c in e.coefficients}
+    homeless = [r for r in wanted if r not in passing and profile.by_role(r) is None and r != REFERENCE_TEMPERATURE]
+    if homeless:
+        raise Refused(
+            f"{path}: {profile.name} has no register for {', '.join(homeless)}; without them the other coefficients "
+            "would be wrong"
+        )
+    for axis, k, sign in zip("xyz", sensor.scale_factor, place.signs, strict=True):
+        if k * sign < 0:
+            raise Refused(f"{path}: scale_factor.{axis} is {k:.4g}, of another sign than the device's: fit with --sign")
+    held = {r: v for r, v in wanted.items() if profile.by_role(r)}
+    return build_image(profile, held, date_days=days_since_1970()), serial
+
+
+def _serial_of(document: Mapping[str, Any], path: str, place: Place) -> str | None:
+    unit = document.get("unit")
+    meant = unit.get("serial") if isinstance(unit, Mapping) else None
+    expected = place.unit.serial
+    if not isinstance(meant, str | None):
+        raise InputError(f"{path}: unit.serial: expected text, not {meant!r}")
+    if meant is not None and expected is not None and not same_serial(meant, expected):
+        raise Refused(f"{path}: is for the unit with serial {meant}, the station expects {expected}")
+    return meant or expected
+
+
+def restore_command(a: argparse.Namespace) -> int:
+    station = load_station(a.station)
+    names = [place.unit.name for place in station.places]
+    theirs = unit_in(a.source)
+    place = station.place(a.unit or (theirs if theirs in names else None))
+    snapshot, _ = snapshot_in(a.source, place.bundle.profile)
+    p = run_interruptible(put_back(station, place, snapshot))
+    if a.json:
+        emit(
+            {
+                "format": "triaxcal.restoration/1",
+                "unit": place.unit.name,
+                "serial": p.identity.serial,
+                "device_state": p.held.state.value,
+                "evidence": p.held.evidence.value,
+                "registers": {name: raw.hex() for name, raw in snapshot.raw.items()},
+            }
+        )
+    else:
+        print(f"unit {place.unit.name}, serial {p.identity.serial}: {text.held(p.held)}")
+    return 0

@@ -1,0 +1,255 @@
+"""Provisioning by hand: a calibration that was made before, one that was cut short, or an old one put back."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from triaxcal_drivers.errors import RegisterValueError
+from triaxcal_drivers.interface import Device
+from triaxcal_drivers.profile import Profile
+from triaxcald import text
+from triaxcald.abort import Left, at_abort
+from triaxcald.certificate import software
+from triaxcald.documents import Document, to_text
+from triaxcald.errors import Implausible, InputError, ProvisionError, RecordingError
+from triaxcald.exit_codes import BAD_INPUT, DISK, DONE
+from triaxcald.files import write_new
+from triaxcald.outcome import (
+    SUFFIX,
+    Ending,
+    Papers,
+    Verdict,
+    latest_of,
+    outcome_document,
+    registers_told,
+)
+from triaxcald.provision.access import RegisterLink
+from triaxcald.provision.identity import check_identity
+from triaxcald.provision.image import RegisterImage, image_of
+from triaxcald.provision.journal import Journal, parse, registers_of
+from triaxcald.provision.plausible import Doubt
+from triaxcald.provision.power import power_cycled
+from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.snapshot import Snapshot
+from triaxcald.provision.state import DeviceState, Held
+from triaxcald.recording.reader import Recording
+from triaxcald.station.config import Place, Station
+from triaxcald.station.endings import aborted
+from triaxcald.station.output_check import doubts_of_live_output
+from triaxcald.station.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
+
+
+@dataclass(frozen=True)
+class Provisioned:
+    """``error`` is one line where it failed; ``path`` is where the outcome was written, if it was."""
+
+    exit_code: int
+    document: Document
+    provisioning: Provisioning | None
+    error: str | None
+    path: Path | None
+
+
+@dataclass
+class ProvisionRun:
+    """Writes ``image``, meant for the unit ``serial``, to the device at ``place``; without an image, the one of a
+    provisioning that was cut short. ``force`` is the reason to write in spite of doubts."""
+
+    station: Station
+    place: Place
+    image: RegisterImage | None = None
+    serial: str | None = None
+    dry_run: bool = False
+    force: str | None = None
+    ask: Callable[[str], None] | None = None
+    """Shows the operator what to do; given, the supply is to be switched off and on where nothing else shows what is
+    stored."""
+    clock_ns: Callable[[], int] = time.time_ns
+    provisioning: Provisioning | None = field(default=None, init=False)
+    doubts: Sequence[Doubt] = field(default=(), init=False)
+
+    async def run(self) -> Provisioned:
+        """Raises nothing, not even when it is cancelled: it says everything in the outcome."""
+        ending: Ending | None = None
+        try:
+            with at_abort(self.left):
+                async with self.place.opened() as device:
+                    await self._work(device)
+                    ending = Ending(Verdict.NOT_JUDGED, self._done(), DONE)
+        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the outcome is owed whatever happens
+            if ending is None:  # what only the closing was stopped in is done
+                ending = aborted(e, self.provisioning)
+        assert ending is not None
+        document = self._document(ending)
+        path = None
+        if self.provisioning is not None and not self.dry_run and ending.exit_code != BAD_INPUT:
+            try:
+                path = self._write(document)
+            except InputError as e:
+                failed = ending if ending.exit_code else Ending(Verdict.ABORTED, str(e), DISK)
+                ending = replace(failed, reason=f"{failed.reason}; {e}" if ending.exit_code else str(e))
+                document = self._document(ending)
+        return Provisioned(ending.exit_code, document, self.provisioning, self._error(ending), path)
+
+    def left(self, _: float) -> Left | None:
+        """What the end at once would leave behind."""
+        p = self.provisioning
+        return None if p is None else Left(text.left(p, self.station.path), not p.settled)
+
+    async def _work(self, device: Device) -> None:
+        bundle = self.place.bundle
+        link = RegisterLink(device, bundle.profile)
+        image = self.image or await self._image_of_journal(link)
+        p = Provisioning(
+            link,
+            bundle,
+            image,
+            unit=self.place.unit.name,
+            folder=self.station.folder,
+            expected_serial=self.serial or self.place.unit.serial,
+            where=self.place.address,
+            started=self._now(),
+            power_cycle=self._power_cycle(link) if self.ask else None,
+        )
+        await p.examine(restart=not self.dry_run)
+        self.provisioning = p
+        self.doubts = p.doubts
+        if not p.carried and p.differing and not self.doubts:
+            self.doubts = await doubts_of_live_output(device, bundle, p.found)
+        if self.doubts and self.force is None and not self.dry_run:
+            raise Implausible(text.doubted(self.doubts))
+        if not self.dry_run:
+            try:
+                await p.write()
+            finally:
+                p.finish()
+
+    def _power_cycle(self, link: RegisterLink) -> Callable[[], Awaitable[bool]]:
+        async def asked() -> bool:
+            assert self.ask is not None
+            self.ask(text.SWITCH_SUPPLY)
+            return await power_cycled(link, self.place.bundle.profile, self.station.file.plan.patience_s)
+
+        return asked
+
+    async def _image_of_journal(self, link: RegisterLink) -> RegisterImage:
+        bundle = self.place.bundle
+        identity = await check_identity(link, bundle, self.place.unit.serial, where=self.place.address)
+        journal = Journal.of(self.station.folder, self.place.unit.name, identity.serial)
+        entry = journal.read()
+        if entry is None:
+            raise InputError(f"{journal.path}: no such file: no provisioning of this unit was cut short")
+        if entry.profile_sha256 != bundle.digest():
+            raise InputError(f"{journal.path}: was begun with another version of the profile {bundle.profile.name}")
+        self.serial = identity.serial
+        return image_of(bundle.profile, entry.wanted)
+
+    @property
+    def _held(self) -> Held:
+        return self.provisioning.held if self.provisioning else Held()
+
+    def _now(self) -> str:
+        return datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds")
+
+    def _done(self) -> str:
+        assert self.provisioning is not None
+        if self.dry_run:
+            return f"dry run: {len(self.provisioning.differing)} registers would be written, nothing was"
+        return text.provisioned(self.provisioning)
+
+    def _document(self, ending: Ending) -> Document:
+        p = self.provisioning
+        return outcome_document(
+            ending,
+            self._held,
+            Papers(registers=registers_told(p) if p else None),
+            unit=self.place.unit.name,
+            serial=p.identity.serial if p else None,
+            station=self.station.file.name,
+            ended=self._now(),
+            software=software(),
+            supersedes=latest_of(self.station.folder, p.identity.serial) if p else None,
+            journal=str(p.journal.path) if p and not p.settled else None,
+            forced=self.force if self.doubts else None,
+        )
+
+    def _write(self, document: Document) -> Path:
+        """Raises InputError."""
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
+        stem = f"{document['serial'] or self.place.unit.name}-{stamp}"
+        return write_new(self.station.folder, stem, SUFFIX, to_text(document))
+
+    def _error(self, ending: Ending) -> str | None:
+        if not ending.exit_code:
+            return None
+        told = [ending.reason]
+        p = self.provisioning
+        if p is not None and ending.verdict is Verdict.ABORTED:
+            told.append(text.left(p, self.station.path))
+        return "; ".join(filter(None, told))
+
+
+async def put_back(station: Station, place: Place, snapshot: Snapshot) -> Provisioning:
+    """The registers of ``snapshot`` back into the device. Raises ProvisionError that says what it holds instead,
+    WrongUnit, DriverError."""
+    async with place.opened() as device:
+        p = Provisioning(
+            RegisterLink(device, place.bundle.profile),
+            place.bundle,
+            image_of(place.bundle.profile, snapshot.raw),
+            unit=place.unit.name,
+            folder=station.folder,
+            expected_serial=snapshot.serial or place.unit.serial,
+            where=place.address,
+        )
+        await p.examine()
+        p.before, p.carried = snapshot, True
+        await p.undo()
+        if p.held.state is not DeviceState.OLD:
+            raise ProvisionError(f"{p.undoing_failed}; {text.held(p.held)}")
+        p.finish()
+        return p
+
+
+def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:
+    """The registers that a recording or a journal has kept, and the name of the unit. Raises InputError."""
+    held, serial, unit = _kept(path)
+    for name, raw in held.items():
+        if name not in profile.registers:
+            raise InputError(f"{path}: register {name}: profile {profile.name} has none of that name")
+        try:
+            profile.decode(name, raw)
+        except RegisterValueError as e:
+            raise InputError(f"{path}: {e}") from e
+    return Snapshot(held, serial), unit
+
+
+def unit_in(path: Path) -> str | None:
+    """The name of the unit whose registers they are. Raises InputError."""
+    return _kept(path)[2]
+
+
+def _kept(path: Path) -> tuple[Mapping[str, bytes], str | None, str | None]:
+    if path.suffix != ".mcap":
+        try:
+            data = path.read_bytes()
+        except OSError as e:
+            raise InputError(f"{path}: {e.strerror}") from e
+        entry = parse(data, where=str(path))
+        return entry.before, entry.serial, entry.unit
+    with Recording.open(path, unfinished=True) as recording:
+        kept = next((n for n in (REGISTERS_EARLIER, REGISTERS_BEFORE) if n in recording.attachments), None)
+        if kept is None:
+            raise RecordingError(f"{path}: attachment {REGISTERS_BEFORE}: missing; no register was written in it")
+        unit = recording.metadata.get("unit", {})
+        try:
+            held = registers_of(json.loads(recording.attachments[kept]))
+        except (ValueError, TypeError, AttributeError) as e:
+            raise RecordingError(f"{path}: attachment {kept}: no registers: {e}") from e
+        return held, unit.get("serial") or None, unit.get("name") or None

@@ -1,0 +1,115 @@
+"""What the daemon says of devices and provisionings, in English. Nothing reads these sentences back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from triaxcal.figures import micro_g
+from triaxcald.provision.plausible import Doubt
+from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.state import DeviceState, Evidence, Held
+
+_HELD: dict[tuple[DeviceState, Evidence | None], str] = {
+    (DeviceState.UNTOUCHED, None): "the old calibration is untouched",
+    (DeviceState.OLD, Evidence.NOTHING_STORED): "the old calibration is in use again, and nothing was stored",
+    (DeviceState.OLD, Evidence.RESTART): "the device holds the old calibration, read back after a restart",
+    (DeviceState.OLD, Evidence.POWER_CYCLE): "the device holds the old calibration, read back after a power cycle",
+    (DeviceState.OLD, Evidence.WRITE_COUNTER): "the device holds the old calibration: by its counter it has not stored",
+    (DeviceState.OLD, None): "the old calibration is written back and reads back equal; no restart has proven it",
+    (DeviceState.NEW_VERIFIED, Evidence.RESTART): "the device holds the new calibration, read back after a restart",
+    (
+        DeviceState.NEW_VERIFIED,
+        Evidence.POWER_CYCLE,
+    ): "the device holds the new calibration, read back after a power cycle",
+    (DeviceState.NEW_UNVERIFIED, Evidence.WRITE_COUNTER): (
+        "the device has stored the new calibration by its own counter; no restart has proven it"
+    ),
+    (DeviceState.NEW_UNVERIFIED, None): "the new calibration is written and reads back equal; no restart has proven it",
+    (DeviceState.MIXED, None): "the device holds a mixture of old and new registers",
+    (DeviceState.UNKNOWN, None): "what the device holds is unknown",
+}
+
+
+SWITCH_SUPPLY = "switch the supply of the unit off and on"
+
+
+def held(of: Held) -> str:
+    """What the device holds."""
+    return _HELD.get((of.state, of.evidence)) or _HELD[of.state, None]
+
+
+def settling(p: Provisioning, station: Path) -> str:
+    """The command that clears up what the device holds; empty where nothing is left to be cleared up."""
+    if p.settled:
+        return ""
+    unit, journal = p.unit, p.journal.path
+    resume = f"triaxcal provision --resume {station} --unit {unit}"
+    if p.held.state is DeviceState.NEW_UNVERIFIED:
+        return f"to verify: '{resume} --power-cycle', and switch its supply off and on when asked (journal: {journal})"
+    restore = f"triaxcal restore {journal} {station} --unit {unit}"
+    return f"to settle: '{resume}' writes the new calibration, '{restore}' the old one"
+
+
+def left(p: Provisioning, station: Path) -> str:
+    """What the device holds, and the command that clears it up."""
+    return "; ".join(filter(None, (held(p.held), settling(p, station))))
+
+
+def provisioned(p: Provisioning) -> str:
+    """What was done, and what the device holds now."""
+    if not p.written:
+        return f"the registers held these values already, and nothing was written; {held(p.held)}"
+    stored = "written and stored" if p.stores else "written"
+    return f"{len(p.written)} registers {stored}; {held(p.held)}"
+
+
+def passed(verification: Mapping[str, Any] | None) -> str:
+    if verification is None:
+        return "the fit is within the limits"
+    limit = verification["limit_rms_g"]
+    told = "" if limit is None else f", limit {micro_g(limit)}"
+    return f"within the limits; the device's own output in the check poses is {_checked(verification)}{told}"
+
+
+def verification_failed(verification: Mapping[str, Any]) -> str:
+    limit = verification["limit_rms_g"]
+    if limit is None:
+        before = micro_g(verification["before_rms_g"])
+        return f"the device's own output in the check poses is {_checked(verification)}, worse than the {before} before"
+    return f"the device's own output in the check poses is {_checked(verification)}, limit {micro_g(limit)}"
+
+
+def _checked(verification: Mapping[str, Any]) -> str:
+    expanded = verification.get("expanded_uncertainty_g")
+    told = f" ± {micro_g(expanded)}" if expanded is not None else ""
+    return f"{micro_g(verification['after_rms_g'])}{told} off"
+
+
+def doubt(of: Doubt) -> str:
+    match of.kind:
+        case "not_a_number":
+            return f"{of.register} holds no number"
+        case "outside_limits":
+            return f"{of.register} holds {of.value:.6g}, outside its limits {of.low:g} to {of.high:g}"
+        case "checksum":
+            return f"the checksum in {of.register} does not fit the registers"
+        case "corrected_output":
+            return f"the corrected output is {of.value:.3g} g off what the registers make of the readings"
+        case _:
+            return f"{of.register} holds {of.value:.6g}, expected {of.low:g} to {of.high:g}"
+
+
+MOST_DOUBTS = 3
+"""So many are listed: what makes one register absurd makes most of them so."""
+
+
+def doubted(of: Sequence[Doubt]) -> str:
+    """Why nothing is written."""
+    listed = "; ".join(doubt(d) for d in of[:MOST_DOUBTS])
+    more = f"; and {len(of) - MOST_DOUBTS} more" if len(of) > MOST_DOUBTS else ""
+    return (
+        f"what the device holds is no calibration under its profile (word order, scaling, addresses?): {listed}{more}; "
+        "nothing was written; --force REASON writes all the same"
+    )
