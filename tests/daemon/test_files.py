@@ -93,7 +93,7 @@ def test_the_systems_names_of_a_descriptor_are_written_to(tmp_path: Path) -> Non
     write_text(Path("/dev/null"), "away")
 
 
-def test_a_file_that_is_new_file_is_gone_after_a_failure_and_never_replaces_one(tmp_path: Path) -> None:
+def test_a_new_file_is_gone_after_a_failure_and_never_replaces_one(tmp_path: Path) -> None:
     path = tmp_path / "new"
     with pytest.raises(TypeError), new_file(path) as file:
         file.write("half" + 1)  # type: ignore[operator]
