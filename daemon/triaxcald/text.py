@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,9 @@ _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
 }
 
 
-SWITCH_SUPPLY = "switch the supply of the unit off and on"
+def switch_supply(off_s: float) -> str:
+    """What the operator is to do."""
+    return f"switch the supply of the unit off for at least {math.ceil(off_s)} s, then on"
 
 
 def held(of: Held) -> str:
@@ -93,6 +96,8 @@ def doubt(of: Doubt) -> str:
             return f"{of.register} holds no number"
         case "outside_limits":
             return f"{of.register} holds {of.value:.6g}, outside its limits {of.low:g} to {of.high:g}"
+        case "unstable":
+            return f"{of.register} reads differently each time"
         case "checksum":
             return f"the checksum in {of.register} does not fit the registers"
         case "corrected_output":

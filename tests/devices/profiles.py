@@ -52,6 +52,7 @@ class Wording:
     word_order: Literal["big", "little"] | None = None
     """None: as the device's; the other: a profile that is wrong about it."""
     product_code: int = PRODUCT_CODE
+    key: int = UNLOCK_KEY
     serial: bool = True
     """Whether it names the register of the serial number."""
     corrected: bool = True
@@ -76,7 +77,7 @@ def profile_text(driver: Driver, habits: Habits, timing: Timing | None = None, w
         ),
         _streams(driver, wording.corrected),
         _table("registers", {name: _register(driver, e, wording) for name, e in registers_of(habits).items()}),
-        _table("sequences", _sequences(habits, timing)),
+        _table("sequences", _sequences(habits, timing, wording)),
     ]
     if habits.checksum:
         parts.append(_table("crc", {"register": CHECKSUM, "algorithm": "crc-16/modbus", "over": NINE}))
@@ -118,10 +119,10 @@ def _register(driver: Driver, entry: Entry, wording: Wording) -> dict[str, Any]:
     return held
 
 
-def _sequences(habits: Habits, timing: Timing) -> dict[str, Any]:
+def _sequences(habits: Habits, timing: Timing, wording: Wording) -> dict[str, Any]:
     held: dict[str, Any] = {}
     if habits.unlock:
-        held["unlock"] = [{"write": "unlock_key", "value": UNLOCK_KEY}]
+        held["unlock"] = [{"write": "unlock_key", "value": wording.key}]
         held["lock"] = [{"write": "unlock_key", "value": 0}]
     if habits.store_command:
         held["store"] = [{"write": "store", "value": STORE_COMMAND}]

@@ -16,7 +16,7 @@ from triaxcal_drivers.profile import Profile
 from triaxcald.provision.image import CRC_ROLE, DATE_ROLE, REFERENCE_ROLE, RegisterImage, checksum_of
 from triaxcald.provision.snapshot import Snapshot
 
-Kind = Literal["not_a_number", "outside_limits", "implausible", "checksum", "corrected_output"]
+Kind = Literal["not_a_number", "outside_limits", "implausible", "unstable", "checksum", "corrected_output"]
 
 SCALE_FACTOR_RATIO = 4.0
 """A scale factor this many times off its nominal value is no scale factor of this device: data sheets allow 0.1."""
@@ -45,6 +45,11 @@ def is_blank(snapshot: Snapshot) -> bool:
     """Never written: every byte 0xFF, or every byte 0x00."""
     held = b"".join(snapshot.raw.values())
     return bool(held) and len(set(held)) == 1 and held[0] in (0x00, 0xFF)
+
+
+def unstable(profile: Profile, first: Snapshot, second: Snapshot) -> list[Doubt]:
+    """Registers that two readings in a row do not agree on."""
+    return [Doubt("unstable", name, profile.decode(name, second.raw[name])) for name in first.differing(second.raw)]
 
 
 def doubts(profile: Profile, snapshot: Snapshot, image: RegisterImage) -> list[Doubt]:

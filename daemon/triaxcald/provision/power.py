@@ -15,6 +15,11 @@ MISSED = 3
 """So many requests in a row go unanswered by chance once in a million times where a link loses one in a hundred."""
 
 
+def least_off_s(profile: Profile) -> float:
+    """The supply has to be off for so long to be seen off."""
+    return MISSED * (profile.sampling.reply_timeout_s + LOOK_S)
+
+
 async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) -> bool:
     """Waits until the device has gone silent and answers again; whether it has within ``patience_s``."""
     register = probe(profile) or next(iter(profile.registers))

@@ -16,7 +16,7 @@ from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.journal import Entry, Journal, Step
-from triaxcald.provision.plausible import Doubt, doubts, fits_its_checksum
+from triaxcald.provision.plausible import Doubt, doubts, fits_its_checksum, unstable
 from triaxcald.provision.proof import show_restart
 from triaxcald.provision.restore import restore
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
@@ -98,7 +98,9 @@ class Provisioning:
             if self.differing and self.found.differing(entry.before):
                 self.held.now(DeviceState.MIXED, Evidence.READ_BACK)
         else:
-            self.doubts = doubts(self.bundle.profile, self.found, self.image)
+            again = await self._read("reading the old calibration again")
+            profile = self.bundle.profile
+            self.doubts = unstable(profile, self.found, again) or doubts(profile, self.found, self.image)
 
     async def write(self) -> None:
         """Write what differs, store it, restart the device, and read it back.

@@ -34,7 +34,7 @@ from triaxcald.provision.identity import check_identity
 from triaxcald.provision.image import RegisterImage, image_of
 from triaxcald.provision.journal import Journal, parse, registers_of
 from triaxcald.provision.plausible import Doubt
-from triaxcald.provision.power import power_cycled
+from triaxcald.provision.power import least_off_s, power_cycled
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.snapshot import Snapshot
 from triaxcald.provision.state import DeviceState, Held
@@ -133,7 +133,7 @@ class ProvisionRun:
     def _power_cycle(self, link: RegisterLink) -> Callable[[], Awaitable[bool]]:
         async def asked() -> bool:
             assert self.ask is not None
-            self.ask(text.SWITCH_SUPPLY)
+            self.ask(text.switch_supply(least_off_s(self.place.bundle.profile)))
             return await power_cycled(link, self.place.bundle.profile, self.station.file.plan.patience_s)
 
         return asked

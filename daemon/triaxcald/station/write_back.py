@@ -23,7 +23,7 @@ from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.corrected import LEAST, departure_g, doubt_of_departure
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.plausible import Doubt, is_blank
-from triaxcald.provision.power import power_cycled
+from triaxcald.provision.power import least_off_s, power_cycled
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
 from triaxcald.recording.writer import RecordingWriter
@@ -111,7 +111,7 @@ class WriteBack:
 
     def _power_cycle(self, link: RegisterLink) -> Callable[[], Awaitable[bool]]:
         async def asked() -> bool:
-            self.ask(text.SWITCH_SUPPLY)
+            self.ask(text.switch_supply(least_off_s(self.place.bundle.profile)))
             return await power_cycled(link, self.place.bundle.profile, self.station.file.plan.patience_s)
 
         return asked

@@ -1,0 +1,29 @@
+"""What is said of a device that misbehaves is what its memory cells hold."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from tests.devices.bench import Bench
+from tests.devices.rows import ROWS, Row
+from triaxcald.cli import provisioning
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.does)
+def test_what_is_said_of_a_device_that(row: Row, tmp_path: Path, triaxcal, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Bench(tmp_path, triaxcal, row.transport, **row.settings) as bench:
+        if row.supply:
+            monkeypatch.setattr(provisioning, "_ask", lambda _: threading.Timer(0.3, bench.power_cycle).start())
+        done = bench.provision("--json", *row.arguments)
+        outcome = done.json["outcome"]
+        said = f"{outcome['reason']} {done.err}"
+        seen = (_held(bench), outcome["device_state"], done.code)
+        assert seen == (row.holds, row.state, row.exit_code), said
+        assert row.says in said
+
+
+def _held(bench: Bench) -> str:
+    return "old" if bench.holds_old() else "new" if bench.holds_new() else "neither"
