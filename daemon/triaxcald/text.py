@@ -13,7 +13,7 @@ from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState, Evidence, Held
 
 _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
-    (DeviceState.UNTOUCHED, None): "the old calibration is untouched",
+    (DeviceState.UNTOUCHED, None): "no register was written",
     (DeviceState.OLD, Evidence.NOTHING_STORED): "the old calibration is in use again, and nothing was stored",
     (DeviceState.OLD, Evidence.RESTART): "the device holds the old calibration, read back after a restart",
     (DeviceState.OLD, Evidence.POWER_CYCLE): "the device holds the old calibration, read back after a power cycle",
@@ -28,7 +28,7 @@ _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
         "the device has stored the new calibration by its own counter; no restart has proven it"
     ),
     (DeviceState.NEW_UNVERIFIED, None): "the new calibration is written and reads back equal; no restart has proven it",
-    (DeviceState.MIXED, None): "the device holds a mixture of old and new registers",
+    (DeviceState.MIXED, None): "the registers read back as neither the old calibration nor the new one",
     (DeviceState.UNKNOWN, None): "what the device holds is unknown",
 }
 

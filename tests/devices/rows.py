@@ -138,7 +138,7 @@ ROWS = (
         motion=Motion(follows_registers=False)),
     row("has another product code", "old", "untouched", 4, "product_code", wording=Wording(product_code=1)),
     row("is another unit than the station expects", "old", "untouched", 4, "serial", serial="9999"),
-    row("restarts with the values of the factory", "neither", "mixed", 4, "mixture",
+    row("restarts with the values of the factory", "neither", "mixed", 4, "neither the old calibration nor the new",
         habits=Habits(resets_to="factory")),
     # The line to it.
     row("loses 3 % of the replies", "new", "new_verified", 0, RESTARTED, timing=QUICK, trouble=Trouble(lose_reply=0.03,

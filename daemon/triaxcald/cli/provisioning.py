@@ -22,7 +22,7 @@ from triaxcald.provision.identity import same_serial
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.station.config import Place, load_station
-from triaxcald.station.provisioning import Provisioned, ProvisionRun, put_back, snapshot_in, unit_in
+from triaxcald.station.provisioning import Provisioned, ProvisionRun, restored, snapshot_in, unit_in
 from triaxcald.station.today import days_since_1970
 
 
@@ -162,7 +162,7 @@ def restore_command(a: argparse.Namespace) -> int:
     theirs = unit_in(a.source)
     place = station.place(a.unit or (theirs if theirs in names else None))
     snapshot, _ = snapshot_in(a.source, place.bundle.profile)
-    p = run_interruptible(put_back(station, place, snapshot))
+    p = run_interruptible(restored(station, place, snapshot))
     if a.json:
         emit(
             {

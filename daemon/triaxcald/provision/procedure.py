@@ -56,6 +56,8 @@ class Provisioning:
     carried: bool = False
     """Whether an earlier provisioning was cut short."""
     undoing_failed: str | None = None
+    _store_owed: bool = False
+    """What is in use is the image, and the provisioning that was cut short may not have stored it."""
     _restarted: bool = False
     _journaled: bool = False
     _unlocked: bool = False
@@ -95,8 +97,11 @@ class Provisioning:
         self.differing = self.found.differing(self.image.raw)
         if (entry := self.journal.read()) is not None and self._is_cut_short(entry):
             self.carried, self.before = True, Snapshot(entry.before, self.identity.serial)
+            self._store_owed = self.stores and entry.step != "stored" and not self._restarted
             if self.differing and self.found.differing(entry.before):
                 self.held.now(DeviceState.MIXED, Evidence.READ_BACK)
+            else:
+                self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         else:
             again = await self._read("reading the old calibration again")
             profile = self.bundle.profile
@@ -109,7 +114,7 @@ class Provisioning:
         exception, goes on only once the old calibration is back. ``held`` then says whether it is.
         """
         try:
-            if self.differing:
+            if self.differing or self._store_owed:
                 await self._write()
                 await self._store()
                 await self._prove()
@@ -180,6 +185,8 @@ class Provisioning:
         self._decided = True  # whatever happens now, writing more would not make it any surer
         if self.resets:
             await self._prove_by_restart()
+        elif not self.stored:
+            await self._decide(Evidence.READ_BACK)  # it may have lost its supply, and started from what is stored
         if self.held.state is not DeviceState.NEW_VERIFIED:
             await self._prove_by_power_cycle()
         if self.held.state is DeviceState.UNKNOWN:

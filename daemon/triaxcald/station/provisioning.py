@@ -30,14 +30,14 @@ from triaxcald.outcome import (
     registers_told,
 )
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.identity import check_identity
 from triaxcald.provision.image import RegisterImage, image_of
-from triaxcald.provision.journal import Journal, parse, registers_of
+from triaxcald.provision.journal import parse, registers_of
 from triaxcald.provision.plausible import Doubt
 from triaxcald.provision.power import least_off_s, power_cycled
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.snapshot import Snapshot
-from triaxcald.provision.state import DeviceState, Held
+from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.provision.unfinished import journaled_image, put_back
 from triaxcald.recording.reader import Recording
 from triaxcald.station.config import Place, Station
 from triaxcald.station.endings import aborted
@@ -139,20 +139,21 @@ class ProvisionRun:
         return asked
 
     async def _image_of_journal(self, link: RegisterLink) -> RegisterImage:
-        bundle = self.place.bundle
-        identity = await check_identity(link, bundle, self.place.unit.serial, where=self.place.address)
-        journal = Journal.of(self.station.folder, self.place.unit.name, identity.serial)
-        entry = journal.read()
-        if entry is None:
-            raise InputError(f"{journal.path}: no such file: no provisioning of this unit was cut short")
-        if entry.profile_sha256 != bundle.digest():
-            raise InputError(f"{journal.path}: was begun with another version of the profile {bundle.profile.name}")
-        self.serial = identity.serial
-        return image_of(bundle.profile, entry.wanted)
+        image, self.serial = await journaled_image(
+            link,
+            self.place.bundle,
+            folder=self.station.folder,
+            unit=self.place.unit.name,
+            expected_serial=self.place.unit.serial,
+            where=self.place.address,
+        )
+        return image
 
     @property
     def _held(self) -> Held:
-        return self.provisioning.held if self.provisioning else Held()
+        if self.provisioning is not None:
+            return self.provisioning.held
+        return Held() if self.image is not None else Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
 
     def _now(self) -> str:
         return datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds")
@@ -195,8 +196,8 @@ class ProvisionRun:
         return "; ".join(filter(None, told))
 
 
-async def put_back(station: Station, place: Place, snapshot: Snapshot) -> Provisioning:
-    """The registers of ``snapshot`` back into the device. Raises ProvisionError that says what it holds instead,
+async def restored(station: Station, place: Place, snapshot: Snapshot) -> Provisioning:
+    """The registers of ``snapshot`` back in the device. Raises ProvisionError that says what it holds instead,
     WrongUnit, DriverError."""
     async with place.opened() as device:
         p = Provisioning(
@@ -208,12 +209,10 @@ async def put_back(station: Station, place: Place, snapshot: Snapshot) -> Provis
             expected_serial=snapshot.serial or place.unit.serial,
             where=place.address,
         )
-        await p.examine()
-        p.before, p.carried = snapshot, True
-        await p.undo()
-        if p.held.state is not DeviceState.OLD:
-            raise ProvisionError(f"{p.undoing_failed}; {text.held(p.held)}")
-        p.finish()
+        try:
+            await put_back(p, snapshot)
+        except ProvisionError as e:
+            raise ProvisionError(f"{e}; {text.held(p.held)}") from e
         return p
 
 

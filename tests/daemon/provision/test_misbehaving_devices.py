@@ -11,6 +11,8 @@ from tests.devices.bench import Bench
 from tests.devices.rows import ROWS, Row
 from triaxcald.cli import provisioning
 
+PAGE = Path(__file__).parents[3] / "docs/reference/misbehaving-devices.md"
+
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.does)
 def test_what_is_said_of_a_device_that(row: Row, tmp_path: Path, triaxcal, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,3 +29,13 @@ def test_what_is_said_of_a_device_that(row: Row, tmp_path: Path, triaxcal, monke
 
 def _held(bench: Bench) -> str:
     return "old" if bench.holds_old() else "new" if bench.holds_new() else "neither"
+
+
+def test_the_page_about_them_shows_these_rows() -> None:
+    page = PAGE.read_text("utf-8")
+    table = [line for line in page.splitlines() if line.startswith("|")]
+    assert table == [
+        "| a device that … | starts with | `device_state` | exit code | and it says |",
+        "|---|---|---|---|---|",
+        *(f"| {row.does} | {row.holds} | `{row.state}` | {row.exit_code} | {row.says} |" for row in ROWS),
+    ]

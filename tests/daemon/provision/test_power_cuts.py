@@ -1,0 +1,109 @@
+"""Whatever is cut off in the middle, the supply or the process, the device ends with the new calibration or the old."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.provision.host import Host
+from tests.devices.habits import Habits
+
+MAKES = {
+    "stores by command": Habits(),
+    "writes straight to the EEPROM": Habits(store_command=False),
+    "stores by command, has no restart": Habits(reset_command=False),
+    "writes straight to the EEPROM, has no restart": Habits(store_command=False, reset_command=False, unlock=False),
+    "has no checksum": Habits(checksum=False),
+    "writes straight, has no checksum": Habits(store_command=False, checksum=False),
+    "starts from the factory's values where the checksum is wrong": Habits(on_wrong_checksum="factory"),
+    "replaces the stored copy as a whole": Habits(atomic_store=True),
+    "takes a while to store": Habits(store_seconds=0.5, while_storing="busy"),
+}
+every_make = pytest.mark.parametrize("habits", MAKES.values(), ids=MAKES)
+finished = pytest.mark.parametrize("finish", ["resume", "restore"])
+SAID = {"untouched": "old", "old": "old", "new_verified": "new"}
+WANTED = {"resume": "new", "restore": "old"}
+
+
+@pytest.fixture(autouse=True)
+def _a_disk_that_forgets_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thousands of journals are written here; what a host keeps over a loss of power is tested elsewhere."""
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+
+
+def eeprom_bytes(habits: Habits, folder: Path) -> int:
+    return sum(map(len, Host(folder, habits).old.values()))
+
+
+def assert_true(host: Host) -> None:
+    """What is said is what the device starts with."""
+    assert host.provisioning is not None
+    said = SAID.get(host.provisioning.held.state)
+    assert said in (None, host.starts_with()), host.provisioning.held
+
+
+@every_make
+@finished
+async def test_the_supply_fails_at_any_byte_of_any_write(tmp_path: Path, habits: Habits, finish: str) -> None:
+    for byte in range(eeprom_bytes(habits, tmp_path)):
+        host = Host(tmp_path / str(byte), habits)
+        host.unit.arm(byte)
+        await host.provision()
+        assert_true(host)
+        host.power_on()
+        assert len(host.journals) == 1, byte
+        assert await getattr(host, finish)(), byte
+        assert host.starts_with() == WANTED[finish], byte
+        assert_true(host)
+
+
+@every_make
+async def test_the_supply_fails_for_a_moment_at_any_byte(tmp_path: Path, habits: Habits) -> None:
+    for byte in range(eeprom_bytes(habits, tmp_path)):
+        host = Host(tmp_path / str(byte), replace(habits, power_back_s=0.3))
+        host.unit.arm(byte)
+        await host.provision()
+        assert host.starts_with() in ("old", "new"), byte
+        assert_true(host)
+
+
+@every_make
+@finished
+async def test_the_supply_fails_again_while_that_is_mended(tmp_path: Path, habits: Habits, finish: str) -> None:
+    bytes_in_all = eeprom_bytes(habits, tmp_path)
+    for byte in range(0, bytes_in_all, 5):
+        for again in range(0, bytes_in_all, 7):
+            host = Host(tmp_path / f"{byte}-{again}", habits)
+            host.unit.arm(byte)
+            await host.provision()
+            host.power_on()
+            host.unit.arm(again)
+            await getattr(host, finish)()
+            assert_true(host)
+            host.unit.arm(None)
+            host.power_on()
+            if host.journals:
+                assert await getattr(host, finish)(), (byte, again)
+            assert host.starts_with() == WANTED[finish], (byte, again)
+
+
+@every_make
+@finished
+@pytest.mark.parametrize("answered", [False, True])
+async def test_the_process_is_killed_at_any_request(
+    tmp_path: Path, habits: Habits, finish: str, answered: bool
+) -> None:
+    whole = Host(tmp_path / "whole", habits)
+    assert await whole.provision()
+    for request in range(1, whole.requests + 1):
+        host = Host(tmp_path / str(request), habits)
+        assert not await host.provision(request, kill_after=answered)
+        if host.journals:
+            assert await getattr(host, finish)(), request
+            assert host.starts_with() == WANTED[finish], request
+            assert_true(host)
+        else:
+            assert host.starts_with() == "old", request
