@@ -30,8 +30,8 @@ from triaxcald.cli.commands import main as command
 from triaxcald.provision.state import DeviceState, Evidence, Held
 
 CLAIMS = {"untouched": ("old",), "old": ("old",), "new_verified": ("new",), "mixed": ("mixture",)}
-"""States that leave no doubt, and what the device then has to start with. A mixture only once a restart has shown it:
-before that, it is what is in use."""
+"""States that leave no doubt, and what the device then has to start with. Where they rest on a mere reading back, they
+are said to be unproven: what is in use may not be what is stored."""
 PROCESSES = ("provision", "resume", "restore")
 
 
@@ -52,9 +52,8 @@ class Result:
     @property
     def false(self) -> bool:
         """Whether a sentence is, or a mixture goes without a word."""
-        unproven = self.evidence is Evidence.READ_BACK or self.habits.flips  # what is read is not what is stored
-        if self.said is DeviceState.MIXED and unproven:
-            return False
+        if self.evidence is Evidence.READ_BACK or (self.said is DeviceState.MIXED and self.habits.flips):
+            return False  # said to be unproven; what is read is not what is stored
         said_nothing = not self.failed and self.said is not DeviceState.NEW_UNVERIFIED
         return self.starts_with not in CLAIMS.get(self.said.value, (self.starts_with,)) or (
             said_nothing and self.starts_with == "mixture"

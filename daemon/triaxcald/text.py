@@ -52,6 +52,8 @@ def settling(p: Provisioning, station: Path) -> str:
     if p.held.state is DeviceState.NEW_UNVERIFIED:
         return f"to verify: '{resume} --power-cycle', and switch its supply off and on when asked (journal: {journal})"
     restore = f"triaxcal restore {journal} {station} --unit {unit}"
+    if p.held.state is DeviceState.OLD:
+        return f"to verify: '{restore} --power-cycle', and switch its supply off and on when asked"
     return f"to settle: '{resume}' writes the new calibration, '{restore}' the old one"
 
 

@@ -33,9 +33,7 @@ def register(commands: Any) -> None:
     p.add_argument("--unit", help="where the station has more than one")
     p.add_argument("--dry-run", action="store_true", help="read and compare, write nothing")
     p.add_argument("--resume", action="store_true", help="finish a provisioning that was cut short, by its journal")
-    p.add_argument(
-        "--power-cycle", action="store_true", help="have the supply switched off and on where nothing else verifies"
-    )
+    _add_power_cycle(p)
     add_force(p)
     add_json(p)
     p.set_defaults(run=provision_command)
@@ -43,8 +41,15 @@ def register(commands: Any) -> None:
     p.add_argument("source", metavar="REC|JOURNAL", type=Path)
     p.add_argument("station", metavar="STATION.toml", type=Path)
     p.add_argument("--unit", help="where the station has more than one; by default the one of that name in the source")
+    _add_power_cycle(p)
     add_json(p)
     p.set_defaults(run=restore_command)
+
+
+def _add_power_cycle(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--power-cycle", action="store_true", help="have the supply switched off and on where nothing else verifies"
+    )
 
 
 def provision_command(a: argparse.Namespace) -> int:
@@ -162,7 +167,8 @@ def restore_command(a: argparse.Namespace) -> int:
     theirs = unit_in(a.source)
     place = station.place(a.unit or (theirs if theirs in names else None))
     snapshot, _ = snapshot_in(a.source, place.bundle.profile)
-    p = run_interruptible(restored(station, place, snapshot))
+    ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
+    p = run_interruptible(restored(station, place, snapshot, ask))
     if a.json:
         emit(
             {
@@ -175,5 +181,5 @@ def restore_command(a: argparse.Namespace) -> int:
             }
         )
     else:
-        print(f"unit {place.unit.name}, serial {p.identity.serial}: {text.held(p.held)}")
+        print(f"unit {place.unit.name}, serial {p.identity.serial}: {text.left(p, station.path)}")
     return 0

@@ -137,6 +137,17 @@ class Provisioning:
         """The old calibration back in the device, by whatever it takes; ``held`` says whether it is."""
         await to_its_end(self._undo())
 
+    async def prove_old(self) -> None:
+        """After an undoing that no restart has proven, by a power cycle, where one can be asked for."""
+        if self.power_cycle is None or self.held.settled:
+            return
+        self.steps.append("power cycle")
+        if await self.power_cycle():
+            self.after = await self._look()
+            if lost := self.after.differing(self.before.raw):
+                self.undoing_failed = f"after the power cycle {', '.join(lost)} no longer held the old calibration"
+            self.held.now(DeviceState.UNKNOWN if lost else DeviceState.OLD, Evidence.POWER_CYCLE)
+
     @property
     def settled(self) -> bool:
         """Whether nothing is left to be cleared up."""

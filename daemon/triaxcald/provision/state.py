@@ -38,10 +38,6 @@ class Evidence(StrEnum):
     NO_ANSWER = "no_answer"
 
 
-SETTLED = (DeviceState.UNTOUCHED, DeviceState.OLD, DeviceState.NEW_VERIFIED)
-"""States in which nothing is left to be cleared up."""
-
-
 @dataclass
 class Held:
     """What the device holds, at any moment: true also when nobody gets to change it any more."""
@@ -54,4 +50,7 @@ class Held:
 
     @property
     def settled(self) -> bool:
-        return self.state in SETTLED
+        """Whether nothing is left to be cleared up."""
+        if self.state is DeviceState.OLD:
+            return self.evidence is not Evidence.READ_BACK
+        return self.state in (DeviceState.UNTOUCHED, DeviceState.NEW_VERIFIED)

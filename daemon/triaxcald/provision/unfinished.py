@@ -42,6 +42,8 @@ async def put_back(p: Provisioning, snapshot: Snapshot) -> None:
     await p.examine()
     p.before, p.carried = snapshot, True
     await p.undo()
+    if p.held.state is DeviceState.OLD:
+        await p.prove_old()
     if p.held.state is not DeviceState.OLD:
         raise ProvisionError(p.undoing_failed or "the old calibration is not back")
     p.finish()

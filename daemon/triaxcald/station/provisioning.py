@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,7 +33,6 @@ from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.image import RegisterImage, image_of
 from triaxcald.provision.journal import parse, registers_of
 from triaxcald.provision.plausible import Doubt
-from triaxcald.provision.power import least_off_s, power_cycled
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.snapshot import Snapshot
 from triaxcald.provision.state import DeviceState, Evidence, Held
@@ -42,6 +41,7 @@ from triaxcald.recording.reader import Recording
 from triaxcald.station.config import Place, Station
 from triaxcald.station.endings import aborted
 from triaxcald.station.output_check import doubts_of_live_output
+from triaxcald.station.power import power_cycle_asked
 from triaxcald.station.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
 
 
@@ -115,7 +115,7 @@ class ProvisionRun:
             expected_serial=self.serial or self.place.unit.serial,
             where=self.place.address,
             started=self._now(),
-            power_cycle=self._power_cycle(link) if self.ask else None,
+            power_cycle=power_cycle_asked(self.ask, link, self.place, self.station) if self.ask else None,
         )
         await p.examine(restart=not self.dry_run)
         self.provisioning = p
@@ -129,14 +129,6 @@ class ProvisionRun:
                 await p.write()
             finally:
                 p.finish()
-
-    def _power_cycle(self, link: RegisterLink) -> Callable[[], Awaitable[bool]]:
-        async def asked() -> bool:
-            assert self.ask is not None
-            self.ask(text.switch_supply(least_off_s(self.place.bundle.profile)))
-            return await power_cycled(link, self.place.bundle.profile, self.station.file.plan.patience_s)
-
-        return asked
 
     async def _image_of_journal(self, link: RegisterLink) -> RegisterImage:
         image, self.serial = await journaled_image(
@@ -196,18 +188,22 @@ class ProvisionRun:
         return "; ".join(filter(None, told))
 
 
-async def restored(station: Station, place: Place, snapshot: Snapshot) -> Provisioning:
+async def restored(
+    station: Station, place: Place, snapshot: Snapshot, ask: Callable[[str], None] | None = None
+) -> Provisioning:
     """The registers of ``snapshot`` back in the device. Raises ProvisionError that says what it holds instead,
     WrongUnit, DriverError."""
     async with place.opened() as device:
+        link = RegisterLink(device, place.bundle.profile)
         p = Provisioning(
-            RegisterLink(device, place.bundle.profile),
+            link,
             place.bundle,
             image_of(place.bundle.profile, snapshot.raw),
             unit=place.unit.name,
             folder=station.folder,
             expected_serial=snapshot.serial or place.unit.serial,
             where=place.address,
+            power_cycle=power_cycle_asked(ask, link, place, station) if ask else None,
         )
         try:
             await put_back(p, snapshot)

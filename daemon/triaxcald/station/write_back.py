@@ -23,12 +23,12 @@ from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.corrected import LEAST, departure_g, doubt_of_departure
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.plausible import Doubt, is_blank
-from triaxcald.provision.power import least_off_s, power_cycled
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station
+from triaxcald.station.power import power_cycle_asked
 from triaxcald.verification import OUTSIDE, UNJUDGED, WORSE, Verification, verification_document, verified
 
 VERIFICATION_FILE = "verification.json"
@@ -62,6 +62,7 @@ class WriteBack:
         Raises Implausible, with nothing written, ProvisionError, StationError, DiskError.
         """
         link = RegisterLink(device, self.place.bundle.profile, _recorder(self.writer))
+        asked = power_cycle_asked(self.ask, link, self.place, self.station)
         p = Provisioning(
             link,
             self.place.bundle,
@@ -71,7 +72,7 @@ class WriteBack:
             expected_serial=serial,
             where=self.place.address,
             started=self.started,
-            power_cycle=self._power_cycle(link) if self.station.file.provisioning.power_cycle else None,
+            power_cycle=asked if self.station.file.provisioning.power_cycle else None,
         )
         await p.examine()
         self.provisioning = p
@@ -108,13 +109,6 @@ class WriteBack:
                 raise StationError(f"verification {self.verdict}, and the old calibration could not be put back")
             if (task := asyncio.current_task()) and task.cancelling():
                 raise asyncio.CancelledError
-
-    def _power_cycle(self, link: RegisterLink) -> Callable[[], Awaitable[bool]]:
-        async def asked() -> bool:
-            self.ask(text.switch_supply(least_off_s(self.place.bundle.profile)))
-            return await power_cycled(link, self.place.bundle.profile, self.station.file.plan.patience_s)
-
-        return asked
 
     def _doubts_of_output(self, tumble: Collection) -> list[Doubt]:
         assert self.provisioning is not None

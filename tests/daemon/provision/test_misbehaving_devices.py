@@ -14,6 +14,13 @@ from triaxcald.cli import provisioning
 PAGE = Path(__file__).parents[3] / "docs/reference/misbehaving-devices.md"
 
 
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Longer than any row is silent or busy that comes back."""
+    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 2.5)
+    monkeypatch.setattr("triaxcald.provision.access.BUSY_S", 2.5)
+
+
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.does)
 def test_what_is_said_of_a_device_that(row: Row, tmp_path: Path, triaxcal, monkeypatch: pytest.MonkeyPatch) -> None:
     with Bench(tmp_path, triaxcal, row.transport, **row.settings) as bench:

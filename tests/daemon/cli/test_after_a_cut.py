@@ -1,0 +1,122 @@
+"""`provision --resume` and `restore`, as a person calls them after a cut."""
+
+from __future__ import annotations
+
+import json
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.devices.bench import TRANSPORTS, Bench, Transport
+from tests.devices.habits import Habits
+from tests.devices.memory import Electronics
+from tests.devices.profiles import Timing
+from triaxcald.cli import provisioning
+
+QUICK = Timing(reply_s=0.3, silence_s=0.6)
+CUT = Habits(cut_at_byte=17)
+every_transport = pytest.mark.parametrize("transport", TRANSPORTS)
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("triaxcald.provision.sequence.RECONNECT_S", 0.5)
+
+
+def cut_short(bench: Bench) -> Path:
+    """The journal that is left."""
+    done = bench.provision()
+    assert done.code == 4
+    journal = bench.folder / "journal" / "4711.json"
+    assert f"provision --resume {bench.station} --unit unit" in done.err
+    assert f"restore {journal} {bench.station} --unit unit" in done.err
+    assert bench.holds_mixture()
+    bench.power_on()
+    return journal
+
+
+@every_transport
+def test_a_provisioning_that_was_cut_short_is_finished(tmp_path: Path, triaxcal, transport: Transport) -> None:
+    with Bench(tmp_path, triaxcal, transport, CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        done = triaxcal("provision", "--resume", bench.station)
+        assert done.code == 0, done.err
+        assert "the device holds the new calibration" in done.out
+        assert bench.holds_new()
+        assert not journal.exists()
+
+
+@every_transport
+def test_or_what_the_device_held_before_is_put_back(tmp_path: Path, triaxcal, transport: Transport) -> None:
+    with Bench(tmp_path, triaxcal, transport, CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        done = triaxcal("restore", journal, bench.station, "--json")
+        assert done.code == 0, done.err
+        assert (done.json["device_state"], done.json["evidence"]) == ("old", "read_after_restart")
+        assert bench.holds_old()
+        assert not journal.exists()
+
+
+def test_the_outcome_of_a_resumed_provisioning_replaces_that_of_the_one_cut_short(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        cut_short(bench)
+        first = json.loads(next(tmp_path.glob("*.outcome.json")).read_text())
+        assert (first["device_state"], first["journal"]) == ("unknown", str(bench.folder / "journal/4711.json"))
+        outcome = triaxcal("provision", "--resume", bench.station, "--json").json["outcome"]
+        assert outcome["supersedes"] is not None
+        assert outcome["registers"]["cut_short_before"]
+
+
+def test_a_restore_that_no_restart_proves_is_proven_by_the_supply(
+    tmp_path: Path, triaxcal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Bench(tmp_path, triaxcal, habits=Habits(cut_at_byte=17, reset_command=False), timing=QUICK) as bench:
+        journal = cut_short(bench)
+        done = triaxcal("restore", journal, bench.station)
+        assert done.code == 0, done.err
+        assert "no restart has proven it" in done.out
+        assert f"'triaxcal restore {journal} {bench.station} --unit unit --power-cycle'" in done.out
+        assert journal.exists()
+        bench.unit.habits = replace(bench.unit.habits, restart_s=2.0)  # so long its supply is off
+        monkeypatch.setattr(provisioning, "_ask", lambda _: threading.Timer(0.3, bench.power_cycle).start())
+        done = triaxcal("restore", journal, bench.station, "--power-cycle")
+        assert "read back after a power cycle" in done.out
+        assert bench.holds_old()
+        assert not journal.exists()
+
+
+def test_there_is_nothing_to_resume_where_nothing_was_cut_short(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal) as bench:
+        triaxcal("provision", "--resume", bench.station).failed(2, "journal/4711.json", "no provisioning of this unit")
+        assert bench.unit.written == []
+
+
+def test_a_journal_is_for_its_own_unit_alone(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK, serial=None) as bench:
+        journal = cut_short(bench)
+        other = bench.place.unit = Electronics(serial_number=4712)
+        triaxcal("restore", journal, bench.station).failed(4, "serial", "4711", "4712")
+        assert other.written == []
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        ("{", "no journal of a provisioning"),
+        ('{"format": "triaxcal.journal/2"}', "expected 'triaxcal.journal/1'"),
+        ('{"format": "triaxcal.journal/1", "step": "writing"}', "serial is missing"),
+    ],
+)
+def test_a_journal_that_cannot_be_read_is_named_and_nothing_written(
+    tmp_path: Path, triaxcal, spoilt: str, said: str
+) -> None:
+    with Bench(tmp_path, triaxcal) as bench:
+        journal = tmp_path / "journal" / "4711.json"
+        journal.parent.mkdir()
+        journal.write_text(spoilt)
+        triaxcal("provision", "--resume", bench.station).failed(2, str(journal), said)
+        triaxcal("restore", journal, bench.station).failed(2, str(journal), said)
+        bench.provision().failed(2, str(journal), said)
+        assert bench.unit.written == []
