@@ -123,16 +123,13 @@ class Workshop:
         return self.write(f"{name}-impatient.toml", "\n".join(lines) + "\n").name
 
     @contextlib.contextmanager
-    def serve(
-        self, device: Path, faults: Faults | None = None, stored: bytes | None = None, *, elastic: bool = False
-    ) -> Iterator[Served]:
-        """The unit of a device file on its bus, on a thread with an event loop of its own; ``elastic`` where nothing
-        may be lost, however slow this process is."""
+    def serve(self, device: Path, faults: Faults | None = None, stored: bytes | None = None) -> Iterator[Served]:
+        """The unit of a device file on its bus, on a thread with an event loop of its own."""
         ready: threading.Event = threading.Event()
         box: dict[str, Any] = {}
 
         async def work() -> None:
-            simulated = simulate(load_device(device), where=str(device), stored=stored, elastic=elastic)
+            simulated = simulate(load_device(device), where=str(device), stored=stored)
             if faults is not None:
                 simulated.unit = ReferenceUnit(
                     physics_of(simulated.device),
@@ -228,7 +225,7 @@ def _run_station(folder: Path) -> None:
     fixture = {**FIXTURE, "poses": 26}
     can = workshop.device("can.toml", profile="triax-ref-can", bus=can_bus, sensor=sensor, fixture=fixture)
     modbus = workshop.device("modbus.toml", serial=4712, seed=4, fixture=fixture)
-    with workshop.serve(can, elastic=True) as first, workshop.serve(modbus, elastic=True) as second:
+    with workshop.serve(can) as first, workshop.serve(modbus) as second:
         station = workshop.station(
             {"name": "can", "profile": "triax-ref-can", "serial": "4711", "bus": first.bus},
             {"name": "modbus", "serial": "4712", "bus": second.bus},

@@ -16,7 +16,7 @@ def test_a_unit_with_an_effect_that_no_register_takes_is_told_of_with_every_coef
     workshop: Any, triaxcal: Any
 ) -> None:
     device = workshop.device(fixture=FIXTURE, sensor={"effects": {"bias_step": STEP}})
-    with workshop.serve(device, elastic=True) as served:
+    with workshop.serve(device) as served:
         station = workshop.station({"serial": "4711", "bus": served.bus}, plan={"poses": 26, "hold_s": 0.6})
         done = triaxcal("run", station)
     said = [line.strip() for line in done.out.splitlines()]
