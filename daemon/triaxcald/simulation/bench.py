@@ -65,9 +65,7 @@ class DeviceFile(Strict):
     format: Literal["triaxcal.device/1"]
     profile: Annotated[str, Field(description="name of a built-in reference profile")]
     serial: Annotated[int, Field(ge=0, lt=2**32)] = 1
-    speed: Annotated[float, Field(gt=0, le=1000, description="unit seconds a second of the wall clock, at most")] = (
-        1.0
-    )
+    speed: Annotated[float, Field(gt=0, le=1000, description="unit seconds a second of the wall clock, at most")] = 1.0
     seed: Annotated[int, Field(ge=0)] = 0
     eeprom: Annotated[
         str | None, Field(pattern=r"^[^\x00]+$", description="file that holds the EEPROM between runs")
