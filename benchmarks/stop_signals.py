@@ -235,7 +235,7 @@ async def _workplace(shot: Shot, folder: Path, stack: AsyncExitStack, steps: _St
     (folder / "cal.json").write_text(json.dumps(CALIBRATION_FILE))
     if shot.command == "sim":
         return None
-    unit = simulate(load_device(device), where=str(device), elastic=True)
+    unit = simulate(load_device(device), where=str(device))
     steps.watch(unit.unit)
     server = await stack.enter_async_context(unit.serve())
     if shot.transport == "tcp":

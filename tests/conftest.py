@@ -22,6 +22,7 @@ from mcap.records import Attachment, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
+from tests.virtual_line import described, virtual_line
 from triaxcald.cli.commands import main
 from triaxcald.simulation.bench import load_device, physics_of, simulate
 from triaxcald.simulation.unit import Faults, ReferenceUnit
@@ -123,16 +124,13 @@ class Workshop:
         return self.write(f"{name}-impatient.toml", "\n".join(lines) + "\n").name
 
     @contextlib.contextmanager
-    def serve(
-        self, device: Path, faults: Faults | None = None, stored: bytes | None = None, *, elastic: bool = False
-    ) -> Iterator[Served]:
-        """The unit of a device file on its bus, on a thread with an event loop of its own; ``elastic`` where nothing
-        may be lost, however slow this process is."""
+    def serve(self, device: Path, faults: Faults | None = None, stored: bytes | None = None) -> Iterator[Served]:
+        """The unit of a device file on its bus, on a thread with an event loop of its own."""
         ready: threading.Event = threading.Event()
         box: dict[str, Any] = {}
 
         async def work() -> None:
-            simulated = simulate(load_device(device), where=str(device), stored=stored, elastic=elastic)
+            simulated = simulate(load_device(device), where=str(device), stored=stored)
             if faults is not None:
                 simulated.unit = ReferenceUnit(
                     physics_of(simulated.device),
@@ -222,22 +220,24 @@ HIDDEN = {"second_order_nonlinearity": {"x": 5e-4, "y": -4e-4, "z": 3e-4}}
 
 
 def _run_station(folder: Path) -> None:
+    """On a virtual clock: of the same samples each time."""
     workshop = Workshop(folder)
-    can_bus = {"interface": "virtual", "channel": f"finished-run-{os.getpid()}", "node_id": 5}
+    can_bus = {"interface": "virtual", "channel": "finished-run", "node_id": 5}
+    modbus_bus = {"host": "127.0.0.1", "port": 502}
     sensor = {"effects": HIDDEN}
     fixture = {**FIXTURE, "poses": 26}
     can = workshop.device("can.toml", profile="triax-ref-can", bus=can_bus, sensor=sensor, fixture=fixture)
-    modbus = workshop.device("modbus.toml", serial=4712, seed=4, fixture=fixture)
-    with workshop.serve(can, elastic=True) as first, workshop.serve(modbus, elastic=True) as second:
-        station = workshop.station(
-            {"name": "can", "profile": "triax-ref-can", "serial": "4711", "bus": first.bus},
-            {"name": "modbus", "serial": "4712", "bus": second.bus},
-            plan={**PLAN, "poses": 26},
-            limits={"rms_g": 1e-4, "verification_rms_g": 1e-4},
-        )
-        out, err = io.StringIO(), io.StringIO()
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            code = main(["run", str(station), "--json"])
+    modbus = workshop.device("modbus.toml", bus=modbus_bus, serial=4712, seed=4, fixture=fixture)
+    station = workshop.station(
+        {"name": "can", "profile": "triax-ref-can", "serial": "4711", "bus": can_bus},
+        {"name": "modbus", "serial": "4712", "bus": modbus_bus},
+        plan={**PLAN, "poses": 26},
+        limits={"rms_g": 1e-4, "verification_rms_g": 1e-4},
+    )
+    out, err = io.StringIO(), io.StringIO()
+    units = described(can), described(modbus)
+    with virtual_line(*units), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(["run", str(station), "--json"])
     assert code == 0, (out.getvalue(), err.getvalue())
     (folder / "run.json").write_text(out.getvalue())
 

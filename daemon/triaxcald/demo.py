@@ -77,7 +77,7 @@ async def run_demo(folder: Path, seed: int, progress: Progress) -> list[DemoUnit
     channel = f"triaxcal-demo-{id(progress)}"
     devices = _devices(seed, channel)
     async with AsyncExitStack() as first:
-        units = [simulate(d, where="demo", elastic=True) for d in devices]
+        units = [simulate(d, where="demo") for d in devices]
         servers = [await first.enter_async_context(unit.serve()) for unit in units]
         path = folder / "station.toml"
         write_text(path, _station(devices, channel, servers[1].bus.port))
@@ -138,7 +138,7 @@ async def _after_power_cycle(
         stored = [u.unit.eeprom for u in units]
         # Other attitudes and other noise, or the poses of the calibration would judge it.
         anew = [device.model_copy(update={"seed": device.seed + 1}) for device in devices]
-        again = [simulate(d, where="demo", stored=s, elastic=True) for d, s in zip(anew, stored, strict=True)]
+        again = [simulate(d, where="demo", stored=s) for d, s in zip(anew, stored, strict=True)]
         servers = [await second.enter_async_context(unit.serve()) for unit in again]
         write_text(path, _station(devices, channel, servers[1].bus.port))
         station = load_station(path)

@@ -27,7 +27,7 @@ from triaxcal_drivers.toml_text import SIZE_MOST
 from triaxcald.errors import InputError
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.modbus_unit import ModbusUnit
-from triaxcald.simulation.time_base import ElasticTimeBase, RealTimeBase, TimeBase
+from triaxcald.simulation.time_base import ElasticTimeBase, TimeBase
 from triaxcald.simulation.unit import ReferenceUnit
 
 Triple = tuple[float, float, float]
@@ -65,7 +65,7 @@ class DeviceFile(Strict):
     format: Literal["triaxcal.device/1"]
     profile: Annotated[str, Field(description="name of a built-in reference profile")]
     serial: Annotated[int, Field(ge=0, lt=2**32)] = 1
-    speed: Annotated[float, Field(gt=0, le=1000, description="unit seconds per second of the wall clock")] = 1.0
+    speed: Annotated[float, Field(gt=0, le=1000, description="unit seconds a second of the wall clock, at most")] = 1.0
     seed: Annotated[int, Field(ge=0)] = 0
     eeprom: Annotated[
         str | None, Field(pattern=r"^[^\x00]+$", description="file that holds the EEPROM between runs")
@@ -163,8 +163,8 @@ class SimulatedUnit:
         return ModbusUnit(self.unit, self.time_base, self.bus.where, unit_id=self.bus.unit_id)
 
 
-def simulate(device: DeviceFile, *, where: str, stored: bytes | None = None, elastic: bool = False) -> SimulatedUnit:
-    """Build the unit; ``elastic`` where it is read by this very process. Raises InputError, ProfileError."""
+def simulate(device: DeviceFile, *, where: str, stored: bytes | None = None) -> SimulatedUnit:
+    """Build the unit. Raises InputError, ProfileError."""
     bundle = load_bundle(Path(device.profile))
     driver = driver_named(bundle.profile.driver, where=where)
     if bundle.profile.name not in ("triax-ref-can", "triax-ref-modbus"):
@@ -176,5 +176,4 @@ def simulate(device: DeviceFile, *, where: str, stored: bytes | None = None, ela
         stored=stored,
         rate_hz=bundle.profile.sampling.rate_hz,
     )
-    time_base = ElasticTimeBase(device.speed) if elastic else RealTimeBase(device.speed)
-    return SimulatedUnit(device, bundle, unit, time_base, bus)
+    return SimulatedUnit(device, bundle, unit, ElasticTimeBase(device.speed), bus)

@@ -21,6 +21,7 @@ from triaxcal_drivers.can.description import object_dictionary
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.profile import BUILT_IN, load_bundle
+from triaxcald.simulation.frames_waiting import reader_is_behind
 from triaxcald.simulation.time_base import TimeBase
 from triaxcald.simulation.unit import (
     INVALID_CORRECTED,
@@ -114,6 +115,8 @@ class CanUnit:
         self._objects = _objects(self._node_id)
         self._registers = {object_address(r.object): name for name, r in profile.registers.items()}
         self._task: asyncio.Task[None] | None = None
+        self._reader_behind = False
+        time_base.wait_for_reader(lambda: self._reader_behind)
 
     async def __aenter__(self) -> Self:
         self._bus = await opened_bus(self._settings)
@@ -140,6 +143,7 @@ class CanUnit:
 
     async def _run(self) -> None:
         while True:
+            self._reader_behind = reader_is_behind(self._settings, self._bus)
             self._work(self._time.now_s())
             if failure := self._failure or self._requests.failure:
                 raise failure

@@ -32,6 +32,8 @@ READINGS_WINDOW, CORRECTED_WINDOW = 0x0000, 0x0400
 HEADER_WORDS, RECORD_WORDS, WINDOW_RECORDS = 3, 10, 12
 WINDOW_WORDS = HEADER_WORDS + RECORD_WORDS * WINDOW_RECORDS
 FIFO_RECORDS = 4096
+BEHIND_RECORDS = 10 * WINDOW_RECORDS
+"""A reader that has left so many in a FIFO does not keep up with the unit."""
 PTY = "pty:"
 _FILL_PERIOD_S = 1.0
 _CODES = {
@@ -73,6 +75,12 @@ class Fifo:
     def __init__(self) -> None:
         self._records = bytearray()
         self.lost = 0
+        self._read = False
+
+    @property
+    def behind(self) -> bool:
+        """Whether a reader has begun to fetch and does not keep up."""
+        return self._read and len(self) > BEHIND_RECORDS
 
     def __len__(self) -> int:
         return len(self._records) // (2 * RECORD_WORDS)
@@ -85,6 +93,7 @@ class Fifo:
 
     def window(self, words: int) -> bytes:
         """The first ``words`` words of the window; takes out the records that lie in them whole."""
+        self._read = True
         number = min(len(self), WINDOW_RECORDS, max(0, words - HEADER_WORDS) // RECORD_WORDS)
         taken = bytes(self._records[: number * 2 * RECORD_WORDS])
         del self._records[: len(taken)]
@@ -94,6 +103,7 @@ class Fifo:
     def clear(self) -> None:
         self._records.clear()
         self.lost = 0
+        self._read = False
 
 
 class ModbusMap:
@@ -104,6 +114,7 @@ class ModbusMap:
         self._time_base = time_base
         self._started_s = unit.started_s
         self._windows = {READINGS_WINDOW: Fifo(), CORRECTED_WINDOW: Fifo()}
+        time_base.wait_for_reader(lambda: any(fifo.behind for fifo in self._windows.values()))
 
     def fill(self) -> None:
         """Moves the samples that have come due into the FIFOs; empties these where the unit has restarted."""

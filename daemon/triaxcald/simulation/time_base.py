@@ -6,10 +6,14 @@ import asyncio
 import heapq
 import itertools
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 
 class TimeBase(Protocol):
+    def wait_for_reader(self, behind: Callable[[], bool]) -> None:
+        """``behind`` says from now on whether much of what the unit has sent is not fetched yet."""
+
     def now_s(self) -> float:
         """Unit time in seconds; never goes back."""
 
@@ -18,13 +22,16 @@ class TimeBase(Protocol):
 
 
 class RealTimeBase:
-    """Starts at 0 when made and runs ``speed`` times as fast as the wall clock."""
+    """Starts at 0 when made and runs ``speed`` times as fast as the wall clock, whatever a reader does."""
 
     def __init__(self, speed: float = 1.0) -> None:
         if not speed > 0:
             raise ValueError(f"speed must be above 0, not {speed}")
         self.speed = speed
         self._origin_s = time.monotonic()
+
+    def wait_for_reader(self, behind: Callable[[], bool]) -> None:
+        pass
 
     def now_s(self) -> float:
         return (time.monotonic() - self._origin_s) * self.speed
@@ -35,10 +42,11 @@ class RealTimeBase:
 
 
 class ElasticTimeBase:
-    """At most ``speed`` times as fast as the wall clock, and never more than ``step_s`` from one look to the next.
+    """At most ``speed`` times as fast as the wall clock, and stretched where machine or reader do not keep up.
 
-    For units simulated in the process that reads them: where that is too slow, their time goes slower too, and nothing
-    overflows that would not in real time.
+    It goes on by no more than ``step_s`` from one look to the next, so that a process that was kept from looking has
+    nothing to make up for; and while the reader is behind no faster than the wall clock, so that nothing overflows that
+    would not in real time. It does not stand still then: a unit that nobody reads still stores and restarts.
     """
 
     def __init__(self, speed: float = 1.0, step_s: float = 0.05) -> None:
@@ -47,16 +55,23 @@ class ElasticTimeBase:
         self.speed, self.step_s = speed, step_s
         self._now_s = 0.0
         self._looked_s = time.monotonic()
+        self._behind: Callable[[], bool] = lambda: False
+
+    def wait_for_reader(self, behind: Callable[[], bool]) -> None:
+        self._behind = behind
 
     def now_s(self) -> float:
         looked_s = time.monotonic()
-        self._now_s += min((looked_s - self._looked_s) * self.speed, self.step_s)
+        self._now_s += min((looked_s - self._looked_s) * self._rate(), self.step_s)
         self._looked_s = looked_s
         return self._now_s
 
     async def wait_until(self, unit_s: float) -> None:
-        while (left := unit_s - self.now_s()) > 0:
-            await asyncio.sleep(min(left, self.step_s) / self.speed)
+        while (left := unit_s - self.now_s()) > 0:  # half a step: to wake a little late costs no time then
+            await asyncio.sleep(min(left, self.step_s / 2) / self._rate())
+
+    def _rate(self) -> float:
+        return min(self.speed, 1.0) if self._behind() else self.speed
 
 
 class SteppedTimeBase:
@@ -66,6 +81,9 @@ class SteppedTimeBase:
         self._now_s = start_s
         self._waiting: list[tuple[float, int, asyncio.Future[None]]] = []
         self._order = itertools.count()
+
+    def wait_for_reader(self, behind: Callable[[], bool]) -> None:
+        pass
 
     def now_s(self) -> float:
         return self._now_s

@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast
 
 from triaxcal.errors import Refused
 from triaxcal.plan.directions import directions
+from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device, RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
@@ -23,6 +24,8 @@ LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the host's, whichever is longer."""
 LOOK_SHARE = 5.0
 """A look is followed by a pause of so many times what it took, or samples would be lost meanwhile."""
+SILENCE_SHARE = 0.25
+"""Of a silence, what one batch without a sample may add. A device that sends brings several in that time."""
 
 
 class Progress(Protocol):
@@ -149,17 +152,19 @@ class Collection:
 class _Watch:
     """Sees that one stream goes on; a device may go on sending another and never this one.
 
-    The time counts from the first look: before that the driver may have been discarding what was sampled earlier.
+    The time counts from the first look: before that the driver may have been discarding what was sampled earlier. From
+    one look to the next no more of it counts than `SILENCE_SHARE`: where this process was kept from looking,
+    samples wait unread.
     """
 
     def __init__(self, pipeline: Pipeline, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
         self._pipeline, self._stream, self._timeout_s, self._clock_s = pipeline, stream, timeout_s, clock_s
-        self._samples, self._heard_s = -1, 0.0
+        self._samples, self._looks = -1, Looks(0.0, 0.0)
 
     def look(self) -> None:
         """Raises DeviceSilent."""
         now_s, samples = self._clock_s(), self._pipeline.counts["samples"]
         if samples != self._samples:
-            self._samples, self._heard_s = samples, now_s
-        elif now_s - self._heard_s > self._timeout_s:
+            self._samples, self._looks = samples, Looks(now_s, SILENCE_SHARE * self._timeout_s)
+        elif self._looks.look(now_s) > self._timeout_s:
             raise DeviceSilent(f"{self._stream}: the device sends, but no whole sample of it for {self._timeout_s:g} s")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import aclosing, suppress
+from contextlib import aclosing, closing, suppress
 from typing import Any, cast
 
 import numpy as np
 
+from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device, SampleBlock
@@ -38,8 +39,9 @@ async def _collect(device: Device, bundle: Bundle, blocks: dict[str, list[Sample
     driver, sampling = driver_named(bundle.profile.driver), bundle.profile.sampling
     decoders = {name: driver.decoder(bundle, name) for name in blocks}
     # So long even if one of the two never comes.
-    async with asyncio.timeout(sampling.silence_timeout_s + 2 * SAMPLES / sampling.rate_hz):
-        async with aclosing(cast(Any, device.stream(list(blocks)))) as stream:
+    limit_s = sampling.silence_timeout_s + 2 * SAMPLES / sampling.rate_hz
+    with closing(Attention(asyncio.get_running_loop())) as attention:
+        async with attention.timeout(limit_s), aclosing(cast(Any, device.stream(list(blocks)))) as stream:
             async for batch in stream:
                 for name, decoder in decoders.items():
                     blocks[name].append(decoder.feed(batch))

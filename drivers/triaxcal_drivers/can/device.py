@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import queue
 import struct
 import threading
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
@@ -14,6 +15,7 @@ import canopen
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.bus import close_bus, opened_bus
 from triaxcal_drivers.can.layout import Layout
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
@@ -26,15 +28,46 @@ T = TypeVar("T")
 
 _POLL_S = 0.1  # how long closing waits for python-can's receive thread to look up
 _NMT_START = 1
+_ABORTED = 0x80
+
+
+class PatientSdo(SdoClient):
+    """canopen's client, whose time-out counts attention.
+
+    It waits in a thread of its own, and where the event loop is held up so may be all else that an answer passes.
+    """
+
+    def __init__(self, node_id: int, attention: Attention) -> None:
+        nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
+        super().__init__(0x600 + node_id, 0x580 + node_id, nothing_known)  # type: ignore[no-untyped-call]
+        self._attention = attention
+
+    def read_response(self) -> bytes:
+        """Raises SdoAbortedError, SdoCommunicationError."""
+        response = self._response()
+        if struct.unpack_from("B", response)[0] == _ABORTED:
+            raise SdoAbortedError(*struct.unpack_from("<L", response, 4))
+        return response
+
+    def _response(self) -> bytes:
+        deadline_s = self._attention.now_s() + self.RESPONSE_TIMEOUT
+        while True:
+            late = self._attention.now_s() >= deadline_s
+            try:
+                return bytes(self.responses.get(timeout=TICK_S))
+            except queue.Empty as e:
+                if late:
+                    raise SdoCommunicationError("no answer") from e
 
 
 @dataclass(frozen=True)
 class _Connection:
     bus: can.BusABC
+    attention: Attention
     notifier: can.Notifier
     frames: FrameQueue
     network: canopen.Network
-    sdo: SdoClient
+    sdo: PatientSdo
 
 
 class CanDevice:
@@ -61,9 +94,10 @@ class CanDevice:
         await self.close()
         bus = await opened_bus(self._settings)
         network = canopen.Network(bus)
-        frames = FrameQueue(asyncio.get_running_loop())
+        attention = Attention(asyncio.get_running_loop())
+        frames = FrameQueue(attention)
         notifier = can.Notifier(bus, [frames, *network.listeners], _POLL_S)
-        self._connection = _Connection(bus, notifier, frames, network, self._sdo_client(network))
+        self._connection = _Connection(bus, attention, notifier, frames, network, self._sdo(network, attention))
         started = False
         try:
             if self._profile.canopen:
@@ -77,6 +111,7 @@ class CanDevice:
         connection, self._connection = self._connection, None
         if connection is not None:
             self._dropped += connection.frames.dropped
+            connection.attention.close()
             await close_bus(connection.bus, connection.notifier)
 
     def _connected(self) -> _Connection:
@@ -84,10 +119,8 @@ class CanDevice:
             raise BusError(f"{self._settings} is not open")
         return self._connection
 
-    def _sdo_client(self, network: canopen.Network) -> SdoClient:
-        node = self._settings.node_id
-        nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
-        client = SdoClient(0x600 + node, 0x580 + node, nothing_known)  # type: ignore[no-untyped-call]
+    def _sdo(self, network: canopen.Network, attention: Attention) -> PatientSdo:
+        client = PatientSdo(self._settings.node_id, attention)
         client.network = network
         network.subscribe(client.tx_cobid, client.on_response)
         return client
@@ -124,18 +157,19 @@ class CanDevice:
 
         Raises DeviceSilent when no frame of theirs has come for ``silence_timeout_s``, BusError.
         """
-        frames = self._connected().frames
+        connection = self._connected()
+        frames, now_s = connection.frames, connection.attention.now_s
         opened = frames.open(self._identifiers(names))
-        loop, timeout_s = asyncio.get_running_loop(), self._profile.sampling.silence_timeout_s
-        deadline = loop.time() + timeout_s
+        timeout_s = self._profile.sampling.silence_timeout_s
+        deadline_s = now_s() + timeout_s
         try:
             while True:
-                batch = await frames.batch(deadline - loop.time())
+                batch = await frames.batch(deadline_s - now_s())
                 if batch is not None and ((batch.flags & RawFlag.ERROR) == 0).any():
-                    deadline = loop.time() + timeout_s
+                    deadline_s = now_s() + timeout_s
                 if batch:
                     yield batch
-                elif loop.time() >= deadline:
+                elif now_s() >= deadline_s:
                     raise DeviceSilent(f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s")
         finally:
             frames.close(opened)

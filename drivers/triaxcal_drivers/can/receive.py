@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection
 
 import can
 
+from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import RawBatch, RawFlag
 
@@ -54,9 +55,9 @@ class FrameQueue(can.Listener):
     in ``dropped``, and the next one kept carries RawFlag.LOST_BEFORE.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, *, capacity: int = CAPACITY) -> None:
+    def __init__(self, attention: Attention, *, capacity: int = CAPACITY) -> None:
         self.dropped = 0
-        self._loop = loop
+        self._attention = attention
         self._capacity = capacity
         self._clock = HostClock()
         self._lock = threading.Lock()
@@ -117,7 +118,7 @@ class FrameQueue(can.Listener):
 
     def _tell(self, event: asyncio.Event) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended, and nobody is left to be told
-            self._loop.call_soon_threadsafe(event.set)
+            self._attention.loop.call_soon_threadsafe(event.set)
 
     def check(self) -> None:
         """Raises BusError when receiving has failed."""
@@ -125,15 +126,16 @@ class FrameQueue(can.Listener):
             raise BusError(f"receiving failed: {self._failure}") from self._failure
 
     async def batch(self, timeout_s: float) -> RawBatch | None:
-        """The next frames: up to 256, or those of 50 ms. None when nothing comes for ``timeout_s``.
+        """The next frames: up to 256, or those of 50 ms. None when nothing comes for ``timeout_s`` of attention.
 
         Raises BusError when receiving has failed.
         """
         try:
-            async with asyncio.timeout(timeout_s):
+            async with self._attention.timeout(timeout_s):
                 await self._some.wait()
         except TimeoutError:
-            return None
+            if not self._frames:
+                return None
         if not self._frames:
             self.check()
         with contextlib.suppress(TimeoutError):

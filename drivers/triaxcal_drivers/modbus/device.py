@@ -42,7 +42,7 @@ Record = tuple[int, int, int, bytes]
 
 @dataclass
 class _Polled:
-    """A stream while it is polled."""
+    """A stream while it is polled. ``due_s`` is of the loop's time, ``heard_s`` of the connection's attention."""
 
     name: str
     stream: PollStream | FifoStream
@@ -135,7 +135,7 @@ class ModbusDevice:
 
     def _check_heard(self, p: _Polled) -> None:
         """Raises DeviceSilent."""
-        silent_s = asyncio.get_running_loop().time() - p.heard_s
+        silent_s = self._connected().attention.now_s() - p.heard_s
         if silent_s >= self._profile.sampling.silence_timeout_s:
             raise DeviceSilent(
                 f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
@@ -143,7 +143,7 @@ class ModbusDevice:
 
     def _polled(self, name: str) -> _Polled:
         now_s = asyncio.get_running_loop().time()
-        return _Polled(name, self._profile.streams[name], now_s, now_s)
+        return _Polled(name, self._profile.streams[name], now_s, self._connected().attention.now_s())
 
     async def _discard(self, p: _Polled) -> None:
         """Takes out of a stream's FIFO what it held at the first reply; whole windows. Raises DeviceSilent."""
@@ -161,7 +161,7 @@ class ModbusDevice:
             left = min(left - taken, remaining) if counted else remaining
             self.discarded += taken
             if taken:
-                p.heard_s = loop.time()
+                p.heard_s = self._connected().attention.now_s()
             elif left > 0:
                 p.trouble = p.trouble if flags else _EMPTY
                 self._check_heard(p)
@@ -175,7 +175,7 @@ class ModbusDevice:
             records.append((self._now_ns(), p.source, flags, data))
             taken, remaining = self._held(p.stream, data) if not flags else (0, 0)
             if taken:
-                p.heard_s = asyncio.get_running_loop().time()
+                p.heard_s = self._connected().attention.now_s()
             elif not flags:
                 p.trouble = _EMPTY
             if not remaining:

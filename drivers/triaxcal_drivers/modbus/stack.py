@@ -12,8 +12,8 @@ import asyncio
 import logging
 import os
 import struct
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from typing import cast
 
 from pymodbus.exceptions import ModbusException
@@ -27,6 +27,7 @@ from pymodbus.pdu.register_message import (
 )
 from pymodbus.transport.serialtransport import create_serial_connection
 
+from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.errors import BusError, DeviceSilent
 from triaxcal_drivers.modbus.protocol import (
     READ_INPUT,
@@ -103,10 +104,14 @@ class _Link(asyncio.Protocol):
 
 
 class ModbusClient:
-    """One connection to one unit; requests queue and go out one at a time."""
+    """One connection to one unit; requests queue and go out one at a time. To be made in a running event loop.
+
+    ``attention`` is what its time-outs count.
+    """
 
     def __init__(self, where: str, unit_id: int, reply_timeout_s: float) -> None:
         self.where = where
+        self.attention = Attention(asyncio.get_running_loop())
         self._unit_id = unit_id
         self._reply_timeout_s = reply_timeout_s
         self._lock = asyncio.Lock()
@@ -123,13 +128,14 @@ class ModbusClient:
         client = cls(f"{host}:{port} unit {unit_id}", unit_id, reply_timeout_s)
         link = client._link = _Link(FramerSocket(DecodePDU(False)), client._on_frame)
         link.lost = client._on_lost
-        try:
-            async with asyncio.timeout(reply_timeout_s):
-                await asyncio.get_running_loop().create_connection(lambda: link, host, port)
-        except TimeoutError as e:
-            raise BusError(f"cannot connect to {host}:{port}: no answer in {reply_timeout_s:g} s") from e
-        except OSError as e:
-            raise BusError(f"cannot connect to {host}:{port}: {_reason(e)}") from e
+        with client._closed_unless_made():
+            try:
+                async with client.attention.timeout(reply_timeout_s):
+                    await asyncio.get_running_loop().create_connection(lambda: link, host, port)
+            except TimeoutError as e:
+                raise BusError(f"cannot connect to {host}:{port}: no answer in {reply_timeout_s:g} s") from e
+            except OSError as e:
+                raise BusError(f"cannot connect to {host}:{port}: {_reason(e)}") from e
         return client
 
     @classmethod
@@ -137,11 +143,21 @@ class ModbusClient:
         """Raises BusError where the port cannot be opened."""
         client = cls(f"{line.port} unit {unit_id}", unit_id, reply_timeout_s)
         client._frame_gap_s = line.frame_gap_s
-        link = client._link = await _open_serial(line, lambda: _Link(FramerRTU(DecodePDU(False)), client._on_frame))
+        with client._closed_unless_made():
+            link = client._link = await _open_serial(line, lambda: _Link(FramerRTU(DecodePDU(False)), client._on_frame))
         link.lost = client._on_lost
         return client
 
+    @contextmanager
+    def _closed_unless_made(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self.attention.close()
+            raise
+
     async def close(self) -> None:
+        self.attention.close()
         self._link.close()
         self._on_lost()
 
@@ -183,21 +199,20 @@ class ModbusClient:
             if self._link.transport is None:
                 raise BusError(f"{self.where}: the connection is closed")
             await self._wait_for_the_line()
-            loop = asyncio.get_running_loop()
-            expected = self._expected = loop.create_future()
+            expected = self._expected = asyncio.get_running_loop().create_future()
             if not self._frame_gap_s:
                 self._transaction = self._transaction % 0xFFFF + 1
             pdu = bytes([request.function_code]) + request.encode()
             self._link.send(self._unit_id, self._transaction, pdu)
             try:
-                async with asyncio.timeout(patience_s):
+                async with self.attention.timeout(patience_s):
                     reply: bytes = await expected
             except TimeoutError as e:
                 raise DeviceSilent(f"{self.where}: no reply in {patience_s:g} s") from e
             finally:
                 self._expected = None
                 if not expected.done() or expected.cancelled():
-                    self._quiet_until_s = loop.time() + self._reply_timeout_s
+                    self._quiet_until_s = self.attention.now_s() + self._reply_timeout_s
         if reply[0] == request.function_code | 0x80 and len(reply) == 2:
             raise ModbusRefusal(reply[1])
         return reply
@@ -207,7 +222,7 @@ class ModbusClient:
         request given up: its frames have no transaction number, so that it would pass for the next one's.
         """
         loop = asyncio.get_running_loop()
-        while self._frame_gap_s and (left := self._quiet_until_s - loop.time()) > 0:
+        while self._frame_gap_s and (left := self._quiet_until_s - self.attention.now_s()) > 0:
             await asyncio.sleep(min(left, 0.01))
         while self._frame_gap_s and (left := self._link.last_byte_s + self._frame_gap_s - loop.time()) > 0:
             await asyncio.sleep(left)

@@ -176,7 +176,7 @@ def test_a_recording_is_finished_and_the_device_left_alone(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, command: str, number: int
 ) -> None:
     _strike_in(monkeypatch, "calibration", number)
-    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
+    with workshop.serve(workshop.device(**QUICK)) as served:
         station = workshop.station({"bus": served.bus}, plan=PLAN)
         path = workshop.folder / "rec.mcap"
         output = ["--json"] if command == "run" else ["-o", path, "--seconds", "60"]
@@ -212,7 +212,7 @@ def test_two_signals_in_the_check_poses_do_not_keep_the_old_calibration_away(
 
     monkeypatch.setattr("triaxcald.provision.procedure.restore", striking)
     _strike_in(monkeypatch, "verification", first)
-    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
+    with workshop.serve(workshop.device(**QUICK)) as served:
         done = triaxcal("run", workshop.station({"bus": served.bus}, plan=PLAN), "--json")
         _holds_old(served)
     assert [Stored.from_image(image).calibration == OLD.calibration for image in (*began, *ended)] == [False, True]
@@ -234,7 +234,7 @@ def test_a_signal_while_a_calibration_that_failed_its_verification_is_put_back_i
         return await put_back(*arguments, **options)
 
     monkeypatch.setattr("triaxcald.provision.procedure.restore", striking)
-    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
+    with workshop.serve(workshop.device(**QUICK)) as served:
         station = workshop.station({"bus": served.bus}, plan=PLAN, limits={"verification_rms_g": 1e-9})
         done = triaxcal("run", station, "--json")
         _holds_old(served)
@@ -252,7 +252,7 @@ def test_a_device_that_could_not_be_put_back_after_an_interruption_is_4_and_said
 
     monkeypatch.setattr("triaxcald.provision.procedure.restore", dead)
     _strike_in(monkeypatch, "verification", INT)
-    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
+    with workshop.serve(workshop.device(**QUICK)) as served:
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
         done = triaxcal("run", workshop.station(unit, plan=PLAN), "--json")
     assert done.code == 4
@@ -280,7 +280,7 @@ def test_provision_interrupted_says_what_the_device_holds(
 
     struck: list[str] = []
     monkeypatch.setattr(ModbusDevice, "write", striking)
-    with workshop.serve(workshop.device(**QUICK), elastic=True) as served:
+    with workshop.serve(workshop.device(**QUICK)) as served:
         station = workshop.station({"bus": served.bus, "profile": workshop.impatient_profile()})
         done = triaxcal("provision", workshop.write("cal.json", json.dumps(CAL)), station, "--json")
         assert Stored.from_image(served.unit.eeprom).calibration == OLD.calibration

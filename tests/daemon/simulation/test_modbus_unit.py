@@ -12,11 +12,11 @@ import pytest
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.modbus.driver import ModbusDriver
-from triaxcal_drivers.modbus.protocol import SerialLine, TcpAddress
+from triaxcal_drivers.modbus.protocol import READ_INPUT, SerialLine, TcpAddress
 from triaxcal_drivers.profile import BUILT_IN, Bundle, parse_bundle
 from triaxcal_drivers.registers import crc
 from triaxcald.simulation.memory import CALIBRATION, COVERED, TABLE
-from triaxcald.simulation.modbus_unit import FIFO_RECORDS, HOLDING, ModbusUnit
+from triaxcald.simulation.modbus_unit import FIFO_RECORDS, HOLDING, WINDOW_WORDS, ModbusMap, ModbusUnit
 from triaxcald.simulation.serial_pair import pty_pair
 from triaxcald.simulation.time_base import RealTimeBase, SteppedTimeBase
 from triaxcald.simulation.unit import Faults, ReferenceUnit
@@ -208,6 +208,32 @@ async def test_samples_that_nobody_fetches_are_counted_as_lost(unit, time_base):
         await time_base.advance(41.0)  # 4101 samples, of which the FIFO holds 4096
         reply = bytes.fromhex(await ask("0001 0000 0006 01 04 0000 000D"))[9:]
         assert struct.unpack(">HHHH", reply[:8]) == (1, FIFO_RECORDS - 1, 5, 5)
+
+
+class ToldBehind(SteppedTimeBase):
+    """Keeps what says whether the reader is behind."""
+
+    def wait_for_reader(self, behind):
+        self.behind = behind
+
+
+async def test_a_reader_is_behind_once_it_has_begun_and_leaves_much_in_a_fifo(unit):
+    time_base = ToldBehind()
+    windows = ModbusMap(unit, time_base)
+
+    def fetch(address):
+        return windows.read(READ_INPUT, address, WINDOW_WORDS)
+
+    await time_base.advance(2.0)
+    windows.fill()
+    assert not time_base.behind(), "nobody reads it, which holds up nobody"
+    fetch(0x0000)
+    assert time_base.behind()
+    while int.from_bytes(fetch(0x0000)[2:4], "big"):
+        pass
+    assert not time_base.behind(), "the corrected ones are not wanted"
+    fetch(0x0400)
+    assert time_base.behind()
 
 
 async def test_a_unit_that_restarts_is_silent_and_comes_back_empty_and_locked(unit, time_base):

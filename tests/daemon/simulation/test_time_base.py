@@ -83,7 +83,7 @@ class WallClock:
 
     async def sleep(self, seconds: float) -> None:
         self.slept.append(seconds)
-        self.now_s += seconds
+        self.now_s += max(seconds, 1e-9)  # no sleep is shorter
 
 
 @pytest.fixture
@@ -131,7 +131,29 @@ async def test_elastic_time_is_waited_for_no_faster_than_its_speed_and_in_steps(
     await base.wait_until(1.0)
     assert base.now_s() >= 1.0
     assert wall.now_s - 1000.0 == pytest.approx(1.0 / 20.0)
-    assert max(wall.slept) == pytest.approx(0.05 / 20.0)
+    assert max(wall.slept) == pytest.approx(0.05 / 20.0 / 2)
+
+
+@pytest.mark.parametrize(("speed", "slowed"), [(20.0, 1.0), (0.5, 0.5)])
+async def test_elastic_time_is_no_faster_than_the_wall_clock_while_the_reader_is_behind(
+    wall: WallClock, speed: float, slowed: float
+) -> None:
+    base, behind = ElasticTimeBase(speed=speed), True
+    base.wait_for_reader(lambda: behind)
+    await base.wait_until(1.0)
+    assert wall.now_s - 1000.0 == pytest.approx(1.0 / slowed)
+    behind = False
+    await base.wait_until(2.0)
+    assert wall.now_s - 1000.0 == pytest.approx(1.0 / slowed + 1.0 / speed)
+
+
+async def test_a_clock_of_the_wall_or_of_a_test_waits_for_no_reader(wall: WallClock) -> None:
+    real, stepped = RealTimeBase(speed=20.0), SteppedTimeBase()
+    for base in (real, stepped):
+        base.wait_for_reader(lambda: True)
+    wall.now_s += 1.0
+    await stepped.advance(20.0)
+    assert (real.now_s(), stepped.now_s()) == (pytest.approx(20.0), 20.0)
 
 
 @pytest.mark.parametrize(("speed", "step_s"), [(0.0, 0.05), (-1.0, 0.05), (1.0, 0.0), (float("nan"), 0.05)])

@@ -6,7 +6,8 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -22,7 +23,7 @@ from triaxcald.simulation.modbus_unit import ModbusUnit
 from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.time_base import SteppedTimeBase
 from triaxcald.simulation.unit import ReferenceUnit
-from triaxcald.station.collection import Collection
+from triaxcald.station.collection import Collection, _Watch
 from triaxcald.station.config import Plan
 
 Run = Callable[..., Any]
@@ -177,3 +178,16 @@ def test_record_of_so_many_seconds_ends_where_the_readings_stop(
         done = triaxcal("record", station, "-o", path, "--seconds", "600")
     done.failed(4, "node_id=5: stream readings: the device sends, but no whole sample of it for 1 s")
     assert triaxcal("log", "info", path, "--json").json["finished"] is True
+
+
+@pytest.mark.parametrize("held_up_s", [4.5, 3600.0])
+def test_a_batch_without_a_sample_after_a_pause_of_ours_is_no_silence(held_up_s: float) -> None:
+    """As of two streams polled in turn one comes first."""
+    pipeline = SimpleNamespace(counts={"samples": 0})
+    now_s = 0.0
+    watch = _Watch(cast(Any, pipeline), "stream readings", 4.0, lambda: now_s)
+    for _ in range(20):
+        watch.look()
+        now_s += held_up_s
+        watch.look()
+        pipeline.counts["samples"] += 1

@@ -6,6 +6,7 @@ import threading
 import can
 import pytest
 
+from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.can.receive import BATCH_FRAMES, FrameQueue, HostClock
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import RawFlag
@@ -19,7 +20,7 @@ def frame(number: int = 0, identifier: int = 0x185, **more: object) -> can.Messa
 
 
 async def opened(capacity: int = 1000) -> FrameQueue:
-    frames = FrameQueue(asyncio.get_running_loop(), capacity=capacity)
+    frames = FrameQueue(Attention(asyncio.get_running_loop()), capacity=capacity)
     frames.open(WANTED)
     return frames
 
@@ -44,7 +45,7 @@ async def test_only_the_streams_identifiers_and_error_frames_are_taken() -> None
 
 
 async def test_nothing_is_taken_while_no_stream_is_open() -> None:
-    frames = FrameQueue(asyncio.get_running_loop())
+    frames = FrameQueue(Attention(asyncio.get_running_loop()))
     frames.on_message_received(frame())
     opened = frames.open(WANTED)
     frames.on_message_received(frame(1))
@@ -56,7 +57,7 @@ async def test_nothing_is_taken_while_no_stream_is_open() -> None:
 
 
 async def test_closing_a_stream_does_not_touch_the_one_opened_after_it() -> None:
-    frames = FrameQueue(asyncio.get_running_loop())
+    frames = FrameQueue(Attention(asyncio.get_running_loop()))
     earlier = frames.open(WANTED)
     frames.on_message_received(frame(1))
     frames.open(WANTED)
@@ -181,7 +182,7 @@ async def test_no_cancellation_is_lost_that_comes_with_a_frame(turns: int) -> No
 
 async def test_a_frame_that_comes_when_the_event_loop_has_ended_is_nobodys() -> None:
     loop = asyncio.new_event_loop()
-    frames = FrameQueue(loop)
+    frames = FrameQueue(Attention(loop))
     frames.open(WANTED)
     loop.close()
     frames.on_message_received(frame())

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from tests.virtual_line import described, virtual_line
+
 FIXTURE = {"poses": 26, "hold_s": 2.0, "move_s": 0.8}
 KNOCKED_S = 31.2
 START_S = 1.0
@@ -16,8 +18,9 @@ def test_a_unit_with_an_effect_that_no_register_takes_is_told_of_with_every_coef
     workshop: Any, triaxcal: Any
 ) -> None:
     device = workshop.device(fixture=FIXTURE, sensor={"effects": {"bias_step": STEP}})
-    with workshop.serve(device, elastic=True) as served:
-        station = workshop.station({"serial": "4711", "bus": served.bus}, plan={"poses": 26, "hold_s": 0.6})
+    bus = {"host": "127.0.0.1", "port": 502}
+    station = workshop.station({"serial": "4711", "bus": bus}, plan={"poses": 26, "hold_s": 0.6})
+    with virtual_line(described(device)):
         done = triaxcal("run", station)
     said = [line.strip() for line in done.out.splitlines()]
     assert done.code == 0, done.err

@@ -6,12 +6,8 @@ that its maker could give it, so that its error before is that of the fault alon
 
 from __future__ import annotations
 
-import asyncio
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AsyncExitStack, contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,13 +27,12 @@ from tests.end_to_end.servo_triad import (
     warm_magnets,
     warm_reference,
 )
-from triaxcald.simulation.eeprom import keep_eeprom, read_eeprom
+from tests.virtual_line import virtual_line
 from triaxcald.simulation.memory import COVERED, CRC, TABLE, Stored, checksum
-from triaxcald.simulation.modbus_unit import ModbusUnit
-from triaxcald.simulation.time_base import ElasticTimeBase
 from triaxcald.simulation.unit import ReferenceUnit
 
-SERIAL, RATE_HZ, SPEED = 4711, 100.0, 60.0
+SERIAL, RATE_HZ = 4711, 100.0
+BUS = {"host": "127.0.0.1", "port": 502}
 HOLD_S, MOVE_S = 1.5, 0.5
 PLAN = {"poses": 26, "hold_s": 0.6, "check_poses": 6}
 LIMIT_G = 1e-4
@@ -81,21 +76,20 @@ def run(workshop: Any, triaxcal: Callable[..., Any]) -> Callable[..., Finished]:
 
     def go(*faults: Fault, seed: int) -> Finished:
         rng = np.random.default_rng(seed)
-        triad, path = drawn(rng, *faults), workshop.folder / "unit.eeprom"
+        triad = drawn(rng, *faults)
         planned = np.array([p["up"] for p in triaxcal("plan", "--poses", "26", "--json").json["poses"]])
         physics = OnFixture(triad, Fixture(_tumbled(rng, planned), HOLD_S, MOVE_S), DAY, seed)
         before = _nine_parameters(triad)
-        with _at_work(ReferenceUnit(physics, serial_number=SERIAL, stored=before), path) as bus:
-            limits = {"rms_g": LIMIT_G, "verification_rms_g": LIMIT_G}
-            station = workshop.station({"serial": str(SERIAL), "bus": bus}, plan=PLAN, limits=limits)
+        unit = ReferenceUnit(physics, serial_number=SERIAL, stored=before)
+        limits = {"rms_g": LIMIT_G, "verification_rms_g": LIMIT_G}
+        station = workshop.station({"serial": str(SERIAL), "bus": BUS}, plan=PLAN, limits=limits)
+        with virtual_line(unit):
             done = triaxcal("run", station, "--json")
         (document,) = done.json["units"]
         assert document["error"] is None
         assert document["exit_code"] == done.code
-        after = read_eeprom(path)
-        assert after is not None
         result = triaxcal("diagnose", document["recording"], "--json").json
-        return Finished(triad, document, result, before, after)
+        return Finished(triad, document, result, before, unit.eeprom)
 
     return go
 
@@ -126,27 +120,6 @@ def _nine_parameters(triad: Triad) -> bytes:
         held |= {f"misalignment_{a}": v / scale for a, v in zip(angles, across, strict=True)}
     copy = {name: TABLE[name].encode(held.get(name, 0.0)) for name in COVERED}
     return Stored({**copy, CRC: checksum(copy)}).image()
-
-
-@contextmanager
-def _at_work(unit: ReferenceUnit, eeprom: Path) -> Iterator[dict[str, Any]]:
-    """On Modbus TCP, on a thread of its own, its EEPROM in a file. Yields the bus."""
-    loop, stack = asyncio.new_event_loop(), AsyncExitStack()
-    thread = threading.Thread(target=loop.run_forever)
-    thread.start()
-
-    def done(work: Any) -> Any:
-        return asyncio.run_coroutine_threadsafe(work, loop).result()
-
-    try:
-        server = done(stack.enter_async_context(ModbusUnit(unit, ElasticTimeBase(SPEED))))
-        done(stack.enter_async_context(keep_eeprom(unit, eeprom)))
-        yield {"host": server.bus.host, "port": server.bus.port}
-    finally:
-        done(stack.aclose())
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join()
-        loop.close()
 
 
 def _power_up(triad: Triad, eeprom: bytes, fixture: Fixture) -> ReferenceUnit:

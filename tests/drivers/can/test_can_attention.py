@@ -1,0 +1,134 @@
+"""Time-outs on CAN: frames and answers that wait unread are in time, however late the event loop is."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from typing import Any, cast
+
+import can
+import canopen
+import pytest
+from canopen.sdo.exceptions import SdoCommunicationError
+
+from tests.drivers.virtual_time import run, virtual
+from triaxcal_drivers.attention import TICK_S, Attention
+from triaxcal_drivers.can.device import PatientSdo
+from triaxcal_drivers.can.receive import FrameQueue
+
+HELD_UP_S = 30.0
+ANSWER = bytes.fromhex("43 18 10 01 41 49 52 54")
+FRAME = can.Message(arbitration_id=0x185, is_extended_id=False, data=b"\1\2")
+
+
+def opened() -> FrameQueue:
+    frames = FrameQueue(Attention(asyncio.get_running_loop()))
+    frames.open({(0x185, False)})
+    return frames
+
+
+def test_frames_that_wait_unread_are_in_time() -> None:
+    async def work() -> bytes:
+        loop, frames = virtual(), opened()
+
+        def held_up() -> None:
+            loop.now_s += HELD_UP_S
+            frames.on_message_received(FRAME)
+
+        loop.call_later(0.99, held_up)
+        batch = await frames.batch(1.0)
+        assert batch is not None
+        return batch.payload
+
+    assert run(work()) == b"\1\2"
+
+
+def test_a_frame_is_seen_before_giving_up_though_nobody_has_told_of_it_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The receive thread has put it there, and was kept from telling the event loop."""
+
+    async def work() -> bytes:
+        frames = opened()
+        monkeypatch.setattr(frames, "_tell", lambda event: None)
+        frames.on_message_received(FRAME)
+        batch = await frames.batch(1.0)
+        assert batch is not None
+        return batch.payload
+
+    assert run(work()) == b"\1\2"
+
+
+def test_where_no_frame_comes_that_is_told_in_its_time() -> None:
+    async def work() -> float:
+        frames, begun_s = opened(), virtual().time()
+        assert await frames.batch(2.0) is None
+        return virtual().time() - begun_s
+
+    assert 2.0 <= run(work()) <= 2.0 + 2 * TICK_S
+
+
+class Clock:
+    """In the place of an event loop's attention: a second a look, or none where the loop is ``held_up``."""
+
+    def __init__(self, held_up: bool) -> None:
+        self.held_up = held_up
+        self.looks = 0
+
+    def now_s(self) -> float:
+        self.looks += 1
+        return 0.0 if self.held_up else float(self.looks)
+
+
+def client(clock: Clock) -> tuple[PatientSdo, list[bytes]]:
+    sdo, sent = PatientSdo(5, cast(Any, clock)), []
+
+    class Network(canopen.Network):
+        def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+            sent.append(bytes(data))
+
+    sdo.network = Network()
+    sdo.RESPONSE_TIMEOUT = 3.0
+    return sdo, sent
+
+
+@pytest.fixture
+def answering() -> Iterator[Any]:
+    """Answers once the waiting client has looked at the clock so many times."""
+    threads = []
+
+    def start(sdo: PatientSdo, clock: Clock, looks: int) -> None:
+        def answer() -> None:
+            while clock.looks < looks:
+                pass
+            sdo.on_response(0x585, ANSWER, 0.0)
+
+        threads.append(threading.Thread(target=answer, daemon=True))
+        threads[-1].start()
+
+    yield start
+    for thread in threads:
+        thread.join()
+
+
+def test_an_answer_is_waited_for_while_the_event_loop_is_held_up(answering: Any) -> None:
+    clock = Clock(held_up=True)
+    sdo, _ = client(clock)
+    answering(sdo, clock, 8)
+    assert sdo.upload(0x1018, 1) == ANSWER[4:]
+
+
+def test_without_an_answer_the_transfer_is_aborted_in_its_time() -> None:
+    clock = Clock(held_up=False)
+    sdo, sent = client(clock)
+    with pytest.raises(SdoCommunicationError):
+        sdo.upload(0x1018, 1)
+    assert clock.looks == 4, "begun at 1 s, it has run out at 4 s"
+    assert sent[-1].hex(" ") == "80 00 00 00 00 00 04 05"
+
+
+def test_an_answer_that_is_there_when_the_time_runs_out_is_in_time() -> None:
+    clock = Clock(held_up=False)
+    sdo, _ = client(clock)
+    sdo.RESPONSE_TIMEOUT = 0.0
+    sdo.network.send_message = lambda *_: sdo.on_response(0x585, ANSWER, 0.0)
+    assert sdo.upload(0x1018, 1) == ANSWER[4:]
