@@ -25,6 +25,7 @@ FORMAT = "triaxcal.recording/1"
 FORMAT_RECORD = "recording"  # the metadata record that holds FORMAT, and ENDS_WITH where it is of a run
 ENDS_WITH = "ends_with"  # the key there that says in which document a whole recording ends
 RAW_RECORD = "raw"  # the metadata record with count and digest, written at the end
+END_RECORD = "end"  # the metadata record with the digest of the document that the recording ends with
 RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
 PROFILE = "triaxcal"  # in the header of the MCAP file
 
@@ -69,6 +70,7 @@ _MESSAGES: Mapping[str, Sequence[_Field]] = {
         ("records", _F.TYPE_FIXED64, False),
         ("reason", _F.TYPE_STRING, False),
     ),
+    "Timed": (("time_ns", _F.TYPE_FIXED64, False),),  # what begins every message but a raw batch
 }
 
 
@@ -217,6 +219,11 @@ def decode_loss(data: bytes) -> Loss:
     return Loss(m.time_ns, m.where, m.first, m.records, m.reason)
 
 
+def decode_time(data: bytes) -> int:
+    """The time of any message but a raw batch. Raises ValueError."""
+    return int(_parse("Timed", data).time_ns)
+
+
 def _parse(name: str, data: bytes) -> Any:
     """Raises ValueError where ``data`` is no message ``name``."""
     try:
@@ -270,7 +277,11 @@ class RawDigest:
         self.records += len(batch)
 
     def hexdigest(self) -> str:
-        whole = hashlib.sha256(self.ends_with.encode())
+        return self.were_it(self.ends_with)
+
+    def were_it(self, ends_with: str) -> str:
+        """The digest of the same records in a recording that says it ends with ``ends_with``."""
+        whole = hashlib.sha256(ends_with.encode())
         for phase in sorted(self._phases):
             columns, payloads = self._phases[phase]
             whole.update(hashlib.sha256(phase.encode()).digest() + columns.digest() + payloads.digest())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import queue
@@ -58,6 +59,7 @@ class RecordingWriter:
         self._decimators = {topic: schema.Decimator(preview_hz) for topic in schema.PREVIEWS}
         self.ends_with = ends_with
         self._digest = schema.RawDigest(ends_with)
+        self._end: dict[str, str] = {}
         self._inventory = Inventory()
         self._offered = 0
         self._attached: set[str] = set()
@@ -124,7 +126,9 @@ class RecordingWriter:
 
         def write() -> None:
             self._report_losses()
-            self._write_attachment(time_ns, name, media_type, make(self._inventory.document()))
+            data = make(self._inventory.document())
+            self._write_attachment(time_ns, name, media_type, data)
+            self._end = {"name": name, "sha256": hashlib.sha256(data).hexdigest()}
 
         self._jobs.put(write)
         self.close()
@@ -247,7 +251,7 @@ class RecordingWriter:
         for name, record in {schema.FORMAT_RECORD: own, **metadata}.items():
             self._inventory.metadata(name, record)
             self._mcap.add_metadata(name, record)
-        self._channel_ids = _declare(self._mcap, self._preview, unit)
+        self._channel_ids = _declare(self._mcap, self._inventory, self._preview, unit)
         self._write(schema.EVENTS, schema.Event(self._clock_ns(), "recording_started", "{}"))
         self._flush()  # schemas and channels are in the first chunk: have it on disk at once
 
@@ -284,6 +288,8 @@ class RecordingWriter:
         self._report_losses()
         raw = {"records": str(self._digest.records), "sha256": self._digest.hexdigest()}
         self._mcap.add_metadata(schema.RAW_RECORD, raw)
+        if self._end:
+            self._mcap.add_metadata(schema.END_RECORD, self._end)
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -293,14 +299,18 @@ def _create(path: Path) -> BinaryIO:
     return open(path, "xb")
 
 
-def _declare(mcap: McapWriter, preview: schema.Schema, unit: str) -> dict[str, int]:
+def _declare(mcap: McapWriter, inventory: Inventory, preview: schema.Schema, unit: str) -> dict[str, int]:
     """Registers schemas and channels in the order that fixes their ids; the channels' ids by topic."""
     ids = {}
+
+    def channel(topic: str, kind: schema.Schema, schema_id: int, said: dict[str, str]) -> None:
+        ids[topic] = mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id, said)
+        inventory.channel(topic, MessageEncoding.Protobuf, said, (kind.name, SchemaEncoding.Protobuf, kind.data))
+
     for topic, name in schema.CHANNELS:
         kind = schema.SCHEMAS[name]
-        schema_id = mcap.register_schema(kind.name, SchemaEncoding.Protobuf, kind.data)
-        ids[topic] = mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id)
+        channel(topic, kind, mcap.register_schema(kind.name, SchemaEncoding.Protobuf, kind.data), {})
     schema_id = mcap.register_schema(preview.name, SchemaEncoding.Protobuf, preview.data)
     for topic, topic_unit in zip(schema.PREVIEWS, (unit, "g"), strict=True):
-        ids[topic] = mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id, {"unit": topic_unit})
+        channel(topic, preview, schema_id, {"unit": topic_unit})
     return ids

@@ -47,13 +47,17 @@ def _run(
     triaxcal: Callable[..., Any],
     faults: Faults | None = None,
     device: Mapping[str, Any] = QUICK,
+    *,
+    recorded: bool = True,
     **settings: Any,
 ) -> Any:
-    """One Modbus unit; the command's outcome, the unit, and its recording (finished and readable)."""
+    """One Modbus unit; the command's outcome, the unit, and its recording: finished, readable, and in agreement with
+    itself, where all that was done to the unit was ``recorded``."""
     with workshop.serve(workshop.device(**device), faults) as served:
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
         done = triaxcal("run", workshop.station(unit, **{"plan": PLAN, **settings}))
         path = _only(workshop.folder, "*.mcap")
+        assert not recorded or audit(path).differences == ()
         return done, served, path
 
 
@@ -184,7 +188,8 @@ def test_a_disk_that_fails_while_registers_are_written_does_not_keep_the_old_one
         register(self, name, operation, raw, error)
 
     monkeypatch.setattr(RecordingWriter, "register", full)
-    done, served, _ = _run(workshop, triaxcal)
+    done, served, path = _run(workshop, triaxcal, recorded=False)
+    assert {d.place for d in audit(path).differences} >= {"evidence"}
     done.failed(5, "No space left on device", "the old calibration")
     assert failed[0] == at
     _holds_old(served)
