@@ -31,7 +31,7 @@ from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, REFUSED
 from triaxcald.inputs import losses_of
 from triaxcald.outcome import ATTACHMENT, FORMAT, Verdict, digest_of
-from triaxcald.provision.state import Held
+from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_RECORD
 from triaxcald.recording.survey import Survey, survey
@@ -162,8 +162,12 @@ class _Audit:
         self._outcome = held
         if self._aborted and held.get("exit_code") not in ABORTED_WITH:
             self._add(ATTACHMENT, Kind.VALUE, "exit_code", stored=held.get("exit_code"), again=list(ABORTED_WITH))
-        if held_in(held) is None:
+        state = held_in(held)
+        if state is None:
             self._add(ATTACHMENT, Kind.NOT_SHOWN, "device_state", stored=held.get("device_state"))
+        elif _needs_journal(state, held.get("registers")) != (held.get("journal") is not None):
+            wanted = "a path" if held.get("journal") is None else None
+            self._add(ATTACHMENT, Kind.VALUE, "journal", stored=held.get("journal"), again=wanted)
         if again is None:
             return
         contents_again = held.get("contents") if self._mended else found.inventory.document()
@@ -334,6 +338,12 @@ def _object(data: bytes) -> Mapping[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def _needs_journal(held: Held, registers: object) -> bool:
+    """Whether something is left to be cleared up."""
+    failed = isinstance(registers, Mapping) and registers.get("undoing_failed") is not None
+    return not held.settled or (failed and held.state is not DeviceState.OLD)
 
 
 def _without_contents(data: bytes) -> bytes:

@@ -280,12 +280,23 @@ def _restarted(traffic: Traffic, said: Said) -> bool:
     tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
     lasting = said.held is not None and said.held.state is DeviceState.OLD
-    resets = [(i, a) for i, a in traffic.steps("reset") if traffic.last_write < i < last]
-    return any(not a.error or tried or lasting for _, a in resets)
+    if _acknowledged(traffic):
+        return True
+    return (tried or lasting) and any(traffic.last_write < i < last for i, _ in traffic.steps("reset"))
 
 
 def _power_cycled(traffic: Traffic, said: Said) -> bool:
     return traffic.silent_since(traffic.last_write)
+
+
+def _not_restarted(traffic: Traffic, said: Said) -> bool:
+    """Nothing was read after a restart that was acknowledged: else it would have proven the registers."""
+    return said.held is None or said.held.state is not DeviceState.NEW_UNVERIFIED or not _acknowledged(traffic)
+
+
+def _acknowledged(traffic: Traffic) -> bool:
+    last = traffic.snapshots[-1].at if traffic.snapshots else -1
+    return any(not a.error for i, a in traffic.steps("reset") if traffic.last_write < i < last)
 
 
 def _counted(traffic: Traffic, said: Said) -> bool:
@@ -294,6 +305,7 @@ def _counted(traffic: Traffic, said: Said) -> bool:
 
 _PROVEN: dict[Evidence, _Shows] = {
     Evidence.NOTHING_STORED: lambda traffic, _: not traffic.steps("store"),
+    Evidence.READ_BACK: _not_restarted,
     Evidence.RESTART: _restarted,
     Evidence.POWER_CYCLE: _power_cycled,
     Evidence.WRITE_COUNTER: _counted,

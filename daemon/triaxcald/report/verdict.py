@@ -85,7 +85,8 @@ def _concluded(found: Verdict, final: FinalWord | None) -> Verdict:
     because = f"{final.reason[:1].upper()}{final.reason[1:]}."
     if final.verdict == "not_judged":
         headline = f"Not judged; {found.headline[:1].lower()}{found.headline[1:]}"
-        return replace(found, headline=headline, sentence=f"{because} {found.sentence}")
+        kind: Kind = "unexplained" if found.kind == "within" else found.kind
+        return replace(found, kind=kind, headline=headline, sentence=f"{because} {found.sentence}")
     declared = tuple(line for line in found.reservations if line != _NO_LIMIT)
     if final.verdict == "fail":
         return replace(found, kind="outside", headline="Failed", sentence=f"{because} {found.sentence}",

@@ -44,9 +44,10 @@ class Forgery:
                     found.records.append(record)
         return found
 
-    def write(self, out: Path) -> Path:
+    def write(self, out: Path, spoil: Callable[[Any], object] = lambda _: None, **options: Any) -> Path:
+        """``options`` are mcap's writer's; ``spoil`` gets the writer before it writes its indices."""
         with open(out, "wb") as sink:
-            writer = Writer(sink, enable_data_crcs=True)
+            writer = Writer(sink, **{"enable_data_crcs": True, **options})
             writer.start(profile=self.profile)
             for schema in self.schemas.values():
                 writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -59,6 +60,7 @@ class Forgery:
                     writer.add_metadata(r.name, r.metadata)
                 else:
                     writer.add_message(r.channel_id, r.log_time, r.data, r.publish_time, r.sequence)
+            spoil(writer)
             writer.finish()
         return out
 
