@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
+from triaxcal_drivers.files import open_file
 from triaxcald.audit.differences import Difference, Kind
-from triaxcald.outcome import ATTACHMENT
+from triaxcald.outcome import ATTACHMENT, SUFFIX, digest_of
 from triaxcald.recording.frames import ATTACHMENT_LIMIT
 from triaxcald.station.line import CERTIFICATE, REPORT
 
@@ -19,8 +21,7 @@ def beside(path: Path, held: Mapping[str, bytes]) -> tuple[list[Difference], lis
     for name in NAMES:
         file = path.with_suffix(f".{name}")
         try:
-            with open(file, "rb") as stream:
-                data = stream.read(ATTACHMENT_LIMIT + 1)
+            data = _read(file)
         except OSError:
             missing += [file.name] if name in held else []
             continue
@@ -29,3 +30,17 @@ def beside(path: Path, held: Mapping[str, bytes]) -> tuple[list[Difference], lis
         elif data != held[name]:
             differences.append(Difference(file.name, Kind.BESIDE))
     return differences, missing
+
+
+def outcomes_beside(path: Path) -> set[str]:
+    """Digests of the outcomes in the recording's folder."""
+    found = set()
+    for file in path.parent.glob(f"*{SUFFIX}"):
+        with suppress(OSError):
+            found.add(digest_of(_read(file)))
+    return found
+
+
+def _read(file: Path) -> bytes:
+    with open_file(file) as stream:
+        return stream.read(ATTACHMENT_LIMIT + 1)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from triaxcald.audit import contents
-from triaxcald.audit.beside import beside
+from triaxcald.audit import contents, previews
+from triaxcald.audit.beside import beside, outcomes_beside
 from triaxcald.audit.differences import Difference, Kind, compare
 from triaxcald.audit.older import turned_back
 from triaxcald.audit.results import (
@@ -27,9 +27,9 @@ from triaxcald.audit.results import (
 from triaxcald.audit.traffic import Said, Traffic, check
 from triaxcald.certificate import software
 from triaxcald.documents import to_text
-from triaxcald.errors import RecordingError
+from triaxcald.errors import InputError, RecordingError
 from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, REFUSED
-from triaxcald.inputs import losses_of
+from triaxcald.inputs import losses_of, parse_document
 from triaxcald.outcome import ATTACHMENT, FORMAT, Verdict, digest_of
 from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.reader import Recording
@@ -54,6 +54,8 @@ class Notes:
     losses: tuple[str, ...] = ()
     mended: bool = False
     not_beside: tuple[str, ...] = ()
+    supersedes: str | None = None
+    """The digest of an earlier outcome that is not in the folder."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ class _Audit:
             self._add(CERTIFICATE, Kind.MISSING)
         if again is not None:
             self._check_results(again)
+            self._differences += previews.check(self._recording, again.previews)
         self._check_raw()
         self._differences += contents.faults(found)
         if self._outcome:
@@ -257,14 +260,14 @@ class _Audit:
                 if name not in self._held:
                     self._add(name, Kind.MISSING)
         told = self._outcome.get("registers")
-        image = again.certified.image.raw if again.certified and again.certified.image else None
         said = Said(
             before=kept[REGISTERS_BEFORE],
             earlier=kept[REGISTERS_EARLIER],
             after=kept[REGISTERS_AFTER],
-            image=image,
+            image=again.certified.image if again.certified else None,
             told=told if isinstance(told, Mapping) else None,
             held=held_in(self._outcome) if self._outcome else None,
+            forced=self._outcome.get("forced") is not None or not self._outcome,
             aborted=self._aborted,
             provisioned=self._check_events(again),
         )
@@ -329,15 +332,22 @@ class _Audit:
             losses=tuple(losses_of(self._recording)),
             mended=self._mended,
             not_beside=not_beside,
+            supersedes=self._superseded(),
         )
+
+    def _superseded(self) -> str | None:
+        digest = self._outcome.get("supersedes")
+        return digest if isinstance(digest, str) and digest not in outcomes_beside(self._path) else None
 
 
 def _object(data: bytes) -> Mapping[str, Any] | None:
+    """A document as one of ours could be: no key twice, no number that is none."""
     try:
-        found = json.loads(data)
-    except (ValueError, RecursionError):
+        found = parse_document(data, where="")
+        to_text(dict(found))
+    except (InputError, ValueError):
         return None
-    return found if isinstance(found, dict) else None
+    return found
 
 
 def _needs_journal(held: Held, registers: object) -> bool:

@@ -56,6 +56,8 @@ class Kind(Enum):
     TOPIC = auto()
     UNDECODABLE = auto()
     INDEX = auto()
+    NOT_OF_RAW = auto()
+    """The content is not what the raw records give."""
     NOT_HELD = auto()
     """The device holds ``stored``, the certificate asks for ``again``."""
     NOT_READ = auto()
@@ -64,6 +66,8 @@ class Kind(Enum):
     """``stored`` was written, which nothing asks for."""
     NOT_SHOWN = auto()
     """The register traffic does not show ``stored``."""
+    NOT_FORCED = auto()
+    """What the device held there is no calibration, and nobody is said to have overruled that."""
     BESIDE = auto()
     """The file beside the recording is not what is in the recording."""
     ALONE = auto()

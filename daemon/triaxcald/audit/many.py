@@ -57,9 +57,9 @@ def _audited(path: Path) -> Audited:
 def _recordings_of(given: Path) -> list[Path]:
     """Raises InputError where there is none."""
     if given.is_dir():
-        found = sorted(given.rglob("*.mcap"))
+        found = sorted(path for path in given.rglob("*.mcap") if not path.is_dir())
         if not found:
-            raise InputError(f"{given}: there is no recording (.mcap) in this folder")
+            raise InputError(f"{given}: Is a directory, without a recording (.mcap) in it")
         return found
     if not given.exists() and _WILD & set(str(given)):
         found = sorted(map(Path, glob.glob(str(given), recursive=True)))

@@ -9,6 +9,7 @@ from typing import Any
 from triaxcal.errors import TriaxcalError
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify
 from triaxcald.documents import Document
 from triaxcald.errors import DaemonError, RecordingError
@@ -48,6 +49,7 @@ class Again:
     certified: Certified | None
     why_not: str
     verification: Document | None
+    previews: Mapping[str, Thinned]
 
     @property
     def written(self) -> bool:
@@ -86,12 +88,11 @@ def compute(recording: Recording, raw: Digests) -> Again:
     station = parse_station(text, where=STATION_FILE)
     streams = [s for s in (READINGS, CORRECTED) if s in bundle.profile.streams]
     tumble, check = ({s: Pipeline(bundle, s) for s in streams} for _ in range(2))
+    previews = Previews(bundle.profile)
+    phases: dict[str, dict[str, Pipeline]] = {CALIBRATION: tumble, VERIFICATION: check}
     for phase, batch in recording.raw_batches():
-        for stream in streams:
-            if phase == CALIBRATION:
-                tumble[stream].feed(batch)
-            elif phase == VERIFICATION and stream == CORRECTED:
-                check[stream].feed(batch)
+        for stream, pipeline in phases.get(phase, {}).items():
+            previews.feed(stream, pipeline.feed(batch))
     certified, why_not = None, ""
     try:
         certified = _certified(recording, bundle, station, text, tumble[READINGS], raw.calibration)
@@ -105,7 +106,7 @@ def compute(recording: Recording, raw: Digests) -> Again:
             limit_g=station.limits.verification_rms_g,
             raw_sha256=raw.verification.hexdigest(),
         )
-    return Again(bundle, station, tumble[READINGS], certified, why_not, verification)
+    return Again(bundle, station, tumble[READINGS], certified, why_not, verification, previews.thinned())
 
 
 def _certified(

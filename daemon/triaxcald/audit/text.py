@@ -63,6 +63,8 @@ def _what(of: Difference) -> str:
             return f"{_records(of)} that cannot be decoded"
         case Kind.INDEX:
             return "the index at the end of the file is not of what is in it"
+        case Kind.NOT_OF_RAW:
+            return "not what the raw records give"
         case Kind.NOT_HELD:
             return f"{place}: the device holds {_bare(of.stored)}, the certificate asks for {_bare(of.again)}"
         case Kind.NOT_READ:
@@ -71,6 +73,8 @@ def _what(of: Difference) -> str:
             return f"{place}: {_bare(of.stored)} was written, which neither the certificate nor the profile asks for"
         case Kind.NOT_SHOWN:
             return f"{place}: {stored}: the register traffic does not bear it out"
+        case Kind.NOT_FORCED:
+            return f"forced: {place} held no plausible calibration before, and no reason is given for writing over it"
         case Kind.BESIDE:
             return "the file beside the recording is not the one in it"
         case Kind.ALONE:
@@ -105,6 +109,8 @@ def notes(of: Notes) -> list[str]:
     found += of.losses
     if of.mended:
         found.append("the recording was cut short or damaged, and mended")
+    if of.supersedes:
+        found.append(f"the outcome that this one supersedes is not in the folder: SHA-256 {of.supersedes}")
     if of.not_beside:
         found.append(f"not beside the recording: {', '.join(of.not_beside)}")
     return found

@@ -9,7 +9,9 @@ from functools import cached_property
 from triaxcal_drivers.profile import Profile, WriteStep
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.outcome import ATTACHMENT
-from triaxcald.provision.image import calibration_registers
+from triaxcald.provision import snapshot
+from triaxcald.provision.image import RegisterImage, calibration_registers
+from triaxcald.provision.plausible import doubts
 from triaxcald.provision.power import MISSED
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.schema import REGISTERS, RegisterAccess
@@ -103,9 +105,10 @@ class Said:
     before: Raw | None
     earlier: Raw | None
     after: Raw | None
-    image: Raw | None
+    image: RegisterImage | None
     told: Mapping[str, object] | None
     held: Held | None
+    forced: bool
     aborted: bool
     provisioned: Sequence[str] | None
     """The registers that were written, by the event; None where there is no such event."""
@@ -113,6 +116,10 @@ class Said:
     @property
     def old(self) -> Raw | None:
         return self.before if self.earlier is None else self.earlier
+
+    @property
+    def new(self) -> Raw:
+        return self.image.raw if self.image else {}
 
 
 def check(traffic: Traffic, said: Said, serial: str | None) -> list[Difference]:
@@ -146,7 +153,7 @@ def _identity(traffic: Traffic, serial: str | None) -> list[Difference]:
 def _asked_for(traffic: Traffic, said: Said) -> list[Difference]:
     """Every write is of the certificate's image, of what the device held before, or of a sequence of the profile."""
     steps = {step for label in ("unlock", "store", "lock", "reset") for step in traffic.sequence(label)}
-    asked = {(name, raw) for some in (said.image, said.before, said.earlier) for name, raw in (some or {}).items()}
+    asked = {(name, raw) for some in (said.new, said.before, said.earlier) for name, raw in (some or {}).items()}
     written = dict.fromkeys((a.register, a.raw) for a in traffic.accesses if a.operation == "write")
     return [
         Difference(REGISTERS, Kind.NOT_ASKED_FOR, name, raw.hex())
@@ -173,7 +180,7 @@ def _after(traffic: Traffic, said: Said) -> list[Difference]:
         Difference(
             REGISTERS_AFTER, Kind.NOT_HELD, name, said.after[name].hex() if name in said.after else None, raw.hex()
         )
-        for name, raw in (said.image or {}).items()
+        for name, raw in said.new.items()
         if said.after.get(name) != raw
     ]
     if said.provisioned is None:
@@ -200,7 +207,7 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
         if stored != again:
             found.append(Difference(ATTACHMENT, Kind.VALUE, f"registers.{place}", stored, again))
 
-    image = said.image or {}
+    image = said.new
     seen = list(dict.fromkeys(a.register for _, a in traffic.writes if a.raw == image.get(a.register)))
     if written is None:
         return [Difference(REGISTERS, Kind.NOT_ASKED_FOR, n) for n in seen]
@@ -214,6 +221,11 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
         differing = [name for name, raw in said.before.items() if name in image and image[name] != raw]
         expect("differing", said.told.get("differing"), differing)
         expect("cut_short_before", said.told.get("cut_short_before"), said.earlier is not None)
+        if said.image and said.earlier is None and not said.forced:
+            found += [
+                Difference(ATTACHMENT, Kind.NOT_FORCED, doubt.register)
+                for doubt in doubts(traffic.profile, snapshot.Snapshot(said.before), said.image)
+            ]
         if not said.aborted:
             expect("written", list(written), differing)
             expect("undoing_failed", said.told.get("undoing_failed"), None)
@@ -239,7 +251,7 @@ def _state(traffic: Traffic, said: Said) -> list[Difference]:
 
 
 def _new(traffic: Traffic, said: Said) -> bool:
-    return bool(said.image) and traffic.known == {**traffic.known, **(said.image or {})}
+    return bool(said.new) and traffic.known == {**traffic.known, **said.new}
 
 
 def _old(traffic: Traffic, said: Said) -> bool:
@@ -276,7 +288,7 @@ def _restarted(traffic: Traffic, said: Said) -> bool:
     was put into a register in use before it, and did not come back."""
     if not traffic.sequence("reset"):  # by no register, so that no traffic could show it
         return True
-    image, old = said.image or {}, said.before or {}
+    image, old = said.new, said.before or {}
     tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
     lasting = said.held is not None and said.held.state is DeviceState.OLD

@@ -35,6 +35,7 @@ Operation = Literal["read", "write"]
 
 RAW, REGISTERS, EVENTS, LOSS = "/raw", "/registers", "/events", "/loss"
 PREVIEWS: tuple[PreviewTopic, PreviewTopic] = ("/preview/readings", "/preview/corrected")
+PREVIEW_HZ = 20.0  # enough to see a pose by, and little beside the raw records
 MAX_RECORDS = 8192  # raw records in one message; a longer batch is cut, so that reading needs little memory
 
 _PACKAGE = "triaxcal.recording.v1"
@@ -288,10 +289,23 @@ class RawDigest:
         return whole.hexdigest()
 
 
+class PreviewEncoder:
+    """Single samples as messages, with a field for each of ``channels``."""
+
+    def __init__(self, channels: Sequence[str]) -> None:
+        self.kind = preview_schema(channels)
+        self._fields = dict(zip(channels, preview_fields(channels), strict=True))
+
+    def encode(self, block: SampleBlock, i: int) -> bytes:
+        x, y, z = block.readings[i].tolist()
+        named = {f: float(block.channels[c][i]) for c, f in self._fields.items() if c in block.channels}
+        return bytes(self.kind.message(time_ns=int(block.time_ns[i]), x=x, y=y, z=z, **named).SerializeToString())
+
+
 class Decimator:
     """Picks at most one sample of each period of the samples' own time, however they are cut into blocks."""
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float = PREVIEW_HZ) -> None:
         self._period_ns = max(1, round(1e9 / rate_hz))
         self._last_slot = -1
 

@@ -46,7 +46,7 @@ class RecordingWriter:
         metadata: Mapping[str, Mapping[str, str]],
         preview_channels: Sequence[str] = (),
         preview_unit: str = "",
-        preview_hz: float = 20.0,
+        preview_hz: float = schema.PREVIEW_HZ,
         clock_ns: Callable[[], int] = time.time_ns,
         queue_batches: int = 256,
         ends_with: str = "",
@@ -54,8 +54,7 @@ class RecordingWriter:
         self.path = path
         self.losses: dict[str, int] = {}
         self._clock_ns = clock_ns
-        self._preview_fields = dict(zip(preview_channels, schema.preview_fields(preview_channels), strict=True))
-        self._preview = schema.preview_schema(preview_channels)
+        self._preview = schema.PreviewEncoder(preview_channels)
         self._decimators = {topic: schema.Decimator(preview_hz) for topic in schema.PREVIEWS}
         self.ends_with = ends_with
         self._digest = schema.RawDigest(ends_with)
@@ -251,7 +250,7 @@ class RecordingWriter:
         for name, record in {schema.FORMAT_RECORD: own, **metadata}.items():
             self._inventory.metadata(name, record)
             self._mcap.add_metadata(name, record)
-        self._channel_ids = _declare(self._mcap, self._inventory, self._preview, unit)
+        self._channel_ids = _declare(self._mcap, self._inventory, self._preview.kind, unit)
         self._write(schema.EVENTS, schema.Event(self._clock_ns(), "recording_started", "{}"))
         self._flush()  # schemas and channels are in the first chunk: have it on disk at once
 
@@ -264,11 +263,7 @@ class RecordingWriter:
 
     def _write_preview(self, topic: str, block: SampleBlock, picked: Sequence[int]) -> None:
         for i in picked:
-            x, y, z = block.readings[i].tolist()
-            named = {f: float(block.channels[c][i]) for c, f in self._preview_fields.items() if c in block.channels}
-            time_ns = int(block.time_ns[i])
-            message = self._preview.message(time_ns=time_ns, x=x, y=y, z=z, **named)
-            self._add(topic, time_ns, message.SerializeToString())
+            self._add(topic, int(block.time_ns[i]), self._preview.encode(block, i))
 
     def _write(self, topic: str, value: schema.RegisterAccess | schema.Event | schema.Loss) -> None:
         self._add(topic, value.time_ns, schema.encode(value))

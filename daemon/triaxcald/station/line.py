@@ -20,7 +20,7 @@ from triaxcald.documents import Document, to_text
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.exit_codes import DISK
 from triaxcald.files import write_text
-from triaxcald.inputs import CALIBRATION, PROFILE, STATION_FILE, VERIFICATION
+from triaxcald.inputs import CALIBRATION, PROFILE, STATION_FILE, VERIFICATION, preview_channels
 from triaxcald.outcome import (
     ATTACHMENT,
     FORMAT,
@@ -251,7 +251,7 @@ class UnitRun:
                 "unit": unit,
                 "software": {**software(), **drawn_with()},
             },
-            preview_channels=self._channels(),
+            preview_channels=preview_channels(self.profile),
             preview_unit=self.profile.output.unit,
             clock_ns=self.clock_ns,
             ends_with=ends_with,
@@ -261,12 +261,6 @@ class UnitRun:
         for name, data in self.place.bundle.files.items():
             writer.attach(f"profile/{name}", "application/octet-stream", data)
         return writer
-
-    def _channels(self) -> list[str]:
-        names: dict[str, None] = {}
-        for stream in self.profile.streams.values():
-            names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
-        return list(names)
 
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan

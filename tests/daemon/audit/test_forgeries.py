@@ -262,6 +262,18 @@ ROWS = [
     Row("a count too small", lambda f: None, "statistics: the index at the end", writing={"spoil": _one_message_less}),
     # By a forger who knows of the inventory and the digests.
     Row("verification taken out", lambda f: f.drop(VERIFICATION), f"{VERIFICATION}: {MISSING}", True),
+    Row(
+        "previews taken out",
+        lambda f: f.each("/preview/corrected", lambda m: None),
+        "/preview/corrected: messages: stored 0, computed again ",
+        True,
+    ),
+    Row(
+        "a preview changed",
+        lambda f: f.first("/preview/readings", lambda m: replace(m, data=m.data[:-1] + b"\x41")),
+        "/preview/readings: not what the raw records give",
+        True,
+    ),
     Row("verification edited", lambda f: f.edit(VERIFICATION, _better), f"{VERIFICATION}: after_rms_g: stored ", True),
     Row("traffic taken out", lambda f: f.each(REGISTERS, lambda m: None), f"{REGISTERS}: written: [", True),
     Row("registers before zeroed", _zeroed, f"{BEFORE}: scale_factor_x: 00000000 here, 9a9919c0 by the register", True),

@@ -156,4 +156,4 @@ def test_no_recording_hides_another(finished_run: Any, tmp_path: Path, triaxcal:
     assert [bool(a["error"]) for a in listed.json["audits"]] == [False, True, True, True]
     assert triaxcal("audit", good).code == 1
     (tmp_path / "empty").mkdir()
-    triaxcal("audit", tmp_path / "empty").failed(2, f"{tmp_path / 'empty'}: there is no recording")
+    triaxcal("audit", tmp_path / "empty").failed(2, f"{tmp_path / 'empty'}: Is a directory, without a recording")
