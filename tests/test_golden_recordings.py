@@ -35,8 +35,11 @@ def diagnosed(name: str) -> Any:
 @pytest.mark.parametrize("name", LINE)
 def test_an_audit_gets_the_same_bytes(name: str) -> None:
     found = audit(RECORDINGS / name)
-    assert set(found.checked) == {"certificate.json", "verification.json", "registers-after.json"}
+    assert set(found.checked) == {
+        "certificate.json", "verification.json", "registers-before.json", "registers-after.json",
+    }  # fmt: skip
     assert found.differences == ()
+    assert found.notes.older
 
 
 CPUINFO = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""

@@ -151,6 +151,14 @@ def signs_of(recording: Recording) -> tuple[int, int, int] | None:
     return int(parts[0]), int(parts[1]), int(parts[2])
 
 
+def preview_channels(profile: Profile) -> list[str]:
+    """Auxiliary channels that the previews of a recording have beside the three outputs."""
+    names: dict[str, None] = {}
+    for stream in profile.streams.values():
+        names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
+    return list(names)
+
+
 def losses_of(recording: Recording) -> list[str]:
     """What did not get into the recording, or was lost from it since, one line each."""
     lost = sum(loss.records for loss in recording.losses())

@@ -70,6 +70,9 @@ def provisioned(p: Provisioning) -> str:
     return f"{len(p.written)} registers {stored}; {held(p.held)}"
 
 
+NO_LIMIT = "the station has no limit for what was measured"
+
+
 def passed(verification: Mapping[str, Any] | None) -> str:
     if verification is None:
         return "the fit is within the limits"

@@ -113,7 +113,7 @@ def test_a_killed_process_loses_at_most_a_second_and_the_rest_can_be_fitted(
     else:
         assert told == []
         assert exported.endswith("none lost\n")
-    triaxcal("audit", mended).failed(2, "certificate.json: missing; the recording holds no result")
+    triaxcal("audit", mended).failed(2, "missing; the recording holds no result")
 
 
 @pytest.mark.parametrize("command", ["record", "run"])
@@ -161,4 +161,4 @@ def test_a_unit_whose_process_dies_in_mid_recording_is_an_error(
     assert "unit rec: " in unit["error"]
     assert process.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
     assert triaxcal("log", "info", unit["recording"], "--json").json["finished"] is True
-    triaxcal("audit", unit["recording"]).failed(2, "holds no result")
+    assert triaxcal("audit", unit["recording"]).code == 0

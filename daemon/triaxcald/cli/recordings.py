@@ -24,7 +24,7 @@ from triaxcald.recording.recover import recover
 
 def register(commands: Any) -> None:
     p = commands.add_parser("audit", help="recompute results from recordings and compare")
-    p.add_argument("recordings", metavar="REC", nargs="+", type=Path)
+    p.add_argument("recordings", metavar="REC|FOLDER|GLOB", nargs="+", type=Path)
     add_json(p)
     p.set_defaults(run=audit_command)
     log = commands.add_parser("log", help="a recording's contents; mend one; write CSV")
@@ -47,21 +47,25 @@ def register(commands: Any) -> None:
 
 
 def audit_command(a: argparse.Namespace) -> int:
-    from triaxcald.audit import audit  # the whole line, which no `log` needs
+    from triaxcald.audit import audit_each, text, worst  # the whole line, which no `log` needs
 
-    audits = [audit(path) for path in a.recordings]
-    if a.json:
-        emit({"format": "triaxcal.audit/1", "audits": [dataclasses.asdict(x) for x in audits]})
-    else:
-        for x in audits:
-            print(
-                f"{x.recording}: {'differs' if x.differences else 'the same, byte for byte'} ({', '.join(x.checked)})"
-            )
-            for line in x.differences:
+    audited = []
+    for one in audit_each(a.recordings):
+        audited.append(one)
+        if one.audit is None:
+            say(f"triaxcal: {one.error}")
+        elif not a.json:
+            print(text.heading(one.audit))
+            for line in map(text.difference, one.audit.differences):
                 print(f"  {line}")
-            for line in x.notes:
+            for line in text.notes(one.audit.notes):
                 print(f"  note: {line}")
-    return 1 if any(x.differences for x in audits) else 0
+    if a.json:
+        emit({"format": "triaxcal.audit/1", "audits": [text.document(x) for x in audited],
+              "summary": text.counts(audited)})  # fmt: skip
+    elif len(audited) > 1:
+        print(text.summary(audited))
+    return worst(audited)
 
 
 def info_command(a: argparse.Namespace) -> int:

@@ -17,6 +17,13 @@ class Inventory:
         self._attachments: list[Document] = []
         self._metadata: list[Document] = []
         self._topics: dict[str, tuple[int, hashlib._Hash]] = {}
+        self._declared: dict[str, set[str]] = {}
+
+    def channel(self, topic: str, encoding: str, metadata: Mapping[str, str], kind: tuple[str, str, bytes]) -> None:
+        """A topic as it is declared; ``kind`` is its schema's name, encoding and data. Each way counts once."""
+        said = [topic, encoding, *(f"{key}\0{value}" for key, value in sorted(metadata.items())), *kind[:2]]
+        text = "\0".join(said).encode() + b"\0" + kind[2]
+        self._declared.setdefault(topic, set()).add(hashlib.sha256(text).hexdigest())
 
     def attachment(self, name: str, media_type: str, time_ns: int, data: bytes) -> None:
         self._attachments.append(
@@ -34,10 +41,16 @@ class Inventory:
         self._topics[topic] = count + 1, digest
 
     def document(self) -> Document:
-        """Attachments and metadata by name, messages by topic."""
+        """Attachments in the order of the file, metadata by name, messages by topic."""
         topics = sorted(self._topics.items())
         return {
-            "attachments": sorted(self._attachments, key=lambda a: str(a["name"])),
+            "attachments": list(self._attachments),
             "metadata": sorted(self._metadata, key=lambda m: str(m["name"])),
-            "topics": [{"name": name, "messages": n, "sha256": d.hexdigest()} for name, (n, d) in topics],
+            "topics": [
+                {"name": name, "messages": n, "sha256": d.hexdigest(), "declared": self._declaration(name)}
+                for name, (n, d) in topics
+            ],
         }
+
+    def _declaration(self, topic: str) -> str:
+        return hashlib.sha256("".join(sorted(self._declared.get(topic, ()))).encode()).hexdigest()

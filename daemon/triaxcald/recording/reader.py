@@ -172,6 +172,10 @@ class Recording:
                         raise Damage(self.name, offset, f"message on unknown channel {record.channel_id}")
                     yield TopicMessage(topics[record.channel_id], record)
 
+    def frames(self) -> Iterator[Frame]:
+        """Every record of the file in its order, as bytes."""
+        return walk(self._stream, self.name, self.size)
+
     def _records(self, offset: int) -> Iterator[Schema | Channel | Message]:
         """Of the chunk at ``offset``."""
         data = chunk_data(self.frame(offset), self.name)

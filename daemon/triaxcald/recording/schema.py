@@ -25,6 +25,7 @@ FORMAT = "triaxcal.recording/1"
 FORMAT_RECORD = "recording"  # the metadata record that holds FORMAT, and ENDS_WITH where it is of a run
 ENDS_WITH = "ends_with"  # the key there that says in which document a whole recording ends
 RAW_RECORD = "raw"  # the metadata record with count and digest, written at the end
+END_RECORD = "end"  # the metadata record with the digest of the document that the recording ends with
 RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
 PROFILE = "triaxcal"  # in the header of the MCAP file
 
@@ -34,6 +35,7 @@ Operation = Literal["read", "write"]
 
 RAW, REGISTERS, EVENTS, LOSS = "/raw", "/registers", "/events", "/loss"
 PREVIEWS: tuple[PreviewTopic, PreviewTopic] = ("/preview/readings", "/preview/corrected")
+PREVIEW_HZ = 20.0  # enough to see a pose by, and little beside the raw records
 MAX_RECORDS = 8192  # raw records in one message; a longer batch is cut, so that reading needs little memory
 
 _PACKAGE = "triaxcal.recording.v1"
@@ -69,6 +71,7 @@ _MESSAGES: Mapping[str, Sequence[_Field]] = {
         ("records", _F.TYPE_FIXED64, False),
         ("reason", _F.TYPE_STRING, False),
     ),
+    "Timed": (("time_ns", _F.TYPE_FIXED64, False),),  # what begins every message but a raw batch
 }
 
 
@@ -217,6 +220,11 @@ def decode_loss(data: bytes) -> Loss:
     return Loss(m.time_ns, m.where, m.first, m.records, m.reason)
 
 
+def decode_time(data: bytes) -> int:
+    """The time of any message but a raw batch. Raises ValueError."""
+    return int(_parse("Timed", data).time_ns)
+
+
 def _parse(name: str, data: bytes) -> Any:
     """Raises ValueError where ``data`` is no message ``name``."""
     try:
@@ -270,17 +278,34 @@ class RawDigest:
         self.records += len(batch)
 
     def hexdigest(self) -> str:
-        whole = hashlib.sha256(self.ends_with.encode())
+        return self.were_it(self.ends_with)
+
+    def were_it(self, ends_with: str) -> str:
+        """The digest of the same records in a recording that says it ends with ``ends_with``."""
+        whole = hashlib.sha256(ends_with.encode())
         for phase in sorted(self._phases):
             columns, payloads = self._phases[phase]
             whole.update(hashlib.sha256(phase.encode()).digest() + columns.digest() + payloads.digest())
         return whole.hexdigest()
 
 
+class PreviewEncoder:
+    """Single samples as messages, with a field for each of ``channels``."""
+
+    def __init__(self, channels: Sequence[str]) -> None:
+        self.kind = preview_schema(channels)
+        self._fields = dict(zip(channels, preview_fields(channels), strict=True))
+
+    def encode(self, block: SampleBlock, i: int) -> bytes:
+        x, y, z = block.readings[i].tolist()
+        named = {f: float(block.channels[c][i]) for c, f in self._fields.items() if c in block.channels}
+        return bytes(self.kind.message(time_ns=int(block.time_ns[i]), x=x, y=y, z=z, **named).SerializeToString())
+
+
 class Decimator:
     """Picks at most one sample of each period of the samples' own time, however they are cut into blocks."""
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float = PREVIEW_HZ) -> None:
         self._period_ns = max(1, round(1e9 / rate_hz))
         self._last_slot = -1
 

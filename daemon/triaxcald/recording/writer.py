@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import queue
@@ -45,7 +46,7 @@ class RecordingWriter:
         metadata: Mapping[str, Mapping[str, str]],
         preview_channels: Sequence[str] = (),
         preview_unit: str = "",
-        preview_hz: float = 20.0,
+        preview_hz: float = schema.PREVIEW_HZ,
         clock_ns: Callable[[], int] = time.time_ns,
         queue_batches: int = 256,
         ends_with: str = "",
@@ -53,11 +54,11 @@ class RecordingWriter:
         self.path = path
         self.losses: dict[str, int] = {}
         self._clock_ns = clock_ns
-        self._preview_fields = dict(zip(preview_channels, schema.preview_fields(preview_channels), strict=True))
-        self._preview = schema.preview_schema(preview_channels)
+        self._preview = schema.PreviewEncoder(preview_channels)
         self._decimators = {topic: schema.Decimator(preview_hz) for topic in schema.PREVIEWS}
         self.ends_with = ends_with
         self._digest = schema.RawDigest(ends_with)
+        self._end: dict[str, str] = {}
         self._inventory = Inventory()
         self._offered = 0
         self._attached: set[str] = set()
@@ -124,7 +125,9 @@ class RecordingWriter:
 
         def write() -> None:
             self._report_losses()
-            self._write_attachment(time_ns, name, media_type, make(self._inventory.document()))
+            data = make(self._inventory.document())
+            self._write_attachment(time_ns, name, media_type, data)
+            self._end = {"name": name, "sha256": hashlib.sha256(data).hexdigest()}
 
         self._jobs.put(write)
         self.close()
@@ -247,7 +250,7 @@ class RecordingWriter:
         for name, record in {schema.FORMAT_RECORD: own, **metadata}.items():
             self._inventory.metadata(name, record)
             self._mcap.add_metadata(name, record)
-        self._channel_ids = _declare(self._mcap, self._preview, unit)
+        self._channel_ids = _declare(self._mcap, self._inventory, self._preview.kind, unit)
         self._write(schema.EVENTS, schema.Event(self._clock_ns(), "recording_started", "{}"))
         self._flush()  # schemas and channels are in the first chunk: have it on disk at once
 
@@ -260,11 +263,7 @@ class RecordingWriter:
 
     def _write_preview(self, topic: str, block: SampleBlock, picked: Sequence[int]) -> None:
         for i in picked:
-            x, y, z = block.readings[i].tolist()
-            named = {f: float(block.channels[c][i]) for c, f in self._preview_fields.items() if c in block.channels}
-            time_ns = int(block.time_ns[i])
-            message = self._preview.message(time_ns=time_ns, x=x, y=y, z=z, **named)
-            self._add(topic, time_ns, message.SerializeToString())
+            self._add(topic, int(block.time_ns[i]), self._preview.encode(block, i))
 
     def _write(self, topic: str, value: schema.RegisterAccess | schema.Event | schema.Loss) -> None:
         self._add(topic, value.time_ns, schema.encode(value))
@@ -284,6 +283,8 @@ class RecordingWriter:
         self._report_losses()
         raw = {"records": str(self._digest.records), "sha256": self._digest.hexdigest()}
         self._mcap.add_metadata(schema.RAW_RECORD, raw)
+        if self._end:
+            self._mcap.add_metadata(schema.END_RECORD, self._end)
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -293,14 +294,18 @@ def _create(path: Path) -> BinaryIO:
     return open(path, "xb")
 
 
-def _declare(mcap: McapWriter, preview: schema.Schema, unit: str) -> dict[str, int]:
+def _declare(mcap: McapWriter, inventory: Inventory, preview: schema.Schema, unit: str) -> dict[str, int]:
     """Registers schemas and channels in the order that fixes their ids; the channels' ids by topic."""
     ids = {}
+
+    def channel(topic: str, kind: schema.Schema, schema_id: int, said: dict[str, str]) -> None:
+        ids[topic] = mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id, said)
+        inventory.channel(topic, MessageEncoding.Protobuf, said, (kind.name, SchemaEncoding.Protobuf, kind.data))
+
     for topic, name in schema.CHANNELS:
         kind = schema.SCHEMAS[name]
-        schema_id = mcap.register_schema(kind.name, SchemaEncoding.Protobuf, kind.data)
-        ids[topic] = mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id)
+        channel(topic, kind, mcap.register_schema(kind.name, SchemaEncoding.Protobuf, kind.data), {})
     schema_id = mcap.register_schema(preview.name, SchemaEncoding.Protobuf, preview.data)
     for topic, topic_unit in zip(schema.PREVIEWS, (unit, "g"), strict=True):
-        ids[topic] = mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id, {"unit": topic_unit})
+        channel(topic, preview, schema_id, {"unit": topic_unit})
     return ids

@@ -22,13 +22,13 @@ from triaxcald.report.registers import read_device
 from triaxcald.report.sphere import sphere_picture
 from triaxcald.report.stream import StreamOverview
 from triaxcald.report.untrusted import mapping
-from triaxcald.report.verdict import judge
+from triaxcald.report.verdict import final_word, judge
 
 # Parts of a certificate that the page shows elsewhere, or that are too long to read.
 _SHOWN_ELSEWHERE = {
     "format", "calibration", "loop", "before", "after", "held_out", "findings", "unexplained", "poses",
     "limits", "data_quality", "advice", "residual", "result", "registers", "verification", "not_written", "device",
-    "choices",
+    "choices", "outcome",
 }  # fmt: skip
 _LONGEST_LIST = 16
 
@@ -56,7 +56,7 @@ def render_report(
         title=title,
         outcome=outcome,
         unit=unit,
-        verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None),
+        verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None, final_word(papers)),
         uncertainty=uncertainty,
         assumed=assumed,
         overlap=overlap("; ".join(outcome.unexplained.leads if outcome.unexplained else ())),
@@ -79,8 +79,9 @@ def render_report(
 
 def _entries(papers: Mapping[str, object], above: str = "") -> Iterator[tuple[str, str]]:
     """The certificate's own facts as (label, text), nested ones with their path."""
+    judged = {"verdict", "outside"} if "outcome" in papers else set()  # of the fit alone
     for key, value in papers.items():
-        if not above and key in _SHOWN_ELSEWHERE:
+        if not above and key in _SHOWN_ELSEWHERE | judged:
             continue
         label = f"{above}{str(key).replace('_', ' ')}"
         if isinstance(value, Mapping):

@@ -13,10 +13,12 @@ from triaxcald.report.document import Finding, Outcome
 from triaxcald.report.faults import faults_of
 from triaxcald.report.figures import micro_g
 from triaxcald.report.meanings import told
+from triaxcald.report.untrusted import mapping
 from triaxcald.units import ErrorUnit
 
 Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
+_NO_LIMIT = "No limit was declared; the verdict compares with the noise floor alone."
 _MOST_NAMED = 3
 
 
@@ -44,20 +46,58 @@ class Verdict:
     checks: tuple[LimitCheck, ...]
 
 
-def judge(outcome: Outcome, certificate_limits: Mapping[str, float | None], expanded_g: float | None = None) -> Verdict:
-    """The verdict on an outcome.
+@dataclass(frozen=True)
+class FinalWord:
+    """A station's verdict on the unit, which knows its own output too, and why."""
+
+    verdict: str
+    reason: str
+
+
+def final_word(papers: Mapping[str, object]) -> FinalWord | None:
+    """None where no station has judged."""
+    said = mapping(papers.get("outcome"))
+    return FinalWord(str(said.get("verdict") or ""), str(said.get("reason") or "")) if said else None
+
+
+def judge(
+    outcome: Outcome,
+    certificate_limits: Mapping[str, float | None],
+    expanded_g: float | None = None,
+    final: FinalWord | None = None,
+) -> Verdict:
+    """The verdict on an outcome, or the ``final`` one of a station, with what the fit says for it and against it.
 
     Limits are named like the fields of a residual, or `held_out_rms_g`, and hold inclusively. A limit that
     nothing was measured against is never taken as kept, and nothing is well whose times or unit are in doubt.
     """
-    found = _judged(outcome, certificate_limits, expanded_g)
+    failed = final is not None and final.verdict == "fail"
+    found = _concluded(_judged(outcome, certificate_limits, expanded_g, failed), final)
     if not (doubts := doubts_of(outcome.data_quality, outcome.warnings)):
         return found
     kind: Kind = "unexplained" if found.kind == "within" else found.kind
     return replace(found, kind=kind, headline="; ".join([found.headline, *doubts]))
 
 
-def _judged(outcome: Outcome, certificate_limits: Mapping[str, float | None], expanded_g: float | None) -> Verdict:
+def _concluded(found: Verdict, final: FinalWord | None) -> Verdict:
+    if final is None or found.kind == "refused":
+        return found
+    because = f"{final.reason[:1].upper()}{final.reason[1:]}."
+    if final.verdict == "not_judged":
+        headline = f"Not judged; {found.headline[:1].lower()}{found.headline[1:]}"
+        kind: Kind = "unexplained" if found.kind == "within" else found.kind
+        return replace(found, kind=kind, headline=headline, sentence=f"{because} {found.sentence}")
+    declared = tuple(line for line in found.reservations if line != _NO_LIMIT)
+    if final.verdict == "fail":
+        return replace(found, kind="outside", headline="Failed", sentence=f"{because} {found.sentence}",
+                       reservations=declared)  # fmt: skip
+    headline = _WITHIN if found.kind == "within" else found.headline
+    return replace(found, headline=headline, sentence=f"{because} {found.sentence}", reservations=declared)
+
+
+def _judged(
+    outcome: Outcome, certificate_limits: Mapping[str, float | None], expanded_g: float | None, failed: bool
+) -> Verdict:
     checks = tuple(_checks(outcome, {**outcome.limits, **certificate_limits}))
     if outcome.refused is not None:
         return Verdict("refused", "Refused", outcome.refused, (), checks)
@@ -68,7 +108,7 @@ def _judged(outcome: Outcome, certificate_limits: Mapping[str, float | None], ex
     if exceeded:
         return Verdict("outside", _OUTSIDE, f"{', '.join(exceeded)}: over the limit. {errors}", reservations, checks)
     if _unexplained(outcome):
-        kept = "Every declared limit is kept, but " if checks and not open_checks else ""
+        kept = "Every declared limit is kept, but " if checks and not open_checks and not failed else ""
         headline, what = _UNEXPLAINED, f"more is left than the noise of the poses accounts for. {errors}"
         if outcome.unexplained is not None and outcome.unexplained.or_spoiled:
             headline = "Spoiled poses or an effect"
@@ -214,7 +254,7 @@ def _reservations(outcome: Outcome, checks: tuple[LimitCheck, ...]) -> list[str]
     if rejected:
         found.append(f"{rejected} of {len(outcome.poses)} poses not used.")
     if not checks:
-        found.append("No limit was declared; the verdict compares with the noise floor alone.")
+        found.append(_NO_LIMIT)
     if not _tested(outcome):
         found.append("Whether anything is left beyond noise was not tested.")
     for count, what in ((len(outcome.warnings), "warning"), (len(outcome.data_quality), "remark")):

@@ -1,19 +1,38 @@
-"""How work that failed ends: the exit code it owes, and the reason in one line."""
+"""How work ends: the verdict, the exit code it owes, and the reason in one line."""
 
 from __future__ import annotations
 
 import asyncio
 import sys
 import traceback
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from typing import Any
 
 from triaxcal.errors import TriaxcalError
 from triaxcal_drivers.errors import DriverError
+from triaxcald import text
 from triaxcald.errors import DaemonError
-from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, exit_code_of
+from triaxcald.exit_codes import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, exit_code_of
 from triaxcald.outcome import Ending, Verdict
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
+from triaxcald.station.config import Limits
+from triaxcald.verification import OUTSIDE as VERIFIED_OUTSIDE
+from triaxcald.verification import WORSE
+
+
+def judged(outside: Sequence[str], verification: Mapping[str, Any] | None, limits: Limits) -> Ending:
+    """The verdict on the figures: on those of the fit, ``outside`` where they are outside a limit, and on the device's
+    own output where it was written. Nothing else enters, so that an audit comes to the same."""
+    if outside:
+        return Ending(Verdict.FAIL, "; ".join(outside), OUTSIDE)
+    if verification is not None and verification["verdict"] in (VERIFIED_OUTSIDE, WORSE):
+        return Ending(Verdict.FAIL, text.verification_failed(verification), OUTSIDE)
+    checked = limits.verification_rms_g is not None and verification is not None
+    if limits.rms_g is None and limits.cross_validated_rms_g is None and not checked:
+        return Ending(Verdict.NOT_JUDGED, text.NO_LIMIT, DONE)
+    return Ending(Verdict.PASS, text.passed(verification), DONE)
 
 
 def aborted(e: BaseException, p: Provisioning | None) -> Ending:

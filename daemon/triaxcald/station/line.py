@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -19,9 +18,9 @@ from triaxcald.abort import Left, at_abort
 from triaxcald.certificate import Certified, certify, software
 from triaxcald.documents import Document, to_text
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.exit_codes import DISK, DONE, OUTSIDE
+from triaxcald.exit_codes import DISK
 from triaxcald.files import write_text
-from triaxcald.inputs import CALIBRATION, PROFILE, STATION_FILE, VERIFICATION
+from triaxcald.inputs import CALIBRATION, PROFILE, STATION_FILE, VERIFICATION, preview_channels
 from triaxcald.outcome import (
     ATTACHMENT,
     FORMAT,
@@ -41,20 +40,15 @@ from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.report.page import render_report
-from triaxcald.report.stream import overview_of
+from triaxcald.report.unit import drawn_with, unit_report
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, Station
-from triaxcald.station.endings import aborted
+from triaxcald.station.endings import aborted, judged
 from triaxcald.station.serials import SerialsSeen
 from triaxcald.station.write_back import WriteBack, corrected
-from triaxcald.verification import OUTSIDE as VERIFIED_OUTSIDE
-from triaxcald.verification import WORSE, Verification
+from triaxcald.verification import Verification
 
 CERTIFICATE, REPORT = "certificate.json", "report.html"
-
-_DRAWING = threading.Lock()
-"""The pictures' style is the process's own: one report is drawn at a time."""
 
 
 @dataclass(frozen=True)
@@ -255,9 +249,9 @@ class UnitRun:
             metadata={
                 "station": {"name": self.station.file.name},
                 "unit": unit,
-                "software": software(),
+                "software": {**software(), **drawn_with()},
             },
-            preview_channels=self._channels(),
+            preview_channels=preview_channels(self.profile),
             preview_unit=self.profile.output.unit,
             clock_ns=self.clock_ns,
             ends_with=ends_with,
@@ -268,12 +262,6 @@ class UnitRun:
             writer.attach(f"profile/{name}", "application/octet-stream", data)
         return writer
 
-    def _channels(self) -> list[str]:
-        names: dict[str, None] = {}
-        for stream in self.profile.streams.values():
-            names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
-        return list(names)
-
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
         tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, writer.ends_with)
@@ -283,12 +271,16 @@ class UnitRun:
         certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
             await self._write(device, writer, certified.image, identity, tumble)
-        ending = self._judged(certified)
+        ending = judged(
+            certified.document["outside"],
+            self._write_back.verification if self._write_back else None,
+            self.station.file.limits,
+        )
         self.progress.stage(self.name, "writing the report")
-        papers = {REPORT: await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS])}
+        papers = {REPORT: await asyncio.to_thread(self._report, certified, tumble.pipelines[READINGS], ending)}
         if ending.verdict is not Verdict.FAIL:
             papers[CERTIFICATE] = to_text(certified.document)
-        for name, media_type in ((CERTIFICATE, "application/json"), (REPORT, "text/html")):
+        for name, media_type in ((REPORT, "text/html"), (CERTIFICATE, "application/json")):
             if name in papers:
                 writer.attach(name, media_type, papers[name].encode())
         self._papers = papers
@@ -312,18 +304,6 @@ class UnitRun:
             force=self.force,
         )
         await self._write_back.run(device, image, identity.serial, tumble)
-
-    def _judged(self, certified: Certified) -> Ending:
-        """The verdict on the figures: on those of the fit, and on the device's own output where it was written."""
-        back, limits = self._write_back, self.station.file.limits
-        if not certified.within_limits:
-            return Ending(Verdict.FAIL, "; ".join(certified.document["outside"]), OUTSIDE)
-        if back and back.verification and back.verdict in (VERIFIED_OUTSIDE, WORSE):
-            return Ending(Verdict.FAIL, text.verification_failed(back.verification), OUTSIDE)
-        checked = limits.verification_rms_g is not None and back is not None and back.verification is not None
-        if limits.rms_g is None and limits.cross_validated_rms_g is None and not checked:
-            return Ending(Verdict.NOT_JUDGED, "the station has no limit for what was measured", DONE)
-        return Ending(Verdict.PASS, text.passed(back.verification if back else None), DONE)
 
     def _certify(self, tumble: Collection, poses: list[Any], identity: IdentityRead) -> Certified:
         return certify(
@@ -362,20 +342,9 @@ class UnitRun:
             await self._collect(device, None, check, CORRECTED, wanted)
             return corrected(check, self.station.file.reference)
 
-    def _report(self, certified: Certified, pipeline: Pipeline) -> str:
-        papers = dict(certified.document)
-        if self._write_back and self._write_back.verification:
-            papers["verification"] = self._write_back.verification
-        if self._write_back:
-            papers["device"] = text.held(self._held)
-        overview = overview_of(pipeline.windows, pipeline.poses(), self.profile.output.unit)
-        with _DRAWING:
-            return render_report(
-                certified.document["result"],
-                title=f"{papers['unit']['product']} {papers['unit']['serial']}",
-                stream=overview,
-                certificate=papers,
-            )
+    def _report(self, certified: Certified, pipeline: Pipeline, ending: Ending) -> str:
+        back = self._write_back
+        return unit_report(certified, pipeline, ending, back.verification if back else None, self._held)
 
 
 async def run_station(station: Station, progress: Progress, *, force: str | None = None) -> list[Outcome]:

@@ -20,8 +20,9 @@ def test_audit_says_that_all_is_the_same(finished_run: Any, triaxcal: Run) -> No
     assert done.json["format"] == "triaxcal.audit/1"
     assert [a["recording"] for a in done.json["audits"]] == [str(finished_run.can), str(finished_run.modbus)]
     for audit in done.json["audits"]:
-        assert audit["checked"] == ["certificate.json", "verification.json", "registers-after.json"]
-        assert audit["differences"] == []
+        assert {"certificate.json", "verification.json", "registers-after.json"} < set(audit["checked"])
+        assert (audit["differences"], audit["notes"], audit["error"], audit["verdict"]) == ([], [], None, "pass")
+    assert done.json["summary"] == {"recordings": 2, "agree": 2, "differ": 0, "unreadable": 0}
 
 
 def test_audit_ends_with_1_and_names_the_difference(
@@ -33,7 +34,8 @@ def test_audit_ends_with_1_and_names_the_difference(
     )
     done = triaxcal("audit", finished_run.can, path)
     assert done.code == 1
-    assert done.out.startswith(f"{finished_run.can}: the same, byte for byte (certificate.json, ")
+    assert done.out.startswith(f"{finished_run.can}: the same, byte for byte (outcome.json, certificate.json, ")
+    assert done.out.endswith("\n2 recordings: 1 agrees, 1 differs\n")
     assert f"{path}: differs" in done.out
     assert '  certificate.json: station.name: stored "bench", computed again "Bench"' in done.out
     assert triaxcal("audit", path, "--json").code == 1
@@ -105,7 +107,7 @@ def test_a_recording_cut_short_is_mended_and_the_loss_is_counted(
     assert triaxcal("poses", done.json["output"], "--json").json["poses"]
     triaxcal("log", "recover", path).failed(2, f"{tmp_path / 'cut.recovered.mcap'}: exists already")
     assert triaxcal("log", "recover", path, "-o", tmp_path / "b.mcap").code == 0
-    triaxcal("audit", tmp_path / "b.mcap").failed(2, "certificate.json: missing")
+    triaxcal("audit", tmp_path / "b.mcap").failed(2, "outcome.json: missing; the recording holds no result to audit")
 
 
 def test_of_an_empty_file_nothing_is_recovered_and_nobody_is_told_to_try(tmp_path: Path, triaxcal: Run) -> None:
@@ -129,4 +131,29 @@ def test_a_whole_recording_recovers_without_a_loss(finished_run: Any, tmp_path: 
     assert not any(recovery[k] for k in ("cut_short", "raw_missing", "raw_dropped", "bytes_dropped", "chunks_failed"))
     done = triaxcal("audit", out, "--json")
     assert done.code == 0
-    assert done.json["audits"][0]["notes"] == ["the recording was cut short or damaged, and mended"]
+    assert done.json["audits"][0]["notes"][0] == "the recording was cut short or damaged, and mended"
+
+
+def test_no_recording_hides_another(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
+    good, cut, other = tmp_path / "a.mcap", tmp_path / "b.mcap", tmp_path / "deeper" / "c.mcap"
+    other.parent.mkdir()
+    whole = finished_run.modbus.read_bytes()
+    for path, data in ((good, whole), (cut, whole[:100_000]), (other, whole)):
+        path.write_bytes(data)
+    good.with_suffix(".outcome.json").write_text("{}")
+    done = triaxcal("audit", tmp_path)
+    assert done.code == 2
+    assert done.out.splitlines()[-1] == "3 recordings: 1 agrees, 1 differs, 1 unreadable"
+    assert f"{good}: differs" in done.out
+    assert "  a.outcome.json: the file beside the recording is not the one in it" in done.out
+    assert done.err.startswith(f"triaxcal: {cut}: the file ends, not finished, ")
+    assert done.err.count("\n") == 1
+    listed = triaxcal("audit", tmp_path / "*.mcap", good, tmp_path / "no.mcap", tmp_path / "x*", "--json")
+    assert listed.code == 2
+    assert [a["recording"] for a in listed.json["audits"]] == [
+        str(good), str(cut), str(tmp_path / "no.mcap"), str(tmp_path / "x*"),
+    ]  # fmt: skip
+    assert [bool(a["error"]) for a in listed.json["audits"]] == [False, True, True, True]
+    assert triaxcal("audit", good).code == 1
+    (tmp_path / "empty").mkdir()
+    triaxcal("audit", tmp_path / "empty").failed(2, f"{tmp_path / 'empty'}: Is a directory, without a recording")

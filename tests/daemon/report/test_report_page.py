@@ -255,6 +255,28 @@ def test_an_exceeded_limit_is_outside_and_named(bare: dict[str, Any]) -> None:
     assert "Residual, rms: over the limit." in page.text
 
 
+@pytest.mark.parametrize(
+    ("verdict", "limits", "box", "headline"),
+    [
+        ("fail", {"rms_g": 1e-3}, "outside", "Failed"),
+        ("fail", {}, "outside", "Failed"),
+        ("pass", {}, "within", "Within limits"),
+        ("not_judged", {}, "unexplained", "Not judged; effect found and corrected"),
+    ],
+)
+def test_the_headline_is_the_stations_own_word_on_the_unit(
+    bare: dict[str, Any], verdict: str, limits: dict[str, float], box: str, headline: str
+) -> None:
+    """Which has the unit's own output before it; the fit alone may be within its limits, or have none."""
+    said = {"verdict": "within limits", "outcome": {"verdict": verdict, "reason": "the check poses say so"}}
+    sure = {**bare["findings"][0], "verdict": "adopted", "alternatives": []}
+    page = render({**bare, "limits": limits, "findings": [sure]}, certificate=said)
+    assert (page.verdict, headline in page.verdict_text) == (box, True), page.verdict_text
+    assert "The check poses say so." in page.verdict_text
+    assert ("No limit was declared" in page.verdict_text) is (verdict == "not_judged")
+    assert not any(row and row[0] == "verdict" for row in page.rows)
+
+
 def test_a_significant_remainder_is_unexplained_even_within_the_limits(bare: dict[str, Any]) -> None:
     left = {"significant": True, "p_value": 1e-9, "rms_g": 4e-5, "lead": "grows with time"}
     page = render({**bare, "unexplained": left}, certificate=samples.certificate())

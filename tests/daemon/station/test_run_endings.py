@@ -189,14 +189,14 @@ async def test_a_device_without_a_corrected_stream_is_written_and_said_to_be_unv
 def test_an_internal_error_in_one_unit_does_not_disturb_the_other(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    render = station_line.render_report
+    report = station_line.unit_report
 
-    def broken(document: Any, *, title: str, **more: Any) -> str:
-        if title.endswith("4712"):
+    def broken(certified: Any, *more: Any) -> str:
+        if certified.document["unit"]["serial"] == "4712":
             raise ValueError("a fault of the program")
-        return render(document, title=title, **more)
+        return report(certified, *more)
 
-    monkeypatch.setattr(station_line, "render_report", broken)
+    monkeypatch.setattr(station_line, "unit_report", broken)
     good, bad = workshop.device("good.toml", **QUICK), workshop.device("bad.toml", serial=4712, **QUICK)
     with workshop.serve(good) as first, workshop.serve(bad) as second:
         station = workshop.station({"name": "good", "bus": first.bus}, {"name": "bad", "bus": second.bus}, plan=PLAN)

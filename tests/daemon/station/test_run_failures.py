@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from triaxcald.audit import audit
+from tests.daemon.audit.forging import Forgery
+from triaxcald.audit import audit, text
 from triaxcald.documents import to_text
 from triaxcald.errors import DiskError
 from triaxcald.recording.reader import Recording
@@ -47,13 +48,17 @@ def _run(
     triaxcal: Callable[..., Any],
     faults: Faults | None = None,
     device: Mapping[str, Any] = QUICK,
+    *,
+    recorded: bool = True,
     **settings: Any,
 ) -> Any:
-    """One Modbus unit; the command's outcome, the unit, and its recording (finished and readable)."""
+    """One Modbus unit; the command's outcome, the unit, and its recording: finished, readable, and in agreement with
+    itself, where all that was done to the unit was ``recorded``."""
     with workshop.serve(workshop.device(**device), faults) as served:
         unit = {"bus": served.bus, "profile": workshop.impatient_profile()}
         done = triaxcal("run", workshop.station(unit, **{"plan": PLAN, **settings}))
         path = _only(workshop.folder, "*.mcap")
+        assert not recorded or audit(path).differences == ()
         return done, served, path
 
 
@@ -80,6 +85,21 @@ def test_verification_outside_the_limit_brings_the_old_calibration_back(
     assert (ended["verdict"], ended["device_state"], ended["exit_code"]) == ("fail", "old", 1)
     assert list(workshop.folder.glob("*.certificate.json")) == []
     assert _only(workshop.folder, "*.outcome.json").read_bytes() == to_text(ended).encode()
+    report = _only(workshop.folder, "*.report.html").read_text()
+    assert "<strong>Failed</strong>" in report
+    assert "No limit was declared" not in report
+    assert f"{BACK[1:]}." in report
+    _whitewashed(path)
+
+
+def _whitewashed(path: Path) -> None:
+    """A failed unit said to have passed, by one who knows of the inventory and the digests, is found."""
+    forged = Forgery.of(path)
+    with_pass = {"verdict": "pass", "exit_code": 0, "reason": "the fit is within the limits"}
+    forged.edit("outcome.json", lambda o: o.update(with_pass))
+    forged.seal()
+    lines = [text.difference(d) for d in audit(forged.write(path.with_name("forged.mcap"))).differences]
+    assert 'outcome.json: verdict: stored "pass", computed again "fail"' in lines
 
 
 def test_a_fit_outside_its_limit_writes_nothing(workshop: Any, triaxcal: Callable[..., Any]) -> None:
@@ -89,6 +109,7 @@ def test_a_fit_outside_its_limit_writes_nothing(workshop: Any, triaxcal: Callabl
     assert served.unit.eeprom == OLD.image()
     assert "provisioned" not in [kind for kind, _ in _events(path)]
     ended = _outcome(path)
+    assert "<strong>Failed</strong>" in _only(workshop.folder, "*.report.html").read_text()
     assert (ended["verdict"], ended["device_state"], ended["evidence"]) == ("fail", "untouched", "nothing_written")
     assert ended["reason"].startswith("rms_g ")
     assert list(workshop.folder.glob("*.certificate.json")) == []
@@ -98,6 +119,9 @@ def test_a_station_that_is_told_not_to_write_does_not(workshop: Any, triaxcal: C
     done, served, path = _run(workshop, triaxcal, provisioning={"write": False})
     assert done.code == 0
     assert served.unit.eeprom == OLD.image()
+    report = _only(workshop.folder, "*.report.html").read_text()
+    assert "<strong>Not judged; nothing found beyond noise</strong>" in report
+    assert "The old calibration is untouched." in report
     with Recording.open(path) as recording:
         assert all(a.operation == "read" for a in recording.register_accesses())
 
@@ -184,7 +208,8 @@ def test_a_disk_that_fails_while_registers_are_written_does_not_keep_the_old_one
         register(self, name, operation, raw, error)
 
     monkeypatch.setattr(RecordingWriter, "register", full)
-    done, served, _ = _run(workshop, triaxcal)
+    done, served, path = _run(workshop, triaxcal, recorded=False)
+    assert "device_state" in {d.place for d in audit(path).differences}
     done.failed(5, "No space left on device", "the old calibration")
     assert failed[0] == at
     _holds_old(served)

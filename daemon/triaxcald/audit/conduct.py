@@ -1,0 +1,370 @@
+"""One audit of one recording: what is looked at, and in which order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from triaxcald.audit import contents, previews
+from triaxcald.audit.beside import beside, outcomes_beside
+from triaxcald.audit.differences import Difference, Kind, compare
+from triaxcald.audit.older import turned_back
+from triaxcald.audit.results import (
+    CANNOT,
+    DRAWN_WITH,
+    Again,
+    Digests,
+    compute,
+    digests,
+    held_in,
+    outcome_again,
+    report_of,
+)
+from triaxcald.audit.traffic import Said, Traffic, check
+from triaxcald.certificate import software
+from triaxcald.documents import to_text
+from triaxcald.errors import InputError, RecordingError
+from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, REFUSED
+from triaxcald.inputs import losses_of, parse_document
+from triaxcald.outcome import ATTACHMENT, FORMAT, Verdict, digest_of
+from triaxcald.provision.state import DeviceState, Held
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_RECORD
+from triaxcald.recording.survey import Survey, survey
+from triaxcald.report.unit import drawn_with
+from triaxcald.station.line import CERTIFICATE, REPORT
+from triaxcald.station.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
+
+ABORTED_WITH = (2, REFUSED, DEVICE, DISK, INTERRUPTED)
+Compute = Callable[[Recording, Digests], Again]
+
+
+@dataclass(frozen=True)
+class Notes:
+    """What an auditor should know and what is no difference. ``versions`` by name, then and now; ``not_beside`` are
+    files that are not beside the recording; ``report_as_listed`` where the report was not drawn again."""
+
+    older: bool = False
+    versions: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    report_as_listed: bool = False
+    losses: tuple[str, ...] = ()
+    mended: bool = False
+    not_beside: tuple[str, ...] = ()
+    supersedes: str | None = None
+    """The digest of an earlier outcome that is not in the folder."""
+
+
+@dataclass(frozen=True)
+class Audit:
+    """No difference means that everything comes out the same, byte for byte, and that no part is missing.
+
+    ``checked`` are the attachments that were computed again or compared with the register traffic. ``verdict`` is the
+    outcome's, None in a recording from before there were outcomes.
+    """
+
+    recording: str
+    checked: tuple[str, ...]
+    differences: tuple[Difference, ...]
+    notes: Notes = Notes()
+    verdict: str | None = None
+
+
+def audit(path: Path, *, compute: Compute = compute) -> Audit:
+    """Raises RecordingError where the file cannot be read, or holds no result. ``compute`` makes the results again."""
+    with Recording.open(path) as recording:
+        if recording.ends_with not in ("", FORMAT):
+            raise RecordingError(f"{path}: ends with {recording.ends_with}, which this version does not know")
+        return _Audit(path, recording, compute).run()
+
+
+class _Audit:
+    def __init__(self, path: Path, recording: Recording, compute: Compute) -> None:
+        self._path, self._recording, self._compute = path, recording, compute
+        self._held = {name: recording.attachments[name] for name in recording.attachments if "/" not in name}
+        self._checked: list[str] = []
+        self._differences: list[Difference] = []
+        self._outcome: Mapping[str, Any] = {}
+        self._raw = digests(recording)
+        self._mended = RECOVERY_RECORD in recording.metadata
+        self._listed_report = False
+
+    def run(self) -> Audit:
+        found = survey(self._recording, ATTACHMENT)
+        back = turned_back(self._recording, self._raw) if not self._recording.ends_with else []
+        if not back and not {CERTIFICATE, ATTACHMENT} & set(self._held) and (self._older or self._mended):
+            missing = CERTIFICATE if self._older else ATTACHMENT
+            raise RecordingError(f"{self._path}: attachment {missing}: missing; the recording holds no result to audit")
+        self._differences += back
+        again = self._again()
+        if self._ends_with_outcome or ATTACHMENT in self._held:
+            self._check_outcome(found, again)
+        elif CERTIFICATE not in self._held:
+            self._add(CERTIFICATE, Kind.MISSING)
+        if again is not None:
+            self._check_results(again)
+            self._differences += previews.check(self._recording, again.previews)
+        self._check_raw()
+        self._differences += contents.faults(found)
+        if self._outcome:
+            self._differences += contents.against_inventory(found, self._outcome)
+        differing, not_beside = beside(self._path, self._held)
+        self._differences += differing
+        verdict = self._outcome.get("verdict")
+        return Audit(
+            str(self._path),
+            tuple(dict.fromkeys(self._checked)),
+            tuple(d for i, d in enumerate(self._differences) if d not in self._differences[:i]),
+            self._notes(tuple(not_beside)),
+            verdict if isinstance(verdict, str) else None,
+        )
+
+    @property
+    def _ends_with_outcome(self) -> bool:
+        return self._recording.ends_with == FORMAT
+
+    @property
+    def _older(self) -> bool:
+        return not self._ends_with_outcome
+
+    @property
+    def _aborted(self) -> bool:
+        return self._outcome.get("verdict") == Verdict.ABORTED.value
+
+    def _add(self, part: str, kind: Kind, place: str = "", **values: Any) -> None:
+        self._differences.append(Difference(part, kind, place, **values))
+
+    def _again(self) -> Again | None:
+        try:
+            return self._compute(self._recording, self._raw)
+        except CANNOT as e:
+            self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=str(e) or repr(e))
+            return None
+
+    # The outcome, which everything else has to agree with.
+
+    def _check_outcome(self, found: Survey, again: Again | None) -> None:
+        self._checked.append(ATTACHMENT)
+        if ATTACHMENT not in self._held:
+            self._add(ATTACHMENT, Kind.NO_END)
+            return
+        data = self._held[ATTACHMENT]
+        end = self._recording.metadata.get(END_RECORD)
+        expected = {"name": ATTACHMENT, "sha256": hashlib.sha256(data).hexdigest()}
+        if end is None:
+            self._add(END_RECORD, Kind.MISSING)
+        elif end != expected:
+            self._add(END_RECORD, Kind.VALUE, "sha256", stored=end.get("sha256"), again=expected["sha256"])
+        held = _object(data)
+        if held is None:
+            self._add(ATTACHMENT, Kind.NO_DOCUMENT)
+            return
+        self._outcome = held
+        if self._aborted and held.get("exit_code") not in ABORTED_WITH:
+            self._add(ATTACHMENT, Kind.VALUE, "exit_code", stored=held.get("exit_code"), again=list(ABORTED_WITH))
+        state = held_in(held)
+        if state is None:
+            self._add(ATTACHMENT, Kind.NOT_SHOWN, "device_state", stored=held.get("device_state"))
+        elif _needs_journal(state, held.get("registers")) != (held.get("journal") is not None):
+            wanted = "a path" if held.get("journal") is None else None
+            self._add(ATTACHMENT, Kind.VALUE, "journal", stored=held.get("journal"), again=wanted)
+        if again is None:
+            return
+        contents_again = held.get("contents") if self._mended else found.inventory.document()
+        document = outcome_again(held, again, self._recording, self._papers(again), contents_again or {})
+        # The inventory is compared part by part.
+        told = compare(ATTACHMENT, _without_contents(data), _without_contents(to_text(document).encode()))
+        if not told and contents_again == held.get("contents") and data != to_text(document).encode():
+            told = [Difference(ATTACHMENT, Kind.BYTES)]
+        self._differences += told
+
+    def _papers(self, again: Again) -> dict[str, str]:
+        """Digests of the papers that the line leaves: computed again where they can be."""
+        found = {}
+        ending = None if self._aborted else again.ending()
+        if ending is not None and again.certified is not None:
+            if ending.verdict is not Verdict.FAIL:
+                found[CERTIFICATE] = digest_of(to_text(again.certified.document).encode())
+            if REPORT in self._held:
+                found[REPORT] = digest_of(self._held[REPORT])
+        return found
+
+    # What the raw records, profile and station file make.
+
+    def _check_results(self, again: Again) -> None:
+        ending = None if self._aborted else again.ending()
+        if again.certified is None and not self._aborted:
+            self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=again.why_not)
+        elif again.certified is not None and ending is not None:
+            has_one = self._older or ending.verdict is not Verdict.FAIL
+            self._result(CERTIFICATE, to_text(again.certified.document) if has_one else None)
+            if not self._older:
+                self._check_report(again)
+        elif self._aborted:
+            for name in (CERTIFICATE, REPORT):
+                self._result(name, None)
+        document = to_text(again.verification) if again.verification is not None else None
+        if VERIFICATION_FILE in self._held and document is None:
+            self._checked.append(VERIFICATION_FILE)
+            self._add(VERIFICATION_FILE, Kind.NOT_COMPUTED, again="there are no check poses, or no output to check")
+        elif VERIFICATION_FILE in self._held or (again.checked and ending is not None):
+            self._result(VERIFICATION_FILE, document)
+            if VERIFICATION_FILE not in self._held:
+                self._add(VERIFICATION_FILE, Kind.MISSING)
+        self._check_registers(again)
+
+    def _result(self, name: str, again: str | None) -> None:
+        """``again`` is None where there ought to be none."""
+        stored = self._held.get(name)
+        if again is None:
+            if stored is not None:
+                self._add(name, Kind.UNCALLED_FOR)
+            return
+        self._checked.append(name)
+        if stored is None:
+            self._add(name, Kind.MISSING)
+        else:
+            self._differences += compare(name, stored, again.encode())
+
+    def _check_report(self, again: Again) -> None:
+        self._checked.append(REPORT)
+        stored, ending = self._held.get(REPORT), again.ending()
+        if stored is None:
+            self._add(REPORT, Kind.MISSING)
+        elif any(self._versions()):
+            self._listed_report = True
+        elif ending is not None:
+            try:
+                drawn = report_of(again, ending, held_in(self._outcome) or Held())
+            except CANNOT as e:
+                self._add(REPORT, Kind.NOT_COMPUTED, again=str(e) or repr(e))
+                return
+            if stored != drawn.encode():
+                self._add(REPORT, Kind.NOT_DRAWN)
+
+    def _check_registers(self, again: Again) -> None:
+        names = (REGISTERS_BEFORE, REGISTERS_EARLIER, REGISTERS_AFTER)
+        kept: dict[str, Mapping[str, bytes] | None] = {}
+        for name in names:
+            kept[name] = None
+            if name in self._held:
+                self._checked.append(name)
+                kept[name] = _registers(self._held[name])
+                if kept[name] is None:
+                    self._add(name, Kind.NO_DOCUMENT)
+        if again.written and not self._aborted:
+            for name in (REGISTERS_BEFORE, REGISTERS_AFTER):
+                if name not in self._held:
+                    self._add(name, Kind.MISSING)
+        told = self._outcome.get("registers")
+        said = Said(
+            before=kept[REGISTERS_BEFORE],
+            earlier=kept[REGISTERS_EARLIER],
+            after=kept[REGISTERS_AFTER],
+            image=again.certified.image if again.certified else None,
+            told=told if isinstance(told, Mapping) else None,
+            held=held_in(self._outcome) if self._outcome else None,
+            forced=self._outcome.get("forced") is not None or not self._outcome,
+            aborted=self._aborted,
+            provisioned=self._check_events(again),
+        )
+        if again.written and not self._aborted and self._outcome and said.told is None:
+            self._add(ATTACHMENT, Kind.VALUE, "registers", stored=told, again="what was written")
+        try:
+            traffic = Traffic(self._recording.register_accesses(), again.bundle.profile)
+            self._differences += check(traffic, said, self._recording.metadata.get("unit", {}).get("serial") or None)
+        except CANNOT as e:
+            self._add("/registers", Kind.NOT_COMPUTED, again=str(e) or repr(e))
+
+    def _check_events(self, again: Again) -> list[str] | None:
+        """The registers that were written, by the event that says so."""
+        events: dict[str, Any] = {}
+        kinds = []
+        try:
+            for event in self._recording.events():
+                kinds.append(event.kind)
+                events[event.kind] = event.detail
+            provisioned = [str(n) for n in events["provisioned"]["written"]] if "provisioned" in events else None
+            failed = events.get("failed", {}).get("error")
+            restored = events.get("restored", {}).get("state")
+        except (RecordingError, ValueError, LookupError, TypeError, AttributeError):
+            self._add(EVENTS, Kind.NO_DOCUMENT)
+            return None
+        if kinds[:1] != ["recording_started"] and not self._mended:
+            self._add(EVENTS, Kind.MISSING, "recording_started")
+        if again.written and not self._aborted and provisioned is None:
+            self._add(EVENTS, Kind.MISSING, "provisioned")
+        if self._outcome:
+            reason = self._outcome.get("reason") if self._aborted else None
+            if failed != reason:
+                self._add(EVENTS, Kind.VALUE, "failed.error", stored=failed, again=reason)
+            state = self._outcome.get("device_state")
+            undone = self._outcome.get("verdict") == Verdict.FAIL.value and again.written
+            if not self._aborted and restored != (state if undone else None):
+                self._add(EVENTS, Kind.VALUE, "restored.state", stored=restored, again=state if undone else None)
+        return provisioned
+
+    def _check_raw(self) -> None:
+        said = self._recording.metadata.get(RAW_RECORD)
+        again = {"records": str(self._raw.whole.records), "sha256": self._raw.whole.hexdigest()}
+        if said is None:
+            self._add(RAW_RECORD, Kind.MISSING)
+            return
+        for key in dict.fromkeys([*said, *again]):
+            if said.get(key) != again.get(key):
+                self._add(RAW_RECORD, Kind.VALUE, key, stored=said.get(key), again=again.get(key))
+
+    # Notes.
+
+    def _versions(self) -> dict[str, tuple[str, str]]:
+        then, now = self._recording.metadata.get("software", {}), {**software(), **drawn_with()}
+        drawn = {name: then.get(name, "unknown") for name in DRAWN_WITH} if not self._older else {}
+        return {n: (v, now[n]) for n, v in {**then, **drawn}.items() if n in now and v != now[n]}
+
+    def _notes(self, not_beside: tuple[str, ...]) -> Notes:
+        return Notes(
+            older=self._older,
+            versions=self._versions(),
+            report_as_listed=self._listed_report,
+            losses=tuple(losses_of(self._recording)),
+            mended=self._mended,
+            not_beside=not_beside,
+            supersedes=self._superseded(),
+        )
+
+    def _superseded(self) -> str | None:
+        digest = self._outcome.get("supersedes")
+        return digest if isinstance(digest, str) and digest not in outcomes_beside(self._path) else None
+
+
+def _object(data: bytes) -> Mapping[str, Any] | None:
+    """A document as one of ours could be: no key twice, no number that is none."""
+    try:
+        found = parse_document(data, where="")
+        to_text(dict(found))
+    except (InputError, ValueError):
+        return None
+    return found
+
+
+def _needs_journal(held: Held, registers: object) -> bool:
+    """Whether something is left to be cleared up."""
+    failed = isinstance(registers, Mapping) and registers.get("undoing_failed") is not None
+    return not held.settled or (failed and held.state is not DeviceState.OLD)
+
+
+def _without_contents(data: bytes) -> bytes:
+    document = json.loads(data)
+    document.pop("contents", None)
+    return to_text(document).encode()
+
+
+def _registers(data: bytes) -> Mapping[str, bytes] | None:
+    found = _object(data)
+    try:
+        return None if found is None else {name: bytes.fromhex(raw) for name, raw in found.items()}
+    except (ValueError, TypeError):
+        return None

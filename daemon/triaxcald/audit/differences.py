@@ -1,0 +1,113 @@
+"""Where a recording says one thing, and what it rests on another. Values alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Any
+
+MOST = 8
+"""So many differences of one document are listed, the others counted."""
+
+
+class Nothing:
+    """In the place of a value that is not there."""
+
+    def __repr__(self) -> str:
+        return "nothing"
+
+
+NOTHING = Nothing()
+
+
+class Kind(Enum):
+    """How a part differs. ``stored`` is what it says, ``again`` what it should say by all the rest."""
+
+    VALUE = auto()
+    BYTES = auto()
+    """The content is the same, its bytes are not."""
+    MORE = auto()
+    """``again`` more of them."""
+    NO_DOCUMENT = auto()
+    NOT_COMPUTED = auto()
+    """``again`` says why."""
+    MISSING = auto()
+    """The outcome lists it, or the result rests on it."""
+    UNCALLED_FOR = auto()
+    """By the verdict there is none."""
+    UNLISTED = auto()
+    """The outcome does not list it."""
+    LISTED = auto()
+    """``place`` is otherwise than the outcome lists it."""
+    NOT_DRAWN = auto()
+    """Drawn again, it comes out otherwise."""
+    ORDER = auto()
+    NOT_LAST = auto()
+    NO_END = auto()
+    """The recording says that it ends with it."""
+    TURNED_BACK = auto()
+    """It was made to end with ``stored``, and does not say so any more."""
+    TWICE = auto()
+    TIMES = auto()
+    SEQUENCE = auto()
+    RUNNING_INDEX = auto()
+    TOPIC = auto()
+    UNDECODABLE = auto()
+    INDEX = auto()
+    NOT_OF_RAW = auto()
+    """The content is not what the raw records give."""
+    NOT_HELD = auto()
+    """The device holds ``stored``, the certificate asks for ``again``."""
+    NOT_READ = auto()
+    """``stored`` is said to have been read, and ``again`` was."""
+    NOT_ASKED_FOR = auto()
+    """``stored`` was written, which nothing asks for."""
+    NOT_SHOWN = auto()
+    """The register traffic does not show ``stored``."""
+    NOT_FORCED = auto()
+    """What the device held there is no calibration, and nobody is said to have overruled that."""
+    BESIDE = auto()
+    """The file beside the recording is not what is in the recording."""
+    ALONE = auto()
+    """There is none in the recording."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """``part`` is an attachment, a topic, a metadata record, or a file; ``place`` where in it."""
+
+    part: str
+    kind: Kind
+    place: str = ""
+    stored: Any = NOTHING
+    again: Any = NOTHING
+
+
+def compare(part: str, stored: bytes, again: bytes) -> list[Difference]:
+    """Two JSON documents, of which the second was computed again."""
+    if stored == again:
+        return []
+    try:
+        before = json.loads(stored)
+    except (ValueError, RecursionError):
+        return [Difference(part, Kind.NO_DOCUMENT)]
+    found = list(differing(part, before, json.loads(again)))
+    if not found:
+        return [Difference(part, Kind.BYTES)]
+    rest = [Difference(part, Kind.MORE, again=len(found) - MOST)] if len(found) > MOST else []
+    return found[:MOST] + rest
+
+
+def differing(part: str, stored: Any, again: Any, at: str = "") -> Iterator[Difference]:
+    """Where two JSON values differ."""
+    if isinstance(stored, Mapping) and isinstance(again, Mapping):
+        for key in dict.fromkeys([*stored, *again]):
+            inner = f"{at}.{key}" if at else str(key)
+            yield from differing(part, stored.get(key, NOTHING), again.get(key, NOTHING), inner)
+    elif isinstance(stored, list) and isinstance(again, list) and len(stored) == len(again):
+        for i, (s, t) in enumerate(zip(stored, again, strict=True)):
+            yield from differing(part, s, t, f"{at}[{i}]")
+    elif type(stored) is not type(again) or stored != again:
+        yield Difference(part, Kind.VALUE, at, stored, again)

@@ -1,0 +1,69 @@
+"""Many recordings, of which none hides another."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from triaxcal.errors import TriaxcalError
+from triaxcal_drivers.errors import DriverError
+from triaxcald.audit.conduct import Audit, audit
+from triaxcald.errors import DaemonError, InputError
+from triaxcald.exit_codes import DONE, OUTSIDE, SEVEREST, exit_code_of
+
+_WILD = frozenset("*?[")
+
+
+@dataclass(frozen=True)
+class Audited:
+    """A recording and its audit, or the ``error`` for which there is none."""
+
+    recording: str
+    audit: Audit | None
+    error: str | None = None
+    exit_code: int = DONE
+
+
+def audit_each(asked: Sequence[Path]) -> Iterator[Audited]:
+    """Recordings, folders of recordings, and patterns, in the order in which they are given, each recording once."""
+    seen: set[Path] = set()
+    for given in asked:
+        try:
+            paths = _recordings_of(given)
+        except InputError as e:
+            yield Audited(str(given), None, str(e), exit_code_of(e))
+            continue
+        for path in paths:
+            if path not in seen:
+                seen.add(path)
+                yield _audited(path)
+
+
+def worst(of: Iterable[Audited]) -> int:
+    codes = {a.exit_code for a in of}
+    return next((code for code in SEVEREST if code in codes), DONE)
+
+
+def _audited(path: Path) -> Audited:
+    try:
+        found = audit(path)
+    except (TriaxcalError, DriverError, DaemonError) as e:
+        return Audited(str(path), None, str(e), exit_code_of(e))
+    return Audited(str(path), found, exit_code=OUTSIDE if found.differences else DONE)
+
+
+def _recordings_of(given: Path) -> list[Path]:
+    """Raises InputError where there is none."""
+    if given.is_dir():
+        found = sorted(path for path in given.rglob("*.mcap") if not path.is_dir())
+        if not found:
+            raise InputError(f"{given}: Is a directory, without a recording (.mcap) in it")
+        return found
+    if not given.exists() and _WILD & set(str(given)):
+        found = sorted(map(Path, glob.glob(str(given), recursive=True)))
+        if not found:
+            raise InputError(f"{given}: no file has a name like this")
+        return [path for of in found for path in (_recordings_of(of) if of.is_dir() else [of])]
+    return [given]

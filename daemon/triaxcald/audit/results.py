@@ -1,0 +1,198 @@
+"""What follows from a recording's raw records, profile, station file and metadata: computed as the station did it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from triaxcal.errors import TriaxcalError
+from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcald.audit.previews import Previews, Thinned
+from triaxcald.certificate import Certified, certify
+from triaxcald.documents import Document
+from triaxcald.errors import DaemonError, RecordingError
+from triaxcald.inputs import CALIBRATION, STATION_FILE, VERIFICATION, bundle_of, signs_of
+from triaxcald.outcome import Ending, Papers, Verdict, measured_in, outcome_document
+from triaxcald.pipeline import Pipeline
+from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.schema import RawDigest
+from triaxcald.report.unit import unit_report
+from triaxcald.station.config import StationFile, parse_station
+from triaxcald.station.endings import judged
+from triaxcald.station.write_back import VERIFICATION_FILE
+from triaxcald.verification import verification_document, verified
+
+CANNOT = (TriaxcalError, DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)
+"""What a changed profile, station file or raw record may end in."""
+
+
+@dataclass(frozen=True)
+class Digests:
+    """Of the raw records: of all, and of each phase by itself."""
+
+    whole: RawDigest
+    calibration: RawDigest
+    verification: RawDigest
+
+
+@dataclass(frozen=True)
+class Again:
+    """``certified`` is None where ``why_not`` says why the poses carry no certificate; ``verification`` is None where
+    there are no check poses, or no output to check."""
+
+    bundle: Bundle
+    station: StationFile
+    readings: Pipeline
+    certified: Certified | None
+    why_not: str
+    verification: Document | None
+    previews: Mapping[str, Thinned]
+
+    @property
+    def written(self) -> bool:
+        """Whether a line that comes to its end writes registers."""
+        c = self.certified
+        return c is not None and c.image is not None and self.station.provisioning.write and c.within_limits
+
+    @property
+    def checked(self) -> bool:
+        """Whether it then asks the device for its own output."""
+        return self.written and CORRECTED in self.bundle.profile.streams
+
+    def ending(self) -> Ending | None:
+        """Of a line that came to its end."""
+        if self.certified is None:
+            return None
+        verification = self.verification if self.checked else None
+        return judged(self.certified.document["outside"], verification, self.station.limits)
+
+
+def digests(recording: Recording) -> Digests:
+    found = Digests(*(RawDigest(recording.ends_with) for _ in range(3)))
+    for phase, batch in recording.raw_batches():
+        found.whole.update(phase, batch)
+        if phase in (CALIBRATION, VERIFICATION):
+            (found.calibration if phase == CALIBRATION else found.verification).update(phase, batch)
+    return found
+
+
+def compute(recording: Recording, raw: Digests) -> Again:
+    """Raises RecordingError, ProfileError, InputError where the recording lacks what there is to compute with."""
+    bundle = bundle_of(recording)
+    if STATION_FILE not in recording.attachments:
+        raise RecordingError(f"attachment {STATION_FILE}: missing")
+    text = recording.attachments[STATION_FILE]
+    station = parse_station(text, where=STATION_FILE)
+    streams = [s for s in (READINGS, CORRECTED) if s in bundle.profile.streams]
+    tumble, check = ({s: Pipeline(bundle, s) for s in streams} for _ in range(2))
+    previews = Previews(bundle.profile)
+    phases: dict[str, dict[str, Pipeline]] = {CALIBRATION: tumble, VERIFICATION: check}
+    for phase, batch in recording.raw_batches():
+        for stream, pipeline in phases.get(phase, {}).items():
+            previews.feed(stream, pipeline.feed(batch))
+    certified, why_not = None, ""
+    try:
+        certified = _certified(recording, bundle, station, text, tumble[READINGS], raw.calibration)
+    except CANNOT as e:
+        why_not = str(e) or repr(e)
+    verification = None
+    if raw.verification.records and CORRECTED in streams:
+        verification = verification_document(
+            verified(tumble[CORRECTED], station.reference),
+            verified(check[CORRECTED], station.reference),
+            limit_g=station.limits.verification_rms_g,
+            raw_sha256=raw.verification.hexdigest(),
+        )
+    return Again(bundle, station, tumble[READINGS], certified, why_not, verification, previews.thinned())
+
+
+def _certified(
+    recording: Recording, bundle: Bundle, station: StationFile, text: bytes, pipeline: Pipeline, digest: RawDigest
+) -> Certified:
+    unit, signs = recording.metadata.get("unit", {}), signs_of(recording)
+    if signs is None:
+        raise ValueError("metadata unit.signs: expected three signs")
+    named = recording.metadata.get("software", {})
+    return certify(
+        bundle,
+        station,
+        text,
+        pipeline,
+        pipeline.finish(),
+        digest,
+        unit_name=unit.get("name", ""),
+        serial=unit.get("serial") or None,
+        signs=signs,
+        computed_with={name: named[name] for name in named if name not in DRAWN_WITH},
+    )
+
+
+DRAWN_WITH = ("matplotlib", "jinja2")
+"""Versions that the recording names and the certificate does not."""
+
+
+def held_in(outcome: Mapping[str, Any]) -> Held | None:
+    """What the device holds, as an outcome says it; None where it says no such thing."""
+    try:
+        return Held(DeviceState(str(outcome.get("device_state"))), Evidence(str(outcome.get("evidence"))))
+    except ValueError:
+        return None
+
+
+def report_of(again: Again, ending: Ending, held: Held) -> str:
+    assert again.certified is not None
+    return unit_report(again.certified, again.readings, ending, again.verification if again.checked else None, held)
+
+
+def outcome_again(
+    stored: Mapping[str, Any], again: Again, recording: Recording, digests_of: Mapping[str, str], contents: Document
+) -> Document:
+    """The outcome as it follows from all the rest. What a recording cannot know of itself is taken as ``stored``:
+    when it ended, which outcome it supersedes, why doubts were overruled, and why work was aborted."""
+    aborted = stored.get("verdict") == Verdict.ABORTED.value
+    ending = None if aborted else again.ending()
+    if ending is None:
+        ending = Ending(
+            Verdict.ABORTED,
+            str(stored.get("reason")),
+            _whole(stored.get("exit_code")),
+            _texts(stored.get("wanted_poses")),
+        )
+    certificate = again.certified.document if again.certified else None
+    if aborted and stored.get("measured") is None:  # it did not come to a fit
+        certificate = None
+    checked = again.checked and not aborted
+    unit = recording.metadata.get("unit", {})
+    named = recording.metadata.get("software", {})
+    return outcome_document(
+        ending,
+        held_in(stored) or Held(),
+        Papers(
+            measured=measured_in(certificate) if certificate else None,
+            verification=again.verification if VERIFICATION_FILE in recording.attachments or checked else None,
+            registers=stored.get("registers"),
+            limits=again.station.limits.model_dump(),
+            outside=certificate["outside"] if certificate else (),
+            digests=digests_of,
+            contents=contents,
+        ),
+        unit=unit.get("name", ""),
+        serial=unit.get("serial") or None,
+        station=again.station.name,
+        ended=str(stored.get("ended")),
+        software={name: named[name] for name in named if name not in DRAWN_WITH},
+        supersedes=stored.get("supersedes"),
+        journal=stored.get("journal"),
+        forced=stored.get("forced"),
+    )
+
+
+def _whole(value: object) -> int:
+    return value if isinstance(value, int) else -1
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    return tuple(map(str, value)) if isinstance(value, list) else ()

@@ -1,0 +1,156 @@
+"""What an audit has found, in lines for people. Nothing reads them back."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from triaxcald.audit.conduct import Audit, Notes
+from triaxcald.audit.differences import NOTHING, Difference, Kind
+from triaxcald.audit.many import Audited
+
+_LONGEST = 60
+
+
+def difference(of: Difference) -> str:
+    return f"{of.part}: {_what(of)}"
+
+
+def _what(of: Difference) -> str:
+    place, stored, again = of.place, _short(of.stored), _short(of.again)
+    match of.kind:
+        case Kind.VALUE:
+            return f"{place}: stored {stored}, computed again {again}"
+        case Kind.BYTES:
+            return "the bytes differ, the content does not"
+        case Kind.MORE:
+            return f"and {of.again} more"
+        case Kind.NO_DOCUMENT:
+            return "the stored one is no JSON document that could be"
+        case Kind.NOT_COMPUTED:
+            return f"cannot be computed again: {of.again}"
+        case Kind.MISSING:
+            return f"{place}: missing" if place else "missing, though the result rests on it"
+        case Kind.UNCALLED_FOR:
+            return "by what was measured there is none"
+        case Kind.UNLISTED:
+            return "is in the recording, and the outcome does not list it"
+        case Kind.LISTED:
+            return f"{place}: the outcome lists {stored}, the recording has {again}"
+        case Kind.NOT_DRAWN:
+            return "drawn again, it comes out otherwise"
+        case Kind.ORDER:
+            return "in another order than the outcome lists them"
+        case Kind.NOT_LAST:
+            return f"not the last attachment; that is {_bare(of.again)}"
+        case Kind.NO_END:
+            return "missing, though the recording says that it ends with it"
+        case Kind.TURNED_BACK:
+            return f"the recording was made to end with {of.stored}, and was turned back into the format before it"
+        case Kind.TWICE:
+            return "is in the recording more than once"
+        case Kind.TIMES:
+            return f"{_records(of)} with other times than those in the content"
+        case Kind.SEQUENCE:
+            return f"{_records(of)} with a sequence number, which the station gives none"
+        case Kind.RUNNING_INDEX:
+            return f"{of.again} gaps in the running index that are not noted as losses"
+        case Kind.TOPIC:
+            return "a topic that no recording has"
+        case Kind.UNDECODABLE:
+            return f"{_records(of)} that cannot be decoded"
+        case Kind.INDEX:
+            return "the index at the end of the file is not of what is in it"
+        case Kind.NOT_OF_RAW:
+            return "not what the raw records give"
+        case Kind.NOT_HELD:
+            return f"{place}: the device holds {_bare(of.stored)}, the certificate asks for {_bare(of.again)}"
+        case Kind.NOT_READ:
+            return f"{place}: {_bare(of.stored)} here, {_bare(of.again)} by the register traffic"
+        case Kind.NOT_ASKED_FOR:
+            return f"{place}: {_bare(of.stored)} was written, which neither the certificate nor the profile asks for"
+        case Kind.NOT_SHOWN:
+            return f"{place}: {stored}: the register traffic does not bear it out"
+        case Kind.NOT_FORCED:
+            return f"forced: {place} held no plausible calibration before, and no reason is given for writing over it"
+        case Kind.BESIDE:
+            return "the file beside the recording is not the one in it"
+        case Kind.ALONE:
+            return "lies beside the recording, which has none"
+
+
+def _records(of: Difference) -> str:
+    return f"{of.again} record{'' if of.again == 1 else 's'}"
+
+
+def _bare(value: object) -> str:
+    return value if isinstance(value, str) else _short(value)
+
+
+def _short(value: object) -> str:
+    if value is NOTHING:
+        return "nothing"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "…"
+
+
+def notes(of: Notes) -> list[str]:
+    found = []
+    if of.older:
+        found.append(
+            "recorded before there were outcomes, and audited by the rules of that format: nothing in it vouches for "
+            "the report, and no one word says how the run ended"
+        )
+    found += [f"{name}: {then} then, {now} now" for name, (then, now) in of.versions.items()]
+    if of.report_as_listed:
+        found.append("report.html was not drawn again, since versions differ; it is compared with the outcome's digest")
+    found += of.losses
+    if of.mended:
+        found.append("the recording was cut short or damaged, and mended")
+    if of.supersedes:
+        found.append(f"the outcome that this one supersedes is not in the folder: SHA-256 {of.supersedes}")
+    if of.not_beside:
+        found.append(f"not beside the recording: {', '.join(of.not_beside)}")
+    return found
+
+
+def heading(of: Audit) -> str:
+    verdict = f"; verdict {of.verdict}" if of.verdict else ""
+    result = "differs" if of.differences else "the same, byte for byte"
+    return f"{of.recording}: {result} ({', '.join(of.checked)}){verdict}"
+
+
+def summary(of: Sequence[Audited]) -> str:
+    """ "12 recordings: 10 agree, 1 differs, 1 unreadable"."""
+    counts = _counted(of)
+    told = [f"{counts['agree']} agree{'s' if counts['agree'] == 1 else ''}"]
+    if counts["differ"]:
+        told.append(f"{counts['differ']} differ{'s' if counts['differ'] == 1 else ''}")
+    if counts["unreadable"]:
+        told.append(f"{counts['unreadable']} unreadable")
+    return f"{len(of)} recording{'' if len(of) == 1 else 's'}: {', '.join(told)}"
+
+
+def counts(of: Sequence[Audited]) -> dict[str, int]:
+    """The same as numbers, for the document."""
+    found = _counted(of)
+    return {"recordings": len(of), **{name: found[name] for name in ("agree", "differ", "unreadable")}}
+
+
+def document(of: Audited) -> dict[str, Any]:
+    """An entry of `triaxcal.audit/1`."""
+    found = of.audit
+    return {
+        "recording": of.recording,
+        "checked": list(found.checked) if found else [],
+        "differences": [difference(d) for d in found.differences] if found else [],
+        "notes": notes(found.notes) if found else [],
+        "verdict": found.verdict if found else None,
+        "error": of.error,
+    }
+
+
+def _counted(of: Sequence[Audited]) -> Counter[str]:
+    return Counter("unreadable" if a.audit is None else "differ" if a.audit.differences else "agree" for a in of)

@@ -1,0 +1,324 @@
+"""The register traffic: what was read and written, against what the recording says was there, and is there now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from triaxcal_drivers.profile import Profile, WriteStep
+from triaxcald.audit.differences import Difference, Kind
+from triaxcald.outcome import ATTACHMENT
+from triaxcald.provision import snapshot
+from triaxcald.provision.image import RegisterImage, calibration_registers
+from triaxcald.provision.plausible import doubts
+from triaxcald.provision.power import MISSED
+from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.recording.schema import REGISTERS, RegisterAccess
+from triaxcald.station.write_back import REGISTERS_AFTER, REGISTERS_BEFORE
+
+Raw = Mapping[str, bytes]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All calibration registers, read one after the other up to the access ``at``."""
+
+    at: int
+    raw: Raw
+
+
+class Traffic:
+    """Register accesses in their order, read as what the line did. ``profile`` says which registers are which."""
+
+    def __init__(self, accesses: Iterable[RegisterAccess], profile: Profile) -> None:
+        self.accesses = list(accesses)
+        self.profile = profile
+        self.names = calibration_registers(profile)
+
+    @cached_property
+    def writes(self) -> list[tuple[int, RegisterAccess]]:
+        """Of calibration registers, those that failed too."""
+        return [(i, a) for i, a in enumerate(self.accesses) if a.operation == "write" and a.register in self.names]
+
+    @cached_property
+    def snapshots(self) -> list[Snapshot]:
+        found, part = [], dict[str, bytes]()
+        for i, a in enumerate(self.accesses):
+            if a.operation != "read" or a.error or a.register not in self.names:
+                continue
+            if a.register != self.names[len(part)]:
+                part = {}
+            if a.register == self.names[len(part)]:
+                part[a.register] = a.raw
+            if len(part) == len(self.names):
+                found.append(Snapshot(i, part))
+                part = {}
+        return found
+
+    @property
+    def last_write(self) -> int:
+        return self.writes[-1][0] if self.writes else -1
+
+    @cached_property
+    def known(self) -> Raw:
+        """What was read last of each calibration register, without those that were written since."""
+        found: dict[str, bytes] = {}
+        for a in self.accesses:
+            if a.operation == "write":
+                found.pop(a.register, None)
+            elif a.register in self.names and not a.error:
+                found[a.register] = a.raw
+        return found
+
+    def steps(self, label: str) -> list[tuple[int, RegisterAccess]]:
+        """Writes of a sequence of the profile."""
+        wanted = self.sequence(label)
+        held = enumerate(self.accesses)
+        return [(i, a) for i, a in held if a.operation == "write" and (a.register, a.raw) in wanted]
+
+    def sequence(self, label: str) -> set[tuple[str, bytes]]:
+        steps = getattr(self.profile.sequences, label)
+        return {(s.write, self.profile.encode(s.write, s.value)) for s in steps if isinstance(s, WriteStep)}
+
+    def counts(self) -> list[bytes]:
+        """What the device's counter of stores was read as."""
+        name = self.profile.by_role("write_counter")
+        return [a.raw for a in self.accesses if a.register == name and a.operation == "read" and not a.error]
+
+    def silent_since(self, at: int) -> bool:
+        """Whether the device went silent, as one does that loses its supply, and was read again."""
+        missed = longest = 0
+        for a in self.accesses[at + 1 :]:
+            if a.operation == "read":
+                missed = missed + 1 if a.error else 0
+                longest = max(longest, missed)
+        return longest >= MISSED
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a recording says of its registers. ``earlier`` is what an undoing brings back where it is not ``before``;
+    ``image`` what the certificate asks for; ``told`` and ``held`` are the outcome's, None in a recording without one.
+    """
+
+    before: Raw | None
+    earlier: Raw | None
+    after: Raw | None
+    image: RegisterImage | None
+    told: Mapping[str, object] | None
+    held: Held | None
+    forced: bool
+    aborted: bool
+    provisioned: Sequence[str] | None
+    """The registers that were written, by the event; None where there is no such event."""
+
+    @property
+    def old(self) -> Raw | None:
+        return self.before if self.earlier is None else self.earlier
+
+    @property
+    def new(self) -> Raw:
+        return self.image.raw if self.image else {}
+
+
+def check(traffic: Traffic, said: Said, serial: str | None) -> list[Difference]:
+    return [
+        *_identity(traffic, serial),
+        *_asked_for(traffic, said),
+        *_before(traffic, said),
+        *_after(traffic, said),
+        *_told(traffic, said),
+        *_state(traffic, said),
+    ]
+
+
+def _identity(traffic: Traffic, serial: str | None) -> list[Difference]:
+    """Whoever answered is the unit that is meant."""
+    identity = traffic.profile.identity
+    meant: dict[str, object] = dict(identity.expect)
+    if identity.serial_register:
+        meant[identity.serial_register] = serial
+    found: dict[str, Difference] = {}
+    for a in traffic.accesses:
+        if a.operation == "read" and not a.error and a.register in meant:
+            register = traffic.profile.registers[a.register]
+            number = round((traffic.profile.decode(a.register, a.raw) - register.offset) / register.scale)
+            answered: object = f"{number:04d}" if a.register == identity.serial_register else number
+            if answered != meant[a.register]:
+                found[a.register] = Difference(REGISTERS, Kind.NOT_READ, a.register, meant[a.register], answered)
+    return list(found.values())
+
+
+def _asked_for(traffic: Traffic, said: Said) -> list[Difference]:
+    """Every write is of the certificate's image, of what the device held before, or of a sequence of the profile."""
+    steps = {step for label in ("unlock", "store", "lock", "reset") for step in traffic.sequence(label)}
+    asked = {(name, raw) for some in (said.new, said.before, said.earlier) for name, raw in (some or {}).items()}
+    written = dict.fromkeys((a.register, a.raw) for a in traffic.accesses if a.operation == "write")
+    return [
+        Difference(REGISTERS, Kind.NOT_ASKED_FOR, name, raw.hex())
+        for name, raw in written
+        if (name, raw) not in asked and (name, raw) not in steps
+    ]
+
+
+def _before(traffic: Traffic, said: Said) -> list[Difference]:
+    if said.before is None:
+        missing = bool(traffic.writes) or said.provisioned is not None
+        return [Difference(REGISTERS_BEFORE, Kind.MISSING)] if missing else []
+    first = traffic.writes[0][0] if traffic.writes else len(traffic.accesses)
+    read = [s.raw for s in traffic.snapshots if s.at < first]
+    if not traffic.writes and any(raw == said.before for raw in read):
+        return []
+    return _unequal(REGISTERS_BEFORE, said.before, read[-1] if read else {})
+
+
+def _after(traffic: Traffic, said: Said) -> list[Difference]:
+    if said.after is None:
+        return [Difference(REGISTERS_AFTER, Kind.MISSING)] if said.provisioned is not None else []
+    found = [
+        Difference(
+            REGISTERS_AFTER, Kind.NOT_HELD, name, said.after[name].hex() if name in said.after else None, raw.hex()
+        )
+        for name, raw in said.new.items()
+        if said.after.get(name) != raw
+    ]
+    if said.provisioned is None:
+        found.append(Difference(REGISTERS, Kind.NOT_SHOWN, "provisioned", REGISTERS_AFTER))
+    if found or any(s.raw == said.after for s in traffic.snapshots):
+        return found
+    return _unequal(REGISTERS_AFTER, said.after, traffic.known)
+
+
+def _unequal(part: str, stored: Raw, read: Raw) -> list[Difference]:
+    return [
+        Difference(part, Kind.NOT_READ, name, *(of[name].hex() if name in of else None for of in (stored, read)))
+        for name in dict.fromkeys([*stored, *read])
+        if stored.get(name) != read.get(name)
+    ]
+
+
+def _told(traffic: Traffic, said: Said) -> list[Difference]:
+    """What the outcome, or the event alone, says was written."""
+    written = _names(said.told.get("written")) if said.told else said.provisioned
+    found: list[Difference] = []
+
+    def expect(place: str, stored: object, again: object) -> None:
+        if stored != again:
+            found.append(Difference(ATTACHMENT, Kind.VALUE, f"registers.{place}", stored, again))
+
+    image = said.new
+    seen = list(dict.fromkeys(a.register for _, a in traffic.writes if a.raw == image.get(a.register)))
+    if written is None:
+        return [Difference(REGISTERS, Kind.NOT_ASKED_FOR, n) for n in seen]
+    # A stop may come between a request and its record; an undoing may write what is old and new alike.
+    cut = said.aborted and seen == list(written[:-1])
+    if seen[: len(written)] != list(written) and not cut:
+        found.append(Difference(REGISTERS, Kind.NOT_SHOWN, "written", list(written), seen))
+    if said.provisioned is not None and list(said.provisioned) != list(written):
+        found.append(Difference("/events", Kind.VALUE, "provisioned.written", list(said.provisioned), list(written)))
+    if said.told and said.before is not None:
+        differing = [name for name, raw in said.before.items() if name in image and image[name] != raw]
+        expect("differing", said.told.get("differing"), differing)
+        expect("cut_short_before", said.told.get("cut_short_before"), said.earlier is not None)
+        if said.image and said.earlier is None and not said.forced:
+            found += [
+                Difference(ATTACHMENT, Kind.NOT_FORCED, doubt.register)
+                for doubt in doubts(traffic.profile, snapshot.Snapshot(said.before), said.image)
+            ]
+        if not said.aborted:
+            expect("written", list(written), differing)
+            expect("undoing_failed", said.told.get("undoing_failed"), None)
+        stores = bool(traffic.sequence("store"))
+        if said.told.get("stored") and stores and not traffic.steps("store"):
+            found.append(Difference(ATTACHMENT, Kind.NOT_SHOWN, "registers.stored", said.told.get("stored")))
+    return found
+
+
+def _names(value: object) -> list[str]:
+    return list(map(str, value)) if isinstance(value, list) else []
+
+
+def _state(traffic: Traffic, said: Said) -> list[Difference]:
+    """Whether the traffic bears out what the device is said to hold."""
+    if said.held is None:
+        return []
+    shown = _SHOWN[said.held.state](traffic, said)
+    proof = _PROVEN.get(said.held.evidence)
+    proven = said.held.evidence in _GOES_WITH[said.held.state] and (proof is None or proof(traffic, said))
+    found = [] if shown else [Difference(ATTACHMENT, Kind.NOT_SHOWN, "device_state", said.held.state.value)]
+    return found if proven else [*found, Difference(ATTACHMENT, Kind.NOT_SHOWN, "evidence", said.held.evidence.value)]
+
+
+def _new(traffic: Traffic, said: Said) -> bool:
+    return bool(said.new) and traffic.known == {**traffic.known, **said.new}
+
+
+def _old(traffic: Traffic, said: Said) -> bool:
+    return bool(said.old) and traffic.known == {**traffic.known, **(said.old or {})}
+
+
+def _mixed(traffic: Traffic, said: Said) -> bool:
+    return not _new(traffic, said) and not _old(traffic, said)
+
+
+_Shows = Callable[[Traffic, Said], bool]
+_SHOWN: dict[DeviceState, _Shows] = {
+    DeviceState.UNTOUCHED: lambda traffic, _: not traffic.writes,
+    DeviceState.OLD: _old,
+    DeviceState.NEW_VERIFIED: _new,
+    DeviceState.NEW_UNVERIFIED: _new,
+    DeviceState.MIXED: _mixed,
+    DeviceState.UNKNOWN: lambda *_: True,  # a link that died shows nothing
+}
+_GOES_WITH: dict[DeviceState, tuple[Evidence, ...]] = {
+    DeviceState.UNTOUCHED: (Evidence.NOTHING_WRITTEN,),
+    DeviceState.OLD: (
+        Evidence.NOTHING_STORED, Evidence.READ_BACK, Evidence.RESTART, Evidence.POWER_CYCLE, Evidence.WRITE_COUNTER,
+    ),
+    DeviceState.NEW_VERIFIED: (Evidence.RESTART, Evidence.POWER_CYCLE),
+    DeviceState.NEW_UNVERIFIED: (Evidence.READ_BACK, Evidence.WRITE_COUNTER),
+    DeviceState.MIXED: (Evidence.READ_BACK, Evidence.RESTART, Evidence.POWER_CYCLE),
+    DeviceState.UNKNOWN: (Evidence.NO_ANSWER, Evidence.READ_BACK, Evidence.RESTART),
+}  # fmt: skip
+
+
+def _restarted(traffic: Traffic, said: Said) -> bool:
+    """A restart after the last write, then all registers read. One that nobody acknowledged counts where an old value
+    was put into a register in use before it, and did not come back."""
+    if not traffic.sequence("reset"):  # by no register, so that no traffic could show it
+        return True
+    image, old = said.new, said.before or {}
+    tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
+    last = traffic.snapshots[-1].at if traffic.snapshots else -1
+    lasting = said.held is not None and said.held.state is DeviceState.OLD
+    if _acknowledged(traffic):
+        return True
+    return (tried or lasting) and any(traffic.last_write < i < last for i, _ in traffic.steps("reset"))
+
+
+def _power_cycled(traffic: Traffic, said: Said) -> bool:
+    return traffic.silent_since(traffic.last_write)
+
+
+def _not_restarted(traffic: Traffic, said: Said) -> bool:
+    """Nothing was read after a restart that was acknowledged: else it would have proven the registers."""
+    return said.held is None or said.held.state is not DeviceState.NEW_UNVERIFIED or not _acknowledged(traffic)
+
+
+def _acknowledged(traffic: Traffic) -> bool:
+    last = traffic.snapshots[-1].at if traffic.snapshots else -1
+    return any(not a.error for i, a in traffic.steps("reset") if traffic.last_write < i < last)
+
+
+def _counted(traffic: Traffic, said: Said) -> bool:
+    return len(set(traffic.counts())) > 1
+
+
+_PROVEN: dict[Evidence, _Shows] = {
+    Evidence.NOTHING_STORED: lambda traffic, _: not traffic.steps("store"),
+    Evidence.READ_BACK: _not_restarted,
+    Evidence.RESTART: _restarted,
+    Evidence.POWER_CYCLE: _power_cycled,
+    Evidence.WRITE_COUNTER: _counted,
+}

@@ -1,0 +1,279 @@
+"""What a finished recording's file consists of, record by record, and where its parts contradict each other."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Footer,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from triaxcald.recording import schema
+from triaxcald.recording.frames import HEAD, Frame, chunk_data, chunk_records, parse, whole_chunk_head
+from triaxcald.recording.inventory import Inventory
+from triaxcald.recording.reader import Recording
+
+Kind = Literal["twice", "times", "sequence", "running_index", "topic", "undecodable", "index"]
+AFTER_THE_END = (schema.RAW_RECORD, schema.END_RECORD, schema.RECOVERY_RECORD)
+"""Metadata records that are written after the document that the recording ends with, and are in no inventory."""
+_TOPICS = frozenset([*(topic for topic, _ in schema.CHANNELS), *schema.PREVIEWS])
+_INDEX_HEAD, _INDEX_ENTRY = struct.Struct("<HI"), struct.Struct("<QQ")
+_CHANNEL_AND_TIME = struct.Struct("<HIQ")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Of what is in the file: ``kind`` of contradiction, ``part`` a topic, a name or an index, how many records."""
+
+    kind: Kind
+    part: str
+    count: int = 1
+
+
+@dataclass
+class Survey:
+    """``inventory`` of all that is before the document that the recording ends with, which is ``last`` among the
+    attachments where all is well; ``faults`` of the file itself."""
+
+    inventory: Inventory = field(default_factory=Inventory)
+    attachments: list[str] = field(default_factory=list)
+    faults: list[Fault] = field(default_factory=list)
+
+    @property
+    def last(self) -> str | None:
+        return self.attachments[-1] if self.attachments else None
+
+
+def survey(recording: Recording, end: str) -> Survey:
+    """``end`` names the attachment that the recording ends with. Raises RecordingError."""
+    return _Surveying(recording, end).run()
+
+
+class _Surveying:
+    def __init__(self, recording: Recording, end: str) -> None:
+        self._recording, self._end = recording, end
+        self._found = Survey()
+        self._counts: Counter[tuple[Kind, str]] = Counter()
+        self._metadata: list[str] = []
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._messages: Counter[int] = Counter()
+        self._times_ns: tuple[int, int] | None = None
+        self._raw_end = 0
+        self._gaps: list[tuple[int, int]] = []  # of running indices of raw records, first and end
+        self._lost: list[tuple[int, int]] = []  # and what is noted as lost
+        self._indices: list[Any] = []  # that the summary has to have
+        self._expected: dict[int, bytes] = {}  # message indices of the latest chunk by channel
+        self._chunk: ChunkIndex | None = None
+
+    def run(self) -> Survey:
+        summary: list[tuple[Frame, Any]] = []
+        ended = False
+        for frame in self._recording.frames():
+            if ended:
+                summary.append((frame, parse(frame, self._recording.name)))
+            elif frame.opcode == Opcode.DATA_END:
+                self._close_chunk()
+                ended = True
+            else:
+                self._data(frame)
+        self._check_summary(summary)
+        for names in (self._found.attachments, self._metadata):
+            for name, count in Counter(names).items():
+                self._counts["twice", name] += count - 1
+        self._found.faults += [Fault(kind, part, n) for (kind, part), n in self._counts.items() if n]
+        return self._found
+
+    def _data(self, frame: Frame) -> None:
+        if frame.opcode == Opcode.MESSAGE_INDEX:
+            self._message_index(frame)
+            return
+        self._close_chunk()
+        if frame.opcode == Opcode.CHUNK:
+            self._records(frame)
+            return
+        record = parse(frame, self._recording.name)
+        length = frame.end - frame.offset
+        if isinstance(record, Attachment):
+            self._attachment(record)
+            self._indices.append(
+                AttachmentIndex(
+                    offset=frame.offset, length=length, create_time=record.create_time, log_time=record.log_time,
+                    data_size=len(record.data), name=record.name, media_type=record.media_type,
+                )
+            )  # fmt: skip
+        elif isinstance(record, Metadata):
+            self._metadata.append(record.name)
+            self._indices.append(MetadataIndex(offset=frame.offset, length=length, name=record.name))
+            if record.name not in AFTER_THE_END:
+                self._found.inventory.metadata(record.name, record.metadata)
+
+    def _attachment(self, record: Attachment) -> None:
+        self._found.attachments.append(record.name)
+        if record.create_time != record.log_time:
+            self._counts["times", record.name] += 1
+        if record.name != self._end:
+            self._found.inventory.attachment(record.name, record.media_type, record.log_time, record.data)
+
+    # Chunks and what they hold.
+
+    def _records(self, frame: Frame) -> None:
+        name, head = self._recording.name, whole_chunk_head(frame, self._recording.name)
+        data = chunk_data(frame, name)
+        self._chunk = ChunkIndex(
+            chunk_length=frame.end - frame.offset, chunk_start_offset=frame.offset, compression=head.compression,
+            compressed_size=len(head.data), message_end_time=head.message_end_time, message_index_length=0,
+            message_index_offsets={}, message_start_time=head.message_start_time,
+            uncompressed_size=head.uncompressed_size,
+        )  # fmt: skip
+        entries: dict[int, list[bytes]] = {}
+        for at, channel_id, time_ns in _messages_in(data):
+            entries.setdefault(channel_id, []).append(_INDEX_ENTRY.pack(time_ns, at))
+        self._expected = {channel_id: b"".join(sorted(held)) for channel_id, held in entries.items()}
+        times: list[int] = []
+        for record in chunk_records(data):
+            if isinstance(record, Schema):
+                self._declare(self._schemas, record.id, record)
+            elif isinstance(record, Channel):
+                self._declare(self._channels, record.id, record)
+                self._channel(record)
+            else:
+                times.append(record.log_time)
+                self._message(record)
+        if times and (min(times), max(times)) != (head.message_start_time, head.message_end_time):
+            self._counts["index", "chunk"] += 1
+        if times:
+            first, last = self._times_ns or (times[0], times[0])
+            self._times_ns = min(first, *times), max(last, *times)
+
+    def _declare(self, known: dict[int, Any], number: int, record: Any) -> None:
+        if known.setdefault(number, record) != record:
+            self._counts["index", "declaration"] += 1
+
+    def _channel(self, channel: Channel) -> None:
+        if channel.topic not in _TOPICS:
+            self._counts["topic", channel.topic] += 1
+        kind = self._schemas.get(channel.schema_id) or Schema(id=0, data=b"", encoding="", name="")
+        self._found.inventory.channel(
+            channel.topic, channel.message_encoding, channel.metadata, (kind.name, kind.encoding, kind.data)
+        )
+
+    def _message(self, message: Message) -> None:
+        self._messages[message.channel_id] += 1
+        channel = self._channels.get(message.channel_id)
+        topic = channel.topic if channel else f"channel {message.channel_id}"
+        self._found.inventory.message(topic, message.log_time, message.publish_time, message.data)
+        if message.sequence:
+            self._counts["sequence", topic] += 1
+        try:
+            own_ns = self._raw(message) if topic == schema.RAW else schema.decode_time(message.data)
+            if topic == schema.LOSS:
+                loss = schema.decode_loss(message.data)
+                self._lost += [(loss.first, loss.first + loss.records)] if loss.where == schema.RAW else []
+        except ValueError:
+            self._counts["undecodable", topic] += 1
+            return
+        if (message.log_time, message.publish_time) != (own_ns, own_ns):
+            self._counts["times", topic] += 1
+
+    def _raw(self, message: Message) -> int:
+        """Its own time, which is that of its last record."""
+        first, _, batch = schema.decode_raw(message.data)
+        if first != self._raw_end:
+            self._gaps.append((self._raw_end, first))
+        self._raw_end = first + len(batch)
+        return int(batch.time_ns[-1]) if len(batch) else message.log_time
+
+    # Indices.
+
+    def _message_index(self, frame: Frame) -> None:
+        channel_id, length = _INDEX_HEAD.unpack_from(frame.body)
+        held = frame.body[_INDEX_HEAD.size :]
+        size = _INDEX_ENTRY.size
+        entries = b"".join(sorted(held[i : i + size] for i in range(0, len(held), size)))
+        if len(held) != length or self._chunk is None or self._expected.pop(channel_id, None) != entries:
+            self._counts["index", "messages"] += 1
+        if self._chunk is not None:
+            self._chunk.message_index_offsets[channel_id] = frame.offset
+            self._chunk.message_index_length += frame.end - frame.offset
+
+    def _close_chunk(self) -> None:
+        if self._chunk is not None:
+            self._counts["index", "messages"] += len(self._expected)
+            self._indices.append(self._chunk)
+        self._chunk, self._expected = None, {}
+
+    def _check_summary(self, summary: list[tuple[Frame, Any]]) -> None:
+        wanted = [*self._schemas.values(), *self._channels.values(), self._statistics(), *self._indices]
+        groups: dict[int, tuple[int, int]] = {}
+        offsets: list[tuple[int, int, int]] = []
+        found = []
+        for frame, record in summary:
+            if isinstance(record, SummaryOffset):
+                offsets.append((record.group_opcode, record.group_start, record.group_length))
+            elif not isinstance(record, Footer):
+                start, length = groups.get(frame.opcode, (frame.offset, 0))
+                groups[frame.opcode] = start, length + frame.end - frame.offset
+                found.append(record)
+        for kind in (Schema, Channel, Statistics, ChunkIndex, AttachmentIndex, MetadataIndex):
+            has, should = ([r for r in some if isinstance(r, kind)] for some in (found, wanted))
+            if has != should:
+                self._counts["index", _NAMES[kind]] += 1
+        if {o for o in offsets if o[2]} != {(code, *place) for code, place in groups.items()}:
+            self._counts["index", "groups"] += 1
+        self._counts["running_index", schema.RAW] += sum(not self._is_noted(*gap) for gap in self._gaps)
+
+    def _is_noted(self, first: int, end: int) -> bool:
+        """Whether the raw records between two running indices are noted as lost."""
+        if end < first:
+            return False
+        for begin, until in sorted(self._lost):
+            if begin <= first:
+                first = max(first, until)
+        return first >= end
+
+    def _statistics(self) -> Statistics:
+        first, last = self._times_ns or (0, 0)
+        of = Counter(type(index) for index in self._indices)
+        return Statistics(
+            attachment_count=of[AttachmentIndex], channel_count=len(self._channels),
+            channel_message_counts=dict(self._messages), chunk_count=of[ChunkIndex],
+            message_count=self._messages.total(), message_end_time=last, message_start_time=first,
+            metadata_count=of[MetadataIndex], schema_count=len(self._schemas),
+        )  # fmt: skip
+
+
+_NAMES: dict[type, str] = {
+    Schema: "schemas",
+    Channel: "channels",
+    Statistics: "statistics",
+    ChunkIndex: "chunks",
+    AttachmentIndex: "attachments",
+    MetadataIndex: "metadata",
+}
+
+
+def _messages_in(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Of each message in a chunk: where it begins, its channel and its log time."""
+    at = 0
+    while at + HEAD.size <= len(data):
+        opcode, length = HEAD.unpack_from(data, at)
+        if opcode == Opcode.MESSAGE and length >= _CHANNEL_AND_TIME.size:
+            channel_id, _, time_ns = _CHANNEL_AND_TIME.unpack_from(data, at + HEAD.size)
+            yield at, channel_id, time_ns
+        at += HEAD.size + length
