@@ -93,7 +93,8 @@ def _stream(bundle: Callable[..., Any], reply: Reply, between: Callable[[], None
 
     async def work() -> tuple[int, float]:
         async with served(reply) as port:
-            device = ModbusDevice(bundle().profile, ModbusBus(host="127.0.0.1", port=port, unit_id=17))
+            profile = bundle(("poll_period_s = 0.001", "poll_period_s = 0.05")).profile
+            device = ModbusDevice(profile, ModbusBus(host="127.0.0.1", port=port, unit_id=17))
             await device.open()
             begun_s, came = virtual().time(), 0
             try:
