@@ -78,15 +78,28 @@ def passed(verification: Mapping[str, Any] | None) -> str:
         return "the fit is within the limits"
     limit = verification["limit_rms_g"]
     told = "" if limit is None else f", limit {micro_g(limit)}"
-    return f"within the limits; the device's own output in the check poses is {_checked(verification)}{told}"
+    return f"within the limits; the device's own output in {_poses(verification)} is {_checked(verification)}{told}"
 
 
 def verification_failed(verification: Mapping[str, Any]) -> str:
     limit = verification["limit_rms_g"]
     if limit is None:
         before = micro_g(verification["before_rms_g"])
-        return f"the device's own output in the check poses is {_checked(verification)}, worse than the {before} before"
-    return f"the device's own output in the check poses is {_checked(verification)}, limit {micro_g(limit)}"
+        limited = f"worse than {before} before"
+    else:
+        limited = f"limit {micro_g(limit)}"
+    return f"the device's own output in {_poses(verification)} is {_checked(verification)}, {limited}"
+
+
+def _poses(verification: Mapping[str, Any]) -> str:
+    count, apart = sum(p["used"] for p in verification["poses"]), verification.get("poses_apart")
+    if apart is None or count == 0:
+        return "the check poses"
+    if apart == 0:
+        return f"{count} check poses in the attitudes of the fit"
+    if apart == count:
+        return f"{count} check poses in other attitudes than the fit's"
+    return f"{count} check poses ({apart} in other attitudes than the fit's)"
 
 
 def _checked(verification: Mapping[str, Any]) -> str:

@@ -19,6 +19,7 @@ from triaxcal.poses.pose import Pose
 from triaxcald.documents import Document, error, number, uncertainty
 from triaxcald.doubts import ANOTHER_UNIT
 from triaxcald.pipeline import Pipeline, creeping
+from triaxcald.station.guidance import ups
 
 WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"
 BY_CHANCE = 0.01
@@ -57,6 +58,17 @@ class Verification:
     def noise_floor_g(self) -> float | None:
         return _rms(self._trusted(self.standard_error_g))
 
+    @property
+    def expanded_uncertainty_g(self) -> float | None:
+        """Of the rms, from the noise of the poses, with a coverage factor of 2.
+
+        The mean of e² has the variance Σ(4 e² s² + 2 s⁴)/n², for errors e with standard errors s.
+        """
+        rms_g, e, s = self.rms_g, self._trusted(self.error_g), self._trusted(self.standard_error_g)
+        if not rms_g:
+            return None
+        return float(np.sqrt(np.sum(4 * e**2 * s**2 + 2 * s**4)) / (len(e) * rms_g))
+
     def _trusted(self, values: Floats) -> Floats:
         return np.delete(values, [i for i, p in enumerate(self.poses) if p.fault])
 
@@ -70,6 +82,30 @@ def verify(poses: Sequence[Pose], reference: float) -> Verification:
     n = a / np.maximum(length[:, None], 1e-300)
     covariance = np.array([p.covariance for p in poses])
     return Verification(poses, length - reference, np.sqrt(np.einsum("ni,nij,nj->n", n, covariance, n)))
+
+
+@dataclass(frozen=True)
+class Apart:
+    """``fitted`` (n,3) are the directions of up of the fit's poses; a check pose ``apart_deg`` from all of them is in
+    another attitude."""
+
+    fitted: Floats
+    apart_deg: float
+
+    def angles_deg(self, poses: Sequence[Pose]) -> Floats:
+        """(m,) from each check pose to the nearest of the fit."""
+        a = np.array([p.mean for p in poses]).reshape(-1, 3)
+        n = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300)
+        cosines: Floats = np.clip(np.max(n @ self.fitted.T, axis=1, initial=-1.0), -1.0, 1.0)
+        return np.asarray(np.degrees(np.arccos(cosines)))
+
+
+def fitted_attitudes(readings: Pipeline, signs: Sequence[int]) -> Floats:
+    """(n,3): the directions of up of the poses that a calibration is made of, to a degree or so. ``signs`` of the
+    outputs, where the profile has no nominal scale factors."""
+    nominal = readings.bundle.profile.output.nominal_scale_factor
+    up = ups(readings.poses(), nominal)
+    return up if nominal is not None else up * np.asarray(signs)
 
 
 def verified(pipeline: Pipeline, reference: float) -> Verification:
@@ -130,11 +166,15 @@ def _is_worse(before: Verification, after: Verification) -> bool:
 
 
 def verification_document(
-    before: Verification, after: Verification, *, limit_g: float | None, raw_sha256: str
+    before: Verification, after: Verification, *, limit_g: float | None, raw_sha256: str, apart: Apart | None
 ) -> Document:
-    """``before``: the device's output with its old registers; ``after``: with the new ones, after a restart."""
+    """``before``: the device's output with its old registers; ``after``: with the new ones, after a restart.
+
+    Without ``apart`` the document is as before there were outcomes: it says nothing of attitudes, and has no
+    uncertainty.
+    """
     rms = after.rms_g
-    return {
+    document: Document = {
         "format": "triaxcal.verification/1",
         "raw_sha256": raw_sha256,
         "before_rms_g": error(before.rms_g),
@@ -146,3 +186,12 @@ def verification_document(
         "poses": pose_rows(after),
         "data_quality": list(after.data_quality),
     }
+    if apart is not None:
+        angles = apart.angles_deg(after.poses)
+        for row, angle in zip(document["poses"], angles, strict=True):
+            row["from_fit_deg"] = number(round(float(angle), 1))
+        document["expanded_uncertainty_g"] = uncertainty(after.expanded_uncertainty_g)
+        document["poses_apart"] = sum(
+            not p.fault and bool(angle >= apart.apart_deg) for p, angle in zip(after.poses, angles, strict=True)
+        )
+    return document

@@ -63,6 +63,35 @@ def spiral(count: int) -> Floats:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
 
+def elsewhere(taken: Floats, count: int) -> list[Direction]:
+    """``count`` directions that lie far from those ``taken`` (n,3) and from each other, the farthest first.
+
+    Labels are in parts of the axes: "+2X-Y" is two parts X to one of minus Y. Of 98 directions, so that a
+    ``count`` above that gives no more.
+    """
+    candidates = _lattice()
+    ups = np.array([v for _, v in candidates])
+    nearest = np.max(ups @ taken.T, axis=1, initial=-1.0)
+    chosen: list[Direction] = []
+    while len(chosen) < min(count, len(candidates)):
+        best = int(np.argmin(np.round(nearest, 9)))
+        chosen.append(candidates[best])
+        nearest = np.maximum(nearest, ups @ ups[best])
+    return chosen
+
+
+@cache
+def _lattice() -> tuple[Direction, ...]:
+    """Directions with up to two parts of each axis."""
+    out = []
+    for parts in itertools.product((1, 2, -1, -2, 0), repeat=3):
+        if np.gcd.reduce(parts) == 1:
+            label = "".join("+-"[p < 0] + "2" * (abs(p) == 2) + axis for p, axis in zip(parts, "XYZ", strict=True) if p)
+            v = np.array(parts, dtype=float)
+            out.append((label, v / np.linalg.norm(v)))
+    return tuple(out)
+
+
 def closed(plan: Sequence[Direction]) -> list[Direction]:
     """The plan with its first pose repeated at the end: what differs between the two is time."""
     return [*plan, plan[0]]

@@ -23,7 +23,7 @@ from triaxcald.report.unit import unit_report
 from triaxcald.station.config import StationFile, parse_station
 from triaxcald.station.endings import judged
 from triaxcald.station.write_back import VERIFICATION_FILE
-from triaxcald.verification import verification_document, verified
+from triaxcald.verification import Apart, fitted_attitudes, verification_document, verified
 
 CANNOT = (TriaxcalError, DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)
 """What a changed profile, station file or raw record may end in."""
@@ -105,8 +105,13 @@ def compute(recording: Recording, raw: Digests) -> Again:
             verified(check[CORRECTED], station.reference),
             limit_g=station.limits.verification_rms_g,
             raw_sha256=raw.verification.hexdigest(),
+            apart=_apart(recording, tumble[READINGS], station) if recording.ends_with else None,
         )
     return Again(bundle, station, tumble[READINGS], certified, why_not, verification, previews.thinned())
+
+
+def _apart(recording: Recording, readings: Pipeline, station: StationFile) -> Apart:
+    return Apart(fitted_attitudes(readings, signs_of(recording) or (1, 1, 1)), station.plan.apart_deg)
 
 
 def _certified(

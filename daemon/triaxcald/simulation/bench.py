@@ -15,7 +15,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects import effect_named, effect_of
 from triaxcal.effects.contract import Effect, channel_of
 from triaxcal.errors import InvalidData
-from triaxcal.plan.directions import directions
+from triaxcal.plan.directions import directions, elsewhere
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import CONDITIONS, Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus
@@ -50,8 +50,13 @@ class Surroundings(Strict):
     swing_period_s: Annotated[float, Field(gt=0)] = 600.0
 
 
+CHECK_POSES = 10
+"""More than a station asks for by default, so that one that comes late still finds enough."""
+
+
 class Fixture(Strict):
-    """The tumble fixture: it goes through the poses of the plan, in its order, again and again."""
+    """The tumble fixture: it goes through the poses of the plan, in its order, the first once more, and through others
+    to check by, again and again."""
 
     poses: Annotated[int, Field(ge=9, le=1000)] = 26
     hold_s: Annotated[float, Field(gt=0)] = 4.0
@@ -130,14 +135,17 @@ def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[Effect, F
 
 
 def tumble_of(device: DeviceFile) -> Tumble:
-    """The plan's directions in its order, each off by the fixture's attitude error."""
+    """The plan's directions in its order, the first once more, others to check by; each off by the fixture's attitude
+    error."""
     fixture = device.fixture
     try:
         plan = np.array([v for _, v in directions(fixture.poses)])
     except InvalidData as e:
         raise InputError(f"fixture.poses: {e}") from e
     rng = np.random.default_rng([device.seed, 1])
-    off = plan + rng.standard_normal(plan.shape) * np.radians(fixture.attitude_error_deg)
+    others = np.array([v for _, v in elsewhere(plan, CHECK_POSES)])
+    plan, others = (v + rng.standard_normal(v.shape) * np.radians(fixture.attitude_error_deg) for v in (plan, others))
+    off = np.concatenate([plan, plan[:1], others])
     return Tumble(off / np.linalg.norm(off, axis=1, keepdims=True), fixture.hold_s, fixture.move_s)
 
 

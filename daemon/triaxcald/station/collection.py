@@ -8,6 +8,7 @@ from contextlib import aclosing
 from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
+from triaxcal.arrays import Floats
 from triaxcal.errors import Refused
 from triaxcal.plan.directions import directions
 from triaxcal_drivers.attention import Looks
@@ -100,10 +101,11 @@ class Collection:
         wanted: int,
         nominal_scale_factor: Sequence[float] | None,
         tell: Callable[[Guide], None],
+        apart_from: Floats | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Records until ``stream`` shows ``wanted`` distinct poses, and of the readings the first of them once more, if
-        the plan says so; ``tell`` is told how it goes.
+        the plan says so; ``tell`` is told how it goes. ``apart_from`` as in `guide`.
 
         Raises Refused when no new pose has come for the plan's patience, and what the device's stream raises. Where
         only the repeat does not come, it goes on without.
@@ -131,6 +133,7 @@ class Collection:
                     plan=stream == READINGS,
                     repeat=plan.repeat and stream == READINGS,
                     counted_s=counted_s,
+                    apart_from=apart_from,
                 )
                 counted_s = state.counted_s
                 took_s = clock_s() - host_s

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.plan.directions import Direction, directions
+from triaxcal.plan.directions import Direction, directions, elsewhere
 from triaxcal.poses.pose import Held
 
 COVERED_DEG = 25.0
@@ -33,10 +33,12 @@ class Guide:
     missing: tuple[str, ...] = ()
     repeat_due: bool = False
     counted_s: tuple[float, ...] = ()
+    only_near: bool = False
+    """The poses keep coming where they were not wanted, and have to do."""
 
     @property
     def complete(self) -> bool:
-        return self.found >= self.wanted and not self.repeat_due
+        return (self.found >= self.wanted or self.only_near) and not self.repeat_due
 
 
 def guide(
@@ -50,8 +52,12 @@ def guide(
     plan: bool = True,
     repeat: bool = False,
     counted_s: Collection[float] = (),
+    apart_from: Floats | None = None,
 ) -> Guide:
     """Judge the poses so far, which may come in any order; ``repeat`` asks for the first of them again at the end.
+
+    With ``apart_from`` (n,3), directions of up, only poses apart from those count. Who offers none of these is asked
+    no longer once twice as many others have come as are wanted, or as many as there are to be apart from.
 
     ``now_s`` is the time of the latest sample, counted as the poses' times are. A pose that lies about one of
     ``counted_s`` was long enough once: it stays so where its ends have moved since, as more of the noise was seen.
@@ -59,22 +65,29 @@ def guide(
     last = poses[-1] if poses else None
     # A pose that is still growing ends a guard window before the latest sample.
     still_s = last.end_s - last.start_s if last is not None and now_s - last.end_s < 0.5 else 0.0
-    up = _directions(poses, nominal_scale_factor)
+    up = ups(poses, nominal_scale_factor)
     enough = [p.end_s - p.start_s >= hold_s or any(p.start_s <= t <= p.end_s for t in counted_s) for p in poses]
     held = [v for v, is_enough in zip(up, enough, strict=True) if is_enough]
+    taken = [] if apart_from is None else list(apart_from)
     distinct: list[Floats] = []
     since: list[Floats] = []
+    others: list[Floats] = []
     for v in held:
-        if len(distinct) < wanted and not _near(v, distinct, apart_deg):
+        if _near(v, taken, apart_deg):
+            if not _near(v, others, apart_deg):
+                others.append(v)
+        elif len(distinct) < wanted and not _near(v, distinct, apart_deg):
             distinct.append(v)
             since = []
         else:
             since.append(v)
     found = len(distinct)
-    targets = directions(wanted) if plan else []
+    in_all = found + len(others)
+    only_near = bool(taken) and found < wanted <= in_all and in_all >= min(2 * wanted, len(taken))
+    targets = directions(wanted) if plan else elsewhere(np.array(taken), wanted) if taken else []
     missing = _uncovered(targets, held) if found < wanted else ()
     due = repeat and found >= wanted and not _near(distinct[0], since, max(apart_deg, SAME_DEG))
-    if found >= wanted and not due:
+    if (found >= wanted or only_near) and not due:
         hint = "done"
     elif 0 < still_s < hold_s and not enough[-1]:
         hint = f"hold still, {still_s:.1f} of {hold_s:.1f} s"
@@ -85,7 +98,7 @@ def guide(
     else:
         hint = "turn the unit to a pose not taken yet"
     middles = tuple((p.start_s + p.end_s) / 2 for p, is_enough in zip(poses, enough, strict=True) if is_enough)
-    return Guide(found, wanted, still_s, hint, missing, due, middles)
+    return Guide(found, wanted, still_s, hint, missing, due, middles, only_near)
 
 
 def _near(v: Floats, others: Sequence[Floats], degrees: float) -> bool:
@@ -109,7 +122,7 @@ def _nearest(targets: Sequence[Direction], v: Floats) -> str:
     return f"{label} up "
 
 
-def _directions(poses: Sequence[Held], nominal: Sequence[float] | None) -> Floats:
+def ups(poses: Sequence[Held], nominal: Sequence[float] | None) -> Floats:
     """Up in the unit's frame, roughly: by the nominal scale factor, else by the range of the outputs so far."""
     if not poses:
         return np.zeros((0, 3))

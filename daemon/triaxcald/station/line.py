@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from triaxcal.arrays import Floats
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
@@ -46,7 +47,7 @@ from triaxcald.station.config import Place, Station
 from triaxcald.station.endings import aborted, judged
 from triaxcald.station.serials import SerialsSeen
 from triaxcald.station.write_back import WriteBack, corrected
-from triaxcald.verification import Verification
+from triaxcald.verification import Verification, fitted_attitudes
 
 CERTIFICATE, REPORT = "certificate.json", "report.html"
 
@@ -291,7 +292,8 @@ class UnitRun:
     ) -> None:
         async def collect(check: Collection) -> None:
             self.progress.stage(self.name, "verifying by physics")
-            await self._collect(device, writer, check, CORRECTED, self.station.file.plan.check_poses)
+            fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
+            await self._collect(device, writer, check, CORRECTED, self.station.file.plan.check_poses, fitted)
 
         self.progress.stage(self.name, "writing the registers")
         self._write_back = WriteBack(
@@ -320,7 +322,13 @@ class UnitRun:
         )
 
     async def _collect(
-        self, device: Device, writer: RecordingWriter | None, collection: Collection, stream: str, wanted: int
+        self,
+        device: Device,
+        writer: RecordingWriter | None,
+        collection: Collection,
+        stream: str,
+        wanted: int,
+        apart_from: Floats | None = None,
     ) -> None:
         await collection.until_posed(
             device,
@@ -330,6 +338,7 @@ class UnitRun:
             wanted=wanted,
             nominal_scale_factor=self.profile.output.nominal_scale_factor if stream == READINGS else (1, 1, 1),
             tell=lambda state: self.progress.poses(self.name, collection.phase, state),
+            apart_from=apart_from,
         )
 
     async def check(self) -> Verification:

@@ -29,7 +29,16 @@ from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station
 from triaxcald.station.power import power_cycle_asked
-from triaxcald.verification import OUTSIDE, UNJUDGED, WORSE, Verification, verification_document, verified
+from triaxcald.verification import (
+    OUTSIDE,
+    UNJUDGED,
+    WORSE,
+    Apart,
+    Verification,
+    fitted_attitudes,
+    verification_document,
+    verified,
+)
 
 VERIFICATION_FILE = "verification.json"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
@@ -130,11 +139,13 @@ class WriteBack:
         check = Collection(VERIFICATION, self.place.bundle, self.place.address, self.writer.ends_with)
         await self.collect(check)
         found, reference = corrected(check, self.station.file.reference), self.station.file.reference
+        fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
         document = self.verification = verification_document(
             corrected(tumble, reference),
             found,
             limit_g=self.station.file.limits.verification_rms_g,
             raw_sha256=check.digest.hexdigest(),
+            apart=Apart(fitted, self.station.file.plan.apart_deg),
         )
         self.writer.attach(VERIFICATION_FILE, "application/json", to_text(document).encode())
         if found.rms_g is None:
