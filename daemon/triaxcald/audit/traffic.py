@@ -124,7 +124,7 @@ class Said:
 
 def check(traffic: Traffic, said: Said, serial: str | None) -> list[Difference]:
     return [
-        *_identity(traffic, serial),
+        *([] if said.aborted else _identity(traffic, serial)),  # another unit may be why it was aborted
         *_asked_for(traffic, said),
         *_before(traffic, said),
         *_after(traffic, said),

@@ -11,11 +11,14 @@ import pytest
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, Register
+from triaxcald.audit.traffic import Said, Traffic, check
+from triaxcald.outcome import registers_told
 from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.image import build_image
 from triaxcald.provision.pace import Pace
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
+from triaxcald.recording import schema
 from triaxcald.simulation.memory import CALIBRATION, CRC, TABLE, Stored
 from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.unit import Faults, ReferenceUnit, RegisterFault, Status, UnitSilent
@@ -221,13 +224,34 @@ class Bench:
             where=where,
             **more,
         )
+        begun, returned = len(self.records), False
         await p.examine(restart=not dry_run)
         if not dry_run:
             try:
                 await p.write()
+                returned = True
             finally:
                 p.finish()
+                self.assert_traffic_shows(p, self.records[begun:], aborted=not returned)
         return p
+
+    def assert_traffic_shows(self, p: Provisioning, records: list[RegisterAccess], *, aborted: bool) -> None:
+        """What the device is said to hold, by the rules of an audit."""
+        traffic = Traffic(
+            [schema.RegisterAccess(0, a.register, a.kind, a.raw, a.error or "") for a in records], self.profile
+        )
+        said = Said(
+            before=p.found.raw,
+            earlier=p.before.raw if p.carried else None,
+            after=None if aborted else p.after.raw,
+            image=self.image,
+            told=registers_told(p),
+            held=p.held,
+            forced=True,
+            aborted=aborted,
+            provisioned=None if aborted else list(p.written),
+        )
+        assert check(traffic, said, f"{self.serial_number:04d}") == []
 
     @property
     def held(self) -> Held:
