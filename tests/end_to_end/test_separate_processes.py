@@ -40,14 +40,11 @@ def test_a_unit_is_calibrated_across_processes_and_stays_so_when_its_power_goes(
     workshop: Any, triaxcal: Callable[..., Any], start: Callable[..., Any], buses: Any
 ) -> None:
     profile, unit_bus, station_bus = buses
-    sensor = {"effects": {"second_order_nonlinearity": {"x": 6e-4, "y": -5e-4, "z": 5e-4}}}
-    fixture = {"poses": 18, "hold_s": 2.0, "move_s": 0.8}
-    device = workshop.device(
-        profile=profile, bus=unit_bus, eeprom="eeprom.bin", sensor=sensor, fixture=fixture, speed=15.0
-    )
+    fixture = {"poses": 12, "hold_s": 2.0, "move_s": 0.8}
+    device = workshop.device(profile=profile, bus=unit_bus, eeprom="eeprom.bin", fixture=fixture, speed=15.0)
     station = workshop.station(
         {"profile": profile, "serial": "4711", "bus": station_bus},
-        plan={"poses": 18, "hold_s": 1.0, "check_poses": 3},
+        plan={"poses": 12, "hold_s": 1.0, "check_poses": 3},
         limits={"rms_g": 1e-4, "verification_rms_g": 1e-4},
     )
     sim = start("sim", device)
@@ -60,8 +57,6 @@ def test_a_unit_is_calibrated_across_processes_and_stays_so_when_its_power_goes(
     (unit,) = document["units"]
     assert set(unit) == UNIT
     assert (unit["exit_code"], unit["error"], unit["serial"]) == (0, None, "4711")
-    assert [f["effect"] for f in unit["findings"]] == ["second_order_nonlinearity"]
-    assert unit["after"]["rms_g"] < 0.5 * unit["before"]["rms_g"]
     assert unit["verification"]["verdict"] == "within limits"
     assert unit["verification"]["before_rms_g"] > 1e-3 > 1e-4 > unit["verification"]["after_rms_g"]
     assert "bias_x" in unit["registers_written"]
@@ -79,7 +74,6 @@ def test_a_unit_is_calibrated_across_processes_and_stays_so_when_its_power_goes(
     again = start("sim", device)
     again.says("serving ")
     rows = {r["register"]: r for r in triaxcal("registers", station, "--json").json["registers"]}
-    assert {name: rows[name]["value"] for name in rows if name.startswith("second_order")} != {}
     assert rows["calibration_crc"]["crc_ok"] is True
     rec = workshop.folder / "after.mcap"
     assert triaxcal("record", station, "-o", rec, "--seconds", "15").code == 0

@@ -147,7 +147,8 @@ class CanUnit:
             self._work(self._time.now_s())
             if failure := self._failure or self._requests.failure:
                 raise failure
-            await self._time.wait_until(self._time.now_s() + 1 / self._unit.rate_hz)
+            now_s = self._time.now_s()
+            await self._time.wait_until(self._time.later_s(now_s, 1 / self._unit.rate_hz))
 
     def _work(self, now_s: float) -> None:
         """Everything due by ``now_s``: boot-up after a start, heartbeat, samples."""
