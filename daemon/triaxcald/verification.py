@@ -62,12 +62,14 @@ class Verification:
     def expanded_uncertainty_g(self) -> float | None:
         """Of the rms, from the noise of the poses, with a coverage factor of 2.
 
-        The mean of e² has the variance Σ(4 e² s² + 2 s⁴)/n², for errors e with standard errors s.
+        An error m measured as e with the standard error s: e² has the variance 4 m² s² + 2 s⁴, and m² is e² − s² on
+        average.
         """
         rms_g, e, s = self.rms_g, self._trusted(self.error_g), self._trusted(self.standard_error_g)
         if not rms_g:
             return None
-        return float(np.sqrt(np.sum(4 * e**2 * s**2 + 2 * s**4)) / (len(e) * rms_g))
+        variance = max(float(np.sum(4 * e**2 * s**2 - 2 * s**4)), float(np.sum(2 * s**4)))
+        return float(np.sqrt(variance)) / (len(e) * rms_g)
 
     def _trusted(self, values: Floats) -> Floats:
         return np.delete(values, [i for i, p in enumerate(self.poses) if p.fault])

@@ -10,7 +10,7 @@ import pytest
 from triaxcal.poses.pose import Pose
 from triaxcal_drivers.profile import CORRECTED, load_bundle
 from triaxcald.pipeline import Pipeline
-from triaxcald.verification import verification_document, verified, verify
+from triaxcald.verification import Apart, verification_document, verified, verify
 
 
 def _pose(mean: list[float], error: float = 1e-5, at_s: float = 0.0, fault: str = "") -> Pose:
@@ -116,3 +116,37 @@ def test_what_spoils_the_corrected_stream_is_in_the_document() -> None:
     assert verification_document(found, found, limit_g=None, raw_sha256="", apart=None)["data_quality"] == [
         *found.data_quality
     ]
+
+
+def test_the_expanded_uncertainty_of_the_rms_is_twice_its_scatter() -> None:
+    """Over many drawings of the noise, for errors far above it, of its size, and below it."""
+    rng = np.random.default_rng(1)
+    noise = 1e-5
+    for size in (1e-4, 1e-5):
+        true = size * (-1.0) ** np.arange(12)
+        drawn = [
+            verify([_pose([1 + e, 0, 0], error=noise) for e in true + noise * rng.standard_normal(12)], 1.0)
+            for _ in range(600)
+        ]
+        scatter = np.std([v.rms_g for v in drawn])
+        told = np.median([v.expanded_uncertainty_g for v in drawn])
+        assert told == pytest.approx(2 * scatter, rel=0.12)
+
+
+def test_a_pose_that_cannot_be_trusted_has_no_part_in_the_uncertainty() -> None:
+    sound = [_pose([1 + 1e-4, 0, 0]), _pose([0, 1 - 1e-4, 0])]
+    spoiled = _pose([0, 0, 1.01], error=1e-2, fault="saturated")
+    assert verify([*sound, spoiled], 1.0).expanded_uncertainty_g == verify(sound, 1.0).expanded_uncertainty_g
+    assert verify([spoiled], 1.0).expanded_uncertainty_g is None
+
+
+def test_the_document_says_how_far_each_check_pose_was_from_the_fits() -> None:
+    fitted = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+    tilted = [np.cos(np.radians(12.0)), np.sin(np.radians(12.0)), 0]
+    after = verify([_pose(tilted), _pose([0, 1, 0]), _pose([0, -1, 0], fault="saturated")], 1.0)
+    document = verification_document(after, after, limit_g=1e-3, raw_sha256="", apart=Apart(fitted, 10.0))
+    assert [p["from_fit_deg"] for p in document["poses"]] == [12.0, 0.0, 90.0]
+    assert document["poses_apart"] == 1
+    older = verification_document(after, after, limit_g=1e-3, raw_sha256="", apart=None)
+    assert set(document) - set(older) == {"poses_apart", "expanded_uncertainty_g"}
+    assert "from_fit_deg" not in older["poses"][0]

@@ -50,7 +50,7 @@ class Surroundings(Strict):
     swing_period_s: Annotated[float, Field(gt=0)] = 600.0
 
 
-CHECK_POSES = 10
+CHECK_POSES = 14
 """More than a station asks for by default, so that one that comes late still finds enough."""
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.plan.directions import directions
+from triaxcal.plan.directions import directions, elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcald.station.guidance import Guide, guide
 
@@ -134,3 +134,31 @@ def test_a_pose_that_was_long_enough_once_stays_counted_when_its_ends_move() -> 
     assert _guide(shorter, counted_s=after.counted_s).found == 2
     assert _guide(shorter).found == 1
     assert _guide([_pose(UP[1], 10.0)], counted_s=before.counted_s).found == 1
+
+
+ELSEWHERE = elsewhere(np.array(UP), 3)
+CHECK = {"plan": False, "wanted": 3, "apart_from": np.array(UP)}
+
+
+def test_check_poses_are_asked_for_in_other_attitudes_than_the_fits() -> None:
+    assert _guide([], **CHECK).hint == f"next: {ELSEWHERE[0][0]} up"
+    state = _guide([_pose(ELSEWHERE[0][1])], **CHECK)
+    assert (state.found, state.hint) == (1, f"next: {ELSEWHERE[1][0]} up")
+    near = UP[3] + np.array([0.0, np.sin(np.radians(6)), 0.0])
+    assert _guide([_pose(near)], **CHECK).found == 0
+    assert _guide([_pose(v, 5.0 * i) for i, (_, v) in enumerate(ELSEWHERE)], **CHECK).complete
+
+
+def test_who_offers_the_fits_attitudes_alone_is_not_waited_for() -> None:
+    offered = [_pose(v, 5.0 * i) for i, v in enumerate(UP)]
+    assert not _guide(offered[:5], **CHECK).complete
+    assert not _guide([offered[0]] * 20, **CHECK).complete
+    state = _guide(offered[:6], **CHECK)
+    assert (state.found, state.only_near, state.complete) == (0, True, True)
+
+
+def test_as_many_other_poses_as_the_fit_had_are_enough_where_these_are_few() -> None:
+    settings = {**CHECK, "wanted": 9, "apart_from": np.array(UP[:10])}
+    offered = [_pose(v, 5.0 * i) for i, v in enumerate(UP[:10])]
+    assert not _guide(offered[:9], **settings).complete
+    assert _guide(offered, **settings).complete

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from triaxcal.errors import InvalidData
-from triaxcal.plan.directions import closed, cube_directions, dilution, directions, distinct, linear_design, most_wanted
+from triaxcal.plan.directions import (
+    closed,
+    cube_directions,
+    dilution,
+    directions,
+    distinct,
+    elsewhere,
+    linear_design,
+    most_wanted,
+)
 
 
 def vectors(plan: list[tuple[str, np.ndarray]]) -> np.ndarray:
@@ -153,3 +164,21 @@ def test_a_pose_of_little_weight_does_not_count_for_one() -> None:
 def test_directions_within_five_degrees_count_as_one() -> None:
     angle = np.radians([0.0, 3.0, 90.0, 94.0, 180.0, 0.5, 6.0])
     assert distinct(np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)) == 4
+
+
+@pytest.mark.parametrize("count", [9, 14, 18, 26])
+def test_directions_elsewhere_lie_apart_from_those_taken_and_from_each_other(count: int) -> None:
+    taken = np.array([v for _, v in directions(count)])
+    chosen = elsewhere(taken, 10)
+    ups = np.array([v for _, v in chosen])
+    assert np.degrees(np.arccos(np.max(ups @ taken.T))) > 15.0
+    assert np.degrees(np.arccos(np.max(ups @ ups.T - 2 * np.eye(10)))) > 15.0
+    assert len({label for label, _ in chosen}) == 10
+
+
+def test_a_label_elsewhere_tells_the_parts_of_the_axes() -> None:
+    for label, up in elsewhere(np.array([v for _, v in directions(26)]), 98):
+        parts = np.zeros(3)
+        for sign, size, axis in re.findall(r"([+-])(2?)([XYZ])", label):
+            parts["XYZ".index(axis)] = (-1 if sign == "-" else 1) * (2 if size else 1)
+        np.testing.assert_allclose(up, parts / np.linalg.norm(parts), atol=1e-15)
