@@ -167,6 +167,8 @@ class Provisioning:
         await self._sequence("unlock")
         for name in self.differing:
             self.steps.append(f"writing {name}")
+            if not self.stores:  # each write lasts, as a store does
+                await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)
             self.written.append(name)
             self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
             await self.link.write(name, self.image.raw[name])

@@ -10,6 +10,8 @@ import pytest
 
 from tests.daemon.provision.host import Host
 from tests.devices.habits import Habits
+from tests.devices.memory import Electronics
+from tests.devices.table import FACTORY
 
 MAKES = {
     "stores by command": Habits(),
@@ -106,4 +108,31 @@ async def test_the_process_is_killed_at_any_request(
             assert host.starts_with() == WANTED[finish], request
             assert_true(host)
         else:
+            assert host.starts_with() == "old", request
+
+
+@pytest.mark.parametrize("make", ["stores by command", "writes straight to the EEPROM"])
+async def test_a_unit_that_takes_the_place_of_another_at_any_request_is_not_given_its_calibration(
+    tmp_path: Path, make: str
+) -> None:
+    """What it stores stays as it was, but for one register where every write lasts; the state is then said to be
+    unknown."""
+    habits = MAKES[make]
+    whole = Host(tmp_path / "whole", habits)
+    assert await whole.provision()
+    for request in range(3, whole.requests + 1):  # the second asks for the serial number for the first time
+        host = Host(tmp_path / str(request), habits)
+        other = Electronics(habits, FACTORY.image(habits), serial_number=4712)
+        kept = other.eeprom
+        host.place.swap_at(request, other)
+        ended_well = await host.provision()
+        assert host.provisioning is not None
+        state = host.provisioning.held.state
+        assert not ended_well or other.written == [], request
+        lost = [name for name, raw in other.starts_with().items() if kept[name] != raw]
+        assert len(lost) <= (0 if habits.store_command else 1), request
+        if other.written:
+            assert not ended_well, request
+            assert state in ("unknown", "untouched"), request
+        if state in ("old", "untouched"):
             assert host.starts_with() == "old", request
