@@ -19,7 +19,7 @@ from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.bus import close_bus, opened_bus
 from triaxcal_drivers.can.layout import Layout
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
-from triaxcal_drivers.can.receive import FrameQueue, Identifier
+from triaxcal_drivers.can.receive import BATCH_FRAMES, FrameQueue, Identifier
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, ProfileError, RegisterRefused
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.nearest import nearest
@@ -167,9 +167,11 @@ class CanDevice:
                 batch = await frames.batch(deadline_s - now_s())
                 if batch is not None and ((batch.flags & RawFlag.ERROR) == 0).any():
                     deadline_s = now_s() + timeout_s
+                more_waits = batch is not None and len(batch) == BATCH_FRAMES
+                silent = now_s() >= deadline_s and not more_waits
                 if batch:
-                    yield batch
-                elif now_s() >= deadline_s:
+                    yield batch  # which may take whoever has it a while
+                if silent:
                     raise DeviceSilent(f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s")
         finally:
             frames.close(opened)
