@@ -12,6 +12,7 @@ import argparse
 import asyncio
 import dataclasses
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -285,7 +286,7 @@ async def _strike(
             early = not _catches(process.pid, signal.SIGTERM)
             struck_s = time.monotonic()
         try:
-            process.send_signal(number)
+            os.kill(process.pid, number)  # `send_signal` would ask for the exit code, which asyncio is waiting for
         except ProcessLookupError:
             break
     return early, struck_s
@@ -336,7 +337,8 @@ def judge(ended: Ended, out: str, folder: Path, held: str | None) -> list[str]:
 def _judge_code(ended: Ended, last: str, held: str | None) -> list[str]:
     code, command = ended.code, ended.shot.command
     if command == "sim":
-        stopped = code == 0 and ended.shot.signals[0] != signal.SIGINT
+        # Of two that come at once, the system may hand over the later one first.
+        stopped = code == 0 and set(ended.shot.signals) != {signal.SIGINT}
         return [] if stopped or code == 130 else [f"exit code {code}"]
     if command in ON_FILES:
         return [] if code == 0 or (code, last) == (130, "triaxcal: interrupted") else [f"exit code {code}: {last}"]

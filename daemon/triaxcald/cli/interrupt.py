@@ -38,9 +38,10 @@ async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals) -> T:
     loop.set_default_executor(_Unawaited())
     task = asyncio.ensure_future(work)
 
-    def cancel() -> None:
+    def cancel() -> bool:
         with suppress(RuntimeError):  # the loop has ended, and the work with it
             loop.call_soon_threadsafe(task.cancel)
+        return not task.done()
 
     with _woken(loop):
         signals.cancel_by(cancel)

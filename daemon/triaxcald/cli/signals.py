@@ -20,15 +20,16 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.caught: list[int] = []
-        self._cancel: Callable[[], object] | None = None
+        self._cancel: Callable[[], bool] | None = None
 
     def heed(self) -> dict[int, Any]:
         """From now on; gives the handlers that were there. SIGTERM and SIGHUP stay ignored where they are (`nohup`)."""
         heeded = [n for n in STOP_SIGNALS if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
         return {number: signal.signal(number, self._strike) for number in heeded}
 
-    def cancel_by(self, cancel: Callable[[], object]) -> None:
-        """From now on the first signal calls ``cancel``, and the second again; also once the work has ended."""
+    def cancel_by(self, cancel: Callable[[], bool]) -> None:
+        """From now on the first signal calls ``cancel``, which says if there still is work, and the second again; also
+        once the work has ended."""
         self._cancel = cancel
 
     def _strike(self, number: int, _: object) -> None:
@@ -37,8 +38,8 @@ class StopSignals:
             abort("interrupted")
         if len(self.caught) > 2:
             abort("interrupted; ended at once")
-        self._cancel()
-        if len(self.caught) == 2:
+        at_work = self._cancel()
+        if len(self.caught) == 2 and at_work:
             tell("triaxcal: putting things in order, please wait; a third signal ends it at once")
 
 
