@@ -61,8 +61,12 @@ def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[
 
 def _posterior(Z: Floats) -> Floats:
     """Covariance that the data leave of coefficients of which ``Z`` (n,q) is what each does to the residuals, in units
-    of the coefficients' prior widths and of the residuals' errors."""
-    return np.asarray(np.linalg.inv(np.eye(Z.shape[1]) + Z.T @ Z))
+    of the coefficients' prior widths and of the residuals' errors: (I + Zᵀ Z)⁻¹, also where Zᵀ Z has no inverse left
+    beside it in floating point."""
+    _, size, axes = np.linalg.svd(Z)
+    left = np.ones(Z.shape[1])
+    left[: len(size)] = (1 / np.hypot(1.0, size)) ** 2  # s² itself might overflow
+    return np.asarray(axes.T * left @ axes)
 
 
 def _halved_by(

@@ -14,6 +14,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Component, Stated, budget
+from triaxcal.uncertainty.thermal import _posterior
 
 NOISE = 2e-5
 SIGNS = (-1, -1, -1)
@@ -113,3 +114,11 @@ def test_what_noise_leaves_of_thermal_effects_is_to_be_halved_as_noise_is(
     assert re.fullmatch(r"hold each pose for .* s, or record 104 poses .*", line.halved_by)
     assert quieter.magnitude == pytest.approx(line.magnitude / 2, rel=0.1)
     assert steadier.magnitude == pytest.approx(line.magnitude, rel=0.1)
+
+
+def test_what_the_data_leave_is_a_covariance_also_beside_effects_of_any_size() -> None:
+    """Two coefficients that do the same, and so much that a unit matrix is nothing beside it."""
+    alike = np.outer(np.arange(1.0, 6.0), [1.0, 1.0])
+    np.testing.assert_allclose(_posterior(alike), np.linalg.inv(np.eye(2) + alike.T @ alike), rtol=1e-12)
+    left = _posterior(1e200 * alike)
+    np.testing.assert_allclose(left, [[0.5, -0.5], [-0.5, 0.5]], atol=1e-12)
