@@ -62,11 +62,16 @@ def write_new(folder: Path, stem: str, suffix: str, text: str) -> Path:
 def write_durably(path: Path, text: str) -> None:
     """Whole or not at all, and on the disk when it returns: it outlives a loss of power. Raises OSError."""
     replace_bytes(path, text.encode())
-    folder = os.open(path.parent, os.O_RDONLY)
+    synchronise(path.parent)
+
+
+def synchronise(folder: Path) -> None:
+    """The names in it are on the disk. Raises OSError."""
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(folder)
+        os.fsync(descriptor)
     finally:
-        os.close(folder)
+        os.close(descriptor)
 
 
 def require_writable(path: Path) -> None:

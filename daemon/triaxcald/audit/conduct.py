@@ -40,6 +40,7 @@ from triaxcald.station.line import CERTIFICATE, REPORT
 from triaxcald.station.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
 
 ABORTED_WITH = (2, REFUSED, DEVICE, DISK, INTERRUPTED)
+NEW = (DeviceState.NEW_VERIFIED, DeviceState.NEW_UNVERIFIED)
 Compute = Callable[[Recording, Digests], Again]
 
 
@@ -173,6 +174,10 @@ class _Audit:
             self._add(ATTACHMENT, Kind.VALUE, "journal", stored=held.get("journal"), again=wanted)
         if again is None:
             return
+        if state is not None and again.written and not self._aborted:
+            ends_with = (DeviceState.OLD,) if held.get("verdict") == Verdict.FAIL.value else NEW
+            if state.state not in ends_with:
+                self._add(ATTACHMENT, Kind.NOT_SHOWN, "device_state", stored=held.get("device_state"))
         contents_again = held.get("contents") if self._mended else found.inventory.document()
         document = outcome_again(held, again, self._recording, self._papers(again), contents_again or {})
         # The inventory is compared part by part.

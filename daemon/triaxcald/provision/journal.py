@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from triaxcald.errors import DiskError, InputError
-from triaxcald.files import write_durably
+from triaxcald.files import synchronise, write_durably
 
 FORMAT, FOLDER = "triaxcal.journal/1", "journal"
-Step = Literal["writing", "storing", "stored"]
+Step = Literal["writing", "storing", "stored", "unverified"]
+"""``unverified``: it came to its end, on a device that no restart has shown to hold it."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,12 @@ class Journal:
             "wanted": {name: raw.hex() for name, raw in entry.wanted.items()},
         }
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            if not self.path.parent.is_dir():
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                synchronise(self.path.parent.parent)
             write_durably(self.path, json.dumps(document, indent=2) + "\n")
         except OSError as e:
             raise DiskError(f"{self.path}: cannot be written: {e.strerror}") from e
-
-    def step(self, entry: Entry, step: Step) -> None:
-        self.write(replace(entry, step=step))
 
     def remove(self) -> None:
         """Raises DiskError."""
@@ -77,8 +76,6 @@ class Journal:
             self.path.unlink(missing_ok=True)
         except OSError as e:
             raise DiskError(f"{self.path}: cannot be removed: {e.strerror}") from e
-        with suppress(OSError):  # the folder has others' journals in it
-            self.path.parent.rmdir()
 
 
 def parse(text: bytes, *, where: str) -> Entry:
@@ -108,11 +105,3 @@ def parse(text: bytes, *, where: str) -> Entry:
 def registers_of(held: Mapping[str, str]) -> dict[str, bytes]:
     """Raw bytes by register from a document. Raises ValueError, TypeError, AttributeError."""
     return {str(name): bytes.fromhex(raw) for name, raw in held.items()}
-
-
-def all_of(folder: Path) -> list[Path]:
-    """The journals in a station's folder."""
-    try:
-        return sorted(folder.joinpath(FOLDER).glob("*.json"))
-    except OSError:
-        return []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from triaxcal_drivers.errors import DeviceBusy, DriverError
+from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Profile
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.sequence import probe, reconnect
@@ -21,17 +21,22 @@ def least_off_s(profile: Profile) -> float:
 
 
 async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) -> bool:
-    """Waits until the device has gone silent and answers again; whether it has within ``patience_s``."""
+    """Waits until the device, which answered, has gone silent and answers again; whether it has within ``patience_s``.
+
+    One that is busy, or refuses, has its supply.
+    """
     register = probe(profile) or next(iter(profile.registers))
-    deadline_s, missed = link.pace.clock_s() + patience_s, 0
+    deadline_s, missed, answered = link.pace.clock_s() + patience_s, 0, False
     while missed < MISSED:
         if link.pace.clock_s() >= deadline_s:
             return False
         try:
             await link.read_once(register)
-            missed = 0
-        except (*NO_CONTACT, DeviceBusy):
-            missed += 1
+            missed, answered = 0, True
+        except RegisterRefused:
+            missed, answered = 0, True
+        except NO_CONTACT:
+            missed += answered
             await link.renew()
         await link.pace.sleep(LOOK_S)
     with suppress(DriverError):

@@ -71,6 +71,11 @@ class Provisioning:
     after: Snapshot = field(init=False)
 
     @property
+    def examined(self) -> bool:
+        """Whether it is known who is there, and what it held."""
+        return hasattr(self, "before")
+
+    @property
     def resets(self) -> bool:
         """Whether the device can be restarted by a command."""
         return bool(self.bundle.profile.sequences.reset)
@@ -83,22 +88,23 @@ class Provisioning:
     async def examine(self, *, restart: bool = True) -> None:
         """Who is there, and what it holds. Nothing is written.
 
-        A device that holds the image already is restarted, where ``restart`` allows: what is in use may be the image,
-        and what is stored another. Raises WrongUnit, InputError (the journal), DriverError, SequenceStalled.
+        A device that holds the image already, or that has a journal, is restarted, where ``restart`` allows: what is in
+        use may not be what is stored. Raises WrongUnit, InputError (the journal), DriverError, SequenceStalled.
         """
         self.steps.append("identity")
         self.identity = await check_identity(self.link, self.bundle, self.expected_serial, where=self.where)
         self.journal = Journal.of(self.folder, self.unit, self.identity.serial)
         self.found = await self._read("reading the old calibration")
-        if restart and self.resets and not self.found.differing(self.image.raw):
+        entry = self.journal.read()
+        if restart and self.resets and (entry is not None or not self.found.differing(self.image.raw)):
             self._restarted = await self._sequence("reset")
             self.found = await self._read("reading the stored calibration")
         self.before = self.after = self.found
         self.differing = self.found.differing(self.image.raw)
-        if (entry := self.journal.read()) is not None and self._is_cut_short(entry):
+        if entry is not None and self._is_cut_short(entry):
             self.carried, self.before = True, Snapshot(entry.before, self.identity.serial)
             self._store_owed = self.stores and entry.step != "stored" and not self._restarted
-            if self.differing and self.found.differing(entry.before):
+            if self.found.differing(entry.wanted) and self.found.differing(entry.before):
                 self.held.now(DeviceState.MIXED, Evidence.READ_BACK)
             else:
                 self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
@@ -133,6 +139,11 @@ class Provisioning:
             await to_its_end(self._give_up())
             raise
 
+    def begin(self) -> None:
+        """What is to be written, and what the device holds, on the disk. Raises DiskError."""
+        if self.journal.read() is None:
+            self._note("writing")
+
     async def undo(self) -> None:
         """The old calibration back in the device, by whatever it takes; ``held`` says whether it is."""
         await to_its_end(self._undo())
@@ -157,6 +168,8 @@ class Provisioning:
         """The journal goes where nothing is left to be cleared up. Raises DiskError."""
         if self.settled and (self.held.state is not DeviceState.UNTOUCHED or self._journaled):
             self.journal.remove()
+        elif self._journaled and self.held.state is DeviceState.NEW_UNVERIFIED:
+            self._note("unverified")
 
     # Forwards.
 
@@ -242,6 +255,7 @@ class Provisioning:
             self.held.now(DeviceState.OLD, Evidence.RESTART if evidence is Evidence.READ_BACK else evidence)
             raise ProvisionError("after the restart the registers hold the old calibration: nothing was stored")
         self._decided = False
+        self.held.now(DeviceState.MIXED, evidence)
         self._require_image()
 
     # Backwards.
@@ -249,7 +263,7 @@ class Provisioning:
     async def _give_up(self) -> None:
         if self._decided:
             return
-        if self.written:
+        if self.written or self.carried or self._store_asked:
             await self._undo()
         elif self._unlocked:
             await lock_quietly(self.link, self.bundle)
@@ -278,7 +292,8 @@ class Provisioning:
         if not held.differing(self.before.raw):
             state = DeviceState.OLD if restarted or not lasting else DeviceState.UNKNOWN
         elif not held.differing(self.image.raw):
-            state = DeviceState.NEW_VERIFIED if restarted else DeviceState.NEW_UNVERIFIED
+            unproven = DeviceState.NEW_UNVERIFIED if self.stored or not self.stores else DeviceState.UNKNOWN
+            state = DeviceState.NEW_VERIFIED if restarted else unproven
         else:
             state = DeviceState.MIXED
         self.held.now(state, evidence)
@@ -341,10 +356,14 @@ class Provisioning:
         """Whether the device still is as that provisioning left it, and not as somebody has made it since."""
         if set(entry.before) != set(self.found.raw):
             raise InputError(f"{self.journal.path}: its registers are not those of profile {self.bundle.profile.name}")
-        if not self.found.differing(entry.before):
-            return False
-        as_wanted = not self.found.differing(entry.wanted)
-        return as_wanted or not fits_its_checksum(self.bundle.profile, self.found)
+        if not self.found.differing(entry.before):  # which is in use, and may not be what is stored
+            return self.stores and not self._restarted
+        if not self.found.differing(entry.wanted):
+            return entry.step != "unverified" or not self.found.differing(self.image.raw)
+        if self.bundle.profile.crc is not None:
+            return not fits_its_checksum(self.bundle.profile, self.found)
+        torn = [n for n, raw in self.found.raw.items() if raw not in (entry.before[n], entry.wanted.get(n))]
+        return len(torn) <= 1  # a supply that fails in a write leaves one register half written
 
 
 async def to_its_end(work: Coroutine[object, object, T]) -> T:

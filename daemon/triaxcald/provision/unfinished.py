@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 from triaxcal_drivers.profile import Bundle
@@ -40,8 +41,12 @@ async def put_back(p: Provisioning, snapshot: Snapshot) -> None:
     """
     p.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
     await p.examine()
+    if p.found.differing(snapshot.raw):
+        p.begin()
     p.before, p.carried = snapshot, True
     await p.undo()
+    if (task := asyncio.current_task()) and task.cancelling():
+        raise asyncio.CancelledError
     if p.held.state is DeviceState.OLD:
         await p.prove_old()
     if p.held.state is not DeviceState.OLD:

@@ -121,7 +121,8 @@ class UnitRun:
         try:
             self._write_papers()
         except InputError as e:
-            ending = replace(ending, reason=str(e), exit_code=DISK)
+            failed = f"{ending.reason}; {e}" if ending.exit_code else str(e)
+            ending = replace(ending, reason=failed, exit_code=ending.exit_code or DISK)
         return self._outcome(ending)
 
     async def _ending(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:

@@ -206,7 +206,8 @@ async def restored(
             power_cycle=power_cycle_asked(ask, link, place, station) if ask else None,
         )
         try:
-            await put_back(p, snapshot)
+            with at_abort(lambda _: Left(text.left(p, station.path), not p.settled) if p.examined else None):
+                await put_back(p, snapshot)
         except ProvisionError as e:
             raise ProvisionError(f"{e}; {text.held(p.held)}") from e
         return p
