@@ -7,6 +7,7 @@ import queue
 import struct
 import threading
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -29,23 +30,34 @@ T = TypeVar("T")
 _POLL_S = 0.1  # how long closing waits for python-can's receive thread to look up
 _NMT_START = 1
 _ABORTED = 0x80
+_DOWNLOAD, _UPLOAD = 1, 2
+_ANSWERED_BY = {_DOWNLOAD: 3, _UPLOAD: 2, 0: 1, 3: 0}
+"""The server's command specifier for the client's (CiA 301): starts of transfers, then segments."""
 
 
 class PatientSdo(SdoClient):
-    """canopen's client, whose time-out counts attention.
+    """canopen's client, whose time-out counts attention, and which takes no answer to somebody else's request.
 
     It waits in a thread of its own, and where the event loop is held up so may be all else that an answer passes.
+    A late answer, or one to another client of the node, is skipped.
     """
 
     def __init__(self, node_id: int, attention: Attention) -> None:
         nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
         super().__init__(0x600 + node_id, 0x580 + node_id, nothing_known)  # type: ignore[no-untyped-call]
         self._attention = attention
+        self._asked, self._object = 0, bytes(3)
+
+    def send_request(self, request: bytes) -> None:
+        self._asked = request[0] >> 5
+        if self._asked in (_DOWNLOAD, _UPLOAD):
+            self._object = bytes(request[1:4])
+        super().send_request(request)  # type: ignore[no-untyped-call]
 
     def read_response(self) -> bytes:
-        """Raises SdoAbortedError, SdoCommunicationError."""
+        """Raises SdoAbortedError, SdoCommunicationError; struct.error for one cut short."""
         response = self._response()
-        if struct.unpack_from("B", response)[0] == _ABORTED:
+        if response[0] == _ABORTED:
             raise SdoAbortedError(*struct.unpack_from("<L", response, 4))
         return response
 
@@ -53,11 +65,21 @@ class PatientSdo(SdoClient):
         deadline_s = self._attention.now_s() + self.RESPONSE_TIMEOUT
         while True:
             late = self._attention.now_s() >= deadline_s
-            try:
-                return bytes(self.responses.get(timeout=TICK_S))
-            except queue.Empty as e:
-                if late:
-                    raise SdoCommunicationError("no answer") from e
+            with suppress(queue.Empty):
+                response = bytes(self.responses.get(timeout=TICK_S))
+                if self._is_mine(response):
+                    return response
+            if late:
+                raise SdoCommunicationError("no answer")
+
+    def _is_mine(self, response: bytes) -> bool:
+        if not response:
+            return False
+        if response[0] == _ABORTED:  # some nodes name no object where they refuse one
+            return response[1:4] in (self._object, bytes(3))
+        if response[0] >> 5 != _ANSWERED_BY.get(self._asked):
+            return False
+        return self._asked not in (_DOWNLOAD, _UPLOAD) or response[1:4] == self._object
 
 
 @dataclass(frozen=True)

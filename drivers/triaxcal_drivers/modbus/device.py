@@ -67,6 +67,7 @@ class ModbusDevice:
         self._bus = bus
         self._now_ns = now_ns
         self._client: ModbusClient | None = None
+        self._owed_s = 0.0
         self.discarded = 0
 
     async def open(self) -> None:
@@ -75,7 +76,9 @@ class ModbusDevice:
         unit_id = self._bus.unit_id
         where = self._bus.where
         if isinstance(where, SerialLine):
-            self._client = await ModbusClient.over_serial(where, unit_id=unit_id, reply_timeout_s=timeout_s)
+            self._client = await ModbusClient.over_serial(
+                where, unit_id=unit_id, reply_timeout_s=timeout_s, quiet_s=self._owed_s
+            )
         else:
             self._client = await ModbusClient.over_tcp(where, unit_id=unit_id, reply_timeout_s=timeout_s)
         try:
@@ -87,6 +90,7 @@ class ModbusDevice:
     async def close(self) -> None:
         client, self._client = self._client, None
         if client is not None:
+            self._owed_s = client.owed_s
             await client.close()
 
     async def _probe(self, client: ModbusClient) -> None:

@@ -139,9 +139,13 @@ class ModbusClient:
         return client
 
     @classmethod
-    async def over_serial(cls, line: SerialLine, *, unit_id: int, reply_timeout_s: float) -> ModbusClient:
-        """Raises BusError where the port cannot be opened."""
+    async def over_serial(
+        cls, line: SerialLine, *, unit_id: int, reply_timeout_s: float, quiet_s: float = 0.0
+    ) -> ModbusClient:
+        """``quiet_s`` is what an earlier client still owed the line (`owed_s`). Raises BusError where the port cannot
+        be opened."""
         client = cls(f"{line.port} unit {unit_id}", unit_id, reply_timeout_s)
+        client._quiet_until_s = client.attention.now_s() + quiet_s
         client._frame_gap_s = line.frame_gap_s
         with client._closed_unless_made():
             link = client._link = await _open_serial(line, lambda: _Link(FramerRTU(DecodePDU(False)), client._on_frame))
@@ -155,6 +159,12 @@ class ModbusClient:
         except BaseException:
             self.attention.close()
             raise
+
+    @property
+    def owed_s(self) -> float:
+        """So long the late reply of a request that was given up may still come, which on RTU would pass for the reply
+        to the next one."""
+        return max(self._quiet_until_s - self.attention.now_s(), 0.0)
 
     async def close(self) -> None:
         self.attention.close()

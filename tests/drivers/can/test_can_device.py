@@ -143,6 +143,25 @@ async def test_an_answer_cut_short_is_no_answer(device: CanDevice, peer: Peer) -
         await asyncio.gather(device.read("status"), peer.converse(script))
 
 
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        "43 00 21 02 aa aa aa aa",  # a late answer: of another register
+        "60 00 21 01 00 00 00 00",  # to a write
+        "80 00 21 02 00 00 02 06",  # a refusal of another register
+    ],
+)
+async def test_an_answer_to_another_request_is_no_answer(device: CanDevice, peer: Peer, foreign: str) -> None:
+    asked = (0x605, "40 00 21 01 00 00 00 00")
+
+    async def answer() -> None:
+        await peer.converse([(asked, (0x585, foreign))])
+        peer.send(0x585, "43 00 21 01 9a 99 19 c0")
+
+    got, _ = await asyncio.gather(device.read("scale_factor_x"), answer())
+    assert got.hex() == "9a9919c0"
+
+
 async def test_two_transfers_at_once_go_one_after_the_other(device: CanDevice, peer: Peer) -> None:
     script = [((0x605, f"40 02 21 {n:02x} 00 00 00 00"), (0x585, f"43 02 21 {n:02x} 0{n} 00 00 00")) for n in (1, 2)]
     x, y, _ = await asyncio.gather(device.read("bias_x"), device.read("bias_y"), peer.converse(script))

@@ -20,6 +20,7 @@ from triaxcal_drivers.errors import (
     RegisterValueError,
 )
 from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.modbus import stack
 from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcal_drivers.modbus.model import ModbusBus
 
@@ -200,6 +201,36 @@ async def test_a_late_reply_on_a_serial_line_is_waited_out(bundle):
     os.write(master, bytes.fromhex("11 03 02 00 0A F9 80"))  # the reply to the first, too late
     assert await device.read("setting") == b"\x00\x0b"
     await device.close()
+    loop.remove_reader(master)
+    os.close(master)
+    os.close(slave)
+
+
+async def test_a_late_reply_on_a_serial_line_does_not_show_that_the_device_is_back(bundle, monkeypatch):
+    master, slave = os.openpty()
+    loop = asyncio.get_running_loop()
+    replies = ["11 04 02 00 0A F8 F4", None, None, None]
+
+    def answer() -> None:
+        os.read(master, 64)
+        if (reply := replies.pop(0)) is not None:
+            os.write(master, bytes.fromhex(reply))
+
+    loop.add_reader(master, answer)
+    device = ModbusDevice(bundle(hasty=True).profile, ModbusBus(serial_port=os.ttyname(slave), parity="N", unit_id=17))
+    await device.open()
+    with pytest.raises(DeviceSilent):
+        await device.read("setting")
+    open_serial = stack._open_serial
+
+    async def open_and_hear_the_late_reply(*where):
+        link = await open_serial(*where)
+        os.write(master, bytes.fromhex("11 03 02 00 0A F9 80"))
+        return link
+
+    monkeypatch.setattr(stack, "_open_serial", open_and_hear_the_late_reply)
+    with pytest.raises(DeviceAbsent):
+        await device.open()
     loop.remove_reader(master)
     os.close(master)
     os.close(slave)
