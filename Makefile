@@ -18,9 +18,10 @@ $(READY): pyproject.toml
 demo: $(READY)  ## the whole line on two simulated units
 	$(BIN)/triaxcal demo --out demo-out
 
-# Three processes on two processors: some tests wait for a bus, and others work meanwhile.
+# Two processes more than processors: some tests wait for a bus, and others work meanwhile.
+WORKERS = $(shell $(BIN)/python -c 'import os; print(os.cpu_count() + 2)')
 test: $(READY)  ## the whole test suite
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n 3 --dist worksteal
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 
 bench: $(READY)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)

@@ -17,7 +17,6 @@ _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
     (DeviceState.OLD, Evidence.NOTHING_STORED): "the old calibration is in use again, and nothing was stored",
     (DeviceState.OLD, Evidence.RESTART): "the device holds the old calibration, read back after a restart",
     (DeviceState.OLD, Evidence.POWER_CYCLE): "the device holds the old calibration, read back after a power cycle",
-    (DeviceState.OLD, Evidence.WRITE_COUNTER): "the device holds the old calibration: by its counter it has not stored",
     (DeviceState.OLD, None): "the old calibration is written back and reads back equal; no restart has proven it",
     (DeviceState.NEW_VERIFIED, Evidence.RESTART): "the device holds the new calibration, read back after a restart",
     (
@@ -45,16 +44,25 @@ def held(of: Held) -> str:
 
 def settling(p: Provisioning, station: Path) -> str:
     """The command that clears up what the device holds; empty where nothing is left to be cleared up."""
-    if p.settled:
-        return ""
-    unit, journal = p.unit, p.journal.path
-    resume = f"triaxcal provision --resume {station} --unit {unit}"
-    if p.held.state is DeviceState.NEW_UNVERIFIED:
-        return f"to verify: '{resume} --power-cycle', and switch its supply off and on when asked (journal: {journal})"
-    restore = f"triaxcal restore {journal} {station} --unit {unit}"
-    if p.held.state is DeviceState.OLD:
+    return "" if p.settled else to_settle(p.held, p.open_journal, p.unit, station)
+
+
+def to_settle(of: Held, journal: Path | None, unit: str, station: Path) -> str:
+    """The same, by the journal where there is one."""
+    provision = f"triaxcal provision {'--resume' if journal else 'CAL.json'} {station} --unit {unit}"
+    restore = f"triaxcal restore {journal or 'REC'} {station} --unit {unit}"
+    told = f" (journal: {journal})" if journal else ""
+    if of.state is DeviceState.NEW_UNVERIFIED:
+        return f"to verify: '{provision} --power-cycle', and switch its supply off and on when asked{told}"
+    if of.state is DeviceState.OLD:
         return f"to verify: '{restore} --power-cycle', and switch its supply off and on when asked"
-    return f"to settle: '{resume}' writes the new calibration, '{restore}' the old one"
+    return f"to settle: '{provision}' writes the new calibration, '{restore}' the old one"
+
+
+def unfinished(journal: Path, unit: str, station: Path) -> str:
+    """Of a device that this run has not examined."""
+    unknown = Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+    return f"an earlier provisioning was cut short; {to_settle(unknown, journal, unit, station)}"
 
 
 def left(p: Provisioning, station: Path) -> str:
@@ -64,10 +72,18 @@ def left(p: Provisioning, station: Path) -> str:
 
 def provisioned(p: Provisioning) -> str:
     """What was done, and what the device holds now."""
+    if not p.written and p.held.state is DeviceState.NEW_UNVERIFIED:
+        return "the registers in use held these values already, and nothing was written; no restart shows them stored"
     if not p.written:
         return f"the registers held these values already, and nothing was written; {held(p.held)}"
     stored = "written and stored" if p.stores else "written"
     return f"{len(p.written)} registers {stored}; {held(p.held)}"
+
+
+def put_back(p: Provisioning) -> str:
+    """The same of an old calibration."""
+    done = f"{len(p.written)} registers written back" if p.written else "nothing had to be written"
+    return f"{done}; {held(p.held)}"
 
 
 NO_LIMIT = "the station has no limit for what was measured"

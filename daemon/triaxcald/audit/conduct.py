@@ -169,9 +169,11 @@ class _Audit:
         state = held_in(held)
         if state is None:
             self._add(ATTACHMENT, Kind.NOT_SHOWN, "device_state", stored=held.get("device_state"))
-        elif _needs_journal(state, held.get("registers")) != (held.get("journal") is not None):
+        elif _needs_journal(state, held.get("registers")) not in (held.get("journal") is not None, None):
             wanted = "a path" if held.get("journal") is None else None
             self._add(ATTACHMENT, Kind.VALUE, "journal", stored=held.get("journal"), again=wanted)
+        if self._aborted and state is not None and _owes_device(state, held) and held.get("exit_code") != DEVICE:
+            self._add(ATTACHMENT, Kind.VALUE, "exit_code", stored=held.get("exit_code"), again=DEVICE)
         if again is None:
             return
         if state is not None and again.written and not self._aborted:
@@ -235,13 +237,14 @@ class _Audit:
             self._differences += compare(name, stored, again.encode())
 
     def _check_report(self, again: Again) -> None:
-        self._checked.append(REPORT)
         stored, ending = self._held.get(REPORT), again.ending()
         if stored is None:
+            self._checked.append(REPORT)
             self._add(REPORT, Kind.MISSING)
         elif any(self._versions()):
             self._listed_report = True
         elif ending is not None:
+            self._checked.append(REPORT)
             try:
                 drawn = report_of(again, ending, held_in(self._outcome) or Held())
             except CANNOT as e:
@@ -355,10 +358,18 @@ def _object(data: bytes) -> Mapping[str, Any] | None:
     return found
 
 
-def _needs_journal(held: Held, registers: object) -> bool:
-    """Whether something is left to be cleared up."""
-    failed = isinstance(registers, Mapping) and registers.get("undoing_failed") is not None
-    return not held.settled or (failed and held.state is not DeviceState.OLD)
+def _needs_journal(held: Held, registers: object) -> bool | None:
+    """Whether something is left to be cleared up; None where nothing was written, so that either may be."""
+    told = registers if isinstance(registers, Mapping) else {}
+    if held.state is DeviceState.NEW_UNVERIFIED and not told.get("written"):
+        return None
+    return not held.settled or (told.get("undoing_failed") is not None and held.state is not DeviceState.OLD)
+
+
+def _owes_device(held: Held, outcome: Mapping[str, Any]) -> bool:
+    """Whether registers were written, and what the device holds is not settled, so that the exit code says so."""
+    told = outcome.get("registers")
+    return isinstance(told, Mapping) and held.state is not DeviceState.UNTOUCHED and bool(_needs_journal(held, told))
 
 
 def _without_contents(data: bytes) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from triaxcal_drivers.interface import SampleBlock
@@ -16,10 +16,9 @@ from triaxcald.recording.schema import PREVIEWS, Decimator, PreviewEncoder
 
 @dataclass(frozen=True)
 class Thinned:
-    """The messages of one topic, one after the other."""
+    """The messages of one topic, one after the other, each by its SHA-256."""
 
-    messages: int
-    sha256: str
+    sha256: tuple[bytes, ...]
 
 
 class Previews:
@@ -28,31 +27,38 @@ class Previews:
     def __init__(self, profile: Profile) -> None:
         self._encoder = PreviewEncoder(preview_channels(profile))
         self._decimators = {topic: Decimator() for topic in PREVIEWS}
-        self._digests = {topic: hashlib.sha256() for topic in PREVIEWS}
-        self._counts = dict.fromkeys(PREVIEWS, 0)
+        self._digests: dict[str, list[bytes]] = {topic: [] for topic in PREVIEWS}
 
     def feed(self, stream: str, block: SampleBlock) -> None:
         topic = PREVIEWS[0] if stream == READINGS else PREVIEWS[1]
         for i in self._decimators[topic].pick(block):
-            self._counts[topic] += 1
-            self._digests[topic].update(self._encoder.encode(block, i))
+            self._digests[topic].append(hashlib.sha256(self._encoder.encode(block, i)).digest())
 
     def thinned(self) -> dict[str, Thinned]:
-        return {topic: Thinned(self._counts[topic], self._digests[topic].hexdigest()) for topic in PREVIEWS}
+        return {topic: Thinned(tuple(digests)) for topic, digests in self._digests.items()}
 
 
 def check(recording: Recording, again: Mapping[str, Thinned]) -> list[Difference]:
-    """Where none were lost on the way to the disk."""
-    counts, digests = dict.fromkeys(again, 0), {topic: hashlib.sha256() for topic in again}
+    """All of them in their order, but for as many as are said to have been lost on the way to the disk."""
+    stored: dict[str, list[bytes]] = {topic: [] for topic in again}
     for topic, message in recording.messages():
-        if topic in counts:
-            counts[topic] += 1
-            digests[topic].update(message.data)
-    lost = {loss.where for loss in recording.losses()}
+        if topic in stored:
+            stored[topic].append(hashlib.sha256(message.data).digest())
+    lost = dict.fromkeys(again, 0)
+    for loss in recording.losses():
+        if loss.where in lost:
+            lost[loss.where] += loss.records
     found = []
-    for topic in again.keys() - lost:
-        if counts[topic] != again[topic].messages:
-            found.append(Difference(topic, Kind.VALUE, "messages", counts[topic], again[topic].messages))
-        elif digests[topic].hexdigest() != again[topic].sha256:
+    for topic, thinned in again.items():
+        kept = len(thinned.sha256) - lost[topic]
+        if len(stored[topic]) != kept:
+            found.append(Difference(topic, Kind.VALUE, "messages", len(stored[topic]), kept))
+        elif not _is_part(stored[topic], thinned.sha256):
             found.append(Difference(topic, Kind.NOT_OF_RAW))
     return sorted(found, key=lambda d: d.part)
+
+
+def _is_part(some: Sequence[bytes], of: Sequence[bytes]) -> bool:
+    """Whether ``some`` is ``of`` with parts left out."""
+    left = iter(of)
+    return all(one in left for one in some)

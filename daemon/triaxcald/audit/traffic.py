@@ -91,7 +91,7 @@ class Traffic:
         missed = longest = 0
         for a in self.accesses[at + 1 :]:
             if a.operation == "read":
-                missed = missed + 1 if a.error else 0
+                missed = missed + 1 if a.unanswered else 0
                 longest = max(longest, missed)
         return longest >= MISSED
 
@@ -274,7 +274,7 @@ _SHOWN: dict[DeviceState, _Shows] = {
 _GOES_WITH: dict[DeviceState, tuple[Evidence, ...]] = {
     DeviceState.UNTOUCHED: (Evidence.NOTHING_WRITTEN,),
     DeviceState.OLD: (
-        Evidence.NOTHING_STORED, Evidence.READ_BACK, Evidence.RESTART, Evidence.POWER_CYCLE, Evidence.WRITE_COUNTER,
+        Evidence.NOTHING_STORED, Evidence.READ_BACK, Evidence.RESTART, Evidence.POWER_CYCLE,
     ),
     DeviceState.NEW_VERIFIED: (Evidence.RESTART, Evidence.POWER_CYCLE),
     DeviceState.NEW_UNVERIFIED: (Evidence.READ_BACK, Evidence.WRITE_COUNTER),
@@ -286,12 +286,14 @@ _GOES_WITH: dict[DeviceState, tuple[Evidence, ...]] = {
 def _restarted(traffic: Traffic, said: Said) -> bool:
     """A restart after the last write, then all registers read. One that nobody acknowledged counts where an old value
     was put into a register in use before it, and did not come back."""
+    lasting = said.held is not None and said.held.state is DeviceState.OLD
+    if not traffic.profile.sequences.reset:  # it may have lost its supply, and started from what is stored
+        return lasting
     if not traffic.sequence("reset"):  # by no register, so that no traffic could show it
         return True
     image, old = said.new, said.before or {}
     tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
-    lasting = said.held is not None and said.held.state is DeviceState.OLD
     if _acknowledged(traffic):
         return True
     return (tried or lasting) and any(traffic.last_write < i < last for i, _ in traffic.steps("reset"))

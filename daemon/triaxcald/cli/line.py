@@ -135,6 +135,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms{without(loop)}; {loop.unexplained.lead}")
     if o.provisioned:
         print(f"  {text.provisioned(o.provisioned)}")
+    if o.settling and o.error is None:
+        print(f"  {o.settling}")
     if v:
         left_out = sum(not p["used"] for p in v["poses"])
         poses = f"; {counted(len(v['poses']), left_out, 'check poses')}" if left_out else ""

@@ -22,7 +22,7 @@ from triaxcald.provision.identity import same_serial
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.station.config import Place, load_station
-from triaxcald.station.provisioning import Provisioned, ProvisionRun, restored, snapshot_in, unit_in
+from triaxcald.station.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
 from triaxcald.station.today import days_since_1970
 
 
@@ -64,7 +64,7 @@ def provision_command(a: argparse.Namespace) -> int:
     if a.json:
         emit(_document(done, place, dry_run=a.dry_run))
     elif done.error is None:
-        _show(done, place)
+        _show(done, place, station.path)
     if done.error is not None:
         say(f"triaxcal: {done.error}")
     return done.exit_code
@@ -106,7 +106,7 @@ def _words(p: Provisioning) -> list[dict[str, Any]]:
     ]
 
 
-def _show(done: Provisioned, place: Place) -> None:
+def _show(done: Provisioned, place: Place, station: Path) -> None:
     p = done.provisioning
     assert p is not None
     table(
@@ -117,9 +117,9 @@ def _show(done: Provisioned, place: Place) -> None:
     for doubt in p.doubts:
         say(f"warning: {text.doubt(doubt)}")
     print(done.document["reason"])
-    if done.path is not None and (journal := done.document["journal"]):
-        print(f"outcome {done.path}, journal {journal}")
-    elif done.path is not None:
+    if settling := text.settling(p, station):
+        print(settling)
+    if done.path is not None:
         print(f"outcome {done.path}")
 
 
@@ -168,18 +168,27 @@ def restore_command(a: argparse.Namespace) -> int:
     place = station.place(a.unit or (theirs if theirs in names else None))
     snapshot, _ = snapshot_in(a.source, place.bundle.profile)
     ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
-    p = run_interruptible(restored(station, place, snapshot, ask))
+    run = RestoreRun(station, place, ask=ask, snapshot=snapshot)
+    done = run_interruptible(run.run())
+    p = done.provisioning
     if a.json:
         emit(
             {
                 "format": "triaxcal.restoration/1",
                 "unit": place.unit.name,
-                "serial": p.identity.serial,
-                "device_state": p.held.state.value,
-                "evidence": p.held.evidence.value,
+                "serial": p.identity.serial if p else None,
+                "device_state": done.document["device_state"],
+                "evidence": done.document["evidence"],
                 "registers": {name: raw.hex() for name, raw in snapshot.raw.items()},
+                "error": done.error,
+                "outcome": done.document,
+                "outcome_file": str(done.path) if done.path else None,
             }
         )
-    else:
-        print(f"unit {place.unit.name}, serial {p.identity.serial}: {text.left(p, station.path)}")
-    return 0
+    elif p is not None and done.error is None:
+        told = [text.put_back(p), text.settling(p, station.path)]
+        print(f"unit {place.unit.name}, serial {p.identity.serial}: {'; '.join(filter(None, told))}")
+        print(f"outcome {done.path}")
+    if done.error is not None:
+        say(f"triaxcal: {done.error}")
+    return done.exit_code

@@ -28,12 +28,14 @@ NO_CONTACT = (BusError, DeviceAbsent, DeviceSilent)
 
 @dataclass(frozen=True)
 class RegisterAccess:
-    """``raw`` as on the wire, written or read (empty where a read failed); ``error`` the driver's message."""
+    """``raw`` as on the wire, written or read (empty where a read failed); ``error`` the driver's message.
+    ``unanswered``: nothing came back, not even a refusal."""
 
     kind: Kind
     register: str
     raw: bytes
     error: str | None = None
+    unanswered: bool = False
 
 
 class RegisterLink:
@@ -132,7 +134,7 @@ class RegisterLink:
         try:
             raw = await self._device.read(register)
         except DriverError as e:
-            self._record(RegisterAccess("read", register, b"", str(e)))
+            self._record(RegisterAccess("read", register, b"", str(e), isinstance(e, NO_CONTACT)))
             raise
         self._record(RegisterAccess("read", register, raw))
         return raw
@@ -143,6 +145,6 @@ class RegisterLink:
         try:
             await self._device.write(register, raw, **given)
         except DriverError as e:
-            self._record(RegisterAccess("write", register, raw, str(e)))
+            self._record(RegisterAccess("write", register, raw, str(e), isinstance(e, NO_CONTACT)))
             raise
         self._record(RegisterAccess("write", register, raw))

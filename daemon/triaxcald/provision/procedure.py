@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
 from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle
-from triaxcald.errors import InputError, ProvisionError, StationError
+from triaxcald.errors import DiskError, InputError, ProvisionError, StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
-from triaxcald.provision.image import RegisterImage
+from triaxcald.provision.image import RegisterImage, calibration_registers
 from triaxcald.provision.journal import Entry, Journal, Step
-from triaxcald.provision.plausible import Doubt, doubts, fits_its_checksum, unstable
+from triaxcald.provision.plausible import Doubt, doubts, unstable
 from triaxcald.provision.proof import show_restart
 from triaxcald.provision.restore import restore
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.provision.unfinished import was_cut_short
 
 T = TypeVar("T")
 
@@ -59,6 +60,7 @@ class Provisioning:
     _store_owed: bool = False
     """What is in use is the image, and the provisioning that was cut short may not have stored it."""
     _restarted: bool = False
+    _journal_lies: bool = False
     _journaled: bool = False
     _unlocked: bool = False
     _store_asked: bool = False
@@ -85,33 +87,47 @@ class Provisioning:
         """Whether what is written takes a store to last; else every write lasts."""
         return bool(self.bundle.profile.sequences.store)
 
+    @property
+    def open_journal(self) -> Path | None:
+        """The journal, where one lies and is still needed."""
+        return self.journal.path if self._journal_lies and not self.settled else None
+
     async def examine(self, *, restart: bool = True) -> None:
         """Who is there, and what it holds. Nothing is written.
 
         A device that holds the image already, or that has a journal, is restarted, where ``restart`` allows: what is in
         use may not be what is stored. Raises WrongUnit, InputError (the journal), DriverError, SequenceStalled.
         """
-        self.steps.append("identity")
-        self.identity = await check_identity(self.link, self.bundle, self.expected_serial, where=self.where)
-        self.journal = Journal.of(self.folder, self.unit, self.identity.serial)
-        self.found = await self._read("reading the old calibration")
+        await self.identify()
         entry = self.journal.read()
+        if entry is not None:
+            if set(entry.before) != set(calibration_registers(self.bundle.profile)):
+                name = self.bundle.profile.name
+                raise InputError(f"{self.journal.path}: its registers are not those of profile {name}")
+            self._journal_lies = True
+            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+        self.found = await self._read("reading the old calibration")
         if restart and self.resets and (entry is not None or not self.found.differing(self.image.raw)):
             self._restarted = await self._sequence("reset")
             self.found = await self._read("reading the stored calibration")
         self.before = self.after = self.found
         self.differing = self.found.differing(self.image.raw)
-        if entry is not None and self._is_cut_short(entry):
+        if entry is not None and was_cut_short(entry, self.bundle.profile, self.found, self.image, self._restarted):
             self.carried, self.before = True, Snapshot(entry.before, self.identity.serial)
-            self._store_owed = self.stores and entry.step != "stored" and not self._restarted
+            self._store_owed = self.stores and entry.step not in ("stored", "unverified") and not self._restarted
             if self.found.differing(entry.wanted) and self.found.differing(entry.before):
                 self.held.now(DeviceState.MIXED, Evidence.READ_BACK)
-            else:
-                self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         else:
+            self.held.now(DeviceState.UNTOUCHED, Evidence.NOTHING_WRITTEN)
             again = await self._read("reading the old calibration again")
             profile = self.bundle.profile
             self.doubts = unstable(profile, self.found, again) or doubts(profile, self.found, self.image)
+
+    async def identify(self) -> None:
+        """Who is there. Raises WrongUnit, DriverError."""
+        self.steps.append("identity")
+        self.identity = await check_identity(self.link, self.bundle, self.expected_serial, where=self.where)
+        self.journal = Journal.of(self.folder, self.unit, self.identity.serial)
 
     async def write(self) -> None:
         """Write what differs, store it, restart the device, and read it back.
@@ -139,10 +155,29 @@ class Provisioning:
             await to_its_end(self._give_up())
             raise
 
-    def begin(self) -> None:
-        """What is to be written, and what the device holds, on the disk. Raises DiskError."""
-        if self.journal.read() is None:
+    async def put_back(self, snapshot: Snapshot) -> None:
+        """Instead of `examine` and `write`: the registers of ``snapshot``, whose image this is, back into the device.
+
+        An earlier journal stays as it is, so that a cut leaves no more to choose from than there was. Raises
+        ProvisionError that says why they are not back, WrongUnit, DriverError, DiskError.
+        """
+        self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+        await self.identify()
+        self.found = self.before = self.after = await self._read("reading the registers")
+        self.differing = self.found.differing(snapshot.raw)
+        with suppress(InputError):  # one that cannot be read is of no use
+            self._journal_lies = self.journal.read() is not None
+        if self.differing and not self._journal_lies:
             self._note("writing")
+        self.before, self.carried = snapshot, True
+        await self.undo()
+        self.written = [name for name in self.differing if name in self.link.touched]
+        if (task := asyncio.current_task()) and task.cancelling():
+            raise asyncio.CancelledError
+        if self.held.state is DeviceState.OLD:
+            await self.prove_old()
+        if self.held.state is not DeviceState.OLD:
+            raise ProvisionError(self.undoing_failed or "the old calibration is not back")
 
     async def undo(self) -> None:
         """The old calibration back in the device, by whatever it takes; ``held`` says whether it is."""
@@ -157,17 +192,32 @@ class Provisioning:
             self.after = await self._look()
             if lost := self.after.differing(self.before.raw):
                 self.undoing_failed = f"after the power cycle {', '.join(lost)} no longer held the old calibration"
-            self.held.now(DeviceState.UNKNOWN if lost else DeviceState.OLD, Evidence.POWER_CYCLE)
+            self.held.now(self._state_of(self.after), Evidence.POWER_CYCLE)
 
     @property
     def settled(self) -> bool:
         """Whether nothing is left to be cleared up."""
         return self.held.settled and (self.undoing_failed is None or self.held.state is DeviceState.OLD)
 
+    @contextmanager
+    def finishing(self) -> Iterator[None]:
+        """At its end the journal goes, where nothing is left to be cleared up. Raises DiskError, unless something else
+        has been raised."""
+        try:
+            yield
+        except BaseException:
+            with suppress(DiskError):
+                self.finish()
+            raise
+        self.finish()
+
     def finish(self) -> None:
-        """The journal goes where nothing is left to be cleared up. Raises DiskError."""
+        """As `finishing` does at its end. Raises DiskError."""
+        if not self.examined:
+            return
         if self.settled and (self.held.state is not DeviceState.UNTOUCHED or self._journaled):
             self.journal.remove()
+            self._journal_lies = False
         elif self._journaled and self.held.state is DeviceState.NEW_UNVERIFIED:
             self._note("unverified")
 
@@ -181,7 +231,7 @@ class Provisioning:
         for name in self.differing:
             self.steps.append(f"writing {name}")
             if not self.stores:  # each write lasts, as a store does
-                await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)
+                await self._require_same_unit()
             self.written.append(name)
             self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
             await self.link.write(name, self.image.raw[name])
@@ -236,7 +286,13 @@ class Provisioning:
         await self._decide(Evidence.RESTART if acknowledged else Evidence.READ_BACK)
         if not acknowledged and self.stores and self.held.state is not DeviceState.OLD:
             self.steps.append("showing the restart")
-            if await show_restart(self.link, self.bundle, self.image.raw, self.found.raw, self.differing):
+            was = self.held.state, self.held.evidence
+            self._decided = False  # for as long as an old value is in one of the registers
+            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+            shown = await show_restart(self.link, self.bundle, self.image.raw, self.found.raw, self.differing)
+            self._decided = True
+            self.held.now(*was)
+            if shown:
                 await self._decide(Evidence.RESTART)
 
     async def _decide(self, evidence: Evidence) -> None:
@@ -266,7 +322,9 @@ class Provisioning:
         if self.written or self.carried or self._store_asked:
             await self._undo()
         elif self._unlocked:
-            await lock_quietly(self.link, self.bundle)
+            with suppress(DriverError, StationError):
+                await self._require_same_unit()
+                await lock_quietly(self.link, self.bundle)
 
     async def _undo(self) -> None:
         lasting = self._store_asked or not self.stores or self.carried
@@ -286,17 +344,21 @@ class Provisioning:
 
     async def _judge(self, lasting: bool) -> None:
         """What an undoing that failed has left. Raises DriverError, StationError."""
+        await self._require_same_unit()
         restarted = self.resets and await run_sequence(self.link, self.bundle, "reset")
         held = self.after = await self._look()
-        evidence = Evidence.RESTART if restarted else Evidence.READ_BACK
+        state = self._state_of(held)
+        if not restarted and state is DeviceState.OLD and lasting:
+            state = DeviceState.UNKNOWN
+        if not restarted and state is DeviceState.NEW_VERIFIED:
+            state = DeviceState.NEW_UNVERIFIED if self.stored or not self.stores else DeviceState.UNKNOWN
+        self.held.now(state, Evidence.RESTART if restarted else Evidence.READ_BACK)
+
+    def _state_of(self, held: Snapshot) -> DeviceState:
+        """What a device holds that started with these registers."""
         if not held.differing(self.before.raw):
-            state = DeviceState.OLD if restarted or not lasting else DeviceState.UNKNOWN
-        elif not held.differing(self.image.raw):
-            unproven = DeviceState.NEW_UNVERIFIED if self.stored or not self.stores else DeviceState.UNKNOWN
-            state = DeviceState.NEW_VERIFIED if restarted else unproven
-        else:
-            state = DeviceState.MIXED
-        self.held.now(state, evidence)
+            return DeviceState.OLD
+        return DeviceState.MIXED if held.differing(self.image.raw) else DeviceState.NEW_VERIFIED
 
     # Steps of both.
 
@@ -310,10 +372,13 @@ class Provisioning:
 
     async def _same_unit(self, step: str) -> None:
         self.steps.append(step)
+        await self._require_same_unit()
+
+    async def _require_same_unit(self) -> None:
         await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)
 
     async def _look(self) -> Snapshot:
-        await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)
+        await self._require_same_unit()
         return await take_snapshot(self.link, self.bundle)
 
     async def _reach(self) -> None:
@@ -339,7 +404,7 @@ class Provisioning:
             )
 
     def _note(self, step: Step) -> None:
-        self._journaled = True
+        self._journaled = self._journal_lies = True
         self.journal.write(
             Entry(
                 unit=self.unit,
@@ -351,19 +416,6 @@ class Provisioning:
                 step=step,
             )
         )
-
-    def _is_cut_short(self, entry: Entry) -> bool:
-        """Whether the device still is as that provisioning left it, and not as somebody has made it since."""
-        if set(entry.before) != set(self.found.raw):
-            raise InputError(f"{self.journal.path}: its registers are not those of profile {self.bundle.profile.name}")
-        if not self.found.differing(entry.before):  # which is in use, and may not be what is stored
-            return self.stores and not self._restarted
-        if not self.found.differing(entry.wanted):
-            return entry.step != "unverified" or not self.found.differing(self.image.raw)
-        if self.bundle.profile.crc is not None:
-            return not fits_its_checksum(self.bundle.profile, self.found)
-        torn = [n for n, raw in self.found.raw.items() if raw not in (entry.before[n], entry.wanted.get(n))]
-        return len(torn) <= 1  # a supply that fails in a write leaves one register half written
 
 
 async def to_its_end(work: Coroutine[object, object, T]) -> T:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from triaxcal_drivers.errors import RegisterRefused
 from triaxcal_drivers.profile import Bundle
-from triaxcald.errors import StationError
+from triaxcald.errors import ProvisionError, StationError
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.sequence import lock_quietly, run_sequence
 
@@ -21,7 +21,7 @@ async def show_restart(
     """Restart once more with an old value in one register in use: only a restart brings the stored one back.
 
     For devices whose writes do not last without a store. The value is put back where the restart did not. Raises
-    DriverError, SequenceStalled where the device does not come back.
+    ProvisionError where that fails; DriverError, SequenceStalled where the device does not come back.
     """
     checksum = bundle.profile.crc.register_name if bundle.profile.crc else None
     name = next((n for n in differing if n != checksum), None)
@@ -30,7 +30,8 @@ async def show_restart(
     await run_sequence(link, bundle, "reset")
     if await link.read(name) == image[name]:
         return True
-    await _put(link, bundle, name, image[name])
+    if not await _put(link, bundle, name, image[name]):
+        raise ProvisionError(f"register {name} does not take the new value again")
     return False
 
 

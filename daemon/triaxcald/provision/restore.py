@@ -8,7 +8,7 @@ from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle, PollStep, WaitStep
 from triaxcald.errors import ProvisionError, StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
-from triaxcald.provision.identity import check_identity
+from triaxcald.provision.identity import WrongUnit, check_identity
 from triaxcald.provision.sequence import lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.provision.state import Evidence
@@ -55,6 +55,7 @@ async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> No
         await check_identity(link, bundle, snapshot.serial)
     except NO_CONTACT:
         await reconnect(link, bundle.profile)
+        await check_identity(link, bundle, snapshot.serial)
 
 
 async def _restart(link: RegisterLink, bundle: Bundle) -> bool:
@@ -69,7 +70,7 @@ async def _restart(link: RegisterLink, bundle: Bundle) -> bool:
 
 
 async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, stored: bool) -> bool:
-    acknowledged = True
+    acknowledged, theirs = True, False
     try:
         await run_sequence(link, bundle, "unlock")
         for name in await differing(link, bundle, snapshot):
@@ -77,8 +78,12 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, st
         await _require_equal(link, bundle, snapshot)  # before anything wrong is made permanent
         if stored:
             acknowledged = await run_sequence(link, bundle, "store")
+    except WrongUnit:
+        theirs = True
+        raise
     finally:
-        await lock_quietly(link, bundle)
+        if not theirs:
+            await lock_quietly(link, bundle)
     if not stored:
         return False
     restarted = bool(bundle.profile.sequences.reset) and await run_sequence(link, bundle, "reset")

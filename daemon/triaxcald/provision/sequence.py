@@ -88,7 +88,8 @@ async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollSt
 async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | None = None) -> None:
     """Close and open until the device answers, for `RECONNECT_S` where nothing else is said.
 
-    Raises DeviceAbsent, DeviceSilent, BusError at the deadline.
+    One that starts may refuse for a while. At the deadline raises DeviceAbsent, DeviceSilent, BusError,
+    RegisterRefused.
     """
     deadline_s = link.pace.clock_s() + (RECONNECT_S if timeout_s is None else timeout_s)
     while True:
@@ -98,7 +99,7 @@ async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | Non
             if register := probe(profile):
                 await link.read_once(register)
             return
-        except (*NO_CONTACT, DeviceBusy):
+        except (*NO_CONTACT, RegisterRefused):
             if link.pace.clock_s() >= deadline_s:
                 raise
         await link.pace.sleep(RETRY_S)

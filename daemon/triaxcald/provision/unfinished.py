@@ -1,19 +1,17 @@
-"""Finishes what an earlier provisioning has begun, or takes it back: by its journal, or by a snapshot."""
+"""What an earlier provisioning that was cut short had begun, by its journal."""
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
-from triaxcal_drivers.profile import Bundle
-from triaxcald.errors import InputError, ProvisionError
+from triaxcal_drivers.profile import Bundle, Profile
+from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import check_identity
 from triaxcald.provision.image import RegisterImage, image_of
-from triaxcald.provision.journal import Journal
-from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.journal import Entry, Journal
+from triaxcald.provision.plausible import fits_its_checksum
 from triaxcald.provision.snapshot import Snapshot
-from triaxcald.provision.state import DeviceState, Evidence
 
 
 async def journaled_image(
@@ -33,22 +31,18 @@ async def journaled_image(
     return image_of(bundle.profile, entry.wanted), identity.serial
 
 
-async def put_back(p: Provisioning, snapshot: Snapshot) -> None:
-    """The registers of ``snapshot`` back into the device of ``p``, whose image is the snapshot's.
+def was_cut_short(entry: Entry, profile: Profile, found: Snapshot, image: RegisterImage, restarted: bool) -> bool:
+    """Whether a device with a journal still is as that provisioning left it, and not as somebody has made it since.
 
-    Raises ProvisionError that says why they are not; what the device holds then is in ``p.held``. WrongUnit,
-    DriverError, DiskError.
+    ``found`` was read after a restart, where ``restarted`` says so; ``image`` is what is to be written now.
     """
-    p.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
-    await p.examine()
-    if p.found.differing(snapshot.raw):
-        p.begin()
-    p.before, p.carried = snapshot, True
-    await p.undo()
-    if (task := asyncio.current_task()) and task.cancelling():
-        raise asyncio.CancelledError
-    if p.held.state is DeviceState.OLD:
-        await p.prove_old()
-    if p.held.state is not DeviceState.OLD:
-        raise ProvisionError(p.undoing_failed or "the old calibration is not back")
-    p.finish()
+    if not found.differing(entry.before):  # which is in use, and may not be what is stored
+        return bool(profile.sequences.store) and not restarted
+    if not found.differing(entry.wanted):
+        return entry.step != "unverified" or not found.differing(image.raw)
+    torn = [n for n, raw in found.raw.items() if raw not in (entry.before[n], entry.wanted.get(n))]
+    if profile.crc is None:
+        return len(torn) <= 1  # a supply that fails in a write leaves one register half written
+    # Without a serial number, a blank unit at the same place is not to be taken for one that was cut short.
+    known = profile.identity.serial_register is not None or len(torn) <= 1
+    return known and not fits_its_checksum(profile, found)

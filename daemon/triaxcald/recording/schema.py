@@ -58,6 +58,7 @@ _MESSAGES: Mapping[str, Sequence[_Field]] = {
         ("operation", _F.TYPE_STRING, False),
         ("raw", _F.TYPE_BYTES, False),
         ("error", _F.TYPE_STRING, False),
+        ("unanswered", _F.TYPE_BOOL, False),
     ),
     "Event": (
         ("time_ns", _F.TYPE_FIXED64, False),
@@ -77,13 +78,15 @@ _MESSAGES: Mapping[str, Sequence[_Field]] = {
 
 @dataclass(frozen=True)
 class RegisterAccess:
-    """``raw`` is what went over the wire, most significant byte first; ``error`` is empty where it worked."""
+    """``raw`` is what went over the wire, most significant byte first; ``error`` is empty where it worked.
+    ``unanswered``: nothing came back, not even a refusal."""
 
     time_ns: int
     register: str
     operation: Operation
     raw: bytes
     error: str = ""
+    unanswered: bool = False
 
 
 @dataclass(frozen=True)
@@ -207,7 +210,7 @@ def encode(value: RegisterAccess | Event | Loss) -> bytes:
 
 def decode_register_access(data: bytes) -> RegisterAccess:
     m = _parse("RegisterAccess", data)
-    return RegisterAccess(m.time_ns, m.register, m.operation, m.raw, m.error)
+    return RegisterAccess(m.time_ns, m.register, m.operation, m.raw, m.error, m.unanswered)
 
 
 def decode_event(data: bytes) -> Event:

@@ -100,9 +100,11 @@ class RecordingWriter:
                 return True
             return self._offer(topic, 0, len(picked), partial(self._write_preview, topic, block, picked))
 
-    def register(self, name: str, operation: schema.Operation, raw: bytes, error: str = "") -> None:
+    def register(
+        self, name: str, operation: schema.Operation, raw: bytes, error: str = "", *, unanswered: bool = False
+    ) -> None:
         self._check()
-        access = schema.RegisterAccess(self._clock_ns(), name, operation, raw, error)
+        access = schema.RegisterAccess(self._clock_ns(), name, operation, raw, error, unanswered)
         self._jobs.put(partial(self._write, schema.REGISTERS, access))
 
     def event(self, kind: str, detail: Mapping[str, Any] | None = None) -> None:

@@ -38,8 +38,9 @@ from triaxcald.pipeline import Pipeline
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.provision.image import RegisterImage
+from triaxcald.provision.journal import Journal
 from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.state import Held
+from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.unit import drawn_with, unit_report
 from triaxcald.station.collection import Collection, Progress
@@ -57,7 +58,8 @@ class Outcome:
     """How one unit's run ended. ``exit_code`` as the command line owes it; ``error`` one line where it failed.
 
     ``document`` is the `triaxcal.outcome/1`. ``device_state`` says in words what the device holds, None where nothing
-    was to be written. ``lost`` counts records that did not get to the disk.
+    was to be written; ``settling`` the command that clears it up, None where nothing is left to be cleared up. ``lost``
+    counts records that did not get to the disk.
     """
 
     unit: str
@@ -72,6 +74,7 @@ class Outcome:
     verification: Document | None = None
     provisioned: Provisioning | None = None
     device_state: str | None = None
+    settling: str | None = None
     error: str | None = None
     wanted: tuple[str, ...] = ()
     lost: int = 0
@@ -95,6 +98,7 @@ class UnitRun:
         self.name = place.unit.name
         self.profile = place.bundle.profile
         self._serial: str | None = None
+        self._open_journal: Path | None = None
         self._recording: Path | None = None
         self._papers: dict[str, str] = {}
         self._paths: dict[str, Path] = {}
@@ -110,6 +114,7 @@ class UnitRun:
             async with self.place.opened() as device:
                 identity = await self.identify(device)
                 self._serial = identity.serial
+                self._open_journal = self._journal_of(identity)
                 self._recording = self.recording_path(identity)
                 with self.writer(self._recording, identity) as writer:
                     ending = await self._ending(device, identity, writer)
@@ -117,6 +122,9 @@ class UnitRun:
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
             if self._document is None:  # what is sealed stays said
                 ending = aborted(e, self._provisioning)
+                self._papers = {}  # which speak of another ending
+                if self._recording is not None:
+                    self._document = self._outcome_document(ending, None)
         assert ending is not None
         try:
             self._write_papers()
@@ -147,7 +155,9 @@ class UnitRun:
 
     @property
     def _held(self) -> Held:
-        return self._provisioning.held if self._provisioning else Held()
+        if self._provisioning:
+            return self._provisioning.held
+        return Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER) if self._open_journal else Held()
 
     def _seal(self, writer: RecordingWriter, ending: Ending) -> None:
         """The outcome as the last attachment, with the inventory of all that is before it; closes the recording."""
@@ -189,7 +199,19 @@ class UnitRun:
     def _journal(self) -> str | None:
         """Where it is still needed."""
         p = self._provisioning
-        return None if p is None or p.settled else str(p.journal.path)
+        path = p.open_journal if p else self._open_journal
+        return str(path) if path else None
+
+    @property
+    def _settling(self) -> str | None:
+        if self._provisioning:
+            return text.settling(self._provisioning, self.station.path) or None
+        return text.unfinished(self._open_journal, self.name, self.station.path) if self._open_journal else None
+
+    def _journal_of(self, identity: IdentityRead) -> Path | None:
+        """The journal of an earlier provisioning of the unit that was cut short."""
+        path = Journal.of(self.station.folder, self.name, identity.serial).path
+        return path if path.exists() else None
 
     def _write_papers(self) -> None:
         """The files beside the recording, once it is closed: certificate and report, the outcome last."""
@@ -207,8 +229,8 @@ class UnitRun:
         error = None
         if ending.verdict is Verdict.ABORTED or ending.exit_code == DISK:
             told = [ending.reason, *([state] if state and state not in ending.reason else [])]
-            if back and back.provisioning and (settle := text.settling(back.provisioning, self.station.path)):
-                told.append(settle)
+            if settling := self._settling:
+                told.append(settling)
             error = f"unit {self.name}: {'; '.join(told)}"
         return Outcome(
             unit=self.name,
@@ -223,6 +245,7 @@ class UnitRun:
             verification=back.verification if back else None,
             provisioned=back.provisioning if back else None,
             device_state=state,
+            settling=self._settling,
             error=error,
             wanted=ending.wanted,
             lost=self._lost,

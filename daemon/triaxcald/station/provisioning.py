@@ -17,7 +17,7 @@ from triaxcald import text
 from triaxcald.abort import Left, at_abort
 from triaxcald.certificate import software
 from triaxcald.documents import Document, to_text
-from triaxcald.errors import Implausible, InputError, ProvisionError, RecordingError
+from triaxcald.errors import Implausible, InputError, RecordingError
 from triaxcald.exit_codes import BAD_INPUT, DISK, DONE
 from triaxcald.files import write_new
 from triaxcald.outcome import (
@@ -36,7 +36,7 @@ from triaxcald.provision.plausible import Doubt
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.snapshot import Snapshot
 from triaxcald.provision.state import DeviceState, Evidence, Held
-from triaxcald.provision.unfinished import journaled_image, put_back
+from triaxcald.provision.unfinished import journaled_image
 from triaxcald.recording.reader import Recording
 from triaxcald.station.config import Place, Station
 from triaxcald.station.endings import aborted
@@ -73,6 +73,7 @@ class ProvisionRun:
     clock_ns: Callable[[], int] = time.time_ns
     provisioning: Provisioning | None = field(default=None, init=False)
     doubts: Sequence[Doubt] = field(default=(), init=False)
+    _begun: Provisioning | None = field(default=None, init=False)
 
     async def run(self) -> Provisioned:
         """Raises nothing, not even when it is cancelled: it says everything in the outcome."""
@@ -99,24 +100,13 @@ class ProvisionRun:
 
     def left(self, _: float) -> Left | None:
         """What the end at once would leave behind."""
-        p = self.provisioning
-        return None if p is None else Left(text.left(p, self.station.path), not p.settled)
+        p = self._begun
+        return Left(text.left(p, self.station.path), not p.settled) if p is not None and p.examined else None
 
     async def _work(self, device: Device) -> None:
         bundle = self.place.bundle
         link = RegisterLink(device, bundle.profile)
-        image = self.image or await self._image_of_journal(link)
-        p = Provisioning(
-            link,
-            bundle,
-            image,
-            unit=self.place.unit.name,
-            folder=self.station.folder,
-            expected_serial=self.serial or self.place.unit.serial,
-            where=self.place.address,
-            started=self._now(),
-            power_cycle=power_cycle_asked(self.ask, link, self.place, self.station) if self.ask else None,
-        )
+        p = self._begin(link, self.image or await self._image_of_journal(link))
         await p.examine(restart=not self.dry_run)
         self.provisioning = p
         self.doubts = p.doubts
@@ -125,10 +115,22 @@ class ProvisionRun:
         if self.doubts and self.force is None and not self.dry_run:
             raise Implausible(text.doubted(self.doubts))
         if not self.dry_run:
-            try:
+            with p.finishing():
                 await p.write()
-            finally:
-                p.finish()
+
+    def _begin(self, link: RegisterLink, image: RegisterImage) -> Provisioning:
+        p = self._begun = Provisioning(
+            link,
+            self.place.bundle,
+            image,
+            unit=self.place.unit.name,
+            folder=self.station.folder,
+            expected_serial=self.serial or self.place.unit.serial,
+            where=self.place.address,
+            started=self._now(),
+            power_cycle=power_cycle_asked(self.ask, link, self.place, self.station) if self.ask else None,
+        )
+        return p
 
     async def _image_of_journal(self, link: RegisterLink) -> RegisterImage:
         image, self.serial = await journaled_image(
@@ -143,8 +145,8 @@ class ProvisionRun:
 
     @property
     def _held(self) -> Held:
-        if self.provisioning is not None:
-            return self.provisioning.held
+        if self._begun is not None:
+            return self._begun.held
         return Held() if self.image is not None else Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
 
     def _now(self) -> str:
@@ -168,7 +170,7 @@ class ProvisionRun:
             ended=self._now(),
             software=software(),
             supersedes=latest_of(self.station.folder, p.identity.serial) if p else None,
-            journal=str(p.journal.path) if p and not p.settled else None,
+            journal=str(self._begun.open_journal) if self._begun and self._begun.open_journal else None,
             forced=self.force if self.doubts else None,
         )
 
@@ -182,35 +184,31 @@ class ProvisionRun:
         if not ending.exit_code:
             return None
         told = [ending.reason]
-        p = self.provisioning
-        if p is not None and ending.verdict is Verdict.ABORTED:
+        p = self._begun
+        if p is not None and (p.examined or p.open_journal) and ending.verdict is Verdict.ABORTED:
             told.append(text.left(p, self.station.path))
         return "; ".join(filter(None, told))
 
 
-async def restored(
-    station: Station, place: Place, snapshot: Snapshot, ask: Callable[[str], None] | None = None
-) -> Provisioning:
-    """The registers of ``snapshot`` back in the device. Raises ProvisionError that says what it holds instead,
-    WrongUnit, DriverError."""
-    async with place.opened() as device:
-        link = RegisterLink(device, place.bundle.profile)
-        p = Provisioning(
-            link,
-            place.bundle,
-            image_of(place.bundle.profile, snapshot.raw),
-            unit=place.unit.name,
-            folder=station.folder,
-            expected_serial=snapshot.serial or place.unit.serial,
-            where=place.address,
-            power_cycle=power_cycle_asked(ask, link, place, station) if ask else None,
-        )
+@dataclass
+class RestoreRun(ProvisionRun):
+    """Puts ``snapshot`` back into the device at ``place``."""
+
+    snapshot: Snapshot = field(default_factory=lambda: Snapshot({}))
+
+    async def _work(self, device: Device) -> None:
+        profile = self.place.bundle.profile
+        self.serial = self.snapshot.serial
+        p = self._begin(RegisterLink(device, profile), image_of(profile, self.snapshot.raw))
         try:
-            with at_abort(lambda _: Left(text.left(p, station.path), not p.settled) if p.examined else None):
-                await put_back(p, snapshot)
-        except ProvisionError as e:
-            raise ProvisionError(f"{e}; {text.held(p.held)}") from e
-        return p
+            with p.finishing():
+                await p.put_back(self.snapshot)
+        finally:
+            self.provisioning = p if p.examined else None
+
+    def _done(self) -> str:
+        assert self.provisioning is not None
+        return text.put_back(self.provisioning)
 
 
 def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:

@@ -91,11 +91,9 @@ class WriteBack:
         self._attach(REGISTERS_BEFORE, p.found.raw)
         if p.carried:
             self._attach(REGISTERS_EARLIER, p.before.raw)
-        try:
+        with p.finishing():
             await p.write()
             await self._finish(p, tumble)
-        finally:
-            p.finish()
 
     async def _finish(self, p: Provisioning, tumble: Collection) -> None:
         try:
@@ -189,4 +187,4 @@ def _paired(pairs: Sequence[tuple[Pose, Pose]]) -> tuple[Floats, Floats, dict[st
 
 
 def _recorder(writer: RecordingWriter) -> Callable[[RegisterAccess], None]:
-    return lambda a: writer.register(a.register, a.kind, a.raw, a.error or "")
+    return lambda a: writer.register(a.register, a.kind, a.raw, a.error or "", unanswered=a.unanswered)

@@ -151,6 +151,32 @@ def _aborted(f: Forgery) -> None:
     f.edit(OUTCOME, lambda o: o.update(verdict="aborted", exit_code=4, reason="out of order"))
 
 
+def _aborted_and_unsettled(f: Forgery) -> None:
+    _aborted(f)
+    unsettled = {"exit_code": 130, "device_state": "unknown", "evidence": "no_answer", "journal": "x"}
+    f.edit(OUTCOME, lambda o: o.update(unsettled))
+
+
+def _previews_under_a_loss(f: Forgery) -> None:
+    """One is noted as lost, and another is changed."""
+    topic = "/preview/readings"
+    f.first(topic, lambda m: None)
+    f.first(topic, lambda m: replace(m, data=m.data[:-1] + b"\x41"))
+    (number,) = (c.id for c in f.channels.values() if c.topic == LOSS)
+    loss = schema.Loss(1, topic, 0, 1, "the queue to the disk was full")
+    f.records.insert(-1, Message(number, 1, schema.encode(loss), 1, 0))
+
+
+def _refusals_for_a_silence(f: Forgery) -> None:
+    """As many failed reads as a supply that is switched off makes, and each was refused."""
+    *_, last = f.messages(REGISTERS)
+    answered = schema.decode_register_access(last.data)
+    refused = replace(answered, raw=b"", error="refused")
+    at = f.records.index(last)
+    f.records[at:at] = [replace(last, data=schema.encode(refused)) for _ in range(5)]
+    f.edit(OUTCOME, lambda o: o.update(evidence="read_after_power_cycle"))
+
+
 def _turned_back(f: Forgery) -> None:
     f.drop(OUTCOME, END)
     f.metadata("recording").metadata.pop("ends_with")
@@ -310,6 +336,11 @@ ROWS = [
     ),
     Row("said to be old", _outcome(device_state="old"), f'{OUTCOME}: device_state: "old": the register traffic', True),
     Row("said to be cycled", _outcome(evidence="read_after_power_cycle"), f"{OUTCOME}: evidence: ", True),
+    Row("said to be cycled, with refusals", _refusals_for_a_silence, f"{OUTCOME}: evidence: ", True),
+    Row(
+        "aborted, unsettled, and no fault of the device", _aborted_and_unsettled, f"{OUTCOME}: exit_code: stored", True
+    ),
+    Row("a preview lost, another changed", _previews_under_a_loss, "/preview/readings: not what the raw records", True),
     Row("fewer registers written", _fewer_written, f"{EVENTS}: provisioned.written: stored ", True),
     Row("said not to differ", _registers(differing=[]), f"{OUTCOME}: registers.differing: stored [], ", True),
     Row("said to be cut short", _registers(cut_short_before=True), f"{OUTCOME}: registers.cut_short_before: ", True),

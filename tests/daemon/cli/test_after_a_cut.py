@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import threading
 from dataclasses import replace
@@ -12,7 +13,9 @@ import pytest
 from tests.devices.bench import TRANSPORTS, Bench, Transport
 from tests.devices.habits import Habits
 from tests.devices.memory import Electronics
+from tests.devices.place import Trouble
 from tests.devices.profiles import Timing
+from tests.devices.table import OLD
 from triaxcald.cli import provisioning
 
 QUICK = Timing(reply_s=0.3, silence_s=0.6)
@@ -85,6 +88,65 @@ def test_a_restore_that_no_restart_proves_is_proven_by_the_supply(
         assert "read back after a power cycle" in done.out
         assert bench.holds_old()
         assert not journal.exists()
+
+
+def test_a_restore_ends_with_an_outcome_too(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        (first,) = tmp_path.glob("*.outcome.json")
+        done = triaxcal("restore", journal, bench.station, "--json")
+        outcome = json.loads(Path(done.json["outcome_file"]).read_text())
+        assert outcome == done.json["outcome"]
+        assert (outcome["verdict"], outcome["device_state"], outcome["journal"]) == ("not_judged", "old", None)
+        assert outcome["supersedes"] == hashlib.sha256(first.read_bytes()).hexdigest()
+        assert 0 < len(outcome["registers"]["written"]) <= len(outcome["registers"]["differing"])
+
+
+@pytest.mark.parametrize("spoilt", ["{", '{"format": "triaxcal.journal/1", "step": "writing"}'])
+def test_a_journal_that_cannot_be_read_does_not_keep_a_recordings_registers_away(
+    tmp_path: Path, triaxcal, spoilt: str
+) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        kept = tmp_path / "kept.json"
+        kept.write_bytes(journal.read_bytes())
+        journal.write_text(spoilt)
+        done = triaxcal("restore", kept, bench.station)
+        assert done.code == 0, done.err
+        assert bench.holds_old()
+        assert not journal.exists()
+
+
+def test_a_device_that_holds_the_values_in_use_is_not_said_to_have_them_stored(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=Habits(reset_command=False), wanted=OLD) as bench:
+        done = bench.provision("--json")
+        assert (done.code, bench.unit.written) == (0, [])
+        assert (done.json["outcome"]["device_state"], done.json["outcome"]["journal"]) == ("new_unverified", None)
+        told = bench.provision().out
+        assert "in use held these values already, and nothing was written; no restart shows them stored" in told
+        assert f"'triaxcal provision CAL.json {bench.station} --unit unit --power-cycle'" in told
+        assert "journal" not in told
+
+
+def test_a_provisioning_that_ends_before_it_has_looked_names_the_journal_of_an_earlier_one(
+    tmp_path: Path, triaxcal
+) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        bench.place.trouble = Trouble(dead_after=bench.place.requests + 3)
+        done = bench.provision("--json")
+        assert (done.json["outcome"]["device_state"], done.json["outcome"]["journal"]) == ("unknown", str(journal))
+        assert "triaxcal provision --resume" in done.err
+
+
+def test_and_so_does_a_run(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        bench.place.trouble = Trouble(dead_after=bench.place.requests + 4)
+        (unit,) = triaxcal("run", bench.station, "--json").json["units"]
+        assert unit["outcome"]["verdict"] == "aborted"
+        assert (unit["outcome"]["device_state"], unit["outcome"]["journal"]) == ("unknown", str(journal))
+        assert f"triaxcal provision --resume {bench.station} --unit unit" in unit["error"]
 
 
 def test_there_is_nothing_to_resume_where_nothing_was_cut_short(tmp_path: Path, triaxcal) -> None:

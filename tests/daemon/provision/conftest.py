@@ -237,9 +237,8 @@ class Bench:
 
     def assert_traffic_shows(self, p: Provisioning, records: list[RegisterAccess], *, aborted: bool) -> None:
         """What the device is said to hold, by the rules of an audit."""
-        traffic = Traffic(
-            [schema.RegisterAccess(0, a.register, a.kind, a.raw, a.error or "") for a in records], self.profile
-        )
+        accesses = [schema.RegisterAccess(0, a.register, a.kind, a.raw, a.error or "", a.unanswered) for a in records]
+        traffic = Traffic(accesses, self.profile)
         said = Said(
             before=p.found.raw,
             earlier=p.before.raw if p.carried else None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -23,7 +23,7 @@ from triaxcald.provision.journal import parse
 from triaxcald.provision.pace import Pace
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.snapshot import Snapshot
-from triaxcald.provision.unfinished import journaled_image, put_back
+from triaxcald.provision.unfinished import journaled_image
 
 ERRORS = Errors(DeviceSilent, DeviceAbsent, BusError, DeviceSilent, RegisterRefused, DeviceBusy)
 Truth = Literal["old", "new", "mixture"]
@@ -99,14 +99,18 @@ class Host:
     async def _provisioned(self, image: RegisterImage) -> None:
         p = self.provisioning = self._begun(image)
         await p.examine()
+        await self._finished(p.write())
+
+    async def _finished(self, work: Awaitable[None]) -> None:
+        assert self.provisioning is not None
         try:
-            await p.write()
+            await work
         except Killed:
             raise
         except BaseException:
-            p.finish()
+            self.provisioning.finish()
             raise
-        p.finish()
+        self.provisioning.finish()
 
     async def _resumed(self) -> None:
         image, _ = await journaled_image(
@@ -117,7 +121,7 @@ class Host:
     async def _restored(self) -> None:
         entry = parse(self.journals[0].read_bytes(), where="the journal")
         self.provisioning = self._begun(image_of(self.bundle.profile, entry.before))
-        await put_back(self.provisioning, Snapshot(entry.before, entry.serial))
+        await self._finished(self.provisioning.put_back(Snapshot(entry.before, entry.serial)))
 
     def _begun(self, image: RegisterImage) -> Provisioning:
         return Provisioning(

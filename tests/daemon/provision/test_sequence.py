@@ -1,9 +1,9 @@
 import pytest
 
-from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent
+from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.profile import PollStep, ReconnectStep, Sequences, WaitStep, WriteStep
 from triaxcald.provision.identity import WrongUnit, check_identity
-from triaxcald.provision.sequence import SequenceStalled, run_sequence
+from triaxcald.provision.sequence import SequenceStalled, reconnect, run_sequence
 
 UNLOCK = WriteStep(write="unlock_key", value=0x5A17)
 
@@ -79,6 +79,16 @@ async def test_a_reset_that_is_not_acknowledged_is_a_reset(bench) -> None:
     bench.device.trouble = lose_the_reply
     await run_sequence(bench.link, bench.bundle, "reset")
     assert bench.unit.started_s > 1.0
+
+
+async def test_a_device_that_refuses_while_it_starts_is_waited_for(bench) -> None:
+    def refuse_at_first(operation: int, done: bool) -> None:
+        if bench.device.log[-1][0] == "read" and bench.device.now_s < 2.5:
+            raise RegisterRefused("starting", register=bench.device.log[-1][1], code=4)
+
+    bench.device.trouble = refuse_at_first
+    await reconnect(bench.link, bench.profile)
+    assert 2.5 <= bench.device.now_s < 3.0
 
 
 async def test_a_lost_reply_without_a_reconnect_to_follow_is_an_error(bench) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -137,6 +138,11 @@ def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_
     assert "No space left on device" in unit["error"]
     assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
     assert unit["error"].endswith(NEW)
+    if where == "closing":  # the recording cannot vouch for what was drawn
+        (beside,) = [path for path in workshop.folder.glob("unit0-*") if path.suffix != ".mcap"]
+        assert str(beside) == unit["outcome_file"]
+        assert json.loads(Path(unit["outcome_file"]).read_text()) == {**unit["outcome"], "contents": None}
+        assert unit["outcome"]["verdict"] == "aborted"
 
 
 async def test_the_table_and_the_document_say_that_the_old_calibration_is_back(

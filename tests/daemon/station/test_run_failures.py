@@ -201,11 +201,11 @@ def test_a_disk_that_fails_while_registers_are_written_does_not_keep_the_old_one
     register = RecordingWriter.register
     failed = []
 
-    def full(self: RecordingWriter, name: str, operation: Any, raw: bytes, error: str = "") -> None:
+    def full(self: RecordingWriter, name: str, operation: Any, raw: bytes, error: str = "", **more: Any) -> None:
         if failed or (name, operation) == (at, "write"):
             failed.append(name)
             raise DiskError("rec.mcap: writing failed: No space left on device")
-        register(self, name, operation, raw, error)
+        register(self, name, operation, raw, error, **more)
 
     monkeypatch.setattr(RecordingWriter, "register", full)
     done, served, path = _run(workshop, triaxcal, recorded=False)
@@ -260,7 +260,7 @@ def test_no_new_pose_for_too_long_is_refused_with_the_poses_that_are_wanted(
     with workshop.serve(device) as served:
         station = workshop.station({"bus": served.bus}, plan={"poses": 26, "hold_s": 1.0, "patience_s": 8.0})
         done = triaxcal("run", station)
-    done.failed(3, "no new still pose for 8 s; 23 of 26 are there; add the poses ")
+    done.failed(3, "no new still pose for 8 s; ", " of 26 are there; add the poses ")
 
 
 def test_of_two_units_the_sound_one_finishes_and_the_worst_code_counts(

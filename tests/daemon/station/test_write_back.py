@@ -293,11 +293,11 @@ def _disk_fails(monkeypatch: pytest.MonkeyPatch, method: str, at: str) -> list[s
     def failing(name: str) -> Callable[..., Any]:
         real = getattr(RecordingWriter, name)
 
-        def call(self: RecordingWriter, first: str = "", *more: Any) -> Any:
+        def call(self: RecordingWriter, first: str = "", *more: Any, **named: Any) -> Any:
             if failed or (name, first) == (method, at):
                 failed.append(name)
                 raise DiskError(NO_ROOM)
-            return real(self, first, *more)
+            return real(self, first, *more, **named)
 
         return call
 
