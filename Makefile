@@ -19,7 +19,7 @@ demo: $(READY)  ## the whole line on two simulated units
 	$(BIN)/triaxcal demo --out demo-out
 
 # Two processes more than processors: some tests wait for a bus, and others work meanwhile.
-WORKERS = $(shell $(BIN)/python -c 'import os; print(os.cpu_count() + 2)')
+WORKERS = $(shell $(BIN)/python -c 'import os; print(min(os.cpu_count(), 8) + 2)')
 test: $(READY)  ## the whole test suite
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 
