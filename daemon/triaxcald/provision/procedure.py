@@ -215,7 +215,7 @@ class Provisioning:
         """As `finishing` does at its end. Raises DiskError."""
         if not self.examined:
             return
-        if self.settled and (self.held.state is not DeviceState.UNTOUCHED or self._journaled):
+        if self.settled:
             self.journal.remove()
             self._journal_lies = False
         elif self._journaled and self.held.state is DeviceState.NEW_UNVERIFIED:
