@@ -42,7 +42,10 @@ class Tumble:
 
     def before(self, t_s: Floats) -> Floats:
         """a (n,3) in g in the pose before, that at times (n,) is held or left; that of the first pose itself in it."""
-        step = np.maximum(self._step(t_s) - 1, 0)
+        return self.taken(np.maximum(self._step(t_s) - 1, 0))
+
+    def taken(self, step: Ints) -> Floats:
+        """(n,3) the directions at steps (n,) of the path, counted from 0."""
         return np.asarray(self.directions[step % len(self.directions)])
 
     def _step(self, t_s: Floats) -> Ints:
@@ -51,8 +54,7 @@ class Tumble:
     def specific_force(self, t_s: Floats) -> Floats:
         """a (n,3) in g at times (n,) from the start."""
         step = self._step(t_s)
-        here = self.directions[step % len(self.directions)]
-        there = self.directions[(step + 1) % len(self.directions)]
+        here, there = self.taken(step), self.taken(step + 1)
         x = np.clip((t_s - step * self.step_s - self.hold_s) / self.move_s, 0.0, 1.0)
         angle = np.arccos(np.clip(np.sum(here * there, axis=1), -1.0, 1.0))
         across = _square(here, there)

@@ -156,3 +156,6 @@ class OnFixture:
         clean = self._triad.volts(self._fixture.force_g(unit_time_s), temperature_c)
         noise_g = self._triad.noise_g * self._rng.standard_normal(clean.shape)
         return clean + self._triad.load_v * noise_g, temperature_c
+
+    def restarted(self, unit_time_s: float) -> None:
+        """The fixture goes on."""

@@ -167,6 +167,9 @@ def restore_command(a: argparse.Namespace) -> int:
     theirs = unit_in(a.source)
     place = station.place(a.unit or (theirs if theirs in names else None))
     snapshot, _ = snapshot_in(a.source, place.bundle.profile)
+    expected = place.unit.serial
+    if snapshot.serial is not None and expected is not None and not same_serial(snapshot.serial, expected):
+        raise Refused(f"{a.source}: is of the unit with serial {snapshot.serial}, the station expects {expected}")
     ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
     run = RestoreRun(station, place, ask=ask, snapshot=snapshot)
     done = run_interruptible(run.run())

@@ -48,7 +48,12 @@ class Journal:
             return None
         except OSError as e:
             raise InputError(f"{self.path}: cannot be read: {e.strerror}") from e
-        return parse(text, where=str(self.path))
+        try:
+            return parse(text, where=str(self.path))
+        except InputError as e:
+            raise InputError(
+                f"{e}; without that file the unit can be provisioned as if nothing had been cut short"
+            ) from e
 
     def write(self, entry: Entry) -> None:
         """Returns once it is on the disk. Raises DiskError."""
@@ -76,6 +81,12 @@ class Journal:
             self.path.unlink(missing_ok=True)
         except OSError as e:
             raise DiskError(f"{self.path}: cannot be removed: {e.strerror}") from e
+
+
+def open_journal(folder: Path, unit: str, serial: str | None) -> Path | None:
+    """The path of a unit's journal, where one lies in the station's folder."""
+    path = Journal.of(folder, unit, serial).path
+    return path if path.exists() else None
 
 
 def parse(text: bytes, *, where: str) -> Entry:

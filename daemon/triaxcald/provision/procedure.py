@@ -73,6 +73,11 @@ class Provisioning:
     after: Snapshot = field(init=False)
 
     @property
+    def identified(self) -> bool:
+        """Whether it is known who is there."""
+        return hasattr(self, "journal")
+
+    @property
     def examined(self) -> bool:
         """Whether it is known who is there, and what it held."""
         return hasattr(self, "before")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import effect_named, effect_of
 from triaxcal.effects.contract import Effect, channel_of
 from triaxcal.errors import InvalidData
@@ -50,13 +50,14 @@ class Surroundings(Strict):
     swing_period_s: Annotated[float, Field(gt=0)] = 600.0
 
 
-CHECK_POSES = 14
-"""More than a station asks for by default, so that one that comes late still finds enough."""
+CHECK_POSES, CHECK_TOURS = 14, 3
+"""More poses than a station asks for by default, so that one that comes late still finds enough; and after so many
+restarts the first ones come again."""
 
 
 class Fixture(Strict):
-    """The tumble fixture: it goes through the poses of the plan, in its order, the first once more, and through others
-    to check by, again and again."""
+    """The tumble fixture: it goes through the poses of the plan, in its order, the first once more, again and again;
+    and after a restart of the unit once through others, to check by."""
 
     poses: Annotated[int, Field(ge=9, le=1000)] = 26
     hold_s: Annotated[float, Field(gt=0)] = 4.0
@@ -82,13 +83,37 @@ class DeviceFile(Strict):
 
 
 @dataclass(frozen=True)
+class CheckedTumble(Tumble):
+    """Goes through ``tours`` (t,k,3), one after each restart, and then on with its own directions."""
+
+    tours: Floats = field(kw_only=True)
+    _begun: list[int] = field(default_factory=list, init=False)
+
+    def restarted(self, t_s: float) -> None:
+        """It sets out at the next move."""
+        self._begun.append(int(t_s // self.step_s) + 1)
+
+    def taken(self, step: Ints) -> Floats:
+        found = super().taken(step)
+        for i, first in enumerate(self._begun):
+            tour = self.tours[i % len(self.tours)]
+            on_tour = (step >= first) & (step < first + len(tour))
+            found[on_tour] = tour[step[on_tour] - first]
+        return found
+
+
+@dataclass(frozen=True)
 class SyntheticPhysics:
     """Binds the metrology's synthetic unit to the simulated electronics."""
 
     unit: SyntheticUnit
+    fixture: CheckedTumble
 
     def sample(self, unit_time_s: Any) -> tuple[Any, Any]:
         return self.unit.sample(unit_time_s)
+
+    def restarted(self, unit_time_s: float) -> None:
+        self.fixture.restarted(unit_time_s)
 
 
 def load_device(path: Path) -> DeviceFile:
@@ -107,8 +132,9 @@ def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics
     sensor = Sensor(np.array(truth.scale_factor), np.array(truth.misalignment), np.array(truth.bias), tuple(effects))
     place = device.surroundings
     environment = Environment(place.temperature_c, place.ramp_c_per_s, place.swing_c, place.swing_period_s)
+    fixture = tumble_of(device)
     return SyntheticPhysics(
-        SyntheticUnit(sensor, tumble_of(device), np.full(3, truth.noise_g), environment, seed=device.seed)
+        SyntheticUnit(sensor, fixture, np.full(3, truth.noise_g), environment, seed=device.seed), fixture
     )
 
 
@@ -134,19 +160,27 @@ def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[Effect, F
     return effect, coefficients
 
 
-def tumble_of(device: DeviceFile) -> Tumble:
-    """The plan's directions in its order, the first once more, others to check by; each off by the fixture's attitude
-    error."""
+def tumble_of(device: DeviceFile) -> CheckedTumble:
+    """The plan's directions in its order, the first once more, and others to check by; each off by the fixture's
+    attitude error."""
     fixture = device.fixture
     try:
         plan = np.array([v for _, v in directions(fixture.poses)])
     except InvalidData as e:
         raise InputError(f"fixture.poses: {e}") from e
     rng = np.random.default_rng([device.seed, 1])
-    others = np.array([v for _, v in elsewhere(plan, CHECK_POSES)])
-    plan, others = (v + rng.standard_normal(v.shape) * np.radians(fixture.attitude_error_deg) for v in (plan, others))
-    off = np.concatenate([plan, plan[:1], others])
-    return Tumble(off / np.linalg.norm(off, axis=1, keepdims=True), fixture.hold_s, fixture.move_s)
+    taken = plan
+    for _ in range(CHECK_TOURS):
+        taken = np.concatenate([taken, [v for _, v in elsewhere(taken, CHECK_POSES)]])
+    off = taken + rng.standard_normal(taken.shape) * np.radians(fixture.attitude_error_deg)
+    off /= np.linalg.norm(off, axis=1, keepdims=True)
+    n = len(plan)
+    return CheckedTumble(
+        np.concatenate([off[:n], off[:1]]),
+        fixture.hold_s,
+        fixture.move_s,
+        tours=off[n:].reshape(CHECK_TOURS, CHECK_POSES, 3),
+    )
 
 
 @dataclass

@@ -16,6 +16,9 @@ class Physics(Protocol):
         Times are in the unit's time base, ascending, each asked for once.
         """
 
+    def restarted(self, unit_time_s: float) -> None:
+        """The unit starts again, as after its registers were written."""
+
 
 @dataclass(frozen=True)
 class ConstantPhysics:
@@ -27,3 +30,6 @@ class ConstantPhysics:
     def sample(self, unit_time_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         n = len(unit_time_s)
         return np.tile(np.array(self.volts, dtype=np.float64), (n, 1)), np.full(n, self.temperature_c)
+
+    def restarted(self, unit_time_s: float) -> None:
+        """It stands where it stood."""

@@ -120,6 +120,8 @@ class ReferenceUnit:
 
     def _start(self, unit_time_s: float) -> None:
         self._started_s = unit_time_s
+        if unit_time_s > 0:
+            self.physics.restarted(unit_time_s)
         self._ram = dict(self._stored.calibration)
         self._damaged = not self._stored.valid
         self._unlocked = False

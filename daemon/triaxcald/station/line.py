@@ -38,7 +38,7 @@ from triaxcald.pipeline import Pipeline
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.provision.image import RegisterImage
-from triaxcald.provision.journal import Journal
+from triaxcald.provision.journal import Journal, open_journal
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.writer import RecordingWriter
@@ -98,7 +98,7 @@ class UnitRun:
         self.name = place.unit.name
         self.profile = place.bundle.profile
         self._serial: str | None = None
-        self._open_journal: Path | None = None
+        self._open_journal = open_journal(station.folder, self.name, place.unit.serial)
         self._recording: Path | None = None
         self._papers: dict[str, str] = {}
         self._paths: dict[str, Path] = {}
@@ -114,7 +114,8 @@ class UnitRun:
             async with self.place.opened() as device:
                 identity = await self.identify(device)
                 self._serial = identity.serial
-                self._open_journal = self._journal_of(identity)
+                self._open_journal = open_journal(self.station.folder, self.name, identity.serial)
+                self._require_readable_journal(identity)
                 self._recording = self.recording_path(identity)
                 with self.writer(self._recording, identity) as writer:
                     ending = await self._ending(device, identity, writer)
@@ -208,11 +209,6 @@ class UnitRun:
             return text.settling(self._provisioning, self.station.path) or None
         return text.unfinished(self._open_journal, self.name, self.station.path) if self._open_journal else None
 
-    def _journal_of(self, identity: IdentityRead) -> Path | None:
-        """The journal of an earlier provisioning of the unit that was cut short."""
-        path = Journal.of(self.station.folder, self.name, identity.serial).path
-        return path if path.exists() else None
-
     def _write_papers(self) -> None:
         """The files beside the recording, once it is closed: certificate and report, the outcome last."""
         if self._recording is None:
@@ -250,6 +246,14 @@ class UnitRun:
             wanted=ending.wanted,
             lost=self._lost,
         )
+
+    def _require_readable_journal(self, identity: IdentityRead) -> None:
+        """Before any pose is taken. Raises InputError."""
+        try:
+            Journal.of(self.station.folder, self.name, identity.serial).read()
+        except InputError:
+            self._open_journal = None  # no command goes by it
+            raise
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")

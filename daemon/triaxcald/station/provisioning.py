@@ -31,7 +31,7 @@ from triaxcald.outcome import (
 )
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.image import RegisterImage, image_of
-from triaxcald.provision.journal import parse, registers_of
+from triaxcald.provision.journal import open_journal, parse, registers_of
 from triaxcald.provision.plausible import Doubt
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.snapshot import Snapshot
@@ -145,9 +145,17 @@ class ProvisionRun:
 
     @property
     def _held(self) -> Held:
-        if self._begun is not None:
+        if self._begun is not None and self._begun.identified:
             return self._begun.held
-        return Held() if self.image is not None else Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+        known = self.image is not None and self._open_journal is None
+        return Held() if known else Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+
+    @property
+    def _open_journal(self) -> Path | None:
+        """The journal of an earlier provisioning, or of this one, where it is still needed."""
+        if self._begun is not None and self._begun.identified:
+            return self._begun.open_journal
+        return open_journal(self.station.folder, self.place.unit.name, self.serial or self.place.unit.serial)
 
     def _now(self) -> str:
         return datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds")
@@ -170,7 +178,7 @@ class ProvisionRun:
             ended=self._now(),
             software=software(),
             supersedes=latest_of(self.station.folder, p.identity.serial) if p else None,
-            journal=str(self._begun.open_journal) if self._begun and self._begun.open_journal else None,
+            journal=str(self._open_journal) if self._open_journal else None,
             forced=self.force if self.doubts else None,
         )
 
@@ -185,8 +193,10 @@ class ProvisionRun:
             return None
         told = [ending.reason]
         p = self._begun
-        if p is not None and (p.examined or p.open_journal) and ending.verdict is Verdict.ABORTED:
+        if p is not None and (p.examined or p.open_journal):
             told.append(text.left(p, self.station.path))
+        elif self._open_journal:
+            told.append(text.unfinished(self._open_journal, self.place.unit.name, self.station.path))
         return "; ".join(filter(None, told))
 
 

@@ -139,6 +139,35 @@ def test_a_provisioning_that_ends_before_it_has_looked_names_the_journal_of_an_e
         assert "triaxcal provision --resume" in done.err
 
 
+@pytest.mark.parametrize("command", ["run", "provision"])
+def test_and_so_does_one_that_does_not_reach_the_device(tmp_path: Path, triaxcal, command: str) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        bench.place.trouble = Trouble(dead_after=0)
+        done = triaxcal("run", bench.station, "--json") if command == "run" else bench.provision("--json")
+        outcome = done.json["units"][0]["outcome"] if command == "run" else done.json["outcome"]
+        assert (outcome["device_state"], outcome["journal"]) == ("unknown", str(journal))
+        assert f"triaxcal provision --resume {bench.station} --unit unit" in done.err
+
+
+def test_a_restore_heeds_the_serial_number_of_the_station(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        other = tmp_path / "other.toml"
+        other.write_text(bench.station.read_text().replace("4711", "4712"))
+        requests = bench.place.requests
+        triaxcal("restore", journal, other).failed(3, "serial 4711", "expects 4712")
+        assert bench.place.requests == requests
+
+
+def test_a_run_with_a_journal_that_cannot_be_read_takes_no_pose(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        journal.write_text(journal.read_text()[:200])
+        triaxcal("run", bench.station).failed(2, str(journal), "without that file the unit can be provisioned")
+        assert list(tmp_path.glob("**/*.mcap")) == []
+
+
 def test_and_so_does_a_run(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
         journal = cut_short(bench)

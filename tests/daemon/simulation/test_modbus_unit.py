@@ -35,6 +35,9 @@ class Ramp:
         still = np.ones_like(unit_time_s)
         return np.stack([unit_time_s / 10, 0.5 * still, -2.4 * still], axis=1), 25.0 * still
 
+    def restarted(self, unit_time_s):
+        pass
+
 
 @pytest.fixture
 def time_base() -> SteppedTimeBase:
