@@ -115,8 +115,9 @@ class UnitRun:
                 identity = await self.identify(device)
                 self._serial = identity.serial
                 self._open_journal = open_journal(self.station.folder, self.name, identity.serial)
+                path = self.recording_path(identity)
                 self._require_readable_journal(identity)
-                self._recording = self.recording_path(identity)
+                self._recording = path
                 with self.writer(self._recording, identity) as writer:
                     ending = await self._ending(device, identity, writer)
                     self._seal(writer, ending)
