@@ -62,7 +62,7 @@ def to_settle(of: Held, journal: Path | None, unit: str, station: Path) -> str:
 def unfinished(journal: Path, unit: str, station: Path) -> str:
     """Of a device that this run has not examined."""
     unknown = Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
-    return f"an earlier provisioning was cut short; {to_settle(unknown, journal, unit, station)}"
+    return f"an earlier provisioning was cut short or not verified; {to_settle(unknown, journal, unit, station)}"
 
 
 def left(p: Provisioning, station: Path) -> str:

@@ -15,6 +15,7 @@ from triaxcal_drivers.profile import BUILT_IN, load_bundle
 from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
+from triaxcald.cli.journals import warn_of_a_journal
 from triaxcald.documents import REGISTER_DIGITS, number
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.explain import explain
@@ -35,8 +36,10 @@ def register(commands: Any) -> None:
 
 
 def registers_command(a: argparse.Namespace) -> int:
-    place = load_station(a.station).place(a.unit)
+    station = load_station(a.station)
+    place = station.place(a.unit)
     serial, rows = run_interruptible(_registers(place))
+    warn_of_a_journal(station, place.unit.name, serial)
     if a.json:
         emit(
             {

@@ -15,6 +15,7 @@ from triaxcald import text
 from triaxcald.cli.arguments import add_force, add_json, positive, seed, writable
 from triaxcald.cli.console import Bars, emit, micro, say, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
+from triaxcald.cli.journals import warn_of_a_journal
 from triaxcald.cli.showing import counted
 from triaxcald.documents import number
 from triaxcald.exit_codes import SEVEREST
@@ -236,6 +237,7 @@ def record_command(a: argparse.Namespace) -> int:
 async def _record(run: UnitRun, path: Path, seconds: float | None) -> None:
     async with run.place.opened() as device:
         identity = await run.identify(device)
+        warn_of_a_journal(run.station, run.name, identity.serial)
         collection = Collection(CALIBRATION, run.place.bundle, run.place.address)
         writer = run.writer(path, identity, ends_with="")
         try:

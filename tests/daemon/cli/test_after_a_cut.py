@@ -178,6 +178,22 @@ def test_and_so_does_a_run(tmp_path: Path, triaxcal) -> None:
         assert f"triaxcal provision --resume {bench.station} --unit unit" in unit["error"]
 
 
+@pytest.mark.parametrize("command", ["registers", "record"])
+def test_who_reads_or_records_a_unit_in_between_is_warned(tmp_path: Path, triaxcal, command: str) -> None:
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        cut_short(bench)
+        reading = [command, bench.station]
+        if command == "record":
+            reading += ["-o", tmp_path / "rec.mcap", "--seconds", 0.2]
+        warned = triaxcal(*reading)
+        assert warned.code == 0, warned.err
+        assert "warning: unit unit: an earlier provisioning was cut short or not verified" in warned.err
+        assert f"triaxcal provision --resume {bench.station} --unit unit" in warned.err
+        assert triaxcal("provision", "--resume", bench.station).code == 0
+        (tmp_path / "rec.mcap").unlink(missing_ok=True)
+        assert "an earlier provisioning" not in triaxcal(*reading).err
+
+
 def test_there_is_nothing_to_resume_where_nothing_was_cut_short(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal) as bench:
         triaxcal("provision", "--resume", bench.station).failed(2, "journal/4711.json", "no provisioning of this unit")
