@@ -12,14 +12,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from triaxcal.arrays import Floats
-from triaxcal.fit import fit
 from triaxcal.frame.faces import AXES, LABELS, nearest_rotation, recognise
 from triaxcal.frame.frames import frames
 from triaxcal.frame.orientations import Assumed
 from triaxcal.frame.standing import stand
 from triaxcal.frame.synthetic_fixture import SyntheticFixture
 from triaxcal.frame.verticals import verticals
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
+from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

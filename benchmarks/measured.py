@@ -15,8 +15,10 @@ from pathlib import Path
 
 from pictures import draw
 
+from triaxcal.caution import HighLeverage, OutlierSetsTied, PoorSpread
 from triaxcal.errors import Refused
 from triaxcal.loop import Loop, diagnose
+from triaxcal.text import caution
 from triaxcald.inputs import Measured, measure
 from triaxcald.recording.csv_text import read_csv
 
@@ -59,12 +61,11 @@ def warnings(loop: Loop, measured: Measured) -> str:
     found = [f"noise ×{loop.after.inflation:.1f}"] if loop.after.inflation >= 1.05 else []
     found += [f"{1e6 * loop.after.excess_g:.0f} µg beside the noise"] if loop.after.excess_g else []
     found += [line.split(",")[0].replace("_", " ") for line in measured.data_quality]
-    found += [w.split(":")[0] for w in loop.after.warnings if "poorly spread" in w or "alone carries" in w]
+    cautions = loop.after.cautions
+    found += [caution(c).split(":")[0] for c in cautions if isinstance(c, PoorSpread | HighLeverage)]
     aside = sum(not p.used for p in loop.after.poses)
     found += [f"{aside} poses set aside" if aside > 1 else "1 pose set aside"] if aside else []
-    found += [
-        "spoiled poses that cannot be told apart" for w in loop.after.warnings if "look as if poses were spoiled" in w
-    ]
+    found += ["spoiled poses that cannot be told apart" for c in cautions if isinstance(c, OutlierSetsTied)]
     return "; ".join(found) or "none"
 
 

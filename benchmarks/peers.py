@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, bound_and_best, hard, plan
 from triaxcal.ellipsoid import closed_form, coefficients
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 

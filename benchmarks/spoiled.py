@@ -14,8 +14,9 @@ from scipy.optimize import least_squares
 from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.calibration import Calibration
-from triaxcal.fit import fit
-from triaxcal.plan.directions import linear_design
+from triaxcal.caution import OutlierSetsTied
+from triaxcal.planning.directions import linear_design
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 
 SEEDS, QUICK = 300, 30
@@ -107,7 +108,7 @@ def measure(count: int, number: int, sigmas: float | None, seeds: int, *, peer: 
         miss = np.einsum("ni,ni->n", noise / c.unit.scale_factor, c.ups) / SIGMA
         miss[list(bad)] += sizes
         named.append(left_out(found) == bad)
-        ambiguous.append(any("cannot be told from each other" in w for w in found.warnings))
+        ambiguous.append(any(isinstance(caution, OutlierSetsTied) for caution in found.cautions))
         wrong.append(not set(left_out(found)) <= set(bad))
         optimum.append(told_the_number(c, poses, miss, number) == bad)
         error = told.standard_errors / told.inflation

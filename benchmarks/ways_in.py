@@ -10,8 +10,8 @@ import numpy as np
 from benchmarks.table import Table, chosen
 from benchmarks.truth import information, plan
 from triaxcal.attitude import fit_attitudes
-from triaxcal.fit import fit
 from triaxcal.passport import Passport, refine
+from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.turning.moments import Moments

@@ -8,8 +8,17 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.arrays import Ints
-from triaxcal.beyond import Beyond, in_words
-from triaxcal.calibration import SPOILED, UNKNOWN_HISTORY, Calibration, PoseResult
+from triaxcal.beyond import Beyond
+from triaxcal.calibration import Calibration, Exclusion, PoseResult
+from triaxcal.caution import (
+    Caution,
+    FaultyPosesExcluded,
+    Outlier,
+    OutlierSetsTied,
+    OutliersExcluded,
+    PosesExcludedByCaller,
+    UnknownHistoryExcluded,
+)
 from triaxcal.conditions import of_unknown_history
 from triaxcal.outliers import Spoiled, not_as_foretold, spoiled
 from triaxcal.poses.pose import Pose
@@ -57,18 +66,17 @@ def of_another_history(
 
 
 def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
-    """A calibration from the sound ones of ``poses`` with the faulty ones among its results, and a warning."""
-    faulty = tuple(i for i, p in enumerate(poses) if p.fault)
+    """A calibration from the sound ones of ``poses`` with the faulty ones among its results, and a caution."""
+    faulty = [i for i, p in enumerate(poses) if p.fault]
     if not faulty:
         return calibration
-    faults = ", ".join(f"the pose at {poses[i].at} ({poses[i].fault})" for i in faulty)
-    warning = f"left out, as the outputs did not follow the acceleration: {faults}"
-    results, _ = _among(calibration, poses, {i: poses[i].fault for i in faulty})
-    return replace(calibration, poses=results, warnings=(warning, *calibration.warnings))
+    caution = FaultyPosesExcluded(tuple((poses[i].began, poses[i].fault) for i in faulty))
+    results, _ = _among(calibration, poses, dict.fromkeys(faulty, Exclusion.FAULT))
+    return replace(calibration, poses=results, cautions=(caution, *calibration.cautions))
 
 
 def _among(
-    calibration: Calibration, poses: Sequence[Pose], reasons: Mapping[int, str]
+    calibration: Calibration, poses: Sequence[Pose], reasons: Mapping[int, Exclusion]
 ) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
     """The results of a calibration with those of further poses left out among them, by rows of all; and these."""
     u = np.array([p.mean for p in poses])
@@ -85,32 +93,30 @@ def _among(
     return tuple(results), added
 
 
-def with_aside(calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: Spoiled) -> Calibration:
-    """The calibration with the poses left out among its results, in order of time, and warnings that name them."""
-    unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects])
-    results, added = _among(calibration, poses, {i: UNKNOWN_HISTORY if i in unknown else SPOILED for i in rows})
-    names = [(p.left_out, f"the pose at {p.pose.at} ({p.studentized:+.0f} standard errors)") for p in added]
-    excused, others = (", ".join(n for why, n in names if why == reason) for reason in (UNKNOWN_HISTORY, SPOILED))
-    warnings = [f"left out, as what was before it is not known: {excused}"] if excused else []
-    warning = f"left out as spoiled: {others}"
-    if verdict.doubtful:
-        warning += (
-            "; the noise inside the poses says so, while the other residuals leave it open whether all poses come "
-            "back less well than that: the standard errors allow for both"
-        )
-        if calibration.excess_g:
-            warning += f", {in_words(calibration)}"
-    warnings += [warning] if others else []
-    return replace(calibration, poses=results, warnings=(*warnings, *calibration.warnings))
+def with_aside(
+    calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: Spoiled, why: Exclusion
+) -> Calibration:
+    """The calibration with the poses left out among its results, in order of time, and cautions that name them: those
+    that an effect knows no history of, and else as ``why`` says."""
+    unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects]) if why != Exclusion.CALLER else ()
+    results, added = _among(calibration, poses, {i: Exclusion.UNKNOWN_HISTORY if i in unknown else why for i in rows})
+
+    def those(reason: Exclusion) -> tuple[Outlier, ...]:
+        return tuple(Outlier(p.pose.began, p.studentized) for p in added if p.excluded == reason)
+
+    cautions: list[Caution] = []
+    if excused := those(Exclusion.UNKNOWN_HISTORY):
+        cautions.append(UnknownHistoryExcluded(excused))
+    if wanted := those(Exclusion.CALLER):
+        cautions.append(PosesExcludedByCaller(wanted))
+    if outliers := those(Exclusion.OUTLIER):
+        cautions.append(OutliersExcluded(outliers, verdict.doubtful, calibration.excess_g / calibration.reference))
+    return replace(calibration, poses=results, cautions=(*cautions, *calibration.cautions))
 
 
 def with_rivals(calibration: Calibration, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
-    """The calibration with a warning of sets of poses one of which may be spoiled, where nobody can tell which."""
+    """The calibration with a caution of sets of poses one of which may be spoiled, where nobody can tell which."""
     if not verdict.rivals:
         return calibration
-    sets = " or ".join(" and ".join(poses[i].at for i in rows) for rows in verdict.rivals)
-    warning = (
-        f"the residuals look as if poses were spoiled ({sets}: these cannot be told from each other), or as if "
-        "something else acts; none is left out"
-    )
-    return replace(calibration, warnings=(warning, *calibration.warnings))
+    tied = OutlierSetsTied(tuple(tuple(poses[i].began for i in rows) for rows in verdict.rivals))
+    return replace(calibration, cautions=(tied, *calibration.cautions))

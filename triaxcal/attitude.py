@@ -9,18 +9,20 @@ where it is large against the noise the magnitude still counts in full, and the 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.calibration import SPOILED, Calibration, PoseResult, Residual
+from triaxcal.calibration import Calibration, Exclusion, PoseResult, Residual
+from triaxcal.caution import BirgeRatio, Caution, FewPoses
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.plan.directions import most_wanted
-from triaxcal.poses.pose import Pose
+from triaxcal.figures import the_poses
+from triaxcal.planning.directions import most_wanted
+from triaxcal.poses.pose import Began, Pose
 from triaxcal.pure_error import LACK_OF_FIT, pure_error_dof
 from triaxcal.sensor import Sensor
 from triaxcal.turntable import (
@@ -36,6 +38,10 @@ from triaxcal.turntable import (
 DILUTION_MOST = 100.0
 SECOND_ORDER = 0.2
 """Share of a standard error from which on squares of the misalignments' errors are added to it."""
+RAISED = 1.5
+"""By how much the error of the attitudes has to raise a standard error to be worth a word."""
+PARAMETERS, LEFT_LEAST = 12, 6
+"""Degrees of freedom below which the residual proves little: half a degree for each of the parameters."""
 WRONG_MOST = 0.25
 """Share of the rows that may be wrong; with more it is not known which ones are right."""
 
@@ -49,6 +55,45 @@ class Attitude:
     up: Floats
     off_rad: float
     off: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One of the attitudes that were given, by its name, and when its pose began."""
+
+    name: str
+    began: Began
+
+
+@dataclass(frozen=True)
+class AttitudesTied(Caution):
+    """One of these attitudes is wrong; none is excluded."""
+
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class AttitudeExcluded(Caution):
+    """It is wrong by ``off_rad``; the pose was measured with ``up`` in the table's frame."""
+
+    row: Row
+    off_rad: float
+    up: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class AttitudesContradict(Caution):
+    """Each other, by more than noise; ``error_rad`` by axis is estimated from that."""
+
+    error_rad: float
+
+
+@dataclass(frozen=True)
+class MagnitudeContradicts(Caution):
+    """Under the fit |a| is off by ``ratio`` times its noise, most in the ``worst`` row."""
+
+    ratio: float
+    worst: Row
 
 
 @dataclass(frozen=True)
@@ -97,7 +142,7 @@ def fit_attitudes(
     rows = np.arange(len(poses))
     wrong = wrong_by_magnitude(poses, ups, reference)
     if len(wrong) > WRONG_MOST * len(poses):
-        told = ", ".join(_told(called[i], poses[i]) for i in wrong[:4])
+        told = ", ".join(f"{called[i]} ({the_poses([poses[i].began])})" for i in wrong[:4])
         raise Refused(
             f"{len(wrong)} of {len(poses)} attitudes contradict the angles between the poses, beginning with {told}; "
             "are the rows in the order of the poses?"
@@ -110,13 +155,12 @@ def fit_attitudes(
         if len(worst) != 1 or len(wrong) + 1 > WRONG_MOST * len(poses):
             break
         wrong = np.sort(np.append(wrong, kept[worst]))
-    rivals = [_told(called[i], poses[i]) for i in kept[worst]]
+    tied = tuple(Row(called[i], poses[i].began) for i in kept[worst])
     found = _concluded(poses, data, solved(data.only(kept), attitude_error_rad), kept, called, signs)
-    if len(rivals) < 2:
+    if len(tied) < 2:
         return found
-    warning = f"one attitude is wrong, and which cannot be told, so none is left out: {' or '.join(rivals)}"
-    warnings = (warning, *found.calibration.warnings)
-    return replace(found, calibration=replace(found.calibration, warnings=warnings))
+    cautions = (AttitudesTied(tied), *found.calibration.cautions)
+    return replace(found, calibration=replace(found.calibration, cautions=cautions))
 
 
 def _checked(
@@ -149,10 +193,6 @@ def _require_spread(ups: Floats, signs: Sequence[float] | None) -> None:
             "one plane or circle",
             wanted=labels,
         )
-
-
-def _told(name: str, pose: Pose) -> str:
-    return f"{name} (the pose at {pose.start_s:.1f} s)"
 
 
 def _concluded(
@@ -191,7 +231,7 @@ def _concluded(
             float(noise[i]),
             float(studentized[i]),
             float(leverage[i]),
-            left_out="" if i in kept else p.fault or SPOILED,
+            excluded=None if i in kept else Exclusion.FAULT if p.fault else Exclusion.OUTLIER,
         )
         for i, p in enumerate(poses)
     )
@@ -225,8 +265,7 @@ def _concluded(
         np.sqrt(np.diag(G @ s.noise_only @ G.T)[:9]),
         attitudes,
     )
-    warnings = tuple(_warnings(found, s))
-    return replace(found, calibration=replace(calibration, warnings=warnings))
+    return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found, s))))
 
 
 def _signs(s: TurntableSolution, signs: Sequence[float] | None) -> Floats:
@@ -316,39 +355,22 @@ def _dilution(ups: Floats) -> float:
     return float(1 / smallest) if smallest > 1e-12 else float("inf")
 
 
-def _warnings(found: AttitudeFit, s: TurntableSolution) -> list[str]:
-    c, out = found.calibration, []
-    for row, result in zip(found.attitudes, c.poses, strict=True):
+def _cautions(found: AttitudeFit, s: TurntableSolution) -> Iterator[Caution]:
+    c = found.calibration
+    rows = [Row(a.name, p.pose.began) for a, p in zip(found.attitudes, c.poses, strict=True)]
+    for row, attitude, result in zip(rows, found.attitudes, c.poses, strict=True):
         if not result.used:
-            out.append(
-                f"left out as wrong: {_told(row.name, result.pose)}, whose attitude is "
-                f"{np.degrees(row.off_rad):.3g} degrees off; what was measured is up at "
-                f"{_vector(found.rotation.T @ result.direction)}"
-            )
-    if found.estimated and np.any(c.standard_errors > 1.5 * found.noise_error):
-        out.append(
-            f"the attitudes contradict each other by more than noise: their error is estimated at "
-            f"{found.attitude_error_rad:.2g} rad by axis"
-        )
+            x, y, z = map(float, found.rotation.T @ result.direction)
+            yield AttitudeExcluded(row, attitude.off_rad, (x, y, z))
+    if found.estimated and np.any(c.standard_errors > RAISED * found.noise_error):
+        yield AttitudesContradict(found.attitude_error_rad)
     if c.inflation > 1:
-        out.append(
-            f"residuals are {c.inflation:.1f} times what noise and the error of the attitudes explain; the standard "
-            "errors are raised by that"
-        )
+        yield BirgeRatio(c.inflation, attitudes=True)
     used = [p for p in c.poses if p.used]
     left = sum(1 - p.leverage for p in used)
     chi2 = sum((p.residual_g / p.standard_error_g) ** 2 for p in used)
     if left > 0.5 and f_sf(chi2 / left, left, max(s.data.dof, 1.0)) < LACK_OF_FIT:
-        worst = max(used, key=lambda p: abs(p.studentized))
-        name = found.attitudes[c.poses.index(worst)].name
-        out.append(
-            f"attitudes disagree with |a|: under this fit the magnitude is off by {np.sqrt(chi2 / left):.1f} times its "
-            f"noise, most in {_told(name, worst.pose)}"
-        )
-    if s.left < 6:
-        out.append(f"{len(used)} poses for twelve parameters: the residual proves little")
-    return out
-
-
-def _vector(v: Floats) -> str:
-    return "(" + ", ".join(f"{x:+.3f}" for x in v) + ")"
+        worst = max(range(len(rows)), key=lambda i: abs(c.poses[i].studentized) if c.poses[i].used else -1.0)
+        yield MagnitudeContradicts(float(np.sqrt(chi2 / left)), rows[worst])
+    if s.left < LEFT_LEAST:
+        yield FewPoses(len(used), PARAMETERS)

@@ -16,10 +16,8 @@ import numpy as np
 import scipy
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
-from triaxcal.errors import Refused
-from triaxcal.figures import micro_g
-from triaxcal.problem import NOT_STILL, Linearised, Problem, State, linearise
+from triaxcal.errors import NotStill
+from triaxcal.problem import Linearised, Problem, State, linearise
 from triaxcal.pure_error import lack_of_fit_p
 from triaxcal.trends import left_of
 
@@ -56,7 +54,7 @@ class Beyond:
 
         whole = ratio(0.0) if left > 0 else 1.0
         if not np.isfinite(whole):
-            raise Refused(f"the fit ran away; {NOT_STILL}")
+            raise NotStill("the fit ran away")
         p = lack_of_fit_p(whole * left, left, pure_dof)
         if p is None or p >= NO_CHANCE:
             return cls(float(np.sqrt(whole if pure_dof < 1 else max(whole, 1.0))))
@@ -72,11 +70,6 @@ class Beyond:
             return problem
         further = problem.further and problem.further.widened(_widened(linearise(problem, state)[2], self.excess_g))
         return replace(problem, excess=self.excess_g, further=further)
-
-
-def in_words(calibration: Calibration) -> str:
-    """How much is beside the noise."""
-    return f"{micro_g(calibration.excess_g / calibration.reference)} beside the noise of each pose"
 
 
 def _widened(error: Floats, excess: float) -> Floats:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 
 import numpy as np
 from scipy import linalg
 
 from triaxcal.arrays import Floats
+from triaxcal.caution import Caution
 from triaxcal.conditions import channels_of, conditions, of_readings, with_scale
 from triaxcal.distributions import t_ppf
 from triaxcal.effects.part import Part, mix_of
@@ -33,9 +35,16 @@ class Residual:
     lack_of_fit_p: float | None
 
 
-SPOILED = "spoiled"
-UNKNOWN_HISTORY = "unknown_history"
-"""An effect goes with what was before the pose, and nobody knows that: it need not be taken again."""
+class Exclusion(StrEnum):
+    """Why a fit does not use a pose."""
+
+    FAULT = "fault"
+    """Its samples have one (`Pose.fault`)."""
+    OUTLIER = "outlier"
+    CALLER = "caller"
+    """The caller wanted it so."""
+    UNKNOWN_HISTORY = "unknown_history"
+    """An effect goes with the pose before, and nobody knows that one: this one need not be taken again."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +59,7 @@ class PoseResult:
     standard_error_g: float
     studentized: float
     leverage: float
-    left_out: str = ""
-    """Why the fit does not use it: `SPOILED`, `UNKNOWN_HISTORY`, or the fault of its samples; empty where it does."""
+    excluded: Exclusion | None = None
     raised_g: float | None = None
     carries: float = 0.0
     """0…1: how much of some combination of its mean and its trend the pose determines by itself."""
@@ -63,7 +71,7 @@ class PoseResult:
 
     @property
     def used(self) -> bool:
-        return not self.left_out
+        return self.excluded is None
 
 
 @dataclass(frozen=True)
@@ -95,7 +103,7 @@ class Calibration:
     shared: frozenset[str] = frozenset()
     trends: bool = False
     blind_to: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()
     rivals: Mapping[str, Calibration] = field(default_factory=dict, repr=False)
 
     @property

@@ -12,11 +12,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import (
     BEFORE,
     CHANGE,
-    DERIVED,
     HELD,
     RUN,
     SCATTER,
@@ -29,7 +27,6 @@ from triaxcal.effects.contract import (
     rate_of,
 )
 from triaxcal.errors import InvalidData
-from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose
 
 
@@ -107,30 +104,6 @@ def conditions_elsewhere(
     channels[TIME] = np.full(len(poses), reference.get(TIME, 0.0))
     channels[SINCE_START] = np.full(len(poses), np.inf)
     return conditions(channels, reference)
-
-
-def held_at(effects: Iterable[Effect], reference: Mapping[str, float], *, several: bool = False) -> tuple[str, ...]:
-    """In words, under which conditions a reading has nothing of these effects, so that scale factor, misalignment and
-    bias are all of it. ``reference`` is whence the conditions count; ``several``: recordings, each with its own clock.
-    """
-    out: list[str] = []
-    for effect in effects:
-        of_conditions = (_held_at(n, reference.get(n, 0.0), several) for n in effect.needs if n != RUN)
-        out += [effect.absent] if effect.absent else of_conditions
-    return tuple(dict.fromkeys(out))
-
-
-def _held_at(name: str, value: float, several: bool) -> str:
-    if name == SINCE_START:
-        return "long after the start"
-    if name == TIME and several:
-        return "at the middle of each recording's poses"
-    if name in DERIVED:
-        unit = {TIME: " s", HELD: " s"}.get(name, "")
-        return f"at {name} = {plain(value, 6)}{unit}"
-    if is_derived(name):
-        return f"while {channel_of(name.removesuffix(rate_of('')))} does not change"
-    return f"at {channel_of(name)} = {plain(value, 6)}{' °C' if name == TEMPERATURE else ''}"
 
 
 def at_reference(names: Iterable[str], n: int) -> dict[str, Floats]:

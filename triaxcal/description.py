@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from triaxcal.calibration import Calibration
+from triaxcal.calibration import Calibration, Exclusion
 from triaxcal.effects.empirical import Empirical
 from triaxcal.errors import Refused
 from triaxcal.figures import micro_g, probability
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.unexplained import Unexplained
 
 DESCRIBES = 1.4
@@ -43,7 +43,14 @@ def _best(after: Calibration, signs: Sequence[float]) -> tuple[Calibration | Non
     trials = []
     for form in Empirical().forms:
         try:
-            trial = fit(poses, signs=signs, reference=after.reference, effects=[*effects, form], aside=aside)
+            trial = fit(
+                poses,
+                signs=signs,
+                reference=after.reference,
+                effects=[*effects, form],
+                aside=aside,
+                why=Exclusion.OUTLIER,
+            )
         except Refused:
             continue
         if (error := trial.residual.cross_validated_rms_g) is not None:

@@ -16,9 +16,16 @@ class InvalidData(TriaxcalError):
 class Refused(TriaxcalError):
     """The data cannot carry the answer.
 
-    ``wanted`` names the poses that would mend it (labels of `triaxcal.plan.directions`), best first.
+    ``wanted`` names the poses that would mend it (labels of `triaxcal.planning.directions`), best first.
     """
 
     def __init__(self, message: str, *, wanted: Sequence[str] = ()) -> None:
         super().__init__(message)
         self.wanted = tuple(wanted)
+
+
+class NotStill(Refused):
+    """The fit went where no still triad's poses lead it; ``how`` it ended."""
+
+    def __init__(self, how: str) -> None:
+        super().__init__(f"{how}; the poses do not look like those of one still triad")

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from triaxcal.calibration import Calibration
+from triaxcal.calibration import Calibration, Exclusion
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.runs import expected_of
@@ -135,7 +135,7 @@ def _searched(
     reference: float,
     catalogue: Sequence[Effect],
 ) -> Explanation:
-    before = fit(poses, signs=signs, reference=reference, aside=aside)
+    before = fit(poses, signs=signs, reference=reference, aside=aside, why=Exclusion.OUTLIER)
     kept = [p for i, p in enumerate(poses) if i not in aside]
     problem = problem_of(kept, signs=signs, reference=reference)
     linear = solve(problem, start(problem, kept, signs), ())

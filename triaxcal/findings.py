@@ -13,6 +13,7 @@ from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import package_of
 from triaxcal.figures import micro_g, probability, the_poses
 from triaxcal.leads import TOWARDS
+from triaxcal.poses.pose import Began
 from triaxcal.search import FAILED, FAMILYWISE, Search, alternatives, compared, telling_apart
 from triaxcal.search.alternatives import instead_of
 from triaxcal.unexplained import MORE, NAMELESS, UNTESTED, Unexplained
@@ -40,7 +41,7 @@ class Finding:
     """The model with this effect and those before it."""
     apart: tuple[str, ...] = ()
     """What to record so as to tell it from its alternatives."""
-    spoiled: tuple[str, ...] = ()
+    spoiled: tuple[Began, ...] = ()
     """When poses began that would do as well as any effect, were they spoiled."""
     coincidence: float | None = None
     """Probability that one effect or another would have explained as much, whatever it was, 1 where |a| goes inside the
@@ -62,7 +63,7 @@ def finding_of(
     after: Calibration,
     step: Calibration,
     rivals: Sequence[Sequence[Effect]],
-    spoiled: Sequence[str],
+    spoiled: Sequence[Began],
     chance: float,
 ) -> Finding:
     """The ``pair`` are the model that lacks this effect alone (None where the poses cannot carry it), and that with all
@@ -120,7 +121,7 @@ def _fall(without: Calibration | None, complete: Calibration, others: int) -> st
         return ""
     beside = f", beside {OTHERS[others]}," if others else ""
     which = "which" if len(found.but) == 1 else "each of which"
-    but = f", but for {the_poses([p.pose.at for p in found.but])}, {which} alone carries a coefficient," * bool(
+    but = f", but for {the_poses(p.pose.began for p in found.but)}, {which} alone carries a coefficient," * bool(
         found.but
     )
     return (

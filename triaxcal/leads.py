@@ -13,7 +13,7 @@ from triaxcal.conditions import channels_of, with_scale
 from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, channel_of, rate_of
 from triaxcal.figures import plain
-from triaxcal.plan.directions import linear_design
+from triaxcal.planning.directions import linear_design
 from triaxcal.search.apart import FROM_OTHER_SIDES, UNSHAKEN
 
 LEAD = 0.01

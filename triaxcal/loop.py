@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from triaxcal.aside import with_faulty
-from triaxcal.calibration import SPOILED, Calibration, PoseResult
+from triaxcal.calibration import Calibration, Exclusion, PoseResult
 from triaxcal.conditions import channels_of
 from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.description import described
@@ -23,8 +23,8 @@ from triaxcal.errors import Refused
 from triaxcal.explanation import Explanation, explained, left_out
 from triaxcal.figures import the_poses
 from triaxcal.findings import Finding, advice_of, description_of, finding_of, why_not_shown
-from triaxcal.fit import fit
 from triaxcal.held_out import HeldOut, better_of, held_out
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.runs import by_run
@@ -71,7 +71,7 @@ def diagnose(
 
     ``catalogue`` are the effects to look for: all that are known for these poses' channels where it is None. ``check``
     are poses of another recording, for the held-out error. ``empirical``: what no effect explains is described by a
-    smooth term, where that helps poses that it was not fitted to. Raises as `triaxcal.fit.fit` does.
+    smooth term, where that helps poses that it was not fitted to. Raises as `triaxcal.pose_fit.fit` does.
     """
     sound = [p for p in poses if not p.fault]
     if check is not None:
@@ -97,7 +97,7 @@ def diagnose(
     for effect, step, chance in zip(made.adopted, steps, made.chances, strict=False):
         others = [e for e in made.adopted if e is not effect]
         without = made.given.tried(others) if others else before
-        spoiled = tuple(poses[i].at for i in made.found.spoiled)
+        spoiled = tuple(poses[i].began for i in made.found.spoiled)
         rivals, pair = made.found.rivals, (without, steps[-1])
         findings.append(finding_of(search, effect, pair, after, step, rivals, spoiled, chance))
     if smooth is not None:
@@ -135,7 +135,14 @@ class _Given:
     aside: tuple[int, ...]
 
     def fit(self, effects: Sequence[Effect]) -> Calibration:
-        return fit(self.poses, signs=self.signs, reference=self.reference, effects=effects, aside=self.aside)
+        return fit(
+            self.poses,
+            signs=self.signs,
+            reference=self.reference,
+            effects=effects,
+            aside=self.aside,
+            why=Exclusion.OUTLIER,
+        )
 
     def tried(self, effects: Sequence[Effect]) -> Calibration | None:
         """None where the poses cannot carry it."""
@@ -175,7 +182,7 @@ class _Made:
     @property
     def aside(self) -> list[PoseResult]:
         """Poses left out as spoiled."""
-        return [p for p in self.steps[-1].poses if p.left_out == SPOILED]
+        return [p for p in self.steps[-1].poses if p.excluded == Exclusion.OUTLIER]
 
     @property
     def rivals(self) -> list[str]:
@@ -222,7 +229,7 @@ def _unexplained(made: _Made) -> Unexplained:
 
 def _named_or_none(made: _Made) -> Unexplained | None:
     """Where effects explain all there is, but need not be what it is; None where they were put to the test."""
-    search, spoiled = made.search, [made.given.poses[i].at for i in made.found.spoiled]
+    search, spoiled = made.search, [made.given.poses[i].began for i in made.found.spoiled]
     in_doubt = made.aside if made.spoiled_by_chance >= FAMILYWISE else []
     if made.untested or spoiled:
         sure = [] if spoiled else [e for e in made.adopted if e.name not in made.untested]
@@ -244,21 +251,21 @@ def _spoiled_instead(made: _Made) -> dict[str, Calibration]:
     model = replace(made.given, aside=made.found.spoiled).tried(())
     if model is None:
         return {}
-    left_out = the_poses([p.pose.at for p in model.poses if not p.used])
+    left_out = the_poses(p.pose.began for p in model.poses if not p.used)
     return {f"that something spoiled {left_out}": model}
 
 
 def _without_faults(poses: Sequence[Pose]) -> list[str]:
     """To take again the poses in which the outputs did not follow the acceleration, by what was the matter."""
     faults = dict.fromkeys(p.fault for p in poses if p.fault)
-    return [f"take again {the_poses([p.at for p in poses if p.fault == f])}: left out ({f})" for f in faults]
+    return [f"take again {the_poses(p.began for p in poses if p.fault == f)}: left out ({f})" for f in faults]
 
 
 def _again(made: _Made) -> list[str]:
     """What to take again: poses left out as spoiled, and what would explain as much without that."""
     if not made.aside:
         return []
-    advice = f"take again {the_poses([p.pose.at for p in made.aside])}: left out as spoiled"
+    advice = f"take again {the_poses(p.pose.began for p in made.aside)}: left out as spoiled"
     if made.rivals:
         advice += f", but {' or '.join(made.rivals)} would explain as much; {SAME}"
     elif made.untested or made.spoiled_by_chance >= FAMILYWISE:

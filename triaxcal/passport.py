@@ -8,16 +8,17 @@ contradict each other can be tested.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, PoseResult, Residual
+from triaxcal.caution import Caution
 from triaxcal.conditions import conditions_elsewhere
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.plan.directions import dilution, linear_design
+from triaxcal.planning.directions import dilution, linear_design
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, parameters_by_theta
 from triaxcal.pure_error import lack_of_fit_p, pure_error_dof
@@ -26,9 +27,15 @@ from triaxcal.sensor import Sensor
 STEPS_MOST = 60
 CONVERGED = 1e-12
 CONFLICT = 0.01
-FAR = "the refinement did not converge: the passport values are far from these poses"
 FROM_POSES, FROM_PASSPORT = 0.9, 0.1
 """Share of the information on a parameter from which on it counts as the poses', or still as the passport's."""
+
+
+class FarFromPoses(Refused):
+    """The poses are too far from the passport's values."""
+
+    def __init__(self) -> None:
+        super().__init__("the refinement did not converge: the passport values are far from these poses")
 
 
 @dataclass(frozen=True)
@@ -70,6 +77,24 @@ class Passport:
         out = np.zeros((len(error), len(free)))
         out[free] = error[free, None] * vectors * np.sqrt(np.maximum(values, 0.0))
         return out
+
+
+@dataclass(frozen=True)
+class DatasheetContradicted(Caution):
+    """Poses and passport values contradict each other (probability ``p``), most in ``parameter``, which moved by
+    ``shift`` standard errors; standard errors are ``raised`` so many times."""
+
+    p: float
+    parameter: str
+    shift: float
+    raised: float
+
+
+@dataclass(frozen=True)
+class StillOfDatasheet(Caution):
+    """The poses say next to nothing of these ``parameters``."""
+
+    parameters: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -130,7 +155,7 @@ def refine(poses: Sequence[Pose], passport: Passport) -> Refinement:
         dof=float(max(len(poses), 1) if raised > 1 else max(pure, 1.0)),
     )
     found = Refinement(calibration, passport, share, shift, conflict_p)
-    return replace(found, calibration=replace(calibration, warnings=tuple(_warnings(found))))
+    return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found))))
 
 
 def _problem(poses: Sequence[Pose], passport: Passport) -> Problem:
@@ -177,11 +202,11 @@ def _solved(problem: Problem, passport: Passport, root: Floats) -> tuple[Floats,
         state = _state(problem, passport, passport.values + root @ z)
         r, J, s = linearise(problem, state)
         if not (np.isfinite(J).all() and np.isfinite(r).all() and np.all(s > 0)):
-            raise Refused(FAR)
+            raise FarFromPoses
         J = J @ _theta_by_parameters(problem, state) @ root / s[:, None]
         information = J.T @ J + np.eye(len(z))
         if not np.isfinite(information).all():
-            raise Refused(FAR)
+            raise FarFromPoses
         step = -np.linalg.solve(information, J.T @ (r / s) + z)
         now, scale = cost(z, s), 1.0  # the weights follow the gradient from step to step
         for _ in range(20):
@@ -193,7 +218,7 @@ def _solved(problem: Problem, passport: Passport, root: Floats) -> tuple[Floats,
         if np.linalg.norm(step) <= CONVERGED * size:
             return z, information
     if np.linalg.norm(step) > 1e-6:
-        raise Refused(FAR)
+        raise FarFromPoses
     return z, information
 
 
@@ -233,17 +258,12 @@ def _dilution(problem: Problem, state: State) -> float:
     return dilution(a, linear_design(a, (problem.u - problem.middle) / problem.half))
 
 
-def _warnings(found: Refinement) -> list[str]:
-    c, out = found.calibration, []
-    names = c.parameters
+def _cautions(found: Refinement) -> Iterator[Caution]:
+    names = found.calibration.parameters
     if found.conflict_p is not None and found.conflict_p < CONFLICT:
         worst = int(np.argmax(np.abs(found.shift)))
-        out.append(
-            f"passport and poses contradict each other (p {found.conflict_p:.1e}), most in {names[worst]}, which moved "
-            f"by {found.shift[worst]:+.1f} standard errors: the unit has changed, the passport's standard errors are "
-            f"too small, or a pose was not still; the standard errors are raised by {c.inflation:.1f}"
+        yield DatasheetContradicted(
+            found.conflict_p, names[worst], float(found.shift[worst]), found.calibration.inflation
         )
-    kept = [n for n, s in zip(names, found.sources, strict=True) if s == "passport"]
-    if kept:
-        out.append(f"these poses say next to nothing of {', '.join(kept)}: still the passport's")
-    return out
+    if kept := tuple(n for n, s in zip(names, found.sources, strict=True) if s == "passport"):
+        yield StillOfDatasheet(kept)

@@ -20,12 +20,11 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.conditions import conditions, references
 from triaxcal.effects.contract import Effect, reshaped
-from triaxcal.errors import Refused
+from triaxcal.errors import NotStill, Refused
 from triaxcal.sensor import Sensor
 
 Linearised = tuple[Floats, Floats, Floats]
 """Residuals (n,), their derivatives by theta (n, 9+p), their standard errors (n,)."""
-NOT_STILL = "the poses do not look like those of one still triad"
 STEPS_MOST = 60
 FAR = 1e6
 """Times the reference vector: what no unit has as bias, nor as the half of its range."""
@@ -128,7 +127,7 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
     for left in reversed(range(steps)):
         r, J, s = here or everything(problem, State(theta, effects))
         if not (np.isfinite(J).all() and np.isfinite(r).all() and np.abs(theta[:6]).max() < FAR * problem.reference):
-            raise Refused(f"the fit ran away; {NOT_STILL}")
+            raise NotStill("the fit ran away")
         norm = np.linalg.norm(J / s[:, None], axis=0)
         norm[norm == 0] = 1.0
         step = -np.linalg.lstsq(J / s[:, None] / norm, r / s, rcond=1e-14)[0] / norm
@@ -143,7 +142,7 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
                 break
         theta = theta + scale * step
     if steps == STEPS_MOST and size > 1e-9:
-        raise Refused(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e}); {NOT_STILL}")
+        raise NotStill(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e})")
     return State(theta, effects)
 
 

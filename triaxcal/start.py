@@ -11,7 +11,7 @@ from triaxcal.conditions import channels_of, references, with_scale
 from triaxcal.distributions import chi2_ppf
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.plan.directions import dilution, distinct, linear_design, most_wanted
+from triaxcal.planning.directions import dilution, distinct, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise
 from triaxcal.sensor import Sensor
@@ -24,6 +24,13 @@ POSES_LEAST = 9
 ROUGH_LEAST, ROUGH_APART_DEG, ROUGH_LIMIT_RAD, TRIAD_UNLIKE_SPHERE = 6, 10.0, 0.2, 0.03
 """Directions are told without a fit from so many poses so far apart, where they are not less sure than this; and by how
 much at least scale factors of the axes are taken to differ."""
+
+
+class Uncarried(Refused):
+    """The poses cannot carry nine parameters; ``a`` (n,3) are what is known of their directions."""
+
+    def __init__(self, why: str, a: Floats, wanted: Sequence[str]) -> None:
+        super().__init__(f"{why}; {len(a)} poses in {distinct(a)} distinct directions", wanted=wanted)
 
 
 def problem_of(poses: Sequence[Pose], *, signs: Sequence[float] = (1, 1, 1), reference: float = 1.0) -> Problem:
@@ -65,7 +72,7 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
         a = (problem.u - c) @ A.T
         spread = dilution(a, linear_design(a / np.linalg.norm(a, axis=1, keepdims=True), x))
     except Refused as e:
-        raise Refused(f"{e}; {_count(rough)}", wanted=wanted_for(poses, signs)) from None
+        raise Uncarried(str(e), rough, wanted_for(poses, signs)) from None
     k, angles, b = coefficients(A * problem.reference, c)
     ax, ay, az = angles
     sx, sy, sz = problem.signs
@@ -75,15 +82,17 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
     noise = float(np.sqrt(np.mean(linearise(problem, state)[2] ** 2))) / problem.reference
     known = spread * noise < NOISE_LIMIT
     if not spread < DILUTION_LIMIT:
-        raise Refused(
+        raise Uncarried(
             f"the poses cannot carry nine parameters: some combination of them would be {spread:.3g} times as "
-            f"uncertain as one pose (limit {DILUTION_LIMIT:g}); {_count(a)}",
-            wanted=wanted_for(poses, signs),
+            f"uncertain as one pose (limit {DILUTION_LIMIT:g})",
+            a,
+            wanted_for(poses, signs),
         )
     if not known:
-        raise Refused(
-            f"the poses cannot carry nine parameters: they differ by little more than their noise; {_count(a)}",
-            wanted=wanted_for(poses, signs),
+        raise Uncarried(
+            "the poses cannot carry nine parameters: they differ by little more than their noise",
+            a,
+            wanted_for(poses, signs),
         )
     return state
 
@@ -98,10 +107,6 @@ def begun(poses: Sequence[Pose], *, signs: Sequence[float], reference: float) ->
     problem = problem_of(poses, signs=signs, reference=reference)
     state = start(problem, poses, signs)
     return with_history(problem, poses, state.sensor(problem)), state
-
-
-def _count(a: Floats) -> str:
-    return f"{len(a)} poses in {distinct(a)} distinct directions"
 
 
 def wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]:

@@ -29,7 +29,13 @@ ERROR_MOST = 0.3
 PAIRS_MOST = 400
 RIVAL = 0.02
 """Rows that take out of the sum of squares within this share of each other cannot be told apart."""
-CONTRADICTION = "attitudes and readings contradict each other; are the rows in the order of the poses?"
+
+
+class AttitudesContradictReadings(Refused):
+    """In too many rows to tell which are right."""
+
+    def __init__(self) -> None:
+        super().__init__("attitudes and readings contradict each other; are the rows in the order of the poses?")
 
 
 @dataclass(frozen=True)
@@ -109,7 +115,7 @@ def solved(data: TurntableData, error_rad: float | None) -> TurntableSolution:
     while excess(high) > 0:
         low, high = high, high + 2
         if low > np.log(ERROR_MOST):
-            raise Refused(CONTRADICTION)
+            raise AttitudesContradictReadings
     best = float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-2)))
     return replace(iterated(data, best), estimated=True)
 
@@ -132,7 +138,7 @@ def iterated(data: TurntableData, error_rad: float) -> TurntableSolution:
         try:
             weight = np.linalg.inv(V)
         except np.linalg.LinAlgError:
-            raise Refused(CONTRADICTION) from None
+            raise AttitudesContradictReadings from None
         target = data.u - np.einsum("nik,nk->ni", turned, stated)
         p, covariance = _weighted(design, weight, target)
         P, before, c = p[:9].reshape(3, 3), P, p[9:]

@@ -9,8 +9,9 @@ import numpy as np
 
 from triaxcal.calibration import Calibration, PoseResult
 from triaxcal.effects.contract import TIME
-from triaxcal.figures import micro_g, probability, the_poses
+from triaxcal.figures import micro_g, moment, probability, the_poses
 from triaxcal.leads import AGAIN, LEAD, TOWARDS, Lead, clear_patterns
+from triaxcal.poses.pose import Began
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.search import FAILED, FAMILYWISE, NEAR, Nearest, Search
 
@@ -69,7 +70,7 @@ def spoiled_or(
     """What the poses leave where those that are ``spoiled`` explain it no better than the effects of these ``names``
     would. ``whole`` is the fit to all poses, ``p`` the probability of what it leaves, which is significant; ``left`` is
     what the others leave without those: where that is significant, neither is all there is."""
-    off = " and ".join(f"the pose at {s.pose.at} ({micro_g(s.residual_g, '+')})" for s in spoiled)
+    off = " and ".join(f"{the_poses([s.pose.began])} ({micro_g(s.residual_g, '+')})" for s in spoiled)
     doubt = f"spoiled, or it is {' or '.join(names)}, which would explain as much"
     if left is not None and left.significant:
         return replace(left, lead=f"{left.lead}; besides, left out is {off}: {doubt}")
@@ -80,7 +81,7 @@ def or_named(
     before: Calibration,
     p: float | None,
     untested: Mapping[str, float],
-    spoiled: Sequence[str],
+    spoiled: Sequence[Began],
     moving: Unexplained | None = None,
 ) -> Unexplained:
     """What the poses leave ``before`` the effects in question, with a probability ``p`` by chance, where these explain
@@ -147,8 +148,10 @@ def lead(
     worst = max(used, key=lambda p: abs(p.studentized))
     parts: list[Lead] = []
     if worst.studentized**2 > 0.5 * sum(p.studentized**2 for p in used):
-        text = f"most of it is one pose, at {worst.pose.at} ({micro_g(worst.residual_g, '+')}): was it still?"
-        parts.append(Lead(text, f"take the pose at {worst.pose.at} again"))
+        text = (
+            f"most of it is one pose, at {moment(worst.pose.began)} ({micro_g(worst.residual_g, '+')}): was it still?"
+        )
+        parts.append(Lead(text, f"take {the_poses([worst.pose.began])} again"))
     parts += [*clear_patterns(after, used), *hints]
     inside = {effect.name for effect, _ in after.sensor.effects}
     near = {name: why for name, why in passed_over.items() if _is_hint(why) and name not in inside}

@@ -10,9 +10,9 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
-from triaxcal.plan.clock import in_plan
-from triaxcal.plan.design import combinations, profile_times, radial
-from triaxcal.plan.directions import linear_design
+from triaxcal.planning.clock import in_plan
+from triaxcal.planning.design import combinations, profile_times, radial
+from triaxcal.planning.directions import linear_design
 
 VISIBLE = 0.02
 """An effect is visible when the part of it that the model cannot absorb is at least this share of it."""

@@ -21,8 +21,8 @@ from triaxcal.conditions import channels_of, with_scale
 from triaxcal.effects import Effect
 from triaxcal.effects.part import whole
 from triaxcal.figures import micro_g
-from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Stated, budget

@@ -13,13 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration, Residual
-from triaxcal.conditions import held_at
+from triaxcal.calibration import Calibration, Exclusion, Residual
+from triaxcal.figures import moment
 from triaxcal.loop import Loop
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Budget, Stated, budget
 from triaxcald.choices import choices_of
+from triaxcald.doubts import UNIT
+from triaxcald.remarks import assumed_in
 from triaxcald.units import SMALLEST, ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]
@@ -30,6 +33,10 @@ LINEAR = ("scale_factor", "misalignment", "bias")
 GRID_G = 1e-11
 """Errors of the magnitude are differences of numbers near 1 g: beyond this they differ from processor to processor. Of
 numbers near another reference, as much finer or coarser as that is smaller or larger, in powers of ten."""
+
+
+_LEFT_OUT = {Exclusion.OUTLIER: "spoiled", Exclusion.CALLER: "caller", Exclusion.UNKNOWN_HISTORY: "unknown_history"}
+"""As documents of 0.1 have it, beside ``excluded``; else the name of the fault."""
 
 
 def number(value: float | None, digits: int = DIGITS) -> float | None:
@@ -121,7 +128,7 @@ def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, 
 def holds_of(c: Calibration) -> list[str]:
     """In words, under which conditions scale factor, misalignment and bias are all of a reading; none where always."""
     several = any(p.pose.run.of > 1 for p in c.poses)
-    return list(held_at([effect for effect, _ in c.sensor.effects], c.channel_reference, several=several))
+    return list(text.holds([effect for effect, _ in c.sensor.effects], c.channel_reference, several=several))
 
 
 def calibration_document(
@@ -179,7 +186,8 @@ def calibration_document(
                 "studentized": uncertainty(p.studentized),
                 "leverage": uncertainty(p.leverage),
                 "used": p.used,
-                **({"left_out": p.left_out} if p.left_out else {}),
+                "excluded": p.excluded,
+                **({"left_out": _LEFT_OUT.get(p.excluded, p.pose.fault)} if p.excluded else {}),
                 "channels": {name: number(v) for name, v in p.pose.channels.items()},
             }
             for p in c.poses
@@ -188,7 +196,7 @@ def calibration_document(
         "condition": uncertainty(c.condition),
         "dilution": uncertainty(c.dilution),
         "blind_to": list(c.blind_to),
-        "warnings": list(c.warnings),
+        "warnings": [text.caution(caution) for caution in c.cautions],
     }
 
 
@@ -206,7 +214,7 @@ def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Doc
     def by_name(values: Floats) -> Document:
         return by_parameter(c, [uncertainty(float(v)) for v in values])
 
-    whole = b.magnitude
+    whole, small = b.magnitude, ErrorUnit.of(reference_unit, c.reference)
     return {
         "level": b.parameters.level,
         "expanded": by_name(b.parameters.expanded),
@@ -224,14 +232,15 @@ def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Doc
                 **by_name(line.parameters),
                 "magnitude_g": uncertainty(line.magnitude),
                 "share": uncertainty(b.share(line)),
-                "how": line.how,
+                "how": text.basis(line.basis),
+                **({"assumes": list(effects)} if (effects := assumed_in(line.basis)) else {}),
             }
             for line in b.components
         ],
         "dominant": b.dominant.source,
-        "halved_by": ErrorUnit.of(reference_unit, c.reference).in_words(b.dominant.halved_by),
+        "halved_by": text.remedy(b.dominant.halved_by, small.figure),
         "magnitude_if_halved_g": uncertainty(b.magnitude_if_halved),
-        "not_evaluated": list(b.not_evaluated),
+        "not_evaluated": [text.not_evaluated(source, small.figure) for source in b.not_evaluated],
     }
 
 
@@ -243,13 +252,17 @@ def loop_document(
     reference_unit: str = "g",
     stated: Stated | None = None,
     held_by_device: Calibration | None = None,
+    remarks: Sequence[str] = (),
+    unit_in_doubt: bool = False,
 ) -> Document:
-    """``held_by_device`` is the calibration that a device has registers for, None where there is no such device."""
+    """``held_by_device`` is the calibration that a device has registers for, None where there is no such device.
+    ``remarks`` are warnings besides those of the fit; ``unit_in_doubt``: one of them asks whether it is one unit."""
     calibration = calibration_document(
         loop.after, output_unit=output_unit, reference_unit=reference_unit, stated=stated
     )
     reference, held = loop.after.reference, loop.held_out
     small = ErrorUnit.of(reference_unit, reference)
+    calibration["warnings"] += remarks
     for pose, before in zip(calibration["poses"], loop.before.poses, strict=True):
         pose["before_residual_g"] = error(before.residual_g, reference)
     return {
@@ -275,7 +288,7 @@ def loop_document(
                 "p_value": probability(f.p_value),
                 "coefficients": coefficients_document(f.coefficients, reference_unit),
                 "alternatives": list(f.alternatives),
-                "spoiled": list(f.spoiled),
+                "spoiled": [moment(began) for began in f.spoiled],
                 "coincidence": probability(f.coincidence),
                 "held_out_rms_g": {n: error(held.instead[n], reference) for n in f.alternatives if n in held.instead}
                 if held
@@ -305,6 +318,7 @@ def loop_document(
             "or_named": loop.unexplained.or_named,
             "only_inside": loop.unexplained.only_inside,
         },
+        **({"doubts": [UNIT]} if unit_in_doubt else {}),
         "data_quality": list(data_quality),
         "advice": [small.in_words(line) for line in loop.advice],
         "calibration": calibration,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from triaxcal import text
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.frame.faces import LABELS, TURNS, axis_of, opposite
@@ -62,7 +63,7 @@ def own_source(name: str, measured: Measured, fitted: Calibration, *, output_uni
         output_unit,
         reference_unit,
         fitted,
-        fitted.warnings,
+        tuple(map(text.caution, fitted.cautions)),
     )
 
 
@@ -113,7 +114,7 @@ def frame_document(sources: Sequence[Source], frames: Frames) -> Document:
             "p_value": probability(frames.lack_of_fit_p),
             "inflation": uncertainty(frames.inflation),
         },
-        "warnings": list(frames.warnings),
+        "warnings": [text.caution(caution) for caution in frames.cautions],
     }
 
 
@@ -159,7 +160,7 @@ def _unit(source: Source, unit: UnitFrame) -> Document:
         "seating_error_rad": uncertainty(standing.seating),
         "seating_degrees_of_freedom": standing.seating_dof,
         "data_quality": list(measured.data_quality),
-        "warnings": [*source.warnings, *standing.labelling.warnings, *standing.warnings],
+        "warnings": [*source.warnings, *map(text.caution, (*standing.labelling.cautions, *standing.cautions))],
     }
 
 

@@ -68,7 +68,8 @@ def measure(
 ) -> Measured:
     """``name`` is a path to an `.mcap`, `.csv` or `.csv.gz`, or `-`. Raises InputError, RecordingError.
 
-    ``moments`` are fed all raw samples on the way, block by block.
+    ``moments`` are fed all raw samples on the way, block by block: of a unit that turns, where what turns slowly enough
+    would pass for a pose that creeps.
     """
     if name.endswith(".mcap"):
         with Recording.open(Path(name)) as recording:
@@ -88,9 +89,10 @@ def measure(
     spans = detector.spans()
     seen = judge.findings(windows, spans)
     poses = poses_of(windows, spans, untrusted_poses(seen))
-    counted = [f"duplicate_samples: {samples.duplicates}"] if samples.duplicates else []
+    counted = {"duplicate_samples": str(samples.duplicates)} if samples.duplicates else {}
     quality = together(counted, seen)
-    return Measured(name, poses, windows, quality + creeping(poses) + _not_seconds(poses))
+    creep = [] if moments is not None else creeping(poses)
+    return Measured(name, poses, windows, quality + creep + _not_seconds(poses))
 
 
 def _not_seconds(poses: Sequence[Pose]) -> list[str]:
@@ -123,7 +125,7 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str, moments:
         if moments is not None:
             moments.feed(block.readings)
     poses = pipeline.finish()
-    quality = pipeline.data_quality() + losses_of(recording) + creeping(poses)
+    quality = pipeline.data_quality() + losses_of(recording) + ([] if moments is not None else creeping(poses))
     signs = signs_of(recording) or bundle.profile.output.signs
     station = None
     if STATION_FILE in recording.attachments:

@@ -18,9 +18,8 @@ from triaxcal.conditions import conditions_elsewhere
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.figures import plain
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
-from triaxcald.doubts import SAME_UNIT
 
 MISALIGNMENT_RAD, SCALE_FACTOR = 1e-3, 6e-3
 """Standard deviations, of each, by which one mass-market unit differs from itself in another recording: scale factors
@@ -110,5 +109,5 @@ def unlike_shapes(name: str, other: str, one: Shape | None, another: Shape | Non
     ratio, angle = (float(np.max(np.abs(v))) for v in ([*apart[:2], apart[:2].sum()], apart[2:]))
     return [
         f"{name} and {other}: misalignment differs by up to {plain(1e3 * angle, 2)} mrad and the ratio of scale "
-        f"factors by up to {plain(100 * ratio, 2)} %, more than age and 20 K make of one unit: {SAME_UNIT}"
+        f"factors by up to {plain(100 * ratio, 2)} %, more than age and 20 K make of one unit: the same unit?"
     ]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from triaxcal import text
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Held, Pose, held_of, poses_of
 from triaxcal.quality import Finding, QualityDetector, untrusted_poses
@@ -108,40 +109,41 @@ class Pipeline:
 
     def data_quality(self) -> list[str]:
         """What the raw stream is to be blamed for, one line each."""
-        found = []
+        found: dict[str, str] = {}
         if self.counts["missing"] or self.counts["incomplete"]:
             lost = self.counts["missing"] + self.counts["incomplete"]
-            found.append(f"missing_samples: {lost} of {self.counts['samples'] + lost}")
+            found["missing_samples"] = f"{lost} of {self.counts['samples'] + lost}"
         elif self.counts["receiver_overflows"]:
-            found.append(f"missing_samples: the receiver overflowed {self.counts['receiver_overflows']} times")
+            found["missing_samples"] = f"the receiver overflowed {self.counts['receiver_overflows']} times"
         if self.counts["duplicates"]:
-            found.append(f"duplicate_samples: {self.counts['duplicates']}")
+            found["duplicate_samples"] = str(self.counts["duplicates"])
         if self.counts["out_of_order"]:
-            found.append(f"out_of_order_samples: {self.counts['out_of_order']}, left out")
+            found["out_of_order_samples"] = f"{self.counts['out_of_order']}, left out"
         if self.counts["errors"]:
-            found.append(f"bus_errors: {self.counts['errors']} records")
-        return together(found, self._seen(self.windows))
+            found["bus_errors"] = f"{self.counts['errors']} records"
+        return together(
+            found, self._seen(self.windows), self.bundle.profile.output.unit if self.stream == READINGS else "g"
+        )
 
     def _seen(self, windows: Windows | None) -> list[Finding]:
         """The findings so far, judged once for the same samples."""
         if self._findings is None:
-            unit = self.bundle.profile.output.unit if self.stream == READINGS else "g"
-            self._findings = self._quality.findings(windows, self._still(windows) if windows else [], unit=unit)
+            self._findings = self._quality.findings(windows, self._still(windows) if windows else [])
         return self._findings
 
 
-def together(counted: Sequence[str], seen: Iterable[Finding]) -> list[str]:
-    """What was counted on the way here, and what is ``seen`` in the samples: one line for each kind of fault. What was
-    counted as missing leaves the gaps that are seen, which are not said again.
+def together(counted: Mapping[str, str], seen: Iterable[Finding], unit: str = "") -> list[str]:
+    """What was ``counted`` on the way here, by name, and what is ``seen`` in the samples, whose outputs are in
+    ``unit``: one line for each kind of fault. What was counted as missing leaves the gaps that are seen, which are not
+    said again.
     """
-    lines = list(counted)
+    said = dict(counted)
     for finding in seen:
-        same = [i for i, line in enumerate(lines) if line.startswith(f"{finding.name}:")]
-        if not same:
-            lines.append(finding.line)
+        if finding.name not in said:
+            said[finding.name] = text.quality(finding, unit)
         elif finding.name != "missing_samples":
-            lines[same[0]] += f"; {finding.text}"
-    return lines
+            said[finding.name] += f"; {text.quality(finding, unit)}"
+    return [f"{name}: {what}" for name, what in said.items()]
 
 
 def creeping(poses: Sequence[Pose]) -> list[str]:

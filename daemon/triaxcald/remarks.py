@@ -8,19 +8,25 @@ from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import BEFORE, CLOCKS
 from triaxcal.loop import Loop
 from triaxcal.uncertainty import SENSITIVITY_PER_K
+from triaxcal.uncertainty.basis import Basis, UnmodelledTemperature
 
 SHARE = "% of it goes with "
 """How the lead of what is unexplained tells a share."""
 
 
-def assumption(source: str, how: str, reference_unit: str = "g") -> str:
-    """On a line of the budget (`triaxcal.uncertainty.Component`), empty where it assumes nothing."""
+def assumed_in(basis: Basis) -> tuple[str, ...]:
+    """The effects whose size a line of the budget (`triaxcal.uncertainty.Component`) assumes."""
+    return basis.effects if isinstance(basis, UnmodelledTemperature) else ()
+
+
+def assumption(effects: Collection[str], reference_unit: str = "g") -> str:
+    """On a line of the budget that assumes the size of these, empty where it assumes nothing."""
     said = {
         "temperature_bias": f"bias {{:g}} {'µg/K' if reference_unit == 'g' else 'ppm of the reference per K'}",
         "temperature_scale_factor": "scale factor {:g} ppm/K",
     }
-    assumed = " and ".join(text.format(1e6 * SENSITIVITY_PER_K[e]) for e, text in said.items() if e in how)
-    if source != "temperature" or not assumed:
+    assumed = " and ".join(text.format(1e6 * SENSITIVITY_PER_K[e]) for e, text in said.items() if e in effects)
+    if not assumed:
         return ""
     return (
         f"as far as the poses do not tell, this rests on an assumption, typical of data sheets: {assumed}; diagnose of "

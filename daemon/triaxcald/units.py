@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from triaxcal.figures import plain
+from triaxcal.figures import micro_g, plain
 
 SMALLEST = 1e-250
 """Of references: beyond it powers of ten end."""
@@ -53,6 +53,10 @@ class ErrorUnit:
 
     def in_full(self, value: float | None) -> str:
         return self._behind(self.told(value))
+
+    def figure(self, value: float) -> str:
+        """A ``value`` in the reference's unit as sentences have it."""
+        return self.in_words(micro_g(value))
 
     def in_words(self, text: str) -> str:
         """What the metrology says in words, where it writes µg for a millionth of the reference's unit."""

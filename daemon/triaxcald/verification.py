@@ -17,7 +17,6 @@ from triaxcal.distributions import f_sf
 from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose
 from triaxcald.documents import Document, error, number, uncertainty
-from triaxcald.doubts import ANOTHER_UNIT
 from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.station.guidance import ups
 
@@ -127,7 +126,7 @@ def unlike(name: str, rms_g: float, reference: float, said: str = "does not look
         return []
     return [
         f"{name} {said}: |a| is off by {plain(rms_g / reference, 2)} of the reference; "
-        f"{ANOTHER_UNIT}, or are signs, order or unit of its outputs others?"
+        "is it another unit, or are signs, order or unit of its outputs others?"
     ]
 
 

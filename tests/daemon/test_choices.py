@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 
 from triaxcal.effects import effect_of
-from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
+from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.choices import choices_of

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcal.calibration import Exclusion
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.part import Part
 from triaxcal.effects.warm_up import WarmUp
-from triaxcal.fit import fit
 from triaxcal.loop import diagnose
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -94,11 +95,19 @@ def test_poses_have_the_keys_of_the_contract(poses: list[Pose]) -> None:
 
 def test_a_pose_that_was_left_out_says_why(poses: list[Pose]) -> None:
     begun = [replace(poses[0], before=None), *(replace(p, before=poses[i].mean) for i, p in enumerate(poses[1:]))]
-    for effects, why in (((), "spoiled"), ((effect_named("hysteresis"),), "unknown_history")):
-        c = fit(begun, effects=effects, aside=[0])
-        document = calibration_document(c, output_unit="V", reference_unit="g", stated=None)
-        assert document["poses"][0]["left_out"] == why
-        assert "left_out" not in document["poses"][1]
+    begun[3] = replace(begun[3], fault="saturation")
+    for effects, why, before in (
+        ((), Exclusion.CALLER, "caller"),
+        ((), Exclusion.OUTLIER, "spoiled"),
+        ((effect_named("hysteresis"),), Exclusion.OUTLIER, "unknown_history"),
+    ):
+        c = fit(begun, effects=effects, aside=[0], why=why)
+        poses_of_document = calibration_document(c, output_unit="V", reference_unit="g", stated=None)["poses"]
+        assert poses_of_document[0]["excluded"] == ("unknown_history" if effects else why)
+        assert poses_of_document[0]["left_out"] == before  # as documents of 0.1 have it
+        assert poses_of_document[1]["excluded"] is None
+        assert "left_out" not in poses_of_document[1]
+        assert (poses_of_document[3]["excluded"], poses_of_document[3]["left_out"]) == ("fault", "saturation")
 
 
 def test_a_calibration_comes_back_as_a_sensor(poses: list[Pose]) -> None:
@@ -239,10 +248,10 @@ def test_a_malformed_calibration_is_an_error_that_names_file_and_field(
 
 def test_the_budget_stands_beside_the_standard_errors(poses: list[Pose]) -> None:
     fitted = fit(poses, signs=SIGNS, effects=[SECOND])
-    said = calibration_document(fitted, stated=Stated(reference=1e-4, reference_source="a guess"))["uncertainty"]
+    said = calibration_document(fitted, stated=Stated(reference=1e-4))["uncertainty"]
     lines = {x["source"]: x for x in said["budget"]}
     assert said["dominant"] == said["budget"][0]["source"] == "reference"
-    assert lines["reference"]["how"] == "a guess"
+    assert lines["reference"]["how"] == "as stated"
     assert lines["reference"]["degrees_of_freedom"] is None
     assert sum(x["share"] for x in said["budget"]) == pytest.approx(1, abs=1e-5)
     for name, index in (("scale_factor", 0), ("misalignment", 3), ("bias", 6)):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import effect_named
-from triaxcal.fit import fit
-from triaxcal.plan.directions import cube_directions
+from triaxcal.planning.directions import cube_directions
+from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.documents import calibration_document

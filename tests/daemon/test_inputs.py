@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from triaxcal.arrays import Floats
-from triaxcal.plan.directions import spiral
+from triaxcal.planning.directions import spiral
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import SyntheticUnit, Tumble
 from triaxcald.errors import InputError, RecordingError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import effect_named
-from triaxcal.fit import fit
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

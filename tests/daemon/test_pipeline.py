@@ -10,6 +10,7 @@ import pytest
 
 from triaxcal.poses.pose import Pose
 from triaxcal.quality import Finding, QualityDetector
+from triaxcal.quality.finding import MissingSamples, StuckOutput
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, load_bundle
 from triaxcald.pipeline import Pipeline, together
@@ -144,12 +145,12 @@ def test_the_same_samples_are_judged_once_for_poses_and_data_quality(
 
 
 def test_what_was_counted_as_missing_is_not_said_again_by_the_times() -> None:
-    seen = [Finding("missing_samples", "10 of 2001 by the times"), Finding("stuck_output", "x never changes")]
-    assert together(["missing_samples: 10 of 2001"], seen) == [
+    seen = [MissingSamples(10, 2001, 1, 10, 3.0), StuckOutput(("x",), None, ())]
+    assert together({"missing_samples": "10 of 2001"}, seen) == [
         "missing_samples: 10 of 2001",
         "stuck_output: x never changes",
     ]
-    assert together([], seen[:1]) == ["missing_samples: 10 of 2001 by the times"]
+    assert together({}, seen[:1]) == ["missing_samples: 10 of 2001 by the times, at 3.0 s"]
 
 
 def test_nothing_fed_is_no_pose_and_no_window() -> None:

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcald.remarks import SHARE, assumption, none_could_show, overlap
+from triaxcal.uncertainty.basis import ThermometerAt, UnmodelledTemperature
+from triaxcald.remarks import SHARE, assumed_in, assumption, none_could_show, overlap
 
 
 @pytest.mark.parametrize(
-    ("how", "said"),
+    ("lacking", "said"),
     [
-        ("temperature_bias and temperature_scale_factor not in the model", "bias 500 µg/K and scale factor 300 ppm/K;"),
-        ("temperature_scale_factor not in the model", "data sheets: scale factor 300 ppm/K;"),
-        ("temperature_bias not in the model", "data sheets: bias 500 µg/K;"),
+        (("temperature_bias", "temperature_scale_factor"), "bias 500 µg/K and scale factor 300 ppm/K;"),
+        (("temperature_scale_factor",), "data sheets: scale factor 300 ppm/K;"),
+        (("temperature_bias",), "data sheets: bias 500 µg/K;"),
     ],
 )
-def test_what_is_assumed_of_temperature_is_what_the_model_has_no_effect_for(how: str, said: str) -> None:
-    assert said in assumption("temperature", how)
-    assert assumption("noise", how) == ""
-    assert "µg" not in assumption("temperature", how, "m/s^2")
+def test_what_is_assumed_of_temperature_is_what_the_model_has_no_effect_for(
+    lacking: tuple[str, ...], said: str
+) -> None:
+    effects = assumed_in(UnmodelledTemperature(lacking, 1.0, identifiable=True))
+    assert said in assumption(effects)
+    assert "µg" not in assumption(effects, "m/s^2")
 
 
 def test_nothing_is_said_of_an_assumption_that_nobody_made() -> None:
-    assert assumption("temperature", "measured") == ""
+    assert assumption(assumed_in(ThermometerAt(25.0))) == ""
 
 
 def test_shares_are_explained_where_there_are_several() -> None:

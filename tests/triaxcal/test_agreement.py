@@ -16,7 +16,7 @@ from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.loop import Loop, diagnose
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
 from triaxcal.poses.pose import Pose
 
 SIGMA_G, HOLD_S, COUNT = 1e-5, 10.0, 26

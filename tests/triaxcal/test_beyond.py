@@ -11,8 +11,8 @@ import pytest
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.beyond import Beyond
 from triaxcal.calibration import Calibration
-from triaxcal.fit import fit
 from triaxcal.loop import diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 
 NOISE_G = 6e-6

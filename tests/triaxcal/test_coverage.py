@@ -9,7 +9,7 @@ from scipy import stats
 from benchmarks.coverage import Knowledge, covered, known, own, pooled, unknown
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.errors import InvalidData
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import pure_error_dof, raised_dof
 

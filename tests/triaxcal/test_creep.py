@@ -10,8 +10,8 @@ import pytest
 from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.effects import effect_named
 from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.fit import fit
 from triaxcal.loop import diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from triaxcal.description import DESCRIBES, described
-from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

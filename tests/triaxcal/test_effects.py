@@ -35,8 +35,8 @@ from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.plugins import plugins
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
-from triaxcal.fit import fit
 from triaxcal.loop import diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.search.candidates import Ground, faults_of
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

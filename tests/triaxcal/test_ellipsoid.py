@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.errors import Refused
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

@@ -15,8 +15,8 @@ from triaxcal.effects.second_order_nonlinearity import SecondOrderNonlinearity
 from triaxcal.effects.temperature_bias import TemperatureBias
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.findings import description_of
-from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

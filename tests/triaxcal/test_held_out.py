@@ -10,9 +10,9 @@ import pytest
 
 from tests.triaxcal.test_loop import MINUS, poses_of
 from triaxcal.effects import effect_named
-from triaxcal.fit import fit
 from triaxcal.held_out import better_of, held_out, magnitude_errors
 from triaxcal.loop import Loop, diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 

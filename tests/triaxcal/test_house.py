@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import triaxcal
@@ -35,9 +37,9 @@ import triaxcal
 for module in pkgutil.walk_packages(triaxcal.__path__, "triaxcal."):
     __import__(module.name)
 
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.loop import diagnose
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
@@ -76,3 +78,64 @@ def test_no_contract_between_the_houses_is_broken() -> None:
 
 def test_the_metrology_says_that_it_is_typed() -> None:
     assert (Path(triaxcal.__file__).parent / "py.typed").is_file()
+
+
+WORDS_LEAST = 4
+"""A string of fewer is a name."""
+SAYS = ("text", "figures")
+EFFECTS = "effects"
+"""An effect's file says what a person should do about it, as its contract has it."""
+UNTIL_THE_POSTERIOR = (
+    "agreement", "description", "explanation", "findings", "held_out", "leads", "loop", "search", "unexplained",
+)  # fmt: skip
+"""The loop that names effects makes its own sentences until a posterior takes its place."""
+
+
+def test_sentences_are_made_in_one_room() -> None:
+    package = Path(triaxcal.__file__).parent
+    others = (*SAYS, EFFECTS, *UNTIL_THE_POSTERIOR)
+    found = [
+        f"{file.relative_to(package)}:{line}: {text}"
+        for file in sorted(package.rglob("*.py"))
+        if file.relative_to(package).with_suffix("").parts[0] not in others
+        for line, text in _sentences(ast.parse(file.read_text()))
+    ]
+    assert found == []
+
+
+def test_a_sentence_is_told_from_a_docstring_a_name_and_the_line_of_an_exception() -> None:
+    source = """
+def f(n):
+    "This is what it does for you."
+    if n:
+        raise ValueError(f"there are {n} of them too many")
+    x = "first and last"
+    return f"there are {n} of them too many"
+
+
+class Far(Refused):
+    def __init__(self):
+        super().__init__("it is too far away from here")
+"""
+    assert list(_sentences(ast.parse(source))) == [(7, "there are  of them too many")]
+
+
+def _sentences(node: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and words of the strings of a module that are neither a docstring nor of an exception or a warning."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Raise | ast.Expr) and not _is_call(child):
+            continue
+        if isinstance(child, ast.ClassDef) and any(isinstance(b, ast.Name) and b.id == "Refused" for b in child.bases):
+            continue
+        if isinstance(child, ast.Call) and ast.unparse(child.func) == "warnings.warn":
+            continue
+        parts = child.values if isinstance(child, ast.JoinedStr) else [child]
+        words = "".join(p.value for p in parts if isinstance(p, ast.Constant) and isinstance(p.value, str))
+        if len(words.split()) >= WORDS_LEAST:
+            yield child.lineno, words
+        if not isinstance(child, ast.JoinedStr):
+            yield from _sentences(child)
+
+
+def _is_call(child: ast.stmt) -> bool:
+    return isinstance(child, ast.Expr) and isinstance(child.value, ast.Call | ast.Yield | ast.Await)

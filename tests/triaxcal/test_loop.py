@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from triaxcal.caution import FaultyPosesExcluded, OutliersExcluded
 from triaxcal.effects import CATALOGUE, TIME, Coefficient, Effect, effect_named, effect_of
 from triaxcal.effects.contract import SCATTER, rate_of
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.findings import Finding
-from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -385,7 +386,8 @@ def test_a_single_bad_pose_is_left_out_and_no_effect_is_made_of_it(paper_unit: S
         poses[bad] = replace(poses[bad], mean=poses[bad].mean + along)
         loop = diagnose(poses, signs=MINUS)
         assert [i for i, p in enumerate(loop.after.poses) if not p.used] == [bad]
-        assert f"at {poses[bad].start_s:.1f} s" in loop.after.warnings[0]
+        assert isinstance(loop.after.cautions[0], OutliersExcluded)
+        assert [p.began for p in loop.after.cautions[0].poses] == [poses[bad].began]
         assert not loop.findings
         assert not loop.unexplained.significant
 
@@ -434,7 +436,7 @@ def test_a_faulty_pose_tells_the_loop_nothing(with_effects: Make, twenty_six: np
     for c in (loop.before, loop.after, loop.findings[0].step):
         assert len(c.poses) == 26
         assert not c.poses[5].used
-        assert "(saturation)" in c.warnings[0]
+        assert c.cautions[0] == FaultyPosesExcluded(((bad.began, "saturation"),))
     assert loop.advice == ("take again the pose at 50.0 s: left out (saturation)", *clean.advice)
 
 

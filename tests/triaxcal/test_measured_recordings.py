@@ -14,8 +14,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from triaxcal.errors import Refused
-from triaxcal.fit import fit
 from triaxcal.loop import diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.stillness.detector import StillnessDetector
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -10,11 +11,12 @@ from scipy import stats
 
 from benchmarks.spoiled import clean_loses, measure
 from benchmarks.truth import plan
-from triaxcal.calibration import Calibration
+from triaxcal.calibration import Calibration, Exclusion
+from triaxcal.caution import Caution, Outlier, OutliersExcluded, PosesExcludedByCaller, UnknownHistoryExcluded
 from triaxcal.effects.hysteresis import Hysteresis
-from triaxcal.fit import fit
 from triaxcal.outliers import not_as_foretold, spoiled
-from triaxcal.plan.directions import linear_design
+from triaxcal.planning.directions import linear_design
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -26,6 +28,13 @@ SIGNS = (-1, -1, -1)
 def spoil(pose: Pose, unit: Sensor, direction: np.ndarray, sigmas: float) -> Pose:
     """The pose with its mean moved along the measured vector by so many standard errors."""
     return replace(pose, mean=pose.mean + unit.scale_factor * direction * sigmas * SIGMA)
+
+
+Kind = TypeVar("Kind", bound=Caution)
+
+
+def caution_of(c: Calibration, kind: type[Kind]) -> Kind:
+    return next(caution for caution in c.cautions if isinstance(caution, kind))
 
 
 def left_out(c: Calibration) -> list[int]:
@@ -92,7 +101,9 @@ def test_a_spoiled_pose_is_named_in_a_warning_and_keeps_its_place_among_the_resu
     assert [p.pose for p in c.poses] == poses
     assert c.poses[7].studentized == pytest.approx(50, abs=5)
     assert c.poses[7].residual_g == pytest.approx(50 * SIGMA, rel=0.1)
-    assert c.warnings[0].startswith("left out as spoiled: the pose at 70.0 s (+")
+    (outlier,) = caution_of(c, OutliersExcluded).poses
+    assert outlier == Outlier(poses[7].began, c.poses[7].studentized)
+    assert c.poses[7].excluded is Exclusion.OUTLIER
     assert c.residual.lack_of_fit_p is not None
     assert c.residual.lack_of_fit_p > 0.001
 
@@ -121,7 +132,7 @@ def test_a_pose_that_only_the_noise_inside_the_poses_calls_spoiled_leaves_the_er
         for sigmas in doubtful:
             found = fit([*poses[:4], spoil(poses[4], paper_unit, fourteen[4], sigmas), *poses[5:]], signs=SIGNS)
             told = fit([p.pose for p in found.poses], signs=SIGNS, aside=[4])
-            if left_out(found) == [4] and "allow for both" in found.warnings[0]:
+            if left_out(found) == [4] and caution_of(found, OutliersExcluded).doubtful:
                 doubtful[sigmas] += 1
                 assert np.all(found.standard_errors > 1.5 * told.standard_errors)
             elif left_out(found) == [4]:
@@ -163,11 +174,14 @@ def test_a_first_pose_that_another_went_before_is_left_out_and_not_called_spoile
         poses = remembering(paper_unit, twenty_six, seed, rested=False)
         c = fit(poses, signs=SIGNS, effects=[Hysteresis()])
         assert left_out(c) == [0]
-        assert c.warnings[0].startswith("left out, as what was before it is not known: the pose at 10.0 s (")
+        (unknown,) = caution_of(c, UnknownHistoryExcluded).poses
+        assert unknown.began == poses[0].began
+        assert c.poses[0].excluded is Exclusion.UNKNOWN_HISTORY
         told = fit(poses, signs=SIGNS, effects=[Hysteresis()], aside=[0])
-        assert c.warnings == told.warnings
+        assert isinstance(told.cautions[0], PosesExcludedByCaller)
+        assert c.cautions[1:] == told.cautions[1:]
         assert c.inflation == told.inflation
-        assert not any("spoiled" in w for w in c.warnings)
+        assert not any(isinstance(caution, OutliersExcluded) for caution in c.cautions)
 
 
 def test_beside_it_another_pose_is_spoiled_as_ever(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
@@ -175,10 +189,8 @@ def test_beside_it_another_pose_is_spoiled_as_ever(paper_unit: Sensor, twenty_si
     poses[7] = replace(poses[7], mean=poses[7].mean * (1 + 60 * SIGMA))
     c = fit(poses, signs=SIGNS, effects=[Hysteresis()])
     assert left_out(c) == [0, 7]
-    assert [w.split(": ")[0] for w in c.warnings[:2]] == [
-        "left out, as what was before it is not known",
-        "left out as spoiled",
-    ]
+    assert [type(caution) for caution in c.cautions[:2]] == [UnknownHistoryExcluded, OutliersExcluded]
+    assert [p.excluded for p in c.poses if not p.used] == [Exclusion.UNKNOWN_HISTORY, Exclusion.OUTLIER]
 
 
 def test_a_first_pose_in_which_the_unit_had_rested_stays(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
@@ -197,7 +209,8 @@ def test_without_an_effect_of_the_pose_before_a_first_pose_that_is_off_is_spoile
     poses[0] = spoil(poses[0], paper_unit, twenty_six[0], 50)
     c = fit(poses, signs=SIGNS)
     assert left_out(c) == [0]
-    assert c.warnings[0].startswith("left out as spoiled: the pose at 0.0 s")
+    assert caution_of(c, OutliersExcluded).poses[0].began == poses[0].began
+    assert c.poses[0].excluded is Exclusion.OUTLIER
 
 
 def test_a_pose_is_as_foretold_unless_it_takes_out_more_than_a_coefficient_costs() -> None:

@@ -13,7 +13,7 @@ import pytest
 from scipy import stats
 
 from triaxcal.calibration import Calibration
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 

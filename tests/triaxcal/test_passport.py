@@ -8,9 +8,9 @@ from scipy import optimize, stats
 
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.fit import fit
-from triaxcal.passport import Passport, refine
-from triaxcal.plan.directions import cube_directions
+from triaxcal.passport import DatasheetContradicted, Passport, StillOfDatasheet, refine
+from triaxcal.planning.directions import cube_directions
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -97,7 +97,8 @@ def test_one_pose_moves_only_the_axis_that_it_points_along() -> None:
     assert [found.sources[i] for i in (1, 2, 3, 4, 5, 7, 8)] == ["passport"] * 7
     moved = (found.calibration.values - found.passport.values) / ERROR
     assert np.max(np.abs(moved[[1, 2, 3, 4, 5, 7, 8]])) < 0.1 < np.max(np.abs(moved[[0, 6]]))
-    assert "still the passport's" in " ".join(found.calibration.warnings)
+    kept = ("scale_factor.y", "scale_factor.z", *(f"misalignment.{a}" for a in "xyz"), "bias.y", "bias.z")
+    assert found.calibration.cautions == (StillOfDatasheet(kept),)
 
 
 def test_shares_of_information_grow_with_every_pose() -> None:
@@ -126,8 +127,9 @@ def test_a_unit_that_has_changed_conflicts_and_the_value_is_named() -> None:
         assert found.conflict_p is not None
         assert found.conflict_p < 1e-6
         assert found.calibration.inflation > 2
-        assert "contradict each other" in found.calibration.warnings[0]
-        assert "most in bias.y" in found.calibration.warnings[0]
+        caution = found.calibration.cautions[0]
+        assert isinstance(caution, DatasheetContradicted)
+        assert caution.parameter == "bias.y"
 
 
 def test_a_value_without_error_stays_where_it_is() -> None:

@@ -19,10 +19,10 @@ from triaxcal.effects.in_run import InRuns
 from triaxcal.effects.run_bias import RunBias
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.fit import fit
 from triaxcal.loop import diagnose
-from triaxcal.plan.directions import directions
-from triaxcal.poses.pose import Pose, Run
+from triaxcal.planning.directions import directions
+from triaxcal.pose_fit import fit
+from triaxcal.poses.pose import Began, Pose, Run
 from triaxcal.problem import solve
 from triaxcal.runs import ByRun, by_run, residuals_by_run, together
 from triaxcal.search import telling_apart
@@ -72,7 +72,7 @@ def test_one_recording_stays_as_it_is_and_is_searched_as_ever() -> None:
     assert together([poses]) == poses
     assert by_run(CATALOGUE, poses) == CATALOGUE
     assert RUN not in channels_of(poses)
-    assert poses[3].at == "30.0 s"
+    assert poses[3].began == Began(30.0)
 
 
 def test_time_counts_from_the_middle_of_each_run_and_the_start_from_its_own(three: list[Pose]) -> None:
@@ -84,7 +84,7 @@ def test_time_counts_from_the_middle_of_each_run_and_the_start_from_its_own(thre
 
 def test_a_pose_says_which_recording_it_is_of(three: list[Pose]) -> None:
     assert three[20].run == Run(1, 3, 70.0)
-    assert three[20].at == "60.0 s of recording 2"
+    assert three[20].began == Began(60.0, recording=1)
     assert three[14].before is None  # nobody knows how the unit lay before it was switched on
 
 

@@ -10,20 +10,21 @@ import pytest
 from scipy import stats
 
 from triaxcal.beyond import Beyond
-from triaxcal.conditions import held_at
+from triaxcal.calibration import Exclusion
 from triaxcal.cross_validation import cross_validated
 from triaxcal.effects import effect_named
 from triaxcal.effects.contract import TIME, Coefficient, Effect, no_slope, on_each_axis, per_axis, per_axis_slope, xyz
 from triaxcal.effects.plugins import Foreign
 from triaxcal.errors import Refused
-from triaxcal.fit import fit
 from triaxcal.loop import diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.problem import State, everything, linearise, solve
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start
 from triaxcal.stillness.detector import StillnessDetector
 from triaxcal.synthetic import Tumble, noisy_poses
+from triaxcal.text import holds
 from triaxcal.trends import Trends, left_by_trends, trends_p, with_trends
 from triaxcal.uncertainty import Stated, budget
 
@@ -257,7 +258,7 @@ def test_an_effect_of_another_package_that_is_known_at_the_means_alone_is_judged
         assert not loop.unexplained.significant  # what it foretells inside the poses nobody knows
         assert (finding.effect, finding.remedy) == ("table", table.remedy)
         effects = [effect for effect, _ in loop.after.sensor.effects]
-        assert held_at(effects, loop.after.channel_reference)[0].startswith("at temp_c = ")
+        assert holds(effects, loop.after.channel_reference)[0].startswith("at temp_c = ")
 
 
 QUADRATIC = effect_named("temperature_bias_quadratic")
@@ -460,7 +461,7 @@ def test_an_effect_that_foretells_what_the_poses_do_not_do_inside_is_in_question
     assert loop.unexplained.rms_g > 1e-4
     poses[5] = replace(poses[5], mean=1.2 * poses[5].mean)
     loop = diagnose(poses, signs=MINUS)
-    assert [p.left_out for p in loop.after.poses if not p.used] == ["spoiled"]
+    assert [p.excluded for p in loop.after.poses if not p.used] == [Exclusion.OUTLIER]
     assert "spoiled" not in loop.unexplained.lead  # whatever the temperature's effect may be, that pose was off
 
 

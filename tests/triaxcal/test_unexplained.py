@@ -15,8 +15,9 @@ from triaxcal.calibration import Calibration
 from triaxcal.effects import Effect
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.empirical import Empirical
-from triaxcal.fit import fit
 from triaxcal.leads import Lead
+from triaxcal.pose_fit import fit
+from triaxcal.poses.pose import Began
 from triaxcal.search import Nearest
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -104,7 +105,7 @@ def test_what_is_named_may_be_none_of_it_where_others_would_do_as_well(fitted: F
     before = fitted(12 * radial(ups, np.sin(TIME / 7)))
     moving = Unexplained(True, 1e-5, SIGMA_G, "inside the poses |a| moves", only_inside=True)
     chance = or_named(before, 1e-9, {"warm_up": 0.08, "bias_step": 0.02}, [], moving)
-    poses = or_named(before, 1e-9, {}, ["70.0 s", "80.0 s"])
+    poses = or_named(before, 1e-9, {}, [Began(70.0), Began(80.0)])
     assert (chance.significant, chance.or_named, chance.p_value) == (True, True, 1e-9)
     assert chance.rms_g == unexplained_of(before, {}).rms_g
     assert chance.lead.startswith("it need not be warm_up or bias_step: of random errors as large as these ")

@@ -10,7 +10,7 @@ import pytest
 
 from triaxcal.effects import CATALOGUE, Effect, effect_named
 from triaxcal.effects.contract import per_axis, per_axis_slope
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import State
 from triaxcal.search.candidates import Ground, candidates_of

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
+from triaxcal.caution import Caution
 from triaxcal.errors import InvalidData, Refused
 
 LABELS = ("+X", "-X", "+Y", "-Y", "+Z", "-Z")
@@ -54,6 +55,16 @@ TURNS: Floats = _proper()
 
 
 @dataclass(frozen=True)
+class AxesAssumed(Caution):
+    """No labels were given: the sensor's axes are taken to lie near the faces' axes of the same name."""
+
+
+@dataclass(frozen=True)
+class SeveralCubes(Caution):
+    """The poses lie on the axes of more than one cube; taken is the one nearest to the sensor's own axes."""
+
+
+@dataclass(frozen=True)
 class Labelling:
     """``labels`` and ``headings`` (rad, or None) of each pose, None where it stands on no face or is left out.
 
@@ -64,7 +75,7 @@ class Labelling:
     headings: tuple[float | None, ...]
     mounting: Floats
     assumed: bool
-    warnings: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()
 
     @property
     def faces(self) -> tuple[str, ...]:
@@ -100,16 +111,8 @@ def recognise(up: Floats, used: Bools) -> Labelling:
         mounting = _mounting(up, labels)
         labels = _on_faces(up, used, mounting)
     mounting = _mounting(up, labels)
-    warnings = [
-        "no labels were given: the sensor's axes are taken to lie near the faces' axes of the same name; a unit "
-        "mounted turned by a quarter turn, or with another sign of a scale factor, would look the same"
-    ]
-    if rival.any():
-        warnings.append(
-            "the poses lie on the axes of more than one cube (faces and edges, say); taken is the one nearest to the "
-            "sensor's own axes. Labels tell them apart"
-        )
-    return Labelling(labels, (None,) * len(up), mounting, True, tuple(warnings))
+    cautions = (AxesAssumed(), SeveralCubes()) if rival.any() else (AxesAssumed(),)
+    return Labelling(labels, (None,) * len(up), mounting, True, cautions)
 
 
 def labelled(

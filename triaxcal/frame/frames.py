@@ -8,13 +8,14 @@ fixture's errors are zero.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from triaxcal.arrays import Floats
+from triaxcal.caution import Caution
 from triaxcal.distributions import chi2_sf, t_ppf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.frame.faces import LABELS, axis_of, nearest_rotation, opposite
@@ -80,6 +81,28 @@ class UnitFrame:
 
 
 @dataclass(frozen=True)
+class UnitsDisagree(Caution):
+    """On the fixture's faces, by ``ratio`` times what noise and seating explain (probability ``p``)."""
+
+    ratio: float
+    p: float
+
+
+@dataclass(frozen=True)
+class FacesMissing(Caution):
+    """Nothing stood with these ``faces`` up, and the least-squares frame is that of the others."""
+
+    faces: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FaceFarOff(Caution):
+    """A face is ``angle_rad`` off its axis."""
+
+    angle_rad: float
+
+
+@dataclass(frozen=True)
 class Frames:
     """``units`` in the order given, in one frame. ``covariance`` (3u,3u) of all their rotations.
 
@@ -94,7 +117,7 @@ class Frames:
     chi2: float
     left: int
     inflation: float
-    warnings: tuple[str, ...]
+    cautions: tuple[Caution, ...]
 
     @property
     def lack_of_fit_p(self) -> float | None:
@@ -133,13 +156,8 @@ def frames(standings: Sequence[Standing], *, datum: Datum | None = None) -> Fram
         for i, s in enumerate(standings)
     )
     fixture = fixture_of(faces, joint.up, covariance[n:, n:], joint.axes, joint.constraints()[0])
-    warnings = list(_warnings(fixture, datum))
-    if inflation > 1:
-        warnings.append(
-            f"the units disagree on the fixture's faces by {inflation:.1f} times what noise and seating explain (p "
-            f"{p:.1g}): not one fixture, or it changed, or a unit moved in it; the standard errors are raised by that"
-        )
-    return Frames(datum, found, fixture, covariance[:n, :n], joint.chi2, left, inflation, tuple(warnings))
+    cautions = [*_cautions(fixture, datum), *([UnitsDisagree(inflation, p)] if inflation > 1 else [])]
+    return Frames(datum, found, fixture, covariance[:n, :n], joint.chi2, left, inflation, tuple(cautions))
 
 
 def _datum_is_there(datum: Datum, faces: Sequence[str]) -> None:
@@ -269,18 +287,10 @@ def _dof(joint: _Joint, standings: Sequence[Standing]) -> list[Floats]:
     return out
 
 
-def _warnings(fixture: Fixture, datum: Datum) -> list[str]:
-    out = []
-    missing = [label for label in LABELS if label not in fixture.faces]
+def _cautions(fixture: Fixture, datum: Datum) -> Iterator[Caution]:
+    missing = tuple(label for label in LABELS if label not in fixture.faces)
     if missing and datum.faces is None:
-        out.append(
-            f"with {', '.join(missing)} up nothing stood: the least-squares frame is that of the other faces, and "
-            "differs from that of all six by the errors of the faces"
-        )
+        yield FacesMissing(missing)
     worst = float(np.abs(fixture.error).max())
     if worst > LARGE_RAD:
-        out.append(
-            f"a face is {worst:.2g} rad off its axis: were these poses on the faces of one fixture, and the unit "
-            "fixed in it?"
-        )
-    return out
+        yield FaceFarOff(worst)

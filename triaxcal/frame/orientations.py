@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
+from triaxcal.caution import Caution
 from triaxcal.distributions import chi2_isf, chi2_sf, t_isf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.frame.faces import Labelling
 from triaxcal.frame.verticals import Verticals
+from triaxcal.poses.pose import Began
 
 FLOOR_RAD = 1e-12
 SHOWS = 1e-4
@@ -26,6 +28,23 @@ SHORT = 0.95
 SPLIT_MOST = 12
 APART_RAD = 0.2
 LARGE_RAD = 0.01
+
+
+@dataclass(frozen=True)
+class NotTurned(Caution):
+    """The poses with a face up differ less than half a turn makes them on the others: taken as not turned by that."""
+
+    face: str
+    began: Began
+
+
+@dataclass(frozen=True)
+class NotFlush(Caution):
+    """The poses with a face up differ by ``angle_rad``, far more than on the other faces."""
+
+    face: str
+    began: Began
+    angle_rad: float
 
 
 @dataclass(frozen=True)
@@ -143,9 +162,9 @@ def pairs_of(faces: Sequence[Face], found: Verticals) -> list[tuple[Face, float,
     return [(f, *_tilt_on(f, found)) for f in faces if not f.headed and f.resolved]
 
 
-def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[str]]:
-    """The faces, those that were seemingly not turned between their poses as in one orientation; and warnings."""
-    warnings = []
+def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[Caution]]:
+    """The faces, those that were seemingly not turned between their poses as in one orientation; and cautions."""
+    cautions: list[Caution] = []
     pairs = pairs_of(faces, found)
     size = np.array([m for _, m, _ in pairs])
     still = set()
@@ -156,21 +175,17 @@ def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[str]]:
         middle = float(np.median(rest))
         scatter = float(np.hypot(error, np.std(rest, ddof=1) * np.sqrt(1 + 1 / len(rest))))
         far = abs(m - middle) > float(t_isf(SHOWS, len(rest) - 1)) * scatter
-        where = f"the poses with {face.label} up (the first at {found.poses[face.rows[0]].start_s:.1f} s)"
+        began = found.poses[face.rows[0]].began
         if far and m < SHORT * middle:
             still.add(face.label)
-            warnings.append(
-                f"{where} differ less than half a turn makes them on the other faces: taken as not turned by that"
-            )
+            cautions.append(NotTurned(face.label, began))
         elif far and m > max(3 * middle, LARGE_RAD / 10):
-            warnings.append(
-                f"{where} differ by {2 * m:.2g} rad, far more than on the other faces: did the fixture stand flush?"
-            )
+            cautions.append(NotFlush(face.label, began, 2 * m))
     single = [f for f in faces if not f.headed and (not f.resolved or f.label in still)]
     if single and len(pairs) - len(still) < PAIRS_LEAST:
         # One or two pairs among faces that stood one way may be poses repeated, without a turn.
         still |= {f.label for f, m, error in pairs if m**2 < chi2_isf(SHOWS, 2) * error**2}
-    return [replace(f, turn=np.zeros(len(f.rows))) if f.label in still else f for f in faces], warnings
+    return [replace(f, turn=np.zeros(len(f.rows))) if f.label in still else f for f in faces], cautions
 
 
 def tilt_of_others(faces: Sequence[Face], found: Verticals) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 
 from triaxcal.arrays import Floats
+from triaxcal.caution import Caution
 from triaxcal.distributions import chi2_sf
 from triaxcal.frame.faces import Labelling, axis_of
 from triaxcal.frame.orientations import FLOOR_RAD, LARGE_RAD, SHOWS, Assumed, Face, felt, tilt_of_others, turned
@@ -68,6 +69,41 @@ class Table:
 
 
 @dataclass(frozen=True)
+class SeatingsDiffer(Caution):
+    """By more than the noise: ``seating_rad`` each, from ``dof`` degrees of freedom; the uncertainties contain that."""
+
+    seating_rad: float
+    dof: int
+
+
+@dataclass(frozen=True)
+class NoSecondOrientation(Caution):
+    """The tilt of the table enters the rotation in full, with the size that was given."""
+
+
+@dataclass(frozen=True)
+class SingleOrientation(Caution):
+    """On these ``faces`` the table's tilt enters with a size of ``tilt_rad``, as ``given`` or as on the other faces,
+    and an unknown direction."""
+
+    faces: tuple[str, ...]
+    tilt_rad: float
+    given: bool
+
+
+@dataclass(frozen=True)
+class OrientationsAlike(Caution):
+    """The two orientations on each face differ by no more than noise."""
+
+
+@dataclass(frozen=True)
+class TableTilts(Caution):
+    """So far that these may not be poses on the faces of one fixture."""
+
+    tilt_rad: float
+
+
+@dataclass(frozen=True)
 class Standing:
     """``up`` (f,3): the inward normal of the face stood on, sensor frame, for each of ``faces`` (labels of up).
 
@@ -88,7 +124,7 @@ class Standing:
     seating_dof: int
     tilts: tuple[FaceTilt, ...]
     table: Table
-    warnings: tuple[str, ...]
+    cautions: tuple[Caution, ...]
 
 
 def basis_of(label: str, up: Floats, mounting: Floats) -> Floats:
@@ -103,7 +139,7 @@ def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None
     """Normals of the faces and the table's tilt. Raises Refused where the tilt cannot be told from the faces."""
     assumed = assumed or Assumed()
     faces = [Face.of(found, labelling, label) for label in labelling.faces]
-    faces, warnings = turned(faces, found)
+    faces, of_faces = turned(faces, found)
     prior = _prior_tilt(faces, assumed)
     seating, dof = assumed.seating or 0.0, 0
     solved = _solve(found, labelling, faces, prior, seating)
@@ -116,12 +152,9 @@ def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None
     covariance = solved.covariance[: 2 * len(faces), : 2 * len(faces)]
     covariance = covariance + _turning(solved, assumed.turn)
     part = solved.gain[: 2 * len(faces)]
-    table, said = _table(solved, assumed, p)
+    table, of_table = _table(solved, assumed, p)
     if dof:
-        said.append(
-            f"the seatings of the fixture, or the table from place to place, differ by more than the noise: "
-            f"{seating:.2g} rad each, from {dof} degrees of freedom; the uncertainties hold it"
-        )
+        of_table.append(SeatingsDiffer(seating, dof))
     return Standing(
         labelling=labelling,
         dof=found.dof,
@@ -134,7 +167,7 @@ def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None
         seating_dof=dof,
         tilts=solved.tilts,
         table=table,
-        warnings=(*warnings, *said),
+        cautions=(*of_faces, *of_table),
     )
 
 
@@ -299,22 +332,16 @@ def _turning(solved: _Solved, turn: float) -> Floats:
     return out
 
 
-def _table(solved: _Solved, assumed: Assumed, p: float | None) -> tuple[Table, list[str]]:
-    warnings = []
+def _table(solved: _Solved, assumed: Assumed, p: float | None) -> tuple[Table, list[Caution]]:
+    cautions: list[Caution] = []
     resolved = [t for t in solved.tilts if t.resolved]
-    single = [t.label for t in solved.tilts if not t.resolved]
+    single = tuple(t.label for t in solved.tilts if not t.resolved)
     if not resolved:
-        warnings.append(
-            "no face stood in two orientations: the tilt of the table enters the rotation in full, with the size that "
-            "was given"
-        )
-        return Table(assumed.tilt, None, "given", False, None), warnings
+        cautions.append(NoSecondOrientation())
+        return Table(assumed.tilt, None, "given", False, None), cautions
     if single:
-        warnings.append(
-            f"with {', '.join(single)} up the fixture stood one way only: the tilt of the table enters there, with a "
-            f"size of {_rms(resolved) if assumed.tilt is None else assumed.tilt:.2g} rad "
-            f"{'as on the other faces' if assumed.tilt is None else 'as given'} and an unknown direction"
-        )
+        size = _rms(resolved) if assumed.tilt is None else assumed.tilt
+        cautions.append(SingleOrientation(single, size, given=assumed.tilt is not None))
     if solved.vector is not None and solved.vector_covariance is not None:
         size = float(np.linalg.norm(solved.vector))
         along = solved.vector / max(size, 1e-300)
@@ -328,13 +355,10 @@ def _table(solved: _Solved, assumed: Assumed, p: float | None) -> tuple[Table, l
         error = float(np.sqrt(np.mean([t.standard_error**2 for t in resolved]) / len(resolved)))
         table = Table(_rms(resolved), error, "measured", shows, p)
     if not table.shows:
-        warnings.append(
-            "the two orientations on each face differ by no more than noise: the table is level to that, or the "
-            "fixture was not turned between them, which nothing shows"
-        )
+        cautions.append(OrientationsAlike())
     if table.tilt is not None and table.tilt > LARGE_RAD:
-        warnings.append(f"the table tilts by {table.tilt:.2g} rad: were these poses on the faces of one fixture?")
-    return table, warnings
+        cautions.append(TableTilts(table.tilt))
+    return table, cautions
 
 
 def _rms(tilts: Sequence[FaceTilt]) -> float:

@@ -32,6 +32,14 @@ class Run:
 
 
 @dataclass(frozen=True)
+class Began:
+    """When a pose began: seconds from the first sample of its recording, and which of several (0-based)."""
+
+    start_s: float
+    recording: int | None = None
+
+
+@dataclass(frozen=True)
 class Pose:
     """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean, output units. ``dof`` are the
     degrees of freedom behind the covariance (along the measured vector, where there are six poses or more), and
@@ -83,9 +91,8 @@ class Pose:
         return (self.start_s + self.end_s) / 2
 
     @property
-    def at(self) -> str:
-        """When it began, in words."""
-        return f"{self.start_s:.1f} s" + (f" of recording {self.run.index + 1}" if self.run.of > 1 else "")
+    def began(self) -> Began:
+        return Began(self.start_s, self.run.index if self.run.of > 1 else None)
 
     @property
     def standard_error(self) -> Floats:

@@ -15,7 +15,7 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.quality import faults, mains
 from triaxcal.quality.cells import CellKeeper, Steps
-from triaxcal.quality.finding import Finding, Holds
+from triaxcal.quality.finding import Finding, Holds, MissingSamples
 from triaxcal.quality.repeats import RunLengths
 from triaxcal.quality.timing import Gaps
 from triaxcal.stillness.detector import Span
@@ -100,13 +100,10 @@ class QualityDetector:
         self._gaps.feed(time_ns)
         self._spectra.feed(time_ns, u)
 
-    def findings(self, w: Windows | None, spans: Sequence[Span], *, unit: str = "") -> list[Finding]:
-        """One for each kind of fault, with the still ``spans`` that windows ``w`` of the same stream show. ``unit`` is
-        that of the outputs, for the text.
-        """
+    def findings(self, w: Windows | None, spans: Sequence[Span]) -> list[Finding]:
+        """One for each kind of fault, with the still ``spans`` that windows ``w`` of the same stream show."""
         if not self.samples or self._begin_ns is None:
             return []
-        unit = f" {unit}" if unit else ""
         holds = Holds.of(self._begin_ns, w, spans)
         step, roughness = self._steps.step(), self._steps.roughness()
         noisy = self._steps.scatters()
@@ -124,9 +121,9 @@ class QualityDetector:
             rails,
             faults.stuck_output(frozen, slow, holds, dead),
             self._missing(),
-            Finding("duplicate_samples", twice) if twice else None,
-            Finding("mains_pickup", mains.told(lines, rate_hz, unit)) if lines else None,
-            faults.coarse_quantization(holds, spoiled, step, unit),
+            twice,
+            mains.pickup(lines, rate_hz) if lines else None,
+            faults.coarse_quantization(holds, spoiled, step),
         ]
         return [f for f in found if f is not None]
 
@@ -135,7 +132,4 @@ class QualityDetector:
         if not g.gaps or self._begin_ns is None:
             return None
         first_s = (g.first_ns - self._begin_ns) * 1e-9
-        where = f"at {first_s:.1f} s" if g.gaps == 1 else f"in {g.gaps} gaps, the first at {first_s:.1f} s"
-        longest = "" if g.gaps == 1 else f", {g.longest} in the longest"
-        text = f"{g.missing} of {self.samples + g.missing} by the times, {where}{longest}"
-        return Finding("missing_samples", text)
+        return MissingSamples(g.missing, self.samples + g.missing, g.gaps, g.longest, first_s)

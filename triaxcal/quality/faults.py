@@ -8,7 +8,19 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.quality.cells import COARSE, Cells
-from triaxcal.quality.finding import AXES, Finding, Holds, counted
+from triaxcal.quality.finding import (
+    AXES,
+    AtRail,
+    CoarseQuantization,
+    DuplicateSamples,
+    Finding,
+    Freeze,
+    Holds,
+    Saturation,
+    SlowUpdate,
+    Steps,
+    StuckOutput,
+)
 from triaxcal.quality.repeats import ROWS, Run, RunLengths
 from triaxcal.stillness.windows import rounding_variance
 
@@ -32,7 +44,7 @@ def saturation(
     cells: Cells, runs: RunLengths, holds: Holds, step: Floats, scatter: Floats, noisy: Bools
 ) -> tuple[Finding | None, list[set[int]]]:
     """And the poses that lie at a rail, by axis."""
-    parts: list[str] = []
+    rails: list[AtRail] = []
     spoiled: list[set[int]] = [set(), set(), set()]
     place = holds.within(cells.start_ns, cells.end_ns)
     for axis in np.flatnonzero(noisy).tolist() if len(cells) else ():
@@ -48,10 +60,8 @@ def saturation(
             touched = sorted({*piled, *_clipped(count * at_rail, place, cells.size)})
             spoiled[axis].update(touched)
             first = holds.seconds(int(cells.start_ns[at_rail][0]))
-            where = holds.named(touched)
-            parts.append(f"{AXES[axis]} at {rail:.7g} in {counted(number, 'sample')}, first at {first:.1f} s{where}")
-    poses = tuple(sorted(set().union(*spoiled)))
-    return Finding("saturation", "; ".join(parts), poses) if parts else None, spoiled
+            rails.append(AtRail(AXES[axis], rail, number, first, holds.touching(touched)))
+    return Saturation(tuple(rails)) if rails else None, spoiled
 
 
 def _extremes(cells: Cells, axis: int) -> tuple[float, float]:
@@ -132,50 +142,48 @@ def _full_scale(rail: float, step: float, side: int) -> bool:
     return step == 1.0 and any(rail == (2.0**k - 1 if side > 0 else -(2.0**k)) for k in FULL_SCALE_BITS)
 
 
-def stuck_output(frozen: Sequence[Sequence[Run]], slow: str, holds: Holds, dead: Sequence[str]) -> Finding | None:
-    """``slow`` says that the sensor is read faster than it updates, ``dead`` are axes that never change."""
-    parts, poses = [f"{axis} never changes" for axis in dead] + ([slow] if slow else []), set[int]()
+def stuck_output(
+    frozen: Sequence[Sequence[Run]], slow: SlowUpdate | None, holds: Holds, dead: Sequence[str]
+) -> Finding | None:
+    """``dead`` are axes that never change."""
+    freezes = []
     for axis, runs in enumerate(frozen):
         if not runs:
             continue
         longest = max(runs, key=lambda r: (r.samples, -r.start_ns))
         touched = sorted({i for r in runs for i in holds.touched(r.start_ns, r.end_ns)})
-        poses.update(touched)
-        what = f"{AXES[axis]} repeats {longest.value:.7g}" if axis < len(AXES) else "all axes repeat one reading"
-        repeats = f"{what} for {longest.samples} samples"
-        if len(runs) > 1:
-            which = AXES[axis] + " freezes" if axis < len(AXES) else "all axes freeze"
-            repeats = f"{which} {len(runs)} times, {longest.samples} samples at the longest"
-        first = holds.seconds(runs[0].start_ns)
-        parts.append(f"{repeats}, first at {first:.1f} s{holds.named(touched)}")
-    return Finding("stuck_output", "; ".join(parts), tuple(sorted(poses))) if parts else None
+        which, first = AXES[axis] if axis < len(AXES) else None, holds.seconds(runs[0].start_ns)
+        freezes.append(Freeze(which, longest.value, len(runs), longest.samples, first, holds.touching(touched)))
+    return StuckOutput(tuple(dead), slow, tuple(freezes)) if dead or slow or freezes else None
 
 
-def repeated_samples(runs: RunLengths, noisy: Bools, rate_hz: float) -> tuple[str, str]:
-    """What is said of samples that repeat the one before on all axes: of a sensor that is read faster than it updates,
-    and of single samples that came twice. Empty where noise explains them.
+def repeated_samples(
+    runs: RunLengths, noisy: Bools, rate_hz: float
+) -> tuple[SlowUpdate | None, DuplicateSamples | None]:
+    """Samples that repeat the one before on all axes: of a sensor that is read faster than it updates, or single ones
+    that came twice. Neither where noise explains them.
     """
     most = runs.allowed(3)
     if noisy.sum() < 2 or not np.isfinite(most):
-        return "", ""
+        return None, None
     triple, samples = runs.repeated(3, most)
     if triple < REPEATS_LEAST:
-        return "", ""
+        return None, None
     share = triple / samples
     if triple < 2 * runs.by_chance + REPEATED_SHARE * samples:
-        return "", ""
+        return None, None
     if share > SLOW_SHARE:
         chance = runs.by_chance / samples
         every = (1 - chance) / (1 - share)
-        return f"new values only every {every:.2f} samples, at {rate_hz / every:.4g} Hz of {rate_hz:.4g} Hz", ""
-    return "", f"{triple} of {samples} samples repeat the one before on all axes"
+        return SlowUpdate(every, rate_hz), None
+    return None, DuplicateSamples(triple, samples)
 
 
-def coarse_quantization(holds: Holds, spoiled: Sequence[set[int]], step: Floats, unit: str) -> Finding | None:
+def coarse_quantization(holds: Holds, spoiled: Sequence[set[int]], step: Floats) -> Finding | None:
     """Where steps are wider than twice the scatter in the poses, so that a mean keeps part of its rounding error;
     ``spoiled`` are poses, by axis, that lack their scatter for another reason.
     """
-    parts = []
+    axes = []
     for axis in np.flatnonzero(step > 0).tolist():
         sound = [i for i in range(len(holds)) if i not in spoiled[axis]]
         if not sound:
@@ -184,11 +192,8 @@ def coarse_quantization(holds: Holds, spoiled: Sequence[set[int]], step: Floats,
         if np.sqrt(variance) >= COARSE * q:
             continue
         off = q * _rounding_error(variance / q**2)
-        parts.append(
-            f"{AXES[axis]} in steps of {q:.3g}{unit}, scatter {np.sqrt(variance):.2g}{unit}, "
-            f"pose means off by up to {off:.2g}{unit}"
-        )
-    return Finding("coarse_quantization", "; ".join(parts)) if parts else None
+        axes.append(Steps(AXES[axis], q, float(np.sqrt(variance)), off))
+    return CoarseQuantization(tuple(axes)) if axes else None
 
 
 def _rounding_error(variance: float) -> float:

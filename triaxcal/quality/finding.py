@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,24 +13,137 @@ from triaxcal.stillness.detector import Span
 from triaxcal.stillness.windows import Windows
 
 AXES = "xyz"
-POSES_NAMED = 8
 UNTRUSTED = ("saturation", "stuck_output")
 """Faults for which a mean is not that of the acceleration."""
 
 
 @dataclass(frozen=True)
-class Finding:
-    """``name`` as in data-quality lines, ``text`` what, which axis, how much and where. ``poses`` are indices of the
-    spans that it touches, which have to be taken again.
-    """
+class Touched:
+    """The still spans that a fault touches, by index, and where each begins, in seconds from the first sample."""
 
-    name: str
-    text: str
     poses: tuple[int, ...] = ()
+    starts_s: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A kind of fault, ``name`` as in data-quality lines. `triaxcal.text` says what, which axis, how much and where."""
+
+    name: ClassVar[str]
 
     @property
-    def line(self) -> str:
-        return f"{self.name}: {self.text}"
+    def poses(self) -> tuple[int, ...]:
+        """Indices of the spans that it touches, which have to be taken again."""
+        return ()
+
+
+@dataclass(frozen=True)
+class AtRail:
+    """So many ``samples`` of an axis read one extreme value, output units."""
+
+    axis: str
+    rail: float
+    samples: int
+    first_s: float
+    touched: Touched
+
+
+@dataclass(frozen=True)
+class Saturation(Finding):
+    name: ClassVar[str] = "saturation"
+    rails: tuple[AtRail, ...]
+
+    @property
+    def poses(self) -> tuple[int, ...]:
+        return tuple(sorted({i for r in self.rails for i in r.touched.poses}))
+
+
+@dataclass(frozen=True)
+class Freeze:
+    """An axis (None: all at once) repeats a reading, so many ``times``, for up to ``longest`` samples; ``value`` is
+    that of the longest, output units."""
+
+    axis: str | None
+    value: float
+    times: int
+    longest: int
+    first_s: float
+    touched: Touched
+
+
+@dataclass(frozen=True)
+class SlowUpdate:
+    """There are new values only ``every`` so many samples, of a stream of ``rate_hz``."""
+
+    every: float
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class StuckOutput(Finding):
+    """``dead`` are axes that never change."""
+
+    name: ClassVar[str] = "stuck_output"
+    dead: tuple[str, ...]
+    slow: SlowUpdate | None
+    freezes: tuple[Freeze, ...]
+
+    @property
+    def poses(self) -> tuple[int, ...]:
+        return tuple(sorted({i for f in self.freezes for i in f.touched.poses}))
+
+
+@dataclass(frozen=True)
+class MissingSamples(Finding):
+    """By the times, ``missing`` of ``of`` samples, in so many ``gaps``."""
+
+    name: ClassVar[str] = "missing_samples"
+    missing: int
+    of: int
+    gaps: int
+    longest: int
+    first_s: float
+
+
+@dataclass(frozen=True)
+class DuplicateSamples(Finding):
+    """So many of the samples repeat the one before on all axes."""
+
+    name: ClassVar[str] = "duplicate_samples"
+    repeated: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class Tone:
+    """``amplitude`` by axis, output units. ``alias_of_hz``: the frequency that it may be the alias of."""
+
+    frequency_hz: float
+    amplitude: tuple[float, float, float]
+    alias_of_hz: float | None
+
+
+@dataclass(frozen=True)
+class MainsPickup(Finding):
+    name: ClassVar[str] = "mains_pickup"
+    tones: tuple[Tone, ...]
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Of an axis, with the scatter in the poses and by how much pose means may be off, output units."""
+
+    axis: str
+    step: float
+    scatter: float
+    mean_error: float
+
+
+@dataclass(frozen=True)
+class CoarseQuantization(Finding):
+    name: ClassVar[str] = "coarse_quantization"
+    axes: tuple[Steps, ...]
 
 
 def untrusted_poses(findings: Iterable[Finding]) -> dict[int, str]:
@@ -77,15 +191,5 @@ class Holds:
         shared: Bools = (self.start_ns <= end_ns) & (self.end_ns >= start_ns)
         return tuple(int(i) for i in np.flatnonzero(shared))
 
-    def named(self, poses: Sequence[int]) -> str:
-        """ ", in N poses, which begin at …" so that they can be taken again."""
-        if not poses:
-            return ", in no pose"
-        times = [f"{self.seconds(int(self.start_ns[i])):.1f}" for i in poses[:POSES_NAMED]]
-        more = "" if len(poses) <= POSES_NAMED else f" and {len(poses) - POSES_NAMED} more"
-        which = "pose that begins" if len(poses) == 1 else "poses that begin"
-        return f", in the {which} at {', '.join(times)} s{more}: take again"
-
-
-def counted(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+    def touching(self, poses: Sequence[int]) -> Touched:
+        return Touched(tuple(poses), tuple(self.seconds(int(self.start_ns[i])) for i in poses))

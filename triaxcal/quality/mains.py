@@ -14,7 +14,7 @@ from scipy import fft
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import gamma_sf
-from triaxcal.quality.finding import AXES, Holds
+from triaxcal.quality.finding import Holds, MainsPickup, Tone
 
 MAINS_HZ = (50.0, 60.0)
 HARMONICS = (1, 2, 3)
@@ -221,12 +221,9 @@ def _offset(excess: Floats, peak: int) -> float:
     return float(np.clip((2 * share - 1) / (share + 1), 0.0, 0.5)) * (1 if up else -1)
 
 
-def told(lines: Sequence[Line], rate_hz: float, unit: str) -> str:
-    parts = []
+def pickup(lines: Sequence[Line], rate_hz: float) -> MainsPickup:
+    tones = []
     for line in lines:
-        sizes = ", ".join(f"{AXES[i]} {a:.2g}{unit}" for i, a in enumerate(line.amplitude) if a > 0)
-        part = f"{line.frequency_hz:.1f} Hz, amplitude {sizes}"
-        if line.band.folded:
-            part += f" (the alias of {line.band.source_hz:g} Hz at {rate_hz:.4g} Hz sampling, or a vibration)"
-        parts.append(part)
-    return "; ".join(parts)
+        x, y, z = (float(a) for a in line.amplitude)
+        tones.append(Tone(line.frequency_hz, (x, y, z), line.band.source_hz if line.band.folded else None))
+    return MainsPickup(tuple(tones), rate_hz)

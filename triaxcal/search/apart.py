@@ -25,7 +25,7 @@ from triaxcal.effects.contract import (
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
 from triaxcal.figures import plain
-from triaxcal.plan.directions import directions, spiral
+from triaxcal.planning.directions import directions, spiral
 from triaxcal.problem import linearise
 from triaxcal.search.alternatives import NEAR
 from triaxcal.search.search import Search

@@ -13,7 +13,7 @@ from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, solve
 from triaxcal.pure_error import lack_of_fit_p, pure_error_dof

@@ -19,12 +19,27 @@ from triaxcal.turning.moments import MONOMIALS, Summary
 
 ARITHMETIC = 1e-15
 """Variance that the arithmetic leaves uncertain."""
-TURN_MORE = "turn the unit about more axes, so that every side is up at some time"
 
-NO_ELLIPSOID = (
-    "the samples lie on no ellipsoid: the unit felt accelerations besides gravity, or turned about too few axes; turn "
-    "it more slowly, so that every side is up at some time"
-)
+
+class NoEllipsoid(Refused):
+    """The samples lie on none."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the samples lie on no ellipsoid: the unit felt accelerations besides gravity, or turned about too few "
+            "axes; turn it more slowly, so that every side is up at some time"
+        )
+
+
+class DirectionsLacking(Refused):
+    """They cannot carry nine parameters; ``dilution`` by how much, where that is known, and its limit."""
+
+    def __init__(self, dilution: tuple[float, float] | None = None) -> None:
+        by = "" if dilution is None else " (dilution {:.3g}, limit {:g})".format(*dilution)
+        super().__init__(
+            f"the directions of the turning unit cannot carry nine parameters{by}: turn the unit about more axes, so "
+            "that every side is up at some time"
+        )
 
 
 @dataclass(frozen=True)
@@ -104,14 +119,14 @@ def noise(mean: Floats, shape: Floats) -> float:
     while smallest(high) > 0:
         low, high = high, high * 4
         if high > 1:
-            raise Refused(NO_ELLIPSOID)
+            raise NoEllipsoid
     return float(scipy.optimize.brentq(smallest, low, high, xtol=1e-18, rtol=1e-12)) / float(np.max(shape))
 
 
 def _ellipsoid(mean: Floats, variance: Floats) -> Ellipsoid:
     values, vectors = np.linalg.eigh(corrected(mean, variance))
     if values[1] < 1e-9 * values[-1]:
-        raise Refused(f"the directions of the turning unit cannot carry nine parameters: {TURN_MORE}")
+        raise DirectionsLacking
     q = dict(zip(MONOMIALS, vectors[:, 0], strict=True))
     B = np.array(
         [
@@ -125,7 +140,7 @@ def _ellipsoid(mean: Floats, variance: Floats) -> Ellipsoid:
         centre = -0.5 * np.linalg.solve(B, linear)
         T = np.linalg.cholesky(B / (centre @ B @ centre - q[0, 0, 0])).T
     except np.linalg.LinAlgError:
-        raise Refused(NO_ELLIPSOID) from None
+        raise NoEllipsoid from None
     return Ellipsoid(T, T @ centre, variance)
 
 

@@ -12,22 +12,24 @@ white, the model complete, and gravity alone was felt.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.calibration import Calibration, Residual
+from triaxcal.caution import Caution
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.plan.directions import linear_design, most_wanted
+from triaxcal.planning.directions import linear_design, most_wanted
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.sensor import Sensor
 from triaxcal.turning.adjusted import (
     ARITHMETIC,
-    NO_ELLIPSOID,
-    TURN_MORE,
+    DirectionsLacking,
     Ellipsoid,
+    NoEllipsoid,
     as_monomials,
     coefficients_by_entries,
     corrected,
@@ -42,6 +44,8 @@ ROUNDS_MOST = 20
 DILUTION_MOST = 100.0
 """Largest standard error of a combination of parameters, in noises of one sample over the root of their number."""
 DILUTION_WARNING = 10.0
+UNSEEN_WARNING = 0.2
+"""Share of a coefficient's variance from which on the unknown share of the noise is worth a word."""
 QUICK = 0.7
 """Share of what differences from sample to sample show that the scatter about the ellipsoid must at least have; with
 less the unit turns too fast for its sample rate, and they are not noise."""
@@ -57,6 +61,46 @@ SPIKE = 10.0
 """How many times farther than nine tenths of all others a stretch may reach."""
 STEPS = 0.5
 """Noise, in steps of the output, below which rounding is no noise any more."""
+
+
+@dataclass(frozen=True)
+class StretchesExcluded(Caution):
+    """Stretches of the recording that stand out from the others."""
+
+    stretches: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class FewDirections(Caution):
+    dilution: float
+
+
+@dataclass(frozen=True)
+class StretchesDiffer(Caution):
+    """``ratio`` times as much as white noise explains; the standard errors are raised by up to ``raised``."""
+
+    ratio: float
+    raised: float
+
+
+@dataclass(frozen=True)
+class NoiseUnseen(Caution):
+    """A ``share`` of the noise does not show from sample to sample, and how the axes share it is not known."""
+
+    share: float
+
+
+@dataclass(frozen=True)
+class NoiseUnequal(Caution):
+    """The noise of one axis is ``ratio`` times that of another; the fit has no weights."""
+
+    ratio: float
+
+
+@dataclass(frozen=True)
+class CoarseSteps(Caution):
+    """The outputs are rounded to steps larger than their noise, which the standard errors do not contain."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +134,10 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
         held, e, unseen = _without_spoiled(whole)
         judged = _Judged(held, e)
         if not judged.dilution < DILUTION_MOST:
-            raise Refused(
-                "the directions of the turning unit cannot carry nine parameters (dilution "
-                f"{judged.dilution:.3g}, limit {DILUTION_MOST:g}): {TURN_MORE}"
-            )
+            raise DirectionsLacking((judged.dilution, DILUTION_MOST))
     except Refused as refusal:
-        raise Refused(str(refusal), wanted=_wanted(whole, s, str(refusal))) from None
+        refusal.wanted = _wanted(whole, s, refusal)
+        raise
     p = judged.lack_of_fit_p
     entries, inflation = judged.covariance(raised=p is not None and p < LACK_OF_FIT)
     G = coefficients_by_entries(e, held, reference)
@@ -124,8 +166,7 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
     noise_g = np.sqrt(e.variance) * held.half / k
     found = RotationFit(calibration, noise_g, unseen, held.count, len(held.counts))
     raised = float(np.max(np.sum(shares**2, axis=1) / np.diag(calibration.covariance)))
-    warnings = (*_left_out(whole, held), *_warnings(found, held, raised))
-    return replace(found, calibration=replace(calibration, warnings=warnings))
+    return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found, whole, held, raised))))
 
 
 def _without_spoiled(held: Summary) -> tuple[Summary, Ellipsoid, float]:
@@ -248,50 +289,32 @@ class _Judged:
         return np.asarray(np.sqrt(ratio))
 
 
-def _wanted(held: Summary, signs: Floats, message: str) -> tuple[str, ...]:
+def _wanted(held: Summary, signs: Floats, refusal: Refused) -> tuple[str, ...]:
     """Sides that were never up, as far as the directions can be told without a fit."""
     # Without one scale for all, an axis that hardly moved would look like one that swung from end to end.
     u = (held.sampled - np.median(held.sampled, axis=0)) / np.max(held.half) * signs
     wanted = most_wanted(u + 1e-12)
-    if not wanted and message != NO_ELLIPSOID:
+    if not wanted and not isinstance(refusal, NoEllipsoid):
         wanted = most_wanted(np.zeros((0, 3)))
     return tuple(dict.fromkeys(label for label, _ in wanted))
 
 
-def _left_out(whole: Summary, held: Summary) -> list[str]:
-    gone = whole.count - held.count
-    if not gone:
-        return []
-    return [f"left out as spoiled: {len(whole.counts) - len(held.counts)} stretches of the recording, {gone} samples"]
-
-
-def _warnings(found: RotationFit, held: Summary, unseen: float) -> list[str]:
+def _cautions(found: RotationFit, whole: Summary, held: Summary, unseen: float) -> Iterator[Caution]:
     """``unseen``: the largest share that the unknown share of the noise has in the variance of a coefficient."""
-    c, out = found.calibration, []
+    c = found.calibration
+    if gone := whole.count - held.count:
+        yield StretchesExcluded(len(whole.counts) - len(held.counts), gone)
     if c.dilution > DILUTION_WARNING:
-        out.append(f"the directions are poorly spread (dilution {c.dilution:.3g}): {TURN_MORE}")
+        yield FewDirections(c.dilution)
     if c.inflation > 1:
-        ratio = c.residual.rms_g / c.residual.noise_floor_g
-        out.append(
-            f"stretches of the recording differ {ratio:.1f} times as much as white noise explains (coloured or "
-            "filtered noise, drift, acceleration besides gravity, or an effect that the model lacks); the standard "
-            f"errors are raised by up to {c.inflation:.1f}, which does not cover a drift as long as the recording"
-        )
-    if np.any(found.noise_g) and (found.unseen_share == 1 or unseen > 0.2):
-        out.append(
-            f"{found.unseen_share:.0%} of the noise does not show from sample to sample (the unit turns fast for its "
-            "sample rate, vibrates, or filters its output): how the axes share it is not known, and in the standard "
-            "errors"
-        )
+        yield StretchesDiffer(c.residual.rms_g / c.residual.noise_floor_g, c.inflation)
+    if np.any(found.noise_g) and (found.unseen_share == 1 or unseen > UNSEEN_WARNING):
+        yield NoiseUnseen(found.unseen_share)
     low, high = float(np.min(found.noise_g)), float(np.max(found.noise_g))
     if high > UNEQUAL * low > 0:
-        out.append(
-            f"the noise of one axis is {high / low:.1f} times that of another: this fit has no weights, still poses "
-            "would give smaller errors"
-        )
+        yield NoiseUnequal(high / low)
     if np.any(_step(held) * STEPS > np.sqrt(held.half**2 * _variance(found, held))):
-        out.append("the outputs are rounded to steps larger than their noise, which the standard errors do not contain")
-    return out
+        yield CoarseSteps()
 
 
 def _variance(found: RotationFit, held: Summary) -> Floats:

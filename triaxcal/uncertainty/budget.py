@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +11,15 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects import TEMPERATURE
-from triaxcal.figures import micro_g
 from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.uncertainty.basis import (
+    NotEvaluated,
+    PosesWithoutScatter,
+    ReferenceTakenAsExact,
+    SingleReading,
+    TemperatureNotLogged,
+    ThermometerNotStated,
+)
 from triaxcal.uncertainty.choice import choice
 from triaxcal.uncertainty.components import Component, reference, rounding, statistical
 from triaxcal.uncertainty.linearised import Linearised
@@ -40,12 +48,12 @@ class Combined:
 
 @dataclass(frozen=True)
 class Budget:
-    """Components, largest first; ``not_evaluated`` are sources that nothing is known of, in words."""
+    """Components, largest first; ``not_evaluated`` are sources that nothing is known of."""
 
     components: tuple[Component, ...]
     parameters: Combined
     magnitude: Combined
-    not_evaluated: tuple[str, ...]
+    not_evaluated: tuple[NotEvaluated, ...]
 
     @property
     def dominant(self) -> Component:
@@ -64,7 +72,7 @@ class Budget:
 
 
 def budget(calibration: Calibration, stated: Stated | None = None, level: float = LEVEL) -> Budget:
-    """The budget of a calibration fitted to still poses (`triaxcal.fit.fit`)."""
+    """The budget of a calibration fitted to still poses (`triaxcal.pose_fit.fit`)."""
     stated = stated or Stated()
     linearised = Linearised(calibration)
     thermal, beyond = temperature(calibration, linearised)
@@ -93,20 +101,15 @@ def _combined(lines: list[tuple[Component, Floats]], dof: float, level: float, l
     return Combined(np.sqrt(variance), np.where(variance > 0, np.minimum(effective, DOF_MOST), DOF_MOST), level)
 
 
-def _not_evaluated(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[str]:
-    out = []
+def _not_evaluated(calibration: Calibration, linearised: Linearised, stated: Stated) -> Iterator[NotEvaluated]:
     if stated.reference is None:
-        out.append("reference: taken as exact; state its uncertainty, or a latitude and height")
+        yield ReferenceTakenAsExact()
     if TEMPERATURE not in linearised.problem.channel_reference:
-        out.append(f"temperature: there is no channel {TEMPERATURE}")
+        yield TemperatureNotLogged(TEMPERATURE)
     elif stated.thermometer_k is None and needs_temperature(linearised.effects):
-        out.append("thermometer: its uncertainty was not stated")
+        yield ThermometerNotStated()
     p, crossed = calibration.residual.lack_of_fit_p, calibration.residual.cross_validated_rms_g
     if p is not None and p < LACK_OF_FIT and crossed is not None:
-        out.append(
-            f"lack of fit of a single reading: {micro_g(crossed)} cross-validated, of which only what it does to the "
-            "parameters is above"
-        )
+        yield SingleReading(crossed)
     if any(p.pose.dof <= 0 for p in calibration.poses):
-        out.append("noise: some poses have no scatter inside to tell it from")
-    return out
+        yield PosesWithoutScatter()

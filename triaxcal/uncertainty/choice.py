@@ -11,6 +11,7 @@ from triaxcal.calibration import Calibration
 from triaxcal.conditions import at_reference
 from triaxcal.effects.contract import SINCE_START
 from triaxcal.errors import InvalidData, Refused
+from triaxcal.uncertainty.basis import CompetingModels, ModelsToldApart
 from triaxcal.uncertainty.components import Component
 from triaxcal.uncertainty.linearised import SPHERE, Linearised
 
@@ -49,9 +50,8 @@ def choice(calibration: Calibration, linearised: Linearised) -> list[Component]:
     if not parameters.any():
         return []
     magnitude = float(np.sqrt(sum(float(error @ error) for error in errors) / (SPHERE * count)))
-    how = f"{' or '.join(names)} would do as well on these poses"
-    by = "record what tells them apart, as advised"
-    return [Component("choice_of_effect", "B", np.inf, parameters, magnitude, how, by)]
+    basis = CompetingModels(tuple(names))
+    return [Component("choice_of_effect", "B", np.inf, parameters, magnitude, basis, ModelsToldApart())]
 
 
 def _middle(model: Calibration, of: Calibration) -> dict[str, Floats]:

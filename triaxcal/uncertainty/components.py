@@ -8,10 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.beyond import in_words
 from triaxcal.calibration import Calibration
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import pure_error_dof
+from triaxcal.uncertainty.basis import (
+    Basis,
+    BirgeFactor,
+    CompleteModel,
+    Creep,
+    CreepHalved,
+    Excess,
+    FinerRegisters,
+    LongerOrMorePoses,
+    ReferenceKnown,
+    RegisterSteps,
+    Remedy,
+    WithinPoseScatter,
+)
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
 
@@ -24,8 +37,7 @@ class Component:
     """One line of the budget.
 
     ``evaluation`` is A (from scatter) or B (otherwise); ``dof`` degrees of freedom behind it. ``parameters`` (p,)
-    standard uncertainties of `Calibration.parameters`; ``magnitude`` of |a|, rms over the sphere. ``how`` it was found
-    and what would halve it, in words.
+    standard uncertainties of `Calibration.parameters`; ``magnitude`` of |a|, rms over the sphere.
     """
 
     source: str
@@ -33,16 +45,23 @@ class Component:
     dof: float
     parameters: Floats
     magnitude: float
-    how: str
-    halved_by: str
+    basis: Basis
+    halved_by: Remedy
 
     @classmethod
     def of(
-        cls, linearised: Linearised, source: str, evaluation: str, dof: float, covariance: Floats, how: str, by: str
+        cls,
+        linearised: Linearised,
+        source: str,
+        evaluation: str,
+        dof: float,
+        covariance: Floats,
+        basis: Basis,
+        by: Remedy,
     ) -> Component:
         """Of a source by the ``covariance`` (p,p) of the parameters that it makes; ``by`` what would halve it."""
         parameters = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return cls(source, evaluation, dof, parameters, linearised.magnitude(covariance), how, by)
+        return cls(source, evaluation, dof, parameters, linearised.magnitude(covariance), basis, by)
 
 
 def statistical(calibration: Calibration, linearised: Linearised, beyond: float) -> list[Component]:
@@ -64,28 +83,25 @@ def statistical(calibration: Calibration, linearised: Linearised, beyond: float)
             "A",
             pure_error_dof(poses),
             (S * noise) @ S.T,
-            f"scatter inside {len(poses)} poses of {_held_s(poses):.3g} s, with its autocorrelation",
+            WithinPoseScatter(len(poses), _held_s(poses)),
             half_the_noise(poses),
         )
     ]
     if creep.any():
-        how = f"{np.count_nonzero(creep)} poses creep; rectangular over the change in each"
-        by = "wait before each pose until the outputs creep by half as much"
-        out.append(Component.of(linearised, "creep", "B", np.inf, (S * creep) @ S.T, how, by))
+        basis = Creep(int(np.count_nonzero(creep)))
+        out.append(Component.of(linearised, "creep", "B", np.inf, (S * creep) @ S.T, basis, CreepHalved()))
     excess = beyond * (calibration.covariance - (S * linearised.noise**2) @ S.T)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
-        how = f"residuals are {calibration.inflation:.2f} times what noise explains"
+        raised: Basis = BirgeFactor(calibration.inflation)
         if calibration.excess_g:
-            how = f"residuals show {in_words(calibration)}"
-        by = "find what the model lacks (diagnose, and what it advises); more poses, some of them repeated"
-        out.append(Component.of(linearised, "lack_of_fit", "A", calibration.dof, excess, how, by))
+            raised = Excess(calibration.excess_g / calibration.reference)
+        out.append(Component.of(linearised, "lack_of_fit", "A", calibration.dof, excess, raised, CompleteModel()))
     return out
 
 
-def half_the_noise(poses: Sequence[Pose]) -> str:
-    """What would halve a component that is the noise of the poses, in words."""
-    longer = f"hold each pose for {4 * _held_s(poses):.2g} s"
-    return f"{longer}, or record {4 * len(poses)} poses (against 1/f noise the latter)"
+def half_the_noise(poses: Sequence[Pose]) -> Remedy:
+    """What would halve a component that is the noise of the poses."""
+    return LongerOrMorePoses(4 * _held_s(poses), 4 * len(poses))
 
 
 def _held_s(poses: Sequence[Pose]) -> float:
@@ -97,14 +113,13 @@ def reference(linearised: Linearised, stated: Stated) -> list[Component]:
         return []
     # What |a| does inside the poses should be nothing, whatever the reference.
     shift = linearised.by_residual[:, : len(linearised.problem.u)].sum(axis=1) * stated.reference
-    by = f"know the reference to {stated.reference / 2 * 1e6:.2g} µg"
-    return [Component.of(linearised, "reference", "B", np.inf, np.outer(shift, shift), stated.reference_source, by)]
+    by = ReferenceKnown(stated.reference / 2)
+    return [Component.of(linearised, "reference", "B", np.inf, np.outer(shift, shift), stated.reference_basis, by)]
 
 
 def rounding(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[Component]:
     if not stated.rounding:
         return []
     steps = np.array([stated.rounding.get(name, 0.0) for name in calibration.parameters])
-    how = f"steps of {np.count_nonzero(steps)} registers; rectangular"
-    by = "registers with one bit more"
-    return [Component.of(linearised, "register_rounding", "B", np.inf, np.diag(steps**2 / 12), how, by)]
+    basis = RegisterSteps(int(np.count_nonzero(steps)))
+    return [Component.of(linearised, "register_rounding", "B", np.inf, np.diag(steps**2 / 12), basis, FinerRegisters())]

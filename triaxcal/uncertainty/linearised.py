@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.beyond import Beyond
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import at_reference
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
 from triaxcal.problem import Problem, State, by_shape, everything, linearise, parameters_by_theta
 from triaxcal.start import problem_of, with_history
 from triaxcal.trends import with_trends

@@ -9,18 +9,19 @@ import numpy as np
 
 from triaxcal.errors import InvalidData
 from triaxcal.gravity import local_gravity_g
+from triaxcal.uncertainty.basis import StatedReference
 
 
 @dataclass(frozen=True)
 class Stated:
     """What no recording can tell, as standard uncertainties; None where nobody stated it.
 
-    ``reference`` in the reference's unit, with words on where it comes from; ``thermometer_k``; ``rounding`` the steps
+    ``reference`` in the reference's unit, with what it rests on; ``thermometer_k``; ``rounding`` the steps
     of the registers that take the result, by parameter (`Calibration.parameters`), in its unit.
     """
 
     reference: float | None = None
-    reference_source: str = "as stated"
+    reference_basis: StatedReference = field(default_factory=StatedReference)
     thermometer_k: float | None = None
     rounding: Mapping[str, float] = field(default_factory=dict)
 
@@ -35,13 +36,11 @@ class Stated:
     ) -> Stated:
         """Where the reference is gravity by `triaxcal.gravity`: a stated uncertainty, in g, comes before that of the
         formula. Without a place, what is stated."""
-        source = "as stated"
-        if latitude_deg is not None and height_m is not None:
-            source = f"normal gravity at latitude {latitude_deg:g}°, height {height_m:g} m; its uncertainty "
-            source += "as stated" if reference is not None else "that of gravity anomalies over the Earth"
-            if reference is None:
-                reference = local_gravity_g(latitude_deg, height_m)[1]
-        return cls(reference, source, thermometer_k)
+        if latitude_deg is None or height_m is None:
+            return cls(reference, thermometer_k=thermometer_k)
+        basis = StatedReference(latitude_deg, height_m, stated=reference is not None)
+        by_formula = local_gravity_g(latitude_deg, height_m)[1]
+        return cls(by_formula if reference is None else reference, basis, thermometer_k)
 
     def __post_init__(self) -> None:
         for name, value in (("reference", self.reference), ("thermometer", self.thermometer_k)):

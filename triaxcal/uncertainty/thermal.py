@@ -9,6 +9,15 @@ from triaxcal.calibration import Calibration
 from triaxcal.effects import CATALOGUE, TEMPERATURE, Effect
 from triaxcal.problem import everything
 from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.uncertainty.basis import (
+    PosesAtOtherTemperatures,
+    Remedy,
+    SteadierTemperature,
+    TemperatureKnown,
+    TemperatureModelled,
+    ThermometerAt,
+    UnmodelledTemperature,
+)
 from triaxcal.uncertainty.components import Component, half_the_noise
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
@@ -53,10 +62,10 @@ def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[
     covariances = np.eye(extra), left, _posterior(Z[:n]), left + np.outer(mean, mean)
     of_parameters = [through @ c @ through.T for c in covariances]
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
-    names = " and ".join(e.name for e in missing)
-    untold, by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
-    how = f"{names} not in the model; the temperature moved by {moved:.2g} K from pose to pose{untold}"
-    return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], how, by)], beyond
+    names = tuple(e.name for e in missing)
+    by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
+    basis = UnmodelledTemperature(names, moved, identifiable=not isinstance(by, PosesAtOtherTemperatures))
+    return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)], beyond
 
 
 def _posterior(Z: Floats) -> Floats:
@@ -70,20 +79,18 @@ def _posterior(Z: Floats) -> Floats:
 
 
 def _halved_by(
-    calibration: Calibration, names: str, prior: float, left: float, apart: float, whole: float
-) -> tuple[str, str]:
-    """What `Component.how` adds, and what would halve the component. As magnitudes: what the ``prior`` makes, what the
-    data leave of it, what they would leave were the parameters known (so that nothing takes an effect for them), and
-    the ``whole`` component, which has the effects' means too."""
+    calibration: Calibration, names: tuple[str, ...], prior: float, left: float, apart: float, whole: float
+) -> Remedy:
+    """As magnitudes: what the ``prior`` makes, what the data leave of it, what they would leave were the parameters
+    known (so that nothing takes an effect for them), and the ``whole`` component, which has the effects' means too."""
     told, p = 2 * left < prior, calibration.residual.lack_of_fit_p
     if told and 2 * left < whole and p is not None and p < LACK_OF_FIT:
-        return "", f"take into the model what the residuals come from: {names}, or another effect"
+        return TemperatureModelled(names)
     if 2 * apart < left:
-        more = "record more poses, or the same ones again in another order, while the temperature differs"
-        return ", but these poses cannot tell what that did", f"{more}, until {names} can be fitted"
+        return PosesAtOtherTemperatures(names)
     if told:
-        return "", half_the_noise([p.pose for p in calibration.poses if p.used])
-    return "", f"hold the temperature twice as steady, or let it swing until {names} can be fitted"
+        return half_the_noise([p.pose for p in calibration.poses if p.used])
+    return SteadierTemperature(names)
 
 
 def _thermal_but(effects: tuple[Effect, ...]) -> list[Effect]:
@@ -101,9 +108,8 @@ def thermometer(calibration: Calibration, linearised: Linearised, stated: Stated
     if not stated.thermometer_k or not needs_temperature(linearised.effects):
         return []
     shift = linearised.when_shifted(calibration, TEMPERATURE, stated.thermometer_k)
-    how = f"thermal effects, reckoned from {calibration.channel_reference[TEMPERATURE]:.4g} °C"
-    by = f"know the temperature to {stated.thermometer_k / 2:.2g} K"
-    return [Component.of(linearised, "thermometer", "B", np.inf, np.outer(shift, shift), how, by)]
+    basis, by = ThermometerAt(calibration.channel_reference[TEMPERATURE]), TemperatureKnown(stated.thermometer_k / 2)
+    return [Component.of(linearised, "thermometer", "B", np.inf, np.outer(shift, shift), basis, by)]
 
 
 def needs_temperature(effects: tuple[Effect, ...]) -> bool:

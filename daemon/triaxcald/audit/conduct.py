@@ -52,6 +52,8 @@ class Notes:
     older: bool = False
     versions: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     report_as_listed: bool = False
+    earlier: bool = False
+    """Sentences, and keys that its version did not make, were not compared."""
     losses: tuple[str, ...] = ()
     mended: bool = False
     not_beside: tuple[str, ...] = ()
@@ -80,6 +82,10 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
         if recording.ends_with not in ("", FORMAT):
             raise RecordingError(f"{path}: ends with {recording.ends_with}, which this version does not know")
         return _Audit(path, recording, compute).run()
+
+
+EARLIER = frozenset({"0.1.0"})
+"""Versions whose documents have other sentences, and lack keys that are made now."""
 
 
 class _Audit:
@@ -130,6 +136,11 @@ class _Audit:
     @property
     def _older(self) -> bool:
         return not self._ends_with_outcome
+
+    @property
+    def _earlier(self) -> bool:
+        """Whether a version made it whose sentences and keys are not those of this one."""
+        return self._recording.metadata.get("software", {}).get("triaxcal") in EARLIER
 
     @property
     def _aborted(self) -> bool:
@@ -183,8 +194,9 @@ class _Audit:
         contents_again = held.get("contents") if self._mended else found.inventory.document()
         document = outcome_again(held, again, self._recording, self._papers(again), contents_again or {})
         # The inventory is compared part by part.
-        told = compare(ATTACHMENT, _without_contents(data), _without_contents(to_text(document).encode()))
-        if not told and contents_again == held.get("contents") and data != to_text(document).encode():
+        again_data = to_text(document).encode()
+        told = compare(ATTACHMENT, _without_contents(data), _without_contents(again_data), earlier=self._earlier)
+        if not told and not self._earlier and contents_again == held.get("contents") and data != again_data:
             told = [Difference(ATTACHMENT, Kind.BYTES)]
         self._differences += told
 
@@ -194,7 +206,8 @@ class _Audit:
         ending = None if self._aborted else again.ending()
         if ending is not None and again.certified is not None:
             if ending.verdict is not Verdict.FAIL:
-                found[CERTIFICATE] = digest_of(to_text(again.certified.document).encode())
+                same = None if self._earlier else to_text(again.certified.document).encode()
+                found[CERTIFICATE] = digest_of(self._held.get(CERTIFICATE, b"") if same is None else same)
             if REPORT in self._held:
                 found[REPORT] = digest_of(self._held[REPORT])
         return found
@@ -234,7 +247,7 @@ class _Audit:
         if stored is None:
             self._add(name, Kind.MISSING)
         else:
-            self._differences += compare(name, stored, again.encode())
+            self._differences += compare(name, stored, again.encode(), earlier=self._earlier)
 
     def _check_report(self, again: Again) -> None:
         stored, ending = self._held.get(REPORT), again.ending()
@@ -337,6 +350,7 @@ class _Audit:
             older=self._older,
             versions=self._versions(),
             report_as_listed=self._listed_report,
+            earlier=self._earlier,
             losses=tuple(losses_of(self._recording)),
             mended=self._mended,
             not_beside=not_beside,

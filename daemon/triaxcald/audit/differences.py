@@ -12,6 +12,13 @@ MOST = 8
 """So many differences of one document are listed, the others counted."""
 
 
+SENTENCES = frozenset({
+    "advice", "apart", "data_quality", "halved_by", "holds", "how", "lead", "not_evaluated", "reason", "remedy",
+    "warnings",
+})  # fmt: skip
+"""Keys of documents under which English stands: words may be better in another version, numbers may not differ."""
+
+
 class Nothing:
     """In the place of a value that is not there."""
 
@@ -85,29 +92,34 @@ class Difference:
     again: Any = NOTHING
 
 
-def compare(part: str, stored: bytes, again: bytes) -> list[Difference]:
-    """Two JSON documents, of which the second was computed again."""
+def compare(part: str, stored: bytes, again: bytes, *, earlier: bool = False) -> list[Difference]:
+    """Two JSON documents, of which the second was computed again. ``earlier``: the first is of a version with other
+    sentences and fewer keys; these are not compared, nor the bytes."""
     if stored == again:
         return []
     try:
         before = json.loads(stored)
     except (ValueError, RecursionError):
         return [Difference(part, Kind.NO_DOCUMENT)]
-    found = list(differing(part, before, json.loads(again)))
+    found = list(differing(part, before, json.loads(again), earlier=earlier))
+    if earlier and not found:
+        return []
     if not found:
         return [Difference(part, Kind.BYTES)]
     rest = [Difference(part, Kind.MORE, again=len(found) - MOST)] if len(found) > MOST else []
     return found[:MOST] + rest
 
 
-def differing(part: str, stored: Any, again: Any, at: str = "") -> Iterator[Difference]:
-    """Where two JSON values differ."""
+def differing(part: str, stored: Any, again: Any, at: str = "", *, earlier: bool = False) -> Iterator[Difference]:
+    """Where two JSON values differ; ``earlier`` as in `compare`."""
     if isinstance(stored, Mapping) and isinstance(again, Mapping):
         for key in dict.fromkeys([*stored, *again]):
+            if earlier and (key in SENTENCES or key not in stored):
+                continue
             inner = f"{at}.{key}" if at else str(key)
-            yield from differing(part, stored.get(key, NOTHING), again.get(key, NOTHING), inner)
+            yield from differing(part, stored.get(key, NOTHING), again.get(key, NOTHING), inner, earlier=earlier)
     elif isinstance(stored, list) and isinstance(again, list) and len(stored) == len(again):
         for i, (s, t) in enumerate(zip(stored, again, strict=True)):
-            yield from differing(part, s, t, f"{at}[{i}]")
+            yield from differing(part, s, t, f"{at}[{i}]", earlier=earlier)
     elif type(stored) is not type(again) or stored != again:
         yield Difference(part, Kind.VALUE, at, stored, again)

@@ -104,6 +104,8 @@ def notes(of: Notes) -> list[str]:
             "the report, and no one word says how the run ended"
         )
     found += [f"{name}: {then} then, {now} now" for name, (then, now) in of.versions.items()]
+    if of.earlier:
+        found.append("an earlier version made it: all its numbers are compared, its sentences are not")
     if of.report_as_listed:
         found.append("report.html was not drawn again, since versions differ; it is compared with the outcome's digest")
     found += of.losses

@@ -8,10 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from triaxcal import text
 from triaxcal.agreement import agreement
 from triaxcal.errors import Refused
-from triaxcal.fit import fit
 from triaxcal.loop import Loop, diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, add_uncertainty, positive, writable
@@ -79,19 +80,20 @@ def fit_command(a: argparse.Namespace) -> int:
         emit(document)
     else:
         show_calibration(calibration, choice)
-        warn([*calibration.warnings, *measured.data_quality])
+        warn([*map(text.caution, calibration.cautions), *measured.data_quality])
     return judge(a.limit, calibration.residual.rms_g)
 
 
 def _fit_by(way: Callable[[argparse.Namespace], Way], a: argparse.Namespace) -> int:
     measured, document, calibration, show = way(a)
+    warnings = document["warnings"]
     document["data_quality"] = measured.data_quality
     _write(a, measured, document)
     if a.json:
         emit(document)
     else:
         show()
-        warn([*calibration.warnings, *measured.data_quality])
+        warn([*warnings, *measured.data_quality])
     return judge(a.limit, calibration.residual.rms_g)
 
 
@@ -108,13 +110,11 @@ def diagnose_command(a: argparse.Namespace) -> int:
     check = measured_check(measured, a)
     choice = chosen(a, measured)
     loop = _loop(a, measured, choice, check.poses if check else None)
-    warnings = channels_of_some(recordings)
-    warnings += doubts_of_one_unit(recordings, loop, choice)
+    remarks, doubts = channels_of_some(recordings), doubts_of_one_unit(recordings, loop, choice)
     if check and loop.held_out:
         measured = replace(measured, data_quality=[*measured.data_quality, *named_quality(check)])
-        warnings += doubts_of_check(measured, check, loop, choice)
-    loop = replace(loop, after=replace(loop.after, warnings=(*loop.after.warnings, *warnings)))
-    document = _loop_document(loop, measured, choice)
+        doubts += doubts_of_check(measured, check, loop, choice)
+    document = _loop_document(loop, measured, choice, [*remarks, *doubts], unit_in_doubt=bool(doubts))
     if len(names) > 1:
         document = with_recordings(document, loop, names)
     _write(a, measured, document)
@@ -125,7 +125,7 @@ def diagnose_command(a: argparse.Namespace) -> int:
             show_by_recording(loop, names, choice)
         show_loop(loop, choice)
         show_calibration(loop.after, choice)
-        warn([*loop.after.warnings, *measured.data_quality])
+        warn([*document["calibration"]["warnings"], *measured.data_quality])
     return judge(a.limit, loop.after.residual.rms_g)
 
 
@@ -136,13 +136,17 @@ def _loop(a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequ
         )
 
 
-def _loop_document(loop: Loop, measured: Measured, choice: Choice) -> documents.Document:
+def _loop_document(
+    loop: Loop, measured: Measured, choice: Choice, remarks: Sequence[str] = (), *, unit_in_doubt: bool = False
+) -> documents.Document:
     return documents.loop_document(
         loop,
         data_quality=measured.data_quality,
         output_unit=choice.output_unit,
         reference_unit=choice.reference_unit,
         stated=choice.stated,
+        remarks=remarks,
+        unit_in_doubt=unit_in_doubt,
     )
 
 
@@ -176,7 +180,8 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
     else:
         show_agreement(found, names, loops, choices)
         for measured, loop in zip(recordings, loops, strict=True):
-            warn([*(f"{measured.name}: {line}" for line in loop.after.warnings), *named_quality(measured)])
+            warnings = map(text.caution, loop.after.cautions)
+            warn([*(f"{measured.name}: {line}" for line in warnings), *named_quality(measured)])
     return max(judge(a.limit, loop.after.residual.rms_g) for loop in loops)
 
 

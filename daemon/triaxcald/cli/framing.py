@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.fit import fit
 from triaxcal.frame.faces import LABELS, Labelling, labelled, opposite, recognise
 from triaxcal.frame.frames import Datum, Frames, frames
 from triaxcal.frame.orientations import Assumed
 from triaxcal.frame.standing import Standing, stand
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
+from triaxcal.pose_fit import fit
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, positive, within, writable
 from triaxcald.cli.console import emit, say, table

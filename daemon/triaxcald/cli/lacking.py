@@ -12,10 +12,10 @@ from triaxcal.calibration import Calibration
 from triaxcal.conditions import channels_of
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
-from triaxcal.fit import fit
-from triaxcal.plan.addition import ENOUGH, Addition, Had, additions
-from triaxcal.plan.design import ask, channels_needed, profile_times
-from triaxcal.plan.directions import FULL, cube_directions, most_wanted
+from triaxcal.planning.addition import ENOUGH, Addition, Had, additions
+from triaxcal.planning.design import ask, channels_needed, profile_times
+from triaxcal.planning.directions import FULL, cube_directions, most_wanted
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.start import rough_directions, wanted_for
 

@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from triaxcal import text as of_metrology
 from triaxcal_drivers.profile import READINGS
 from triaxcald import text
 from triaxcald.cli.arguments import add_force, add_json, positive, seed, writable
@@ -149,8 +150,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     print(f"  verdict: {o.document['verdict']}: {o.document['reason']}")
     for line in o.certified.document["outside"]:
         print(f"  outside limits: {line}")
-    for line in loop.after.warnings:
-        print(f"  warning: {line}")
+    for caution in loop.after.cautions:
+        print(f"  warning: {of_metrology.caution(caution)}")
     papers = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
     for what, path in papers.items():
         if path is not None:

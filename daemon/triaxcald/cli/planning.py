@@ -13,11 +13,11 @@ from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
 from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER
 from triaxcal.errors import InvalidData
-from triaxcal.plan.addition import Addition
-from triaxcal.plan.clock import in_plan
-from triaxcal.plan.design import Asked, ask, needs_time
-from triaxcal.plan.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
-from triaxcal.plan.optimal import OptimalPlan, optimal
+from triaxcal.planning.addition import Addition
+from triaxcal.planning.clock import in_plan
+from triaxcal.planning.design import Asked, ask, needs_time
+from triaxcal.planning.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
+from triaxcal.planning.optimal import OptimalPlan, optimal
 from triaxcal.visibility import Sight, sight, unseen_effects
 from triaxcald.cli.arguments import add_recording, count
 from triaxcald.cli.console import emit, say, table

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from triaxcal import text
 from triaxcal.calibration import Calibration, Residual
 from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import probability
@@ -12,7 +13,7 @@ from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, counted
 from triaxcald.documents import holds_of
-from triaxcald.remarks import assumption, nothing_shows, overlap, without
+from triaxcald.remarks import assumed_in, assumption, nothing_shows, overlap, without
 from triaxcald.units import ErrorUnit, grouped, in_units_of
 
 
@@ -84,12 +85,12 @@ def show_budget(b: Budget, choice: Choice) -> None:
         [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", small.told(float(whole.expanded)), ""]
     )
     table(f"uncertainty of the magnitude, {small}", ["source", "type", "standard", "share"], rows)
-    by = small.in_words(b.dominant.halved_by)
+    by = text.remedy(b.dominant.halved_by, small.figure)
     print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
-    if assumed := assumption(b.dominant.source, b.dominant.how, choice.reference_unit):
+    if assumed := assumption(assumed_in(b.dominant.basis), choice.reference_unit):
         print(f"{b.dominant.source}: {assumed}")
-    for line in b.not_evaluated:
-        print(f"not evaluated: {small.in_words(line)}")
+    for source in b.not_evaluated:
+        print(f"not evaluated: {text.not_evaluated(source, small.figure)}")
 
 
 def show_loop(loop: Loop, choice: Choice) -> None:

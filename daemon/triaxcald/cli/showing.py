@@ -65,7 +65,7 @@ def _stated(a: argparse.Namespace, measured: Measured) -> Stated:
         thermometer_k=own.thermometer_k if thermometer is None else thermometer,
     )
     if said.reference is None and a.reference is None:
-        return replace(said, reference=own.reference, reference_source=own.reference_source)
+        return replace(said, reference=own.reference, reference_basis=own.reference_basis)
     return said
 
 

@@ -89,9 +89,6 @@ def _three_errors(text: str) -> tuple[float, float, float]:
 def _turning(a: argparse.Namespace) -> Way:
     moments = Moments()
     measured = measure(a.recording, moments=moments)
-    # What turns slowly enough passes for a pose that creeps.
-    quality = [line for line in measured.data_quality if not line.startswith("creeping_pose")]
-    measured = replace(measured, data_quality=quality)
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
         found = fit_rotation(moments, signs=choice.signs, reference=choice.reference)
@@ -101,7 +98,6 @@ def _turning(a: argparse.Namespace) -> Way:
     if len(still) >= POSES_ENOUGH:
         advice = f"there are {len(still)} still poses in it: without --turning the fit would use their quiet"
         document["warnings"] = [*document["warnings"], advice]
-        calibration = replace(calibration, warnings=(*calibration.warnings, advice))
     return measured, document, calibration, lambda: _show_turning(found, choice)
 
 

@@ -18,6 +18,7 @@ class BudgetLine:
     magnitude_g: float | None
     share: float | None
     how: str
+    assumes: tuple[str, ...] = ()
 
     @property
     def percent(self) -> str:
@@ -68,6 +69,7 @@ def _line(entry: Mapping[str, object]) -> BudgetLine:
         number(entry.get("magnitude_g")),
         number(entry.get("share")),
         str(entry.get("how") or ""),
+        texts(entry.get("assumes")),
     )
 
 

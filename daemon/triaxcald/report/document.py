@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from triaxcal.calibration import UNKNOWN_HISTORY
+from triaxcal.calibration import Exclusion
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names
 from triaxcald.report.stages import HeldOut, Residual, Stage, held_out_of, stages_of
@@ -21,6 +21,10 @@ from triaxcald.units import ErrorUnit
 _OF_A_POSE = (
     "start_s", "end_s", "before_residual_g", "residual_g", "studentized", "leverage", "standard_error_g",
 )  # fmt: skip
+
+
+_NOT_AGAIN = (Exclusion.UNKNOWN_HISTORY, Exclusion.CALLER)
+"""Poses that are not to be taken again, though the fit excludes them."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +127,7 @@ class Outcome:
     condition: float | None
     blind_to: tuple[str, ...]
     warnings: tuple[str, ...]
+    doubts: tuple[str, ...]
     data_quality: tuple[str, ...]
     advice: tuple[str, ...]
     limits: Mapping[str, float | None]
@@ -180,6 +185,7 @@ def read_document(document: Mapping[str, object]) -> Outcome:
         condition=number(calibration.get("condition")),
         blind_to=texts(calibration.get("blind_to")),
         warnings=texts(calibration.get("warnings")),
+        doubts=texts(document.get("doubts")),
         data_quality=tuple(_with_names(line, names) for line in texts(document.get("data_quality"))),
         advice=texts(document.get("advice")),
         limits=numbers(document.get("limits")),
@@ -289,7 +295,7 @@ def _poses(
             mean=mean,
             direction=vector(known.get("direction")) or _direction(mean, matrix, centre),
             used=known.get("used") is None or bool(known["used"]),
-            again=known.get("used") is False and known.get("left_out") != UNKNOWN_HISTORY,
+            again=known.get("used") is False and (known.get("excluded") or known.get("left_out")) not in _NOT_AGAIN,
             recording=recordings.get(str(known.get("recording")), ""),
             channels=numbers(known.get("channels")),
             **{name: number(known.get(name)) for name in _OF_A_POSE},

@@ -51,7 +51,7 @@ def render_report(
     floor_g = outcome.final.noise_floor_g
     uncertainty = read_uncertainty(mapping(document.get("calibration")) or document)
     dominant = uncertainty.lines[0] if uncertainty else None
-    assumed = assumption(dominant.source, dominant.how, outcome.reference_unit) if dominant else ""
+    assumed = assumption(dominant.assumes, outcome.reference_unit) if dominant else ""
     return _ENVIRONMENT.get_template("report.html").render(
         title=title,
         outcome=outcome,

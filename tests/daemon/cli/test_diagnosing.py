@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from triaxcal.calibration import Residual
-from triaxcal.plan.directions import spiral
+from triaxcal.planning.directions import spiral
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcald.cli.results import cross_validated

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.plan.directions import cube_directions
+from triaxcal.planning.directions import cube_directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Tumble
 from triaxcald.recording.reader import Recording
@@ -211,7 +211,7 @@ def test_a_wrong_row_is_named_at_the_console(files: Path, triaxcal: Run, tmp_pat
     path = attitudes(tmp_path, "label\n" + "\n".join(labels) + "\n")
     done = triaxcal("fit", files / "14.csv", "--attitudes", path, "--attitude-error", "1e-4")
     assert done.code == 0
-    assert "left out as wrong: line 6 (+X-Y)" in done.err
+    assert "excluded as wrong: line 6 (+X-Y)" in done.err
     assert "rotation from the table's frame" in done.out
     assert "as declared" in done.out
 

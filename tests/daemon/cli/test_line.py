@@ -9,7 +9,7 @@ import pytest
 
 from triaxcal.effects.third_order_nonlinearity import ThirdOrderNonlinearity
 from triaxcal.loop import Loop, diagnose
-from triaxcal.plan import directions
+from triaxcal.planning import directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.certificate import Certified

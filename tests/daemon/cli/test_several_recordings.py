@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcald.cli.arguments import parsed

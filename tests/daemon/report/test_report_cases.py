@@ -305,15 +305,14 @@ def test_the_headline_is_not_that_all_is_well_while_poses_have_to_be_taken_again
             "time_unit: a sample every 10 s, poses of 5000 s: is t_s in seconds?",
             "are the times in seconds?",
         ),
-        ("warnings", "a.csv and b.csv: misalignment differs by up to 6 mrad: the same unit?", "is it the same unit?"),
-        ("warnings", "b.csv does not look like this unit: |a| is off; is it another unit?", "is it the same unit?"),
+        ("doubts", "unit", "is it the same unit?"),
     ],
 )
 def test_nothing_is_well_whose_times_or_unit_are_in_doubt(
     bare: dict[str, Any], where: str, line: str, asked: str
 ) -> None:
     assert asked not in page(bare)[1]
-    (bare if where == "data_quality" else bare["calibration"])[where] = [line]
+    bare[where] = [line]
     html, text = page(bare)
     assert 'class="verdict unexplained"' in html
     assert f"Nothing found beyond noise; {asked}" in text
@@ -323,7 +322,10 @@ def test_a_first_pose_of_unknown_history_is_left_out_and_not_to_be_taken_again(b
     bare["calibration"]["poses"][0] |= {"used": False, "left_out": "unknown_history"}
     _, text = page(bare)
     assert "again" not in text
-    bare["calibration"]["poses"][0]["left_out"] = "spoiled"
+    bare["calibration"]["poses"][0] |= {"excluded": "caller", "left_out": "caller"}
+    _, text = page(bare)
+    assert "again" not in text
+    bare["calibration"]["poses"][0] |= {"excluded": None, "left_out": "spoiled"}  # of 0.1
     assert "poses to take again" in page(bare)[1]
 
 

@@ -13,7 +13,7 @@ from triaxcal.effects import effect_named
 from triaxcal.effects.contract import Coefficient
 from triaxcal.effects.part import Part, mix_of, whole
 from triaxcal.effects.warm_up import WarmUp
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from triaxcal.calibration import Calibration
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.fit import fit
-from triaxcal.frame.faces import AXES, LABELS, axis_of, labelled, nearest_rotation, recognise
-from triaxcal.frame.frames import Datum, Frames, frames
-from triaxcal.frame.orientations import Assumed
-from triaxcal.frame.standing import Standing, stand
+from triaxcal.frame.faces import AXES, LABELS, AxesAssumed, axis_of, labelled, nearest_rotation, recognise
+from triaxcal.frame.frames import Datum, FacesMissing, Frames, UnitsDisagree, frames
+from triaxcal.frame.orientations import Assumed, NotTurned
+from triaxcal.frame.standing import OrientationsAlike, SingleOrientation, Standing, stand
 from triaxcal.frame.synthetic_fixture import SyntheticFixture
 from triaxcal.frame.verticals import verticals, verticals_under
-from triaxcal.plan.directions import directions
+from triaxcal.planning.directions import directions
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -302,7 +302,7 @@ def test_units_on_different_fixtures_are_told_by_their_faces(paper_unit: Sensor)
     result = frames([Bench.of(paper_unit, seed).stood() for seed in (1, 2)])
     assert result.lack_of_fit_p is not None
     assert result.lack_of_fit_p < 1e-10
-    assert "not one fixture" in result.warnings[-1]
+    assert isinstance(result.cautions[-1], UnitsDisagree)
     assert result.units[0].standard_error.min() > 1e-4
 
 
@@ -326,7 +326,7 @@ def test_fewer_faces_give_a_frame_of_those(paper_unit: Sensor, faces: list[str])
         assert result.fixture.faces == order
         assert np.all(np.abs(bench.miss(result, faces=order)) < 5 * result.units[0].standard_error)
         assert np.all(result.units[0].standard_error < 4e-5)
-        assert any("nothing stood" in w for w in result.warnings)
+        assert FacesMissing(tuple(label for label in LABELS if label not in faces)) in result.cautions
 
 
 @pytest.mark.parametrize("datum", [None, ("-Z", "-X"), ("+Y", "-Z")])
@@ -363,7 +363,8 @@ def test_a_face_that_stood_one_way_gets_the_tilt_of_the_others_as_uncertainty(pa
         standing = bench.stood(seating=0.0)
         result = frames([standing])
         assert [t.label for t in standing.tilts if not t.resolved] == ["+Z"]
-        assert "with +Z up the fixture stood one way only" in standing.warnings[0]
+        assert isinstance(standing.cautions[0], SingleOrientation)
+        assert standing.cautions[0].faces == ("+Z",)
         (unit,) = result.units
         pulls.append(bench.miss(result) / unit.standard_error)
         # A quarter of the tilt's component, doubled in variance because headings may go together.
@@ -401,7 +402,8 @@ def test_a_face_that_was_not_turned_by_half_a_turn_is_noticed(paper_unit: Sensor
     bench = Bench.of(paper_unit, 3, plan=plan)
     standing = bench.stood(seating=0.0)
     assert [t.label for t in standing.tilts if not t.resolved] == [plan[4][0]]
-    assert "taken as not turned" in standing.warnings[0]
+    assert isinstance(standing.cautions[0], NotTurned)
+    assert standing.cautions[0].face == plan[4][0]
     result = frames([standing])
     assert np.all(np.abs(bench.miss(result)) < 4 * result.units[0].standard_error)
 
@@ -457,7 +459,7 @@ def test_a_level_table_and_a_fixture_that_was_not_turned_look_the_same(paper_uni
     still = Bench.of(paper_unit, 1, plan=[(label, 0.3) for label in LABELS for _ in range(2)]).stood()
     for standing in (level, still):
         assert not standing.table.shows
-        assert "level to that, or the fixture was not turned" in " ".join(standing.warnings)
+        assert OrientationsAlike() in standing.cautions
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, 1), (1, -1, -1)])
@@ -490,7 +492,7 @@ def test_without_labels_the_nearest_axes_are_taken_and_it_is_said(paper_unit: Se
         bench = Bench.of(paper_unit, 6, mount=quarter @ mount)
         standing = bench.stood()
         assert standing.labelling.assumed
-        assert "would look the same" in standing.labelling.warnings[0]
+        assert standing.labelling.cautions == (AxesAssumed(),)
         assert standing.labelling.mounting == pytest.approx(mount, abs=5e-3)
         assert standing.labelling.labels[12:] == (None,) * len(NO_FACE)
 

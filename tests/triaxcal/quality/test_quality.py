@@ -13,7 +13,18 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.coloured_noise import first_order, flicker, white
 from triaxcal.quality import Finding, QualityDetector
 from triaxcal.quality.faults import coarse_quantization
-from triaxcal.quality.finding import Holds
+from triaxcal.quality.finding import (
+    AtRail,
+    CoarseQuantization,
+    DuplicateSamples,
+    Holds,
+    MainsPickup,
+    MissingSamples,
+    Saturation,
+    SlowUpdate,
+    StuckOutput,
+    Touched,
+)
 from triaxcal.quality.mains import bands
 from triaxcal.quality.timing import Gaps
 from triaxcal.stillness.detector import StillnessDetector
@@ -146,10 +157,11 @@ def test_a_rail_is_named_with_the_pose_that_it_touches(rate_hz: float) -> None:
     (found,) = judged(time_ns, clipped)
     assert found.poses == (pose,)
     count = int((clipped[:, 0] == rail).sum())
-    assert found.line.startswith(f"saturation: x at {rail:g} in ")
-    assert abs(int(found.text.split(" in ")[1].split()[0]) - count) <= 0.1 * rate_hz  # the last stretch may be cut
-    begin = float(found.text.split("the pose that begins at ")[1].split(" s")[0])
-    assert begin == pytest.approx(pose * (HOLD_S + MOVE_S), abs=0.4)
+    assert isinstance(found, Saturation)
+    (at_rail,) = found.rails
+    assert (at_rail.axis, at_rail.rail) == ("x", rail)
+    assert abs(at_rail.samples - count) <= 0.1 * rate_hz  # the last stretch may be cut
+    assert at_rail.touched.starts_s == (pytest.approx(pose * (HOLD_S + MOVE_S), abs=0.4),)
 
 
 @pytest.mark.parametrize("place", [-1.0, 0.0, 1.0])
@@ -167,10 +179,8 @@ def test_counts_that_end_where_an_integer_ends_are_a_rail_even_once() -> None:
     counts = np.round(u * 2048 + 4 * np.random.default_rng(0).standard_normal(u.shape))
     counts[450] = [32767, -32768, 9000]
     (found,) = judged(time_ns, counts)
-    assert found.line == (
-        "saturation: x at 32767 in 1 sample, first at 4.5 s, in no pose; "
-        "y at -32768 in 1 sample, first at 4.5 s, in no pose"
-    )
+    first_s = pytest.approx(4.5, abs=0.1)
+    assert found == Saturation((AtRail("x", 32767, 1, first_s, Touched()), AtRail("y", -32768, 1, first_s, Touched())))
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 100.0, 1000.0])
@@ -179,7 +189,10 @@ def test_a_frozen_axis_is_named_with_its_value_and_length(rate_hz: float) -> Non
     n = int(rate_hz)
     u[21 * n : 23 * n, 1] = u[21 * n, 1]
     (found,) = judged(time_ns, u)
-    assert found.line.startswith(f"stuck_output: y repeats {u[21 * n, 1]:.7g} for {2 * n} samples, first at 21.0 s")
+    assert isinstance(found, StuckOutput)
+    (freeze,) = found.freezes
+    assert (freeze.axis, freeze.value, freeze.times, freeze.longest) == ("y", u[21 * n, 1], 1, 2 * n)
+    assert freeze.first_s == pytest.approx(21.0, abs=0.1)
     assert found.poses
 
 
@@ -187,13 +200,16 @@ def test_all_axes_frozen_are_said_once() -> None:
     time_ns, u = stream(7)
     u[2100:2300] = u[2100]
     (found,) = judged(time_ns, u)
-    assert found.line.startswith("stuck_output: all axes repeat one reading for 200 samples, first at 21.0 s")
+    assert isinstance(found, StuckOutput)
+    (freeze,) = found.freezes
+    assert (freeze.axis, freeze.times, freeze.longest) == (None, 1, 200)
+    assert freeze.first_s == pytest.approx(21.0, abs=0.1)
 
 
 def test_an_axis_that_never_changes_is_stuck() -> None:
     time_ns, u = stream(8)
     u[:, 2] = 0.25
-    assert [f.line for f in judged(time_ns, u)] == ["stuck_output: z never changes"]
+    assert judged(time_ns, u) == [StuckOutput(("z",), None, ())]
 
 
 @pytest.mark.parametrize("every", [1.25, 2.0, 5.0])
@@ -201,7 +217,8 @@ def test_a_sensor_read_faster_than_it_updates_is_told_its_rate(every: float) -> 
     time_ns, u = stream(9)
     fresh = np.floor(np.floor(np.arange(len(u)) / every + 1e-9) * every + 1e-9).astype(int)
     (found,) = judged(time_ns, u[fresh])
-    assert found.line == f"stuck_output: new values only every {every:.2f} samples, at {100 / every:.4g} Hz of 100 Hz"
+    slow = SlowUpdate(pytest.approx(every, rel=0.005), pytest.approx(100, rel=1e-3))
+    assert found == StuckOutput((), slow, ())
 
 
 def test_single_samples_that_come_twice_are_duplicates() -> None:
@@ -209,16 +226,15 @@ def test_single_samples_that_come_twice_are_duplicates() -> None:
     again = np.arange(50, 5000, 100)
     u[again] = u[again - 1]
     (found,) = judged(time_ns, u)
-    assert found.line == "duplicate_samples: 50 of 5999 samples repeat the one before on all axes"
+    assert found == DuplicateSamples(50, 5999)
 
 
 def test_gaps_are_counted_by_the_times() -> None:
     time_ns, u = stream(11)
     kept = np.ones(len(u), dtype=bool)
     kept[[1000, 2000, 2001, 2002]] = False
-    assert [f.line for f in judged(time_ns[kept], u[kept])] == [
-        "missing_samples: 4 of 6000 by the times, in 2 gaps, the first at 10.0 s, 3 in the longest"
-    ]
+    (found,) = judged(time_ns[kept], u[kept])
+    assert found == MissingSamples(missing=4, of=6000, gaps=2, longest=3, first_s=pytest.approx(10.0, abs=0.02))
 
 
 def _gaps(times: Floats) -> tuple[int, int, int]:
@@ -270,9 +286,11 @@ def test_late_time_stamps_are_no_gaps_and_gaps_among_them_are(kind: str) -> None
 def test_a_line_of_the_mains_is_named_with_its_frequency_and_amplitude(hz: float, rate_hz: float, shown: str) -> None:
     time_ns, u = stream(13, rate_hz)
     (found,) = judged(time_ns, u + hum(time_ns, hz, 3 * NOISE))
-    assert found.line.startswith(f"mains_pickup: {shown}, amplitude x ")
-    x, y = (float(part.split()[1]) for part in found.text.split("amplitude ")[1].split(", "))
-    # Amplitudes of lines in noise: a standard deviation of √(2/n) σ for n samples, and two digits are shown.
+    assert isinstance(found, MainsPickup)
+    (tone,) = found.tones
+    assert (f"{tone.frequency_hz:.1f} Hz", tone.alias_of_hz) == (shown, None)
+    x, y, _ = tone.amplitude
+    # Amplitudes of lines in noise: a standard deviation of √(2/n) σ for n samples; a twentieth for the window.
     limit = 4 * NOISE * np.sqrt(2 / (POSES * HOLD_S * rate_hz)) + 0.05 * 3 * NOISE
     assert abs(x - 3 * NOISE) < limit
     assert abs(y - 1.5 * NOISE) < limit
@@ -282,8 +300,10 @@ def test_a_line_of_the_mains_is_named_with_its_frequency_and_amplitude(hz: float
 def test_a_folded_line_is_said_to_be_an_alias_or_a_vibration(hz: float, rate_hz: float, at: float) -> None:
     time_ns, u = stream(14, rate_hz)
     (found,) = judged(time_ns, u + hum(time_ns, hz, 3 * NOISE))
-    assert found.text.startswith(f"{at:.1f} Hz, amplitude x ")
-    assert found.text.endswith(f"(the alias of {hz:g} Hz at {rate_hz:g} Hz sampling, or a vibration)")
+    assert isinstance(found, MainsPickup)
+    assert found.rate_hz == pytest.approx(rate_hz, rel=1e-3)
+    (tone,) = found.tones
+    assert (round(tone.frequency_hz, 1), tone.alias_of_hz) == (at, hz)
 
 
 @pytest.mark.parametrize("hz", [24.7, 47.0, 53.0, 57.0, 97.0])
@@ -316,7 +336,8 @@ def test_knocks_in_a_pose_are_no_line() -> None:
 def test_steps_wider_than_the_noise_are_coarse(step: float) -> None:
     (found,) = judged(*stream(17, step=step * NOISE))
     assert found.name == "coarse_quantization"
-    assert found.text.startswith(f"x in steps of {step * NOISE:.3g}, scatter ")
+    assert isinstance(found, CoarseQuantization)
+    assert (found.axes[0].axis, found.axes[0].step) == ("x", pytest.approx(step * NOISE))
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.35, 0.4])
@@ -329,17 +350,17 @@ def test_the_error_stated_for_coarse_steps_is_that_of_rounded_means(sigma: float
     worst = float(np.abs(mean - place[:, 0]).max())
     variance = float((((codes - mean[:, None]) ** 2) * p).sum(axis=1).mean())
     holds = Holds(0, np.arange(20), np.arange(20), np.full((20, 3), variance))
-    found = coarse_quantization(holds, [set(), set(), set()], np.ones(3), "")
-    assert found is not None
-    stated = float(found.text.split("by up to ")[1].split(";")[0])
-    assert stated == pytest.approx(worst, rel=0.15)
+    found = coarse_quantization(holds, [set(), set(), set()], np.ones(3))
+    assert isinstance(found, CoarseQuantization)
+    assert found.axes[0].mean_error == pytest.approx(worst, rel=0.15)
 
 
 def test_decimals_that_jitter_about_the_steps_hide_no_coarse_steps() -> None:
     time_ns, u = stream(18, step=10 * 2.3945e-4)
     (found,) = judged(time_ns, np.round(u, 5))
     assert found.name == "coarse_quantization"
-    assert "steps of 0.0024" in found.text.replace("0.00239", "0.0024")
+    assert isinstance(found, CoarseQuantization)
+    assert found.axes[0].step == pytest.approx(10 * 2.3945e-4, rel=0.01)
 
 
 @pytest.mark.parametrize("count", [0, 1, 11, 30])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import CATALOGUE, TIME, Effect
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import solve
 from triaxcal.search import LeftOut, Search

@@ -14,7 +14,7 @@ from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.part import Part
 from triaxcal.effects.warm_up import WarmUp
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.search.candidates import Ground
 from triaxcal.search.shape import refined

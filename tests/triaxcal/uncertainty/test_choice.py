@@ -9,11 +9,12 @@ import pytest
 
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.effects import effect_named
-from triaxcal.fit import fit
 from triaxcal.loop import diagnose
+from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import budget
+from triaxcal.uncertainty.basis import CompetingModels
 
 NOISE = 2e-5
 SIGNS = (-1, -1, -1)
@@ -37,7 +38,7 @@ def test_models_that_explain_the_poses_as_well_are_a_line_of_their_own(
     assert not any(line.source == "choice_of_effect" for line in budget(c).components)
     b = budget(replace(c, rivals={"this": without, "that": without}))
     (line,) = [line for line in b.components if line.source == "choice_of_effect"]
-    assert line.how == "this or that would do as well on these poses"
+    assert line.basis == CompetingModels(("this", "that"))
     # Two of three are off by as much; coefficients of effects count as they are.
     off = np.append(without.values - c.values[:9], np.zeros(3))
     assert line.parameters == pytest.approx(np.abs(off) * np.sqrt(2 / 3))

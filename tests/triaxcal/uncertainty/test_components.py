@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from triaxcal.effects import effect_named
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated, budget

@@ -10,9 +10,9 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME
-from triaxcal.plan.design import LINEAR, Asked, channels_needed, profile_times
-from triaxcal.plan.directions import FULL, Direction, cube_directions, dilution, directions, linear_design
-from triaxcal.plan.optimal import profile
+from triaxcal.planning.design import LINEAR, Asked, channels_needed, profile_times
+from triaxcal.planning.directions import FULL, Direction, cube_directions, dilution, directions, linear_design
+from triaxcal.planning.optimal import profile
 
 ENOUGH = 1.25
 """A set is good whose worst parameter is no more uncertain than this many poses' standard errors (the 14 have 1.06

@@ -13,9 +13,9 @@ from scipy import stats
 from triaxcal.effects import CATALOGUE, Coefficient, Effect, effect_named
 from triaxcal.effects.contract import per_axis, per_axis_slope
 from triaxcal.errors import Refused
-from triaxcal.plan.design import ask
-from triaxcal.plan.directions import cube_directions, dilution, directions, distinct
-from triaxcal.plan.optimal import OptimalPlan, bound, optimal
+from triaxcal.planning.design import ask
+from triaxcal.planning.directions import cube_directions, dilution, directions, distinct
+from triaxcal.planning.optimal import OptimalPlan, bound, optimal
 from triaxcal.problem import solve
 from triaxcal.sensor import Sensor
 from triaxcal.start import problem_of, start

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.aside import of_another_history, spoiled_among, with_aside, with_faulty, with_rivals
-from triaxcal.beyond import Beyond, in_words
-from triaxcal.calibration import Calibration, PoseResult, Residual
+from triaxcal.beyond import Beyond
+from triaxcal.calibration import Calibration, Exclusion, PoseResult, Residual
+from triaxcal.caution import (
+    BirgeRatio,
+    Caution,
+    ExcessVariance,
+    FewPoses,
+    HighLeverage,
+    PoorSpread,
+    ResidualsTooSmall,
+)
 from triaxcal.conditions import of_unknown_history
 from triaxcal.cross_validation import cross_validated
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
-from triaxcal.errors import InvalidData, Refused
+from triaxcal.errors import InvalidData, NotStill, Refused
 from triaxcal.outliers import Spoiled
-from triaxcal.plan.directions import dilution, linear_design, most_wanted
+from triaxcal.planning.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import (
-    NOT_STILL,
     Linearised,
     Problem,
     State,
@@ -38,6 +46,9 @@ from triaxcal.trends import left_of, trends_p, with_trends
 DILUTION_WARNING = 10.0
 SPREAD_WARNING = 15.0
 """Dilution times the root of the number of poses: about 5 where they are all over the sphere, 25 over half of it."""
+LEFT_LEAST = 3
+"""Degrees of freedom below which a residual proves little: its standard deviation is known to about 40 % by three."""
+LEVERAGE_WARNING = 0.95
 SIGNIFICANT = 0.05
 CONTRADICTED = 0.01
 """p of the trends inside the poses below which the coefficients are left to the means."""
@@ -50,12 +61,14 @@ def fit(
     reference: float = 1.0,
     effects: Sequence[Effect] = (),
     aside: Sequence[int] | None = None,
+    why: Exclusion = Exclusion.CALLER,
 ) -> Calibration:
     """Fit the linear model, and the effects given, to still poses.
 
-    ``signs`` (3,) of the scale factors, which |a| does not show. ``aside`` are indices of poses to leave out; where it
-    is None, poses that something spoiled are found and left out (`triaxcal.outliers`), and where an effect goes with
-    the pose before, a first pose in which the unit had not rested before. Poses with a fault are left out in any case.
+    ``signs`` (3,) of the scale factors, which |a| does not show. ``aside`` are indices of poses to leave out, and
+    ``why``; where it is None, poses that something spoiled are found and left out (`triaxcal.outliers`), and where an
+    effect goes with the pose before, a first pose in which the unit had not rested before. Poses with a fault are left
+    out in any case.
     Raises Refused where the poses cannot carry the parameters, InvalidData where a channel that an effect needs is not
     there.
     """
@@ -63,7 +76,7 @@ def fit(
     if len(sound) < len(poses):
         among = None if aside is None else [k for k, i in enumerate(sound) if i in aside]
         kept = [poses[i] for i in sound]
-        return with_faulty(fit(kept, signs=signs, reference=reference, effects=effects, aside=among), poses)
+        return with_faulty(fit(kept, signs=signs, reference=reference, effects=effects, aside=among, why=why), poses)
     whole, begin = begun(poses, signs=signs, reference=reference)
     missing = {n for e in effects for n in e.needs if n not in whole.channel_reference}
     if missing:
@@ -87,7 +100,7 @@ def fit(
     judged = whole.only(np.setdiff1d(np.arange(len(poses)), unknown)) if verdict.doubtful else None
     calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, judged)
     if found:
-        calibration = with_aside(calibration, poses, found, verdict)
+        calibration = with_aside(calibration, poses, found, verdict, Exclusion.OUTLIER if aside is None else why)
     return with_rivals(calibration, poses, verdict)
 
 
@@ -150,7 +163,7 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
     with np.errstate(over="ignore", invalid="ignore"):
         every_r, J, every_s = everything(problem, state)
     if not (np.isfinite(J).all() and np.isfinite(every_r).all()):
-        raise Refused(f"the fit ran away; {NOT_STILL}")
+        raise NotStill("the fit ran away")
     n, p = len(poses), J.shape[1]
     found = _Left.of((every_r, J, every_s), problem, state, judged, pure_error_dof(poses))
     noise, inflation = every_s[:n], found.beyond.inflation
@@ -174,7 +187,7 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
     spread = dilution(direction, design)
     if not spread < DILUTION_LIMIT:
         # No scale factor and a bias of one reference fit anything: |a| is right everywhere and means nothing.
-        raise Refused(f"the fit ran away, to a dilution of {spread:.3g}; {NOT_STILL}")
+        raise NotStill(f"the fit ran away, to a dilution of {spread:.3g}")
     norms = np.linalg.norm(weighted, axis=0)
     shapes = by_shape(problem, state)
     covariance = _covariance(problem, state, np.concatenate([J, shapes], axis=1) / every_s[:, None]) * inflation**2
@@ -212,7 +225,7 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
         shape_errors=shape_errors(problem, state, shapes, np.sqrt(np.diag(covariance)[p:]), inflation),
         trends=problem.further is not None,
     )
-    return replace(calibration, warnings=tuple(_warnings(calibration)))
+    return replace(calibration, cautions=tuple(_cautions(calibration)))
 
 
 def _covariance(problem: Problem, state: State, weighted: Floats) -> Floats:
@@ -227,32 +240,17 @@ def _covariance(problem: Problem, state: State, weighted: Floats) -> Floats:
     return np.asarray(G @ theta @ G.T)
 
 
-def _warnings(c: Calibration) -> list[str]:
-    out = []
+def _cautions(c: Calibration) -> Iterator[Caution]:
     if c.dilution > DILUTION_WARNING or c.dilution * np.sqrt(len(c.poses)) > SPREAD_WARNING:
         up, enough = np.array([p.direction for p in c.poses]), min(2.0, c.dilution / 4)
-        labels = ", ".join(label for label, _ in most_wanted(up, enough))
-        out.append(
-            f"the poses are poorly spread: some combination of parameters is {c.dilution:.3g} times as uncertain as "
-            f"one pose; add {labels}"
-        )
-    left = len(c.poses) - len(c.parameters)
-    if left < 3:
-        out.append(f"{len(c.poses)} poses for {len(c.parameters)} parameters: the residual proves little")
+        yield PoorSpread(c.dilution, tuple(label for label, _ in most_wanted(up, enough)))
+    if len(c.poses) - len(c.parameters) < LEFT_LEAST:
+        yield FewPoses(len(c.poses), len(c.parameters))
     worst = max(c.poses, key=lambda p: p.leverage)
-    if worst.leverage > 0.95:
-        out.append(f"the pose at {worst.pose.at} alone carries a parameter (leverage {worst.leverage:.2f})")
-    if c.residual.lack_of_fit_p is not None and c.residual.lack_of_fit_p < SIGNIFICANT:
-        out.append(_how_raised(c))
-    if c.residual.lack_of_fit_p is not None and c.residual.lack_of_fit_p > 1 - SIGNIFICANT / 5:
-        out.append(
-            "residuals are smaller than the poses' noise and creep explain: what moves the outputs inside a pose (a "
-            "temperature, a stand that settles) moves the means less, and the standard errors are on the safe side"
-        )
-    return out
-
-
-def _how_raised(c: Calibration) -> str:
-    if c.excess_g:
-        return f"residuals show {in_words(c)}; the standard errors allow for it"
-    return f"residuals are {c.inflation:.1f} times what the noise explains; the standard errors are raised by that"
+    if worst.leverage > LEVERAGE_WARNING:
+        yield HighLeverage(worst.pose.began, worst.leverage)
+    p = c.residual.lack_of_fit_p
+    if p is not None and p < SIGNIFICANT:
+        yield ExcessVariance(c.excess_g / c.reference) if c.excess_g else BirgeRatio(c.inflation)
+    if p is not None and p > 1 - SIGNIFICANT / 5:
+        yield ResidualsTooSmall()

@@ -10,7 +10,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.errors import InvalidData
-from triaxcal.plan.order import in_order
+from triaxcal.planning.order import in_order
 
 PAPER, FULL = 14, 26
 LEAST = 9
@@ -38,7 +38,7 @@ def directions(count: int = FULL) -> list[Direction]:
 
     14 is the paper's (faces and vertices of a cube), 26 adds its edges; any other number of nine or more is spread
     evenly over the sphere on a spiral (golden angle), labelled by number. The order keeps drift apart from the
-    rest (`triaxcal.plan.order`). Raises InvalidData where there are fewer than nine.
+    rest (`triaxcal.planning.order`). Raises InvalidData where there are fewer than nine.
     """
     return list(_directions(count))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal.errors import InvalidData
-from triaxcal.plan.directions import (
+from triaxcal.planning.directions import (
     closed,
     cube_directions,
     dilution,

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from triaxcal.calibration import Exclusion
+from triaxcal.caution import ExcessVariance, FaultyPosesExcluded
 from triaxcal.effects import CATALOGUE, TIME, effect_named
 from triaxcal.effects.contract import SCATTER, rate_of
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.fit import fit
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Problem, State, linearise, solve
 from triaxcal.sensor import Sensor
@@ -202,7 +204,7 @@ def test_residuals_far_beyond_the_noise_raise_the_standard_errors_however_small_
     c = fit([replace(p, covariance=p.covariance * 1e-6) for p in poses], signs=MINUS)
     assert c.residual.lack_of_fit_p == pytest.approx(0, abs=1e-300)
     assert c.excess_g == pytest.approx(1e-3, rel=0.6)
-    assert any("beside the noise of each pose" in w for w in c.warnings)
+    assert ExcessVariance(c.excess_g) in c.cautions
 
 
 def test_the_noise_floor_is_the_rms_of_standard_errors_along_the_vector(
@@ -271,7 +273,8 @@ def test_a_pose_whose_outputs_were_stuck_is_left_out_whatever_its_noise_says(
     assert np.array_equal(with_it.covariance, without.covariance)
     assert [i for i, p in enumerate(with_it.poses) if not p.used] == [7]
     assert with_it.poses[7].pose is frozen
-    assert f"the pose at {frozen.at} (stuck_output)" in with_it.warnings[0]
+    assert with_it.cautions[0] == FaultyPosesExcluded(((frozen.began, "stuck_output"),))
+    assert with_it.poses[7].excluded is Exclusion.FAULT
 
 
 def test_a_faulty_pose_and_a_spoiled_one_are_both_left_out(paper_unit: Sensor, twenty_six: np.ndarray) -> None:

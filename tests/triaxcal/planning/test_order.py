@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from triaxcal.plan.directions import closed, cube_directions, directions
-from triaxcal.plan.order import in_order
+from triaxcal.planning.directions import closed, cube_directions, directions
+from triaxcal.planning.order import in_order
 
 
 def taken(plan: list[tuple[str, np.ndarray]]) -> np.ndarray:

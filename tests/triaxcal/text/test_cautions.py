@@ -1,0 +1,143 @@
+"""The sentences of cautions: one for each kind, and all figures in it."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+
+import pytest
+
+import triaxcal
+from triaxcal.attitude import AttitudeExcluded, AttitudesTied, MagnitudeContradicts, Row
+from triaxcal.caution import (
+    BirgeRatio,
+    Caution,
+    ExcessVariance,
+    FaultyPosesExcluded,
+    FewPoses,
+    HighLeverage,
+    Outlier,
+    OutlierSetsTied,
+    OutliersExcluded,
+    PoorSpread,
+    PosesExcludedByCaller,
+    UnknownHistoryExcluded,
+)
+from triaxcal.frame.orientations import NotFlush
+from triaxcal.frame.standing import SingleOrientation
+from triaxcal.passport import DatasheetContradicted, StillOfDatasheet
+from triaxcal.poses.pose import Began
+from triaxcal.text import caution
+from triaxcal.turning.rotation import StretchesDiffer
+
+FIRST, SECOND = Began(10.0), Began(70.04, recording=1)
+SENTENCES: list[tuple[Caution, str]] = [
+    (FewPoses(9, 9), "9 poses for 9 parameters: the residual proves little"),
+    (
+        FaultyPosesExcluded(((FIRST, "saturation"), (SECOND, "stuck_output"))),
+        "excluded, because the outputs did not follow the acceleration: the pose at 10.0 s (saturation), the pose at "
+        "70.0 s of recording 2 (stuck_output)",
+    ),
+    (
+        UnknownHistoryExcluded((Outlier(FIRST, -12.3),)),
+        "excluded, because the pose before is not known: the pose at 10.0 s (-12 standard errors)",
+    ),
+    (
+        PosesExcludedByCaller((Outlier(FIRST, 2.0),)),
+        "excluded, as asked for: the pose at 10.0 s (+2 standard errors)",
+    ),
+    (
+        OutliersExcluded((Outlier(SECOND, 50.2),), doubtful=False, excess=0.0),
+        "excluded as outliers: the pose at 70.0 s of recording 2 (+50 standard errors)",
+    ),
+    (
+        OutliersExcluded((Outlier(FIRST, 8.0),), doubtful=True, excess=1.5e-5),
+        "excluded as outliers: the pose at 10.0 s (+8 standard errors); by the noise inside the poses they are, by the "
+        "other residuals all poses may repeat less well than their noise, and the standard errors allow for both "
+        "(15.0 µg beside the noise of each pose)",
+    ),
+    (
+        OutlierSetsTied(((FIRST, SECOND), (Began(20.0),))),
+        "some poses may be outliers (10.0 s and 70.0 s of recording 2 or 20.0 s: the residuals do not tell these sets "
+        "apart), or something else acts; none is excluded",
+    ),
+    (
+        PoorSpread(23.456, ("-Z", "+X+Y")),
+        "the poses are poorly spread: some combination of parameters is 23.5 times as uncertain as one pose; add "
+        "-Z, +X+Y",
+    ),
+    (HighLeverage(FIRST, 0.987), "the pose at 10.0 s alone determines a parameter (leverage 0.99)"),
+    (
+        ExcessVariance(2.5e-4),
+        "residuals show 250.0 µg beside the noise of each pose; the standard errors allow for it",
+    ),
+    (
+        BirgeRatio(1.84),
+        "residuals are 1.8 times what the noise explains; the standard errors are raised by that",
+    ),
+    (
+        BirgeRatio(1.84, attitudes=True),
+        "residuals are 1.8 times what noise and the error of the attitudes explain; the standard errors are raised by "
+        "that",
+    ),
+    (
+        AttitudeExcluded(Row("line 4", FIRST), 0.0349, (0.0, -1.0, 0.01)),
+        "excluded as wrong: line 4 (the pose at 10.0 s), whose attitude is 2 degrees off; the readings show up at "
+        "(+0.000, -1.000, +0.010)",
+    ),
+    (
+        AttitudesTied((Row("line 4", FIRST), Row("line 5", SECOND))),
+        "one attitude is wrong, and the data do not tell which; none is excluded: line 4 (the pose at 10.0 s) or "
+        "line 5 (the pose at 70.0 s of recording 2)",
+    ),
+    (
+        MagnitudeContradicts(4.44, Row("line 4", FIRST)),
+        "attitudes disagree with |a|: under this fit the magnitude is off by 4.4 times its noise, most in line 4 (the "
+        "pose at 10.0 s)",
+    ),
+    (
+        DatasheetContradicted(1.2e-9, "bias.y", 20.04, 3.21),
+        "passport and poses contradict each other (p 1.2e-09), most in bias.y, which moved by +20.0 standard errors: "
+        "the unit has changed, the passport's standard errors are too small, or a pose was not still; the standard "
+        "errors are raised by 3.2",
+    ),
+    (
+        StillOfDatasheet(("bias.x", "bias.y")),
+        "these poses say next to nothing of bias.x, bias.y: the values are still the passport's",
+    ),
+    (
+        StretchesDiffer(2.04, 3.96),
+        "stretches of the recording differ 2.0 times as much as white noise explains (coloured or filtered noise, "
+        "drift, acceleration besides gravity, or an effect that the model lacks); the standard errors are raised by "
+        "up to 4.0, which does not cover a drift as long as the recording",
+    ),
+    (
+        NotFlush("+Z", FIRST, 0.0123),
+        "the poses with +Z up (the first at 10.0 s) differ by 0.012 rad, far more than on the other faces: did the "
+        "fixture stand flush?",
+    ),
+    (
+        SingleOrientation(("+Z",), 1.5e-3, given=False),
+        "with +Z up the fixture stood one way only: the tilt of the table enters there, with a size of 0.0015 rad as "
+        "on the other faces and an unknown direction",
+    ),
+]
+
+
+@pytest.mark.parametrize(("value", "sentence"), SENTENCES, ids=lambda v: type(v).__name__)
+def test_a_caution_is_said_with_its_figures(value: Caution, sentence: str) -> None:
+    assert caution(value) == sentence
+
+
+def test_every_kind_of_caution_has_a_sentence() -> None:
+    for module in pkgutil.walk_packages(triaxcal.__path__, "triaxcal."):
+        importlib.import_module(module.name)
+    kinds = _below(Caution)
+    assert len(kinds) > 30
+    assert [kind for kind in kinds if caution.dispatch(kind) is caution.dispatch(Caution)] == []
+    with pytest.raises(TypeError, match="no sentence for Caution"):
+        caution(Caution())
+
+
+def _below(kind: type[Caution]) -> list[type[Caution]]:
+    return [below for one in kind.__subclasses__() for below in (one, *_below(one))]

@@ -1,0 +1,12 @@
+"""English for the values that the metrology returns: cautions, findings of data quality, lines of the budget.
+
+The one room that makes sentences; no other reads them back. An effect brings its own remedy, and an exception its own
+line.
+"""
+
+from triaxcal.text.budget import basis, not_evaluated, remedy
+from triaxcal.text.cautions import caution
+from triaxcal.text.holds import holds
+from triaxcal.text.quality import quality, quality_line
+
+__all__ = ["basis", "caution", "holds", "not_evaluated", "quality", "quality_line", "remedy"]

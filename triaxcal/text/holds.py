@@ -1,0 +1,42 @@
+"""Under which conditions a calibration's nine parameters are all of a reading."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from triaxcal.effects import TEMPERATURE
+from triaxcal.effects.contract import (
+    DERIVED,
+    HELD,
+    RUN,
+    SINCE_START,
+    TIME,
+    Effect,
+    channel_of,
+    is_derived,
+    rate_of,
+)
+from triaxcal.figures import plain
+
+
+def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several: bool = False) -> tuple[str, ...]:
+    """The conditions under which a reading has nothing of these effects, so that scale factor, misalignment and bias
+    are all of it. ``reference`` is whence the conditions count; ``several``: recordings, each with its own clock."""
+    out: list[str] = []
+    for effect in effects:
+        of_conditions = (_at(n, reference.get(n, 0.0), several) for n in effect.needs if n != RUN)
+        out += [effect.absent] if effect.absent else of_conditions
+    return tuple(dict.fromkeys(out))
+
+
+def _at(name: str, value: float, several: bool) -> str:
+    if name == SINCE_START:
+        return "long after the start"
+    if name == TIME and several:
+        return "at the middle of each recording's poses"
+    if name in DERIVED:
+        unit = {TIME: " s", HELD: " s"}.get(name, "")
+        return f"at {name} = {plain(value, 6)}{unit}"
+    if is_derived(name):
+        return f"while {channel_of(name.removesuffix(rate_of('')))} does not change"
+    return f"at {channel_of(name)} = {plain(value, 6)}{' °C' if name == TEMPERATURE else ''}"
