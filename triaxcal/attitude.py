@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.calibration import Calibration, Exclusion, PoseResult, Residual
+from triaxcal.calibration import Calibration, Exclusion, HoldsAt, PoseResult, Residual
 from triaxcal.caution import BirgeRatio, Caution, FewPoses
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
@@ -255,6 +255,7 @@ def _concluded(
         dilution=_dilution(s.data.ups),
         inflation=raised,
         dof=float(s.left if raised > 1 or s.estimated else max(s.data.dof, 1.0)),
+        holds_at=HoldsAt.of(poses),
     )
     found = AttitudeFit(
         calibration,

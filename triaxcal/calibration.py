@@ -11,8 +11,9 @@ from scipy import linalg
 
 from triaxcal.arrays import Floats
 from triaxcal.caution import Caution
-from triaxcal.conditions import channels_of, conditions, of_readings, with_scale
+from triaxcal.conditions import channels_of, conditions, of_moment, of_readings, with_scale
 from triaxcal.distributions import t_ppf
+from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.effects.part import Part, mix_of
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose
@@ -33,6 +34,50 @@ class Residual:
     cross_validated_rms_g: float | None
     noise_floor_g: float
     lack_of_fit_p: float | None
+
+
+class Moment(StrEnum):
+    """Which moment of its recording a calibration holds for."""
+
+    END = "end"
+    MEAN = "mean"
+    SECONDS = "seconds"
+
+
+@dataclass(frozen=True)
+class HoldsAt:
+    """The moment for which effects of time are evaluated in another recording, whose clock is its own.
+
+    ``t_s`` in seconds from the first sample of the recording that was fitted, of the last one where these are several;
+    ``time_s`` the same as the condition `TIME` counts it, which of several recordings is from the middle of each.
+    """
+
+    moment: Moment
+    t_s: float
+    time_s: float
+
+    @classmethod
+    def of(cls, poses: Sequence[Pose], at: Moment | float = Moment.END) -> HoldsAt | None:
+        """None where there are no poses. A number is a moment in seconds. Raises InvalidData for one before the
+        start."""
+        if not poses:
+            return None
+        last = max(p.run.index for p in poses)
+        own = [p for p in poses if p.run.index == last]
+        if not isinstance(at, Moment):
+            if not 0 <= at < np.inf:
+                raise InvalidData(f"a calibration holds at a moment of its recording, not at {at:g} s")
+            moment, t_s = Moment.SECONDS, float(at)
+        elif at is Moment.END:
+            moment, t_s = at, max(p.end_s for p in own)
+        else:
+            moment, t_s = Moment.MEAN, float(np.mean([p.t_s for p in own]))
+        return cls(moment, t_s, t_s - own[0].run.middle_s)
+
+    @property
+    def clocks(self) -> tuple[float, float]:
+        """As `triaxcal.conditions.of_moment` has it."""
+        return self.t_s, self.time_s
 
 
 class Exclusion(StrEnum):
@@ -86,6 +131,8 @@ class Calibration:
     "effect.name"; ``shared`` are coefficients, named so, that only a combination of them is known of. ``trends``: how
     |a| goes inside the poses was fitted along with their means. ``rivals`` are models that explain the same poses as
     well, by what they have in the place of an effect; standard errors are those of this model, were it the right one.
+    ``holds_at`` None: effects of time count as long after the start, as in documents of 0.1. ``linear_only`` is the
+    linear model fitted by itself, where there are effects and somebody asked for it.
     """
 
     sensor: Sensor
@@ -105,6 +152,13 @@ class Calibration:
     blind_to: tuple[str, ...] = ()
     cautions: tuple[Caution, ...] = ()
     rivals: Mapping[str, Calibration] = field(default_factory=dict, repr=False)
+    holds_at: HoldsAt | None = None
+    linear_only: Calibration | None = field(default=None, repr=False)
+
+    @property
+    def moment(self) -> tuple[float, float] | None:
+        """`holds_at` as `triaxcal.conditions.of_moment` has it."""
+        return None if self.holds_at is None else self.holds_at.clocks
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -172,13 +226,18 @@ class Calibration:
         half = self.coverage_factor(level) * self.standard_errors
         return self.values - half, self.values + half
 
-    def specific_force(self, readings: Floats, channels: Mapping[str, Floats]) -> Floats:
-        """a (n,3) for readings (n,3) in output units and the channels (n,) that the effects need.
-
-        Raises KeyError for a channel that is not there; time stands under ``t_s``.
-        """
-        held = of_readings(channels, self.channel_reference, len(readings))
-        return self.sensor.specific_force(readings, held)
+    def conditions_of_readings(
+        self, n: int, channels: Mapping[str, Floats], t_s: Floats | None = None
+    ) -> tuple[dict[str, Floats], tuple[str, ...]]:
+        """Of n single readings with the ``channels`` (n,) that are known of them: and the conditions that are needed
+        and not known, which count as at their reference. Effects of time at the times ``t_s`` (n,) of the recording
+        that was fitted, at `holds_at` where that is None."""
+        if t_s is None:
+            clocks: Mapping[str, Floats | float] = of_moment(self.channel_reference, self.moment)
+        else:
+            offset = self.holds_at.t_s - self.holds_at.time_s if self.holds_at else 0.0
+            clocks = {SINCE_START: t_s, TIME: t_s - offset}
+        return of_readings(channels, self.channel_reference, n, clocks)
 
     def conditions_of(self, poses: Sequence[Pose]) -> dict[str, Floats]:
         """Of poses of the recording that it was fitted to."""

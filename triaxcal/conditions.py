@@ -90,10 +90,14 @@ def _decimals(span: float) -> int:
 
 
 def conditions_elsewhere(
-    poses: Sequence[Pose], reference: Mapping[str, float], scale_factor: Floats, bias: Floats
+    poses: Sequence[Pose],
+    reference: Mapping[str, float],
+    scale_factor: Floats,
+    bias: Floats,
+    moment: tuple[float, float] | None = None,
 ) -> dict[str, Floats]:
     """`conditions` of poses of another recording than that which ``reference`` is of, whose clock is its own: effects
-    of time count as at their reference. Raises InvalidData where a channel is missing.
+    of time count as at one ``moment`` (`of_moment`). Raises InvalidData where a channel is missing.
     """
     channels = with_scale(channels_of(poses), poses, scale_factor, bias)
     channels[RUN] = np.full(len(poses), np.inf)
@@ -101,9 +105,15 @@ def conditions_elsewhere(
     if missing:
         named = ", ".join(map(channel_of, missing))
         raise InvalidData(f"the poses have no channel {named}, which the calibration needs")
-    channels[TIME] = np.full(len(poses), reference.get(TIME, 0.0))
-    channels[SINCE_START] = np.full(len(poses), np.inf)
+    channels |= {name: np.full(len(poses), value) for name, value in of_moment(reference, moment).items()}
     return conditions(channels, reference)
+
+
+def of_moment(reference: Mapping[str, float], moment: tuple[float, float] | None) -> dict[str, float]:
+    """The clocks at a moment, given as seconds from the first sample and as `TIME` counts them; long after the start,
+    and at the reference of `TIME`, where that is None."""
+    since_start_s, time_s = moment or (np.inf, reference.get(TIME, 0.0))
+    return {SINCE_START: since_start_s, TIME: time_s}
 
 
 def at_reference(names: Iterable[str], n: int) -> dict[str, Floats]:
@@ -111,11 +121,19 @@ def at_reference(names: Iterable[str], n: int) -> dict[str, Floats]:
     return {name: np.full(n, np.inf if name in (SINCE_START, RUN) else 0.0) for name in names}
 
 
-def of_readings(channels: Mapping[str, Floats], reference: Mapping[str, float], n: int) -> dict[str, Floats]:
-    """`conditions` of n single readings, for whoever applies a calibration: what was not given and nobody logs (rates,
-    scatter, the pose before) counts as at its reference. Raises KeyError for a channel that is not there.
+def of_readings(
+    channels: Mapping[str, Floats], reference: Mapping[str, float], n: int, clocks: Mapping[str, Floats | float]
+) -> tuple[dict[str, Floats], tuple[str, ...]]:
+    """`conditions` of n single readings, for whoever applies a calibration; and those that are needed and were not
+    given: a channel, its rate, scatter, the pose before. These count as at their reference.
+
+    A derived condition may be among the ``channels``, unless the reference knows a logged channel of that name.
     """
-    given = at_reference({name for name in reference if is_derived(name)} - {TIME}, n)
-    # A derived condition may be given too, unless the reference knows a logged channel of that name.
-    given |= {name if condition_of(name) not in reference else condition_of(name): v for name, v in channels.items()}
-    return {name: np.asarray(given[name]) - value for name, value in reference.items()}
+    given = {condition_of(name) if condition_of(name) in reference else name: v for name, v in channels.items()}
+    known: dict[str, Floats | float] = {**clocks, **given}
+    default = at_reference(reference, n)
+    held = {
+        name: np.broadcast_to(np.asarray(known[name], dtype=float), (n,)) - value if name in known else default[name]
+        for name, value in reference.items()
+    }
+    return held, tuple(name for name in reference if name not in known and name != HELD)

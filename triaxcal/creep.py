@@ -62,7 +62,7 @@ def _outward(poses: Sequence[Pose], model: Calibration, held: Mapping[str, Float
 def _held(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> dict[str, Floats]:
     sensor = model.sensor
     if elsewhere:
-        return conditions_elsewhere(poses, model.channel_reference, sensor.scale_factor, sensor.bias)
+        return conditions_elsewhere(poses, model.channel_reference, sensor.scale_factor, sensor.bias, model.moment)
     return dict(model.conditions_of(poses))
 
 

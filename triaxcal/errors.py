@@ -29,3 +29,7 @@ class NotStill(Refused):
 
     def __init__(self, how: str) -> None:
         super().__init__(f"{how}; the poses do not look like those of one still triad")
+
+
+class MissingChannel(UserWarning):
+    """A channel that an effect needs was not given, and counts as at its reference."""

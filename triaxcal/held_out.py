@@ -79,22 +79,29 @@ def better_of(held: HeldOut | None) -> list[str]:
 
 
 def magnitude_errors(
-    sensor: Sensor, poses: Sequence[Pose], *, channel_reference: Mapping[str, float], reference: float
+    sensor: Sensor,
+    poses: Sequence[Pose],
+    *,
+    channel_reference: Mapping[str, float],
+    reference: float,
+    moment: tuple[float, float] | None = None,
 ) -> tuple[Floats, Floats]:
     """|a| − reference (n,) of poses under a sensor's model, and its standard error (n,) from their noise.
 
-    The poses are of another recording than the model's, whose clock is its own: effects of time count as at their
-    reference. Raises InvalidData where a channel that the effects need is missing.
+    The poses are of another recording than the model's, whose clock is its own: effects of time count as at one
+    ``moment`` (`triaxcal.conditions.of_moment`). Raises InvalidData where a channel that the effects need is missing.
     """
     u = np.array([p.mean for p in poses])
-    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias)
+    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
     length, by_u = sensor.magnitude(u, held)
     covariance = np.array([p.covariance for p in poses])
     return length - reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))
 
 
 def _errors(c: Calibration, poses: Sequence[Pose]) -> tuple[Floats, Floats]:
-    return magnitude_errors(c.sensor, poses, channel_reference=c.channel_reference, reference=c.reference)
+    return magnitude_errors(
+        c.sensor, poses, channel_reference=c.channel_reference, reference=c.reference, moment=c.moment
+    )
 
 
 def _deviance(miss: Floats, error: Floats) -> float:

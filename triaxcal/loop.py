@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from triaxcal.aside import with_faulty
-from triaxcal.calibration import Calibration, Exclusion, PoseResult
+from triaxcal.calibration import Calibration, Exclusion, HoldsAt, Moment, PoseResult
 from triaxcal.conditions import channels_of
 from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.description import described
@@ -21,6 +21,7 @@ from triaxcal.effects.part import Part
 from triaxcal.effects.plugins import EffectFault, plugins
 from triaxcal.errors import Refused
 from triaxcal.explanation import Explanation, explained, left_out
+from triaxcal.extrapolation import extrapolated
 from triaxcal.figures import the_poses
 from triaxcal.findings import Finding, advice_of, description_of, finding_of, why_not_shown
 from triaxcal.held_out import HeldOut, better_of, held_out
@@ -66,18 +67,32 @@ def diagnose(
     check: Sequence[Pose] | None = None,
     catalogue: Sequence[Effect] | None = None,
     empirical: bool = False,
+    at: Moment | float = Moment.END,
 ) -> Loop:
     """Find and add the effects that still poses show beyond the linear model.
 
     ``catalogue`` are the effects to look for: all that are known for these poses' channels where it is None. ``check``
     are poses of another recording, for the held-out error. ``empirical``: what no effect explains is described by a
-    smooth term, where that helps poses that it was not fitted to. Raises as `triaxcal.pose_fit.fit` does.
+    smooth term, where that helps poses that it was not fitted to. ``at`` is the moment of the recording for which the
+    calibration holds elsewhere: a number in seconds from the first sample. Raises as `triaxcal.pose_fit.fit` does.
     """
+    return _diagnosed(poses, signs, reference, check, catalogue, empirical, HoldsAt.of(poses, at))
+
+
+def _diagnosed(
+    poses: Sequence[Pose],
+    signs: Sequence[float],
+    reference: float,
+    check: Sequence[Pose] | None,
+    catalogue: Sequence[Effect] | None,
+    empirical: bool,
+    moment: HoldsAt | None,
+) -> Loop:
     sound = [p for p in poses if not p.fault]
     if check is not None:
         check = [p for p in check if not p.fault]
     if len(sound) < len(poses):
-        loop = diagnose(sound, signs=signs, reference=reference, check=check, catalogue=catalogue, empirical=empirical)
+        loop = _diagnosed(sound, signs, reference, check, catalogue, empirical, moment)
         return replace(
             loop,
             before=with_faulty(loop.before, poses),
@@ -112,6 +127,11 @@ def diagnose(
     known = {n: c for n, c in instead.items() if c is not None}
     if smooth is None:
         after = replace(after, rivals=known | _spoiled_instead(made))
+    before, after = (replace(c, holds_at=moment) for c in (before, after))
+    if after.sensor.effects:
+        beyond = extrapolated(after)
+        after = replace(after, linear_only=before, cautions=(*after.cautions, *([beyond] if beyond else [])))
+    known = {name: replace(c, holds_at=moment) for name, c in known.items()}
     held = None if check is None else held_out(before, after, check, known)
     advice = advice_of(findings, unexplained, undescribed, blind, faulty)
     return Loop(

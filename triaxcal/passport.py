@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration, PoseResult, Residual
+from triaxcal.calibration import Calibration, HoldsAt, PoseResult, Residual
 from triaxcal.caution import Caution
 from triaxcal.conditions import conditions_elsewhere
 from triaxcal.errors import InvalidData, Refused
@@ -49,6 +49,12 @@ class Passport:
     channel_reference: Mapping[str, float]
     reference: float
     correlation: Floats | None = None
+    holds_at: HoldsAt | None = None
+
+    @property
+    def moment(self) -> tuple[float, float] | None:
+        """As `Calibration.moment`."""
+        return None if self.holds_at is None else self.holds_at.clocks
 
     def __post_init__(self) -> None:
         n = 9 + sum(len(e.coefficients) for e, _ in self.sensor.effects)
@@ -153,6 +159,7 @@ def refine(poses: Sequence[Pose], passport: Passport) -> Refinement:
         dilution=_dilution(problem, state),
         inflation=raised,
         dof=float(max(len(poses), 1) if raised > 1 else max(pure, 1.0)),
+        holds_at=passport.holds_at,
     )
     found = Refinement(calibration, passport, share, shift, conflict_p)
     return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found))))
@@ -161,7 +168,7 @@ def refine(poses: Sequence[Pose], passport: Passport) -> Refinement:
 def _problem(poses: Sequence[Pose], passport: Passport) -> Problem:
     """Scaled by what the passport expects, since few poses have no range of their own."""
     sensor = passport.sensor
-    held = conditions_elsewhere(poses, passport.channel_reference, sensor.scale_factor, sensor.bias)
+    held = conditions_elsewhere(poses, passport.channel_reference, sensor.scale_factor, sensor.bias, passport.moment)
     return Problem(
         u=np.array([p.mean for p in poses]),
         covariance=np.array([p.covariance for p in poses]),

@@ -10,7 +10,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.aside import of_another_history, spoiled_among, with_aside, with_faulty, with_rivals
 from triaxcal.beyond import Beyond
-from triaxcal.calibration import Calibration, Exclusion, PoseResult, Residual
+from triaxcal.calibration import Calibration, Exclusion, HoldsAt, PoseResult, Residual
 from triaxcal.caution import (
     BirgeRatio,
     Caution,
@@ -76,7 +76,8 @@ def fit(
     if len(sound) < len(poses):
         among = None if aside is None else [k for k, i in enumerate(sound) if i in aside]
         kept = [poses[i] for i in sound]
-        return with_faulty(fit(kept, signs=signs, reference=reference, effects=effects, aside=among, why=why), poses)
+        found_of = fit(kept, signs=signs, reference=reference, effects=effects, aside=among, why=why)
+        return replace(with_faulty(found_of, poses), holds_at=HoldsAt.of(poses))
     whole, begin = begun(poses, signs=signs, reference=reference)
     missing = {n for e in effects for n in e.needs if n not in whole.channel_reference}
     if missing:
@@ -101,7 +102,7 @@ def fit(
     calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, judged)
     if found:
         calibration = with_aside(calibration, poses, found, verdict, Exclusion.OUTLIER if aside is None else why)
-    return with_rivals(calibration, poses, verdict)
+    return replace(with_rivals(calibration, poses, verdict), holds_at=HoldsAt.of(poses))
 
 
 def _solved(

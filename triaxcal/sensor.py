@@ -68,6 +68,14 @@ class Sensor:
         """The same sensor with every effect in full; coefficients that its parts leave out are zero."""
         return replace(self, effects=tuple((whole(e), mix_of(e) @ q) for e, q in self.effects))
 
+    def moved(self, by: Floats) -> Sensor:
+        """With ``by`` (9+p,) added to scale factors, misalignments, biases and the effects' coefficients."""
+        at, effects = 9, []
+        for effect, q in self.effects:
+            effects.append((effect, q + by[at : at + len(q)]))
+            at += len(q)
+        return Sensor(self.scale_factor + by[:3], self.misalignment + by[3:6], self.bias + by[6:9], tuple(effects))
+
     def output(self, a: Floats, conditions: Mapping[str, Floats]) -> Floats:
         """u (n,3) for specific force (n,3); ``conditions`` are deviations from their references, each (n,)."""
         s = a @ self.axes.T

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from triaxcal.calibration import Calibration
+from triaxcal.calibration_document import Document, budget_document, holds_of
 from triaxcal.conditions import channels_of, with_scale
 from triaxcal.effects import Effect
 from triaxcal.effects.part import whole
@@ -24,11 +25,12 @@ from triaxcal.figures import micro_g
 from triaxcal.loop import Loop, diagnose
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
+from triaxcal.rounding import error, number
 from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
 from triaxcald.choices import is_passing
-from triaxcald.documents import Document, budget_document, error, holds_of, loop_document, number
+from triaxcald.documents import loop_document
 from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
@@ -65,7 +67,7 @@ def certify(
     """``computed_with``: `software` of the station, so that an audit years later can get the same bytes.
 
     Raises Refused where the poses cannot carry the answer, RegisterValueError where the registers cannot."""
-    loop = diagnose(poses, signs=signs, reference=station.reference)
+    loop = diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
     profile = bundle.profile
     measured_ns = pipeline.first_host_ns or 0
     held = _held_by_device(profile, loop.after, poses, signs, station.reference)

@@ -11,22 +11,16 @@ import numpy as np
 from triaxcal import text
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
+from triaxcal.calibration_document import Document
+from triaxcal.calibration_reading import calibration_part, holds_at_of, sensor_of
+from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.frame.faces import LABELS, TURNS, axis_of, opposite
 from triaxcal.frame.fixture import Fixture, Quantity
 from triaxcal.frame.frames import Frames, UnitFrame
 from triaxcal.frame.verticals import Verticals, verticals, verticals_under
+from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
 from triaxcal.sensor import Sensor
-from triaxcald.documents import (
-    UNCERTAINTY_DIGITS,
-    Document,
-    number,
-    numbers,
-    probability,
-    uncertainty,
-)
 from triaxcald.errors import InputError
-from triaxcald.held_errors import correlation_of, effect_errors_of, linear_errors_of
-from triaxcald.held_sensor import calibration_part, sensor_of
 from triaxcald.inputs import Measured
 
 ANGLE_DIGITS = 8
@@ -73,11 +67,17 @@ def source_under(
     """A unit with a calibration document. Raises InputError, InvalidData."""
     sensor, channel_reference, reference = sensor_of(document, where=where)
     covariance, warnings = covariance_of(document, sensor, where=where)
+    moment = holds_at_of(calibration_part(document, where=where), where=where)
     absurd = f"{where}: its numbers and the readings of {measured.name} give no finite direction of up"
     try:
         with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
             found = verticals_under(
-                sensor, measured.poses, covariance, channel_reference=channel_reference, reference=reference
+                sensor,
+                measured.poses,
+                covariance,
+                channel_reference=channel_reference,
+                reference=reference,
+                moment=moment.clocks if moment else None,
             )
     except np.linalg.LinAlgError:
         raise InputError(absurd) from None

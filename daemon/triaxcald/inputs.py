@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from triaxcal.calibration import Moment
 from triaxcal.errors import InvalidData
 from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose, poses_of
@@ -61,6 +62,7 @@ class Measured:
     reference: float | None = None
     unit: Mapping[str, str] | None = None
     stated: Stated | None = None
+    holds_at: Moment | float | None = None
 
 
 def measure(
@@ -131,10 +133,12 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str, moments:
     if STATION_FILE in recording.attachments:
         where = f"{recording.name}: {STATION_FILE}"
         station = parse_station(recording.attachments[STATION_FILE], where=where)
-    reference, stated = (station.reference, station.stated) if station else (None, None)
+    reference, stated, at = (station.reference, station.stated, station.moment) if station else (None, None, None)
     meant = recording.metadata.get("unit", {})
     unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
-    return Measured(recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference, unit, stated)
+    return Measured(
+        recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference, unit, stated, at
+    )
 
 
 def require_unit(document: Mapping[str, Any], measured: Measured, *, where: str) -> None:

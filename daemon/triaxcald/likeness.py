@@ -69,7 +69,7 @@ def shape_beside(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
     sensor = held.sensor
     if sensor.effects:
         try:
-            at = conditions_elsewhere(poses, held.channel_reference, sensor.scale_factor, sensor.bias)
+            at = conditions_elsewhere(poses, held.channel_reference, sensor.scale_factor, sensor.bias, held.moment)
             s = sensor.along_axes(np.array([p.mean for p in poses]), at)
         except Refused:
             return None

@@ -8,15 +8,9 @@ from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import BEFORE, CLOCKS
 from triaxcal.loop import Loop
 from triaxcal.uncertainty import SENSITIVITY_PER_K
-from triaxcal.uncertainty.basis import Basis, UnmodelledTemperature
 
 SHARE = "% of it goes with "
 """How the lead of what is unexplained tells a share."""
-
-
-def assumed_in(basis: Basis) -> tuple[str, ...]:
-    """The effects whose size a line of the budget (`triaxcal.uncertainty.Component`) assumes."""
-    return basis.effects if isinstance(basis, UnmodelledTemperature) else ()
 
 
 def assumption(effects: Collection[str], reference_unit: str = "g") -> str:

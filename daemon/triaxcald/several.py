@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from triaxcal.agreement import Agreement, Common, SharedShape
+from triaxcal.calibration_document import Document
 from triaxcal.loop import Loop
+from triaxcal.rounding import error, number, probability, uncertainty
 from triaxcal.runs import residuals_by_run
-from triaxcald.documents import Document, error, number, probability, uncertainty
-from triaxcald.units import in_units_of
+from triaxcal.units import in_units_of
 
 
 def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Document:

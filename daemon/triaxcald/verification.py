@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.calibration_document import Document
 from triaxcal.distributions import f_sf
 from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose
-from triaxcald.documents import Document, error, number, uncertainty
+from triaxcal.rounding import error, number, uncertainty
 from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.station.guidance import ups
 

@@ -11,22 +11,13 @@ from typing import Any
 import numpy as np
 
 from triaxcal.attitude import AttitudeFit
+from triaxcal.calibration_document import LINEAR, Document, by_parameter, calibration_document
+from triaxcal.calibration_reading import calibration_part, holds_at_of, sensor_of
+from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.passport import Passport, Refinement
+from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
 from triaxcal.turning.rotation import RotationFit
-from triaxcald.documents import (
-    LINEAR,
-    UNCERTAINTY_DIGITS,
-    Document,
-    by_parameter,
-    calibration_document,
-    number,
-    numbers,
-    probability,
-    uncertainty,
-)
 from triaxcald.errors import InputError
-from triaxcald.held_errors import correlation_of, effect_errors_of, linear_errors_of
-from triaxcald.held_sensor import calibration_part, sensor_of
 
 
 def turning_document(found: RotationFit, *, output_unit: str, reference_unit: str) -> Document:
@@ -108,4 +99,6 @@ def read_passport(
     units = part.get("units")
     held = {str(k): str(v) for k, v in units.items()} if isinstance(units, Mapping) else {}
     magnitude = own if reference is None else reference
-    return Passport(sensor, standard_error, channel_reference, magnitude, correlation), held
+    return Passport(
+        sensor, standard_error, channel_reference, magnitude, correlation, holds_at_of(part, where=where)
+    ), held

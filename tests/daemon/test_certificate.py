@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcal.calibration_reading import sensor_of
 from triaxcal.errors import Refused
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.profile import BUILT_IN, Bundle, parse_bundle
 from triaxcald.certificate import Certified, certify, roles
 from triaxcald.documents import to_text
-from triaxcald.held_sensor import sensor_of
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.reader import Recording

@@ -11,30 +11,22 @@ import numpy as np
 import pytest
 
 from triaxcal.calibration import Exclusion
+from triaxcal.calibration_document import calibration_document, poses_document
+from triaxcal.calibration_reading import calibration_part, sensor_of
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.part import Part
 from triaxcal.effects.warm_up import WarmUp
+from triaxcal.errors import InvalidData
 from triaxcal.loop import diagnose
 from triaxcal.planning.directions import directions
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
+from triaxcal.rounding import error, number, numbers, probability, uncertainty
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated
-from triaxcald.documents import (
-    calibration_document,
-    error,
-    loop_document,
-    number,
-    numbers,
-    poses_document,
-    probability,
-    to_text,
-    uncertainty,
-)
-from triaxcald.errors import InputError
-from triaxcald.held_sensor import calibration_part, sensor_of
+from triaxcald.documents import loop_document, to_text
 
 SECOND = effect_named("second_order_nonlinearity")
 TRUTH = Sensor(
@@ -239,7 +231,7 @@ def test_a_malformed_calibration_is_an_error_that_names_file_and_field(
 ) -> None:
     document = calibration_document(fit(poses, signs=SIGNS, effects=[SECOND]))
     change(document)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InvalidData) as caught:
         sensor_of(document, where="cal.json")
     assert str(caught.value).startswith("cal.json: ")
     assert words in str(caught.value)

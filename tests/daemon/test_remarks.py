@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from triaxcal.calibration_document import assumed_in
 from triaxcal.uncertainty.basis import ThermometerAt, UnmodelledTemperature
-from triaxcald.remarks import SHARE, assumed_in, assumption, none_could_show, overlap
+from triaxcald.remarks import SHARE, assumption, none_could_show, overlap
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,8 @@ def test_a_logged_channel_stands_beside_the_derived_condition_of_its_name(name: 
     assert reference[condition] == 5.5
     assert conditions_elsewhere(poses, reference, K, B)[condition].tolist() == [-1.5, 1.5, 0.0]
     given = {"temp_c": np.zeros(1), "supply_v": np.zeros(1), name: np.array([6.0])}
-    assert of_readings(given | ({} if name == TIME else {TIME: np.zeros(1)}), {condition: 5.5}, 1)[condition] == [0.5]
+    held, missing = of_readings(given, {condition: 5.5}, 1, CLOCKS)
+    assert (held[condition].tolist(), missing) == ([0.5], ())
     with pytest.raises(InvalidData, match=f"no channel {name},"):
         conditions_elsewhere(three, reference, K, B)
 
@@ -161,6 +162,9 @@ def test_a_reference_lies_within_the_range_of_its_channel_whatever_the_unit(midd
     assert values.min() < references({"channel": values})["channel"] < values.max()
 
 
+CLOCKS = {SINCE_START: np.inf, TIME: 0.0}
+
+
 def test_poses_of_another_recording_count_their_time_as_at_the_reference_and_long_after_the_start(
     three: list[Pose],
 ) -> None:
@@ -181,21 +185,29 @@ def test_poses_of_another_recording_without_the_channel_are_refused_by_its_name(
 
 def test_single_readings_need_no_condition_that_nobody_logs() -> None:
     reference = {"temp_c": 25.0, SINCE_START: 0.0, HELD: 0.0, "change_y": 0.0, "scatter_z": 0.0, "temp_c.rate": 0.0}
-    found = of_readings({"temp_c": np.array([26.0, 27.5])}, reference, 2)
+    found, missing = of_readings({"temp_c": np.array([26.0, 27.5])}, reference, 2, CLOCKS)
     assert found["temp_c"].tolist() == [1.0, 2.5]
     assert np.all(np.isposinf(found[SINCE_START]))
     assert all(found[n].tolist() == [0.0, 0.0] for n in (HELD, "change_y", "scatter_z", "temp_c.rate"))
+    assert missing == ("change_y", "scatter_z", "temp_c.rate")
     # What is given counts.
-    rate = of_readings({"temp_c": np.zeros(1), "temp_c.rate": np.array([0.01])}, reference, 1)["temp_c.rate"]
-    assert rate.tolist() == [0.01]
+    given = {"temp_c": np.zeros(1), "temp_c.rate": np.array([0.01])}
+    found, missing = of_readings(given, reference, 1, CLOCKS)
+    assert found["temp_c.rate"].tolist() == [0.01]
+    assert missing == ("change_y", "scatter_z")
 
 
-@pytest.mark.parametrize("missing", ["temp_c", TIME])
-def test_single_readings_without_a_channel_or_the_time_are_a_key_error(missing: str) -> None:
-    given = {"temp_c": np.zeros(2), TIME: np.zeros(2)}
-    del given[missing]
-    with pytest.raises(KeyError, match=missing):
-        of_readings(given, {"temp_c": 25.0, TIME: 100.0}, 2)
+def test_single_readings_without_a_channel_count_as_at_its_reference_and_say_so() -> None:
+    found, missing = of_readings({}, {"temp_c": 25.0, TIME: 100.0}, 2, {SINCE_START: 130.0, TIME: 130.0})
+    assert missing == ("temp_c",)
+    assert (found["temp_c"].tolist(), found[TIME].tolist()) == ([0.0, 0.0], [30.0, 30.0])
+
+
+def test_poses_of_another_recording_count_their_time_as_at_the_moment_that_is_chosen(three: list[Pose]) -> None:
+    reference = {TIME: 130.0, SINCE_START: 0.0}
+    found = conditions_elsewhere(three, reference, K, B, (240.0, 230.0))
+    assert found[SINCE_START].tolist() == [240.0] * 3
+    assert found[TIME].tolist() == [100.0] * 3
 
 
 def test_at_the_reference_nothing_deviates_and_the_start_was_long_ago() -> None:

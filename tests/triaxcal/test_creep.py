@@ -175,7 +175,8 @@ def test_in_another_recording_the_channel_explains_creep_and_the_clock_does_not(
     other = creeping(paper_unit, twenty_six, 7, rates[:, None] * HOLD_S * SENSITIVITY, rates)
     for before, after in zip(other, with_creep_left(other, model, elsewhere=True), strict=True):
         assert np.linalg.norm(after.creep) < 0.1 * np.linalg.norm(before.creep)
-    steep = replace(model, sensor=replace(model.sensor, effects=((BiasDrift(), np.full(3, 1e-3)),)))
+    drift = ((BiasDrift(), np.full(3, 1e-3)),)
+    steep = replace(model, holds_at=None, sensor=replace(model.sensor, effects=drift))
     assert with_creep_left(other, steep, elsewhere=True) == other
 
 

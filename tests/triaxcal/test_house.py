@@ -82,7 +82,7 @@ def test_the_metrology_says_that_it_is_typed() -> None:
 
 WORDS_LEAST = 4
 """A string of fewer is a name."""
-SAYS = ("text", "figures")
+SAYS = ("text", "figures", "units")
 EFFECTS = "effects"
 """An effect's file says what a person should do about it, as its contract has it."""
 UNTIL_THE_POSTERIOR = (

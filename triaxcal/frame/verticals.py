@@ -59,14 +59,15 @@ def verticals_under(
     *,
     channel_reference: Mapping[str, float],
     reference: float = 1.0,
+    moment: tuple[float, float] | None = None,
 ) -> Verticals:
     """Of poses of another recording than the calibration's; ``covariance`` (p,p) of `Calibration.parameters`.
 
-    Effects of time count as at their reference there, since its clock is its own. Raises InvalidData where a channel
-    that the calibration needs is missing.
+    Effects of time count as at one ``moment`` (`triaxcal.conditions.of_moment`), since its clock is its own. Raises
+    InvalidData where a channel that the calibration needs is missing.
     """
     used = np.ones(len(poses), dtype=bool)
-    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias)
+    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
     direction, V = _directions(sensor, poses, held, reference, covariance, used)
     return Verticals(tuple(poses), direction, V, used, 1e6)
 

@@ -8,5 +8,8 @@ from triaxcal.text.budget import basis, not_evaluated, remedy
 from triaxcal.text.cautions import caution
 from triaxcal.text.holds import holds
 from triaxcal.text.quality import quality, quality_line
+from triaxcal.text.summary import html, short, summary
 
-__all__ = ["basis", "caution", "holds", "not_evaluated", "quality", "quality_line", "remedy"]
+__all__ = [
+    "basis", "caution", "holds", "html", "not_evaluated", "quality", "quality_line", "remedy", "short", "summary",
+]  # fmt: skip

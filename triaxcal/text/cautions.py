@@ -7,7 +7,7 @@ from functools import singledispatch
 
 import numpy as np
 
-from triaxcal import attitude, passport
+from triaxcal import attitude, extrapolation, passport
 from triaxcal import caution as of_fit
 from triaxcal.figures import micro_g, moment, the_poses
 from triaxcal.frame import faces, frames, orientations, standing
@@ -93,6 +93,14 @@ def _(_: of_fit.ResidualsTooSmall) -> str:
     return (
         "residuals are smaller than the noise and the creep of the poses explain: what moves the outputs inside a pose "
         "(a temperature, a stand that settles) moves the means less, so the standard errors are on the safe side"
+    )
+
+
+@caution.register
+def _(c: extrapolation.Extrapolated) -> str:
+    return (
+        f"the calibration is to hold {c.beyond_s:.0f} s after the last pose: what effects of time make of the bias "
+        f"there has a standard uncertainty of {micro_g(c.uncertainty_g)}"
     )
 
 

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from triaxcal.calibration_document import Document
 from triaxcal.errors import TriaxcalError
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify
-from triaxcald.documents import Document
 from triaxcald.errors import DaemonError, RecordingError
 from triaxcald.inputs import CALIBRATION, STATION_FILE, VERIFICATION, bundle_of, signs_of
 from triaxcald.outcome import Ending, Papers, Verdict, measured_in, outcome_document

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from triaxcal.calibration import Moment
 from triaxcal.gravity import HEIGHTS_M
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
@@ -41,6 +42,16 @@ def signs(text: str) -> tuple[int, int, int]:
     if len(parts) != 3 or any(p not in known for p in parts):
         raise argparse.ArgumentTypeError(f"expected three signs as in -,-,+, not '{text}'")
     return known[parts[0]], known[parts[1]], known[parts[2]]
+
+
+def moment(text: str) -> Moment | float:
+    """`end`, `mean`, or seconds from the first sample."""
+    if text in (Moment.END, Moment.MEAN):
+        return Moment(text)
+    try:
+        return not_negative(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"expected end, mean or seconds of at least 0, not '{text}'") from None
 
 
 def positive(text: str) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.plugins import package_of, plugins
+from triaxcal.rounding import REGISTER_DIGITS, number
 from triaxcal_drivers.catalogue import listed
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
 from triaxcal_drivers.profile import BUILT_IN, load_bundle
@@ -16,7 +17,6 @@ from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import warn_of_a_journal
-from triaxcald.documents import REGISTER_DIGITS, number
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.explain import explain
 from triaxcald.provision.identity import check_identity

@@ -10,12 +10,14 @@ from typing import Any
 
 from triaxcal import text
 from triaxcal.agreement import agreement
+from triaxcal.calibration import Moment
+from triaxcal.calibration_document import Document, calibration_document
 from triaxcal.errors import Refused
 from triaxcal.loop import Loop, diagnose
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcald import documents
-from triaxcald.cli.arguments import add_recording, add_uncertainty, positive, writable
+from triaxcald.cli.arguments import add_recording, add_uncertainty, moment, positive, writable
 from triaxcald.cli.console import emit
 from triaxcald.cli.results import show_calibration, show_loop
 from triaxcald.cli.several import (
@@ -50,6 +52,10 @@ def register(commands: Any) -> None:
         "--units", action="store_true", help="each recording is of another unit: judge each, then whether they agree"
     )
     p.add_argument("--empirical", action="store_true", help="describe what no effect explains by a smooth term")
+    p.add_argument(
+        "--at", type=moment, metavar="end|mean|SECONDS",
+        help="of the recording: the moment for which effects of time hold elsewhere (default: end)",
+    )  # fmt: skip
     p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
     p.set_defaults(run=diagnose_command)
 
@@ -71,7 +77,7 @@ def fit_command(a: argparse.Namespace) -> int:
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
         calibration = fit(measured.poses, signs=choice.signs, reference=choice.reference)
-    document = documents.calibration_document(
+    document = calibration_document(
         calibration, output_unit=choice.output_unit, reference_unit=choice.reference_unit, stated=choice.stated
     )
     document["data_quality"] = measured.data_quality
@@ -132,13 +138,18 @@ def diagnose_command(a: argparse.Namespace) -> int:
 def _loop(a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequence[Pose] | None = None) -> Loop:
     with telling_data_quality(measured), telling_default_signs(a, measured):
         return diagnose(
-            measured.poses, signs=choice.signs, reference=choice.reference, check=check, empirical=a.empirical
+            measured.poses,
+            signs=choice.signs,
+            reference=choice.reference,
+            check=check,
+            empirical=a.empirical,
+            at=a.at if a.at is not None else measured.holds_at or Moment.END,
         )
 
 
 def _loop_document(
     loop: Loop, measured: Measured, choice: Choice, remarks: Sequence[str] = (), *, unit_in_doubt: bool = False
-) -> documents.Document:
+) -> Document:
     return documents.loop_document(
         loop,
         data_quality=measured.data_quality,
@@ -185,7 +196,7 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
     return max(judge(a.limit, loop.after.residual.rms_g) for loop in loops)
 
 
-def _write(a: argparse.Namespace, measured: Measured, document: documents.Document) -> None:
+def _write(a: argparse.Namespace, measured: Measured, document: Document) -> None:
     if measured.unit:
         document["unit"] = dict(measured.unit)  # so that it cannot be written to another
     if a.report:  # before anything is written

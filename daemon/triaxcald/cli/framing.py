@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from triaxcal.calibration_reading import sensor_of
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.frame.faces import LABELS, Labelling, labelled, opposite, recognise
 from triaxcal.frame.frames import Datum, Frames, frames
@@ -19,6 +20,7 @@ from triaxcal.frame.orientations import Assumed
 from triaxcal.frame.standing import Standing, stand
 from triaxcal.planning.directions import directions
 from triaxcal.pose_fit import fit
+from triaxcal.units import reference_unit_of
 from triaxcald import documents
 from triaxcald.cli.arguments import add_recording, positive, within, writable
 from triaxcald.cli.console import emit, say, table
@@ -26,9 +28,7 @@ from triaxcald.cli.showing import chosen, warn
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.framing import Source, frame_document, own_source, source_under
-from triaxcald.held_sensor import sensor_of
 from triaxcald.inputs import measure, read_document, require_unit
-from triaxcald.units import reference_unit_of
 
 OWN = "own"
 NO_FACE = "*"

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from triaxcal import text as of_metrology
+from triaxcal.rounding import number
 from triaxcal_drivers.profile import READINGS
 from triaxcald import text
 from triaxcald.cli.arguments import add_force, add_json, positive, seed, writable
@@ -18,7 +19,6 @@ from triaxcald.cli.console import Bars, emit, micro, say, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.journals import warn_of_a_journal
 from triaxcald.cli.showing import counted
-from triaxcald.documents import number
 from triaxcald.exit_codes import SEVEREST
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline

@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 
 from triaxcal.calibration import Calibration
+from triaxcal.calibration_document import poses_document
+from triaxcal.calibration_reading import calibration_of, calibration_part, reference_unit_in
 from triaxcal.creep import with_creep_left
 from triaxcal.effects.contract import RUN, SINCE_START, TIME
 from triaxcal.errors import Refused
 from triaxcal.held_out import magnitude_errors
-from triaxcald import documents
+from triaxcal.rounding import error
+from triaxcal.units import ErrorUnit
 from triaxcald.cli.arguments import add_recording, positive
 from triaxcald.cli.console import emit
 from triaxcald.cli.showing import counted, judge, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
-from triaxcald.held_sensor import calibration_part, model_of, reference_unit_in, sensor_of
 from triaxcald.inputs import Measured, measure, read_document
 from triaxcald.likeness import shape_beside, shape_in, unlike_shapes
-from triaxcald.units import ErrorUnit
 from triaxcald.verification import Verification, pose_rows, trust, unlike
 
 
@@ -38,7 +39,7 @@ def register(commands: Any) -> None:
 
 def poses(a: argparse.Namespace) -> int:
     measured = measure(a.recording)
-    document = documents.poses_document(measured.poses)
+    document = poses_document(measured.poses)
     for row, p in zip(document["poses"], measured.poses, strict=True):
         row |= trust(p)
     document["data_quality"] = measured.data_quality
@@ -67,7 +68,8 @@ def poses(a: argparse.Namespace) -> int:
 
 def verify_command(a: argparse.Namespace) -> int:
     document = read_document(a.calibration)
-    sensor, channel_reference, reference = sensor_of(document, where=a.calibration)
+    model = calibration_of(document, where=a.calibration)
+    sensor, reference = model.sensor, model.reference
     if a.sign and any(k * s < 0 for k, s in zip(sensor.scale_factor, a.sign, strict=True)):
         raise InputError(f"--sign: the scale factors in {a.calibration} have other signs")
     if a.reference and not math.isclose(a.reference, reference, rel_tol=1e-9):
@@ -75,22 +77,18 @@ def verify_command(a: argparse.Namespace) -> int:
     measured = measure(a.recording)
     with telling_data_quality(measured):
         _require_trusted(measured)
-    model = model_of(sensor, channel_reference, reference)
     found = _verified(measured, model, where=a.calibration)
     assert found.rms_g is not None
     warnings = unlike(measured.name, found.rms_g, reference)
     if not warnings:
         held = shape_in(calibration_part(document, where=a.calibration))
         warnings = unlike_shapes(a.calibration, measured.name, held, shape_beside(model, measured.poses))
-    if left := [e.name for e, _ in sensor.effects if {TIME, SINCE_START, RUN} & set(e.needs)]:
-        warnings.append(
-            f"{', '.join(left)} in {a.calibration} belongs to the recording that it was made from, and counts as zero"
-        )
+    warnings += _of_its_recording(model, a.calibration)
     result = {
         "format": "triaxcal.verify/1",
-        "rms_g": documents.error(found.rms_g, reference),
-        "max_abs_g": documents.error(found.max_abs_g, reference),
-        "noise_floor_g": documents.error(found.noise_floor_g, reference),
+        "rms_g": error(found.rms_g, reference),
+        "max_abs_g": error(found.max_abs_g, reference),
+        "noise_floor_g": error(found.noise_floor_g, reference),
         "poses": pose_rows(found, reference),
         "data_quality": measured.data_quality,
         "warnings": warnings,
@@ -102,6 +100,20 @@ def verify_command(a: argparse.Namespace) -> int:
         _show_verified(found, f"|a| − {reference:g} {unit} under {a.calibration}", ErrorUnit.of(unit, reference))
         warn([*warnings, *measured.data_quality])
     return judge(a.limit, found.rms_g)
+
+
+def _of_its_recording(model: Calibration, name: str) -> list[str]:
+    """A line each for effects of time, and of the recording, which say little of another recording."""
+    of_time = [e.name for e, _ in model.sensor.effects if {TIME, SINCE_START} & set(e.needs)]
+    of_run = [e.name for e, _ in model.sensor.effects if RUN in e.needs and e.name not in of_time]
+    out = []
+    if of_time:
+        held = model.holds_at
+        moment = f"as {held.t_s:.0f} s after its start" if held else "as long after its start"
+        out.append(f"{', '.join(of_time)} in {name} goes with the time of its own recording, and counts {moment}")
+    if of_run:
+        out.append(f"{', '.join(of_run)} in {name} belongs to its own recordings, and counts as in their mean")
+    return out
 
 
 def _require_trusted(measured: Measured) -> None:
@@ -120,6 +132,7 @@ def _verified(measured: Measured, model: Calibration, *, where: str) -> Verifica
             with_creep_left(measured.poses, model, elsewhere=True),
             channel_reference=model.channel_reference,
             reference=model.reference,
+            moment=model.moment,
         )
         found = Verification(measured.poses, errors, noise, tuple(measured.data_quality))
         figures = np.array([*errors, *noise, found.rms_g, found.noise_floor_g], dtype=float)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.calibration_document import Document
 from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
 from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER
 from triaxcal.errors import InvalidData
@@ -18,12 +19,12 @@ from triaxcal.planning.clock import in_plan
 from triaxcal.planning.design import Asked, ask, needs_time
 from triaxcal.planning.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
 from triaxcal.planning.optimal import OptimalPlan, optimal
+from triaxcal.rounding import number, numbers, uncertainty
 from triaxcal.visibility import Sight, sight, unseen_effects
 from triaxcald.cli.arguments import add_recording, count
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.lacking import Lacking, lacking
 from triaxcald.cli.showing import chosen, counted, telling_data_quality, warn
-from triaxcald.documents import Document, number, numbers, uncertainty
 from triaxcald.errors import InputError
 from triaxcald.inputs import measure
 

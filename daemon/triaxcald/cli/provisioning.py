@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from triaxcal.calibration_reading import sensor_of
 from triaxcal.errors import Refused
+from triaxcal.rounding import REGISTER_DIGITS, number
 from triaxcald import text
 from triaxcald.certificate import REFERENCE_TEMPERATURE, roles
 from triaxcald.choices import is_passing
 from triaxcald.cli.arguments import add_force, add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
-from triaxcald.documents import REGISTER_DIGITS, number
 from triaxcald.errors import InputError
-from triaxcald.held_sensor import sensor_of
 from triaxcald.inputs import read_document
 from triaxcald.provision.identity import same_serial
 from triaxcald.provision.image import RegisterImage, build_image

@@ -6,15 +6,15 @@ import math
 
 from triaxcal import text
 from triaxcal.calibration import Calibration, Residual
+from triaxcal.calibration_document import assumed_in, holds_of
 from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import probability
 from triaxcal.loop import Loop
 from triaxcal.uncertainty import Budget, Combined, budget
+from triaxcal.units import ErrorUnit, grouped, in_units_of
 from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, counted
-from triaxcald.documents import holds_of
-from triaxcald.remarks import assumed_in, assumption, nothing_shows, overlap, without
-from triaxcald.units import ErrorUnit, grouped, in_units_of
+from triaxcald.remarks import assumption, nothing_shows, overlap, without
 
 
 def show_calibration(c: Calibration, choice: Choice) -> None:

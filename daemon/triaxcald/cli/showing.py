@@ -12,10 +12,10 @@ from triaxcal.errors import Refused
 from triaxcal.gravity import local_gravity_g
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Stated
+from triaxcal.units import ErrorUnit, reference_unit_of
 from triaxcald.cli.console import say, table
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
-from triaxcald.units import ErrorUnit, reference_unit_of
 
 
 @dataclass(frozen=True)

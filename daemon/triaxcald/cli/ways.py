@@ -11,12 +11,13 @@ import numpy as np
 
 from triaxcal.attitude import AttitudeFit, fit_attitudes
 from triaxcal.calibration import Calibration
+from triaxcal.calibration_document import Document
 from triaxcal.errors import Refused
 from triaxcal.figures import probability
 from triaxcal.passport import Refinement, refine
 from triaxcal.turning.moments import Moments
 from triaxcal.turning.rotation import RotationFit, fit_rotation
-from triaxcald import documents, ways_in
+from triaxcald import ways_in
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.arguments import not_negative, within
 from triaxcald.cli.console import micro, table
@@ -26,7 +27,7 @@ from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, read_document, require_unit
 
 POSES_ENOUGH = 9
-Way = tuple[Measured, documents.Document, Calibration, Callable[[], None]]
+Way = tuple[Measured, Document, Calibration, Callable[[], None]]
 """What was measured, the document, the calibration, and how it is shown at the console."""
 
 

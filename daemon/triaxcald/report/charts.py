@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import MICRO_G, clean, micro, micro_g, unit_label
 from triaxcald.report.ink import AXES, BAND, FLOOR, draw, hang_grid
 from triaxcald.report.over_time import stage_colours
 from triaxcald.report.stages import HeldOut, Stage
 from triaxcald.report.stream import StreamOverview
-from triaxcald.units import ErrorUnit
 
 Group = tuple[str, list[tuple[str, float]], float | None]
 _LONGEST_LABEL = 34

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.calibration import Exclusion
+from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names
 from triaxcald.report.stages import HeldOut, Residual, Stage, held_out_of, stages_of
 from triaxcald.report.untrusted import Vector, mapping, numbers, texts, vector, words
-from triaxcald.units import ErrorUnit
 
 _OF_A_POSE = (
     "start_s", "end_s", "before_residual_g", "residual_g", "studentized", "leverage", "standard_error_g",

@@ -6,10 +6,10 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from triaxcal.units import ErrorUnit
 from triaxcald.report.document import Pose
 from triaxcald.report.figures import micro_g
 from triaxcald.report.meanings import QUALITY
-from triaxcald.units import ErrorUnit
 
 _TAKE_AGAIN = "take again"
 _NAMED = re.compile(rf"(.+?: )?({'|'.join(QUALITY)}): (.*)", re.DOTALL)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from triaxcald.units import ErrorUnit
+from triaxcal.units import ErrorUnit
 
 MICRO_G = ErrorUnit()
 MISSING = "—"

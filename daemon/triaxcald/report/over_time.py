@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from triaxcal.units import ErrorUnit
 from triaxcald.report.document import Pose
 from triaxcald.report.figures import MICRO_G, clean, unit_label
 from triaxcald.report.ink import AFTER, BAND, BEFORE, FLOOR, INK, MUTED, STEP, draw, hang_grid
 from triaxcald.report.stages import Stage
-from triaxcald.units import ErrorUnit
 
 _CONSPICUOUS = 3.0
 _MOST_MARKED = 8

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
+from triaxcal.units import ErrorUnit
 from triaxcald.report.document import Pose
 from triaxcald.report.figures import MICRO_G, micro, unit_label
 from triaxcald.report.ink import GRID, INK, MUTED, draw
 from triaxcald.report.stages import Stage
-from triaxcald.units import ErrorUnit
 
 # Readable on white and on near-black alike: saturated ends, a middle grey for "no more than noise".
 _COLOURS = LinearSegmentedColormap.from_list(

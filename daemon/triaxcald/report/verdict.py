@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.units import ErrorUnit
 from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
 from triaxcald.report.document import Finding, Outcome
@@ -14,7 +15,6 @@ from triaxcald.report.faults import faults_of
 from triaxcald.report.figures import micro_g
 from triaxcald.report.meanings import told
 from triaxcald.report.untrusted import mapping
-from triaxcald.units import ErrorUnit
 
 Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, FailFast, Field, model_validator
 
+from triaxcal.calibration import Moment
 from triaxcal.effects import CATALOGUE
 from triaxcal.gravity import local_gravity_g
 from triaxcal.uncertainty import Stated
@@ -100,6 +101,10 @@ class StationFile(Strict):
     thermometer_uncertainty_k: Annotated[
         float | None, Field(ge=0, le=100, description="standard uncertainty of the units' thermometers")
     ] = None
+    holds_at: Annotated[
+        Literal["end", "mean"] | Annotated[float, Field(ge=0, allow_inf_nan=False)],
+        Field(description="moment of the recording, in s from its start, for which effects of time hold elsewhere"),
+    ] = "end"
     plan: Plan = Plan()
     limits: Limits = Limits()
     provisioning: Provisioning = Provisioning()
@@ -111,6 +116,11 @@ class StationFile(Strict):
         if self.latitude_deg is not None and self.height_m is not None:
             return local_gravity_g(self.latitude_deg, self.height_m)[0]
         return 1.0 if self.given_reference is None else self.given_reference
+
+    @property
+    def moment(self) -> Moment | float:
+        """As `triaxcal.loop.diagnose` has it."""
+        return Moment(self.holds_at) if isinstance(self.holds_at, str) else self.holds_at
 
     @property
     def stated(self) -> Stated:

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal.arrays import Floats
+from triaxcal.calibration_document import Document
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
 from triaxcald.abort import Left, at_abort
 from triaxcald.certificate import Certified, certify, software
-from triaxcald.documents import Document, to_text
+from triaxcald.documents import to_text
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.exit_codes import DISK
 from triaxcald.files import write_text

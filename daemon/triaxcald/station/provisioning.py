@@ -10,13 +10,14 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from triaxcal.calibration_document import Document
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Profile
 from triaxcald import text
 from triaxcald.abort import Left, at_abort
 from triaxcald.certificate import software
-from triaxcald.documents import Document, to_text
+from triaxcald.documents import to_text
 from triaxcald.errors import Implausible, InputError, RecordingError
 from triaxcald.exit_codes import BAD_INPUT, DISK, DONE
 from triaxcald.files import write_new

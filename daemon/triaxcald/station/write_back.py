@@ -10,13 +10,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.calibration_document import Document
 from triaxcal.errors import Refused, TriaxcalError
 from triaxcal.poses.pose import Pose
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
-from triaxcald.documents import Document, to_text
+from triaxcald.documents import to_text
 from triaxcald.errors import DaemonError, DiskError, Implausible, StationError
 from triaxcald.inputs import VERIFICATION
 from triaxcald.provision.access import RegisterAccess, RegisterLink

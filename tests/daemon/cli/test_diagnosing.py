@@ -14,10 +14,10 @@ from triaxcal.calibration import Residual
 from triaxcal.planning.directions import spiral
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+from triaxcal.units import ErrorUnit
 from triaxcald.cli.results import cross_validated
 from triaxcald.cli.several import COLUMNS
 from triaxcald.remarks import SHARE, overlap
-from triaxcald.units import ErrorUnit
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0

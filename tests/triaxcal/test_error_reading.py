@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcal.calibration_document import calibration_document
 from triaxcal.effects import effect_named
+from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
+from triaxcal.errors import InvalidData
 from triaxcal.planning.directions import cube_directions
 from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
-from triaxcald.documents import calibration_document
-from triaxcald.errors import InputError
 from triaxcald.framing import covariance_of
-from triaxcald.held_errors import correlation_of, effect_errors_of, linear_errors_of
 
 EFFECT = effect_named("temperature_bias")
 UNIT = Sensor(np.array([-2.41, -2.40, -2.37]), np.array([6e-3, 4e-3, -1e-3]), np.array([6e-3, -3e-3, 5e-3]))
@@ -65,14 +65,14 @@ def test_a_document_without_correlation_counts_as_independent(
 def test_a_correlation_that_is_none_is_named(made: tuple[dict[str, Any], Sensor, np.ndarray], value: Any) -> None:
     document, sensor, _ = made
     document["correlation"] = value
-    with pytest.raises(InputError, match=r"cal.json: correlation: expected a correlation matrix of 12 rows"):
+    with pytest.raises(InvalidData, match=r"cal.json: correlation: expected a correlation matrix of 12 rows"):
         correlation_of(document, sensor, where="cal.json")
 
 
 def test_one_that_no_errors_can_have_is_named(made: tuple[dict[str, Any], Sensor, np.ndarray]) -> None:
     document, sensor, _ = made
     document["correlation"] = (2 * np.eye(12) - 1).tolist()
-    with pytest.raises(InputError, match="correlation"):
+    with pytest.raises(InvalidData, match="correlation"):
         correlation_of(document, sensor, where="cal.json")
 
 
@@ -80,8 +80,8 @@ def test_one_that_no_errors_can_have_is_named(made: tuple[dict[str, Any], Sensor
 def test_errors_that_are_none_are_named(made: tuple[dict[str, Any], Sensor, np.ndarray], value: Any) -> None:
     document, sensor, _ = made
     document["standard_error"]["bias"] = [1e-5, value, 1e-5]
-    with pytest.raises(InputError, match=r"cal.json: standard_error.bias: expected three numbers"):
+    with pytest.raises(InvalidData, match=r"cal.json: standard_error.bias: expected three numbers"):
         linear_errors_of(document, where="cal.json")
     document["effects"]["temperature_bias"][EFFECT.coefficients[0].name]["standard_error"] = value
-    with pytest.raises(InputError, match=r"cal.json: effects.temperature_bias.*expected a number of at least 0"):
+    with pytest.raises(InvalidData, match=r"cal.json: effects.temperature_bias.*expected a number of at least 0"):
         effect_errors_of(document, sensor, where="cal.json")

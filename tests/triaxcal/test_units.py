@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcald.units import ErrorUnit, in_units_of
+from triaxcal.units import ErrorUnit, in_units_of
 
 
 @pytest.mark.parametrize(

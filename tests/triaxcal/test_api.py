@@ -1,0 +1,188 @@
+"""From samples to a calibration in use, as a caller does it, against the truth of a simulated unit."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+
+import triaxcal as tc
+from triaxcal.effects import effect_of
+from triaxcal.planning.directions import directions
+from triaxcal.quality.finding import UNTRUSTED
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+
+MINUS = (-1, -1, -1)
+
+
+class Recorded(NamedTuple):
+    unit: SyntheticUnit
+    t: np.ndarray
+    u: np.ndarray
+    temp_c: np.ndarray
+
+    def frame(self) -> pd.DataFrame:
+        outputs = dict(zip(("ux", "uy", "uz"), self.u.T, strict=True))
+        return pd.DataFrame({"t_s": self.t, **outputs, "temp_c": self.temp_c})
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recorded:
+    effect = effect_of("temperature_bias", {"x": 4e-4, "y": -2e-4, "z": 3e-4})
+    sensor = Sensor(
+        np.array([-2.41, -2.4, -2.37]), np.array([6e-3, 4e-3, -6e-4]), np.array([5e-3, -3e-3, 4e-3]), (effect,)
+    )
+    path = Tumble(np.array([v for _, v in directions(26)]), 2.0, 1.0)
+    unit = SyntheticUnit(sensor, path, np.full(3, 2e-4), Environment(25.0, 0.02, 4.0, 37.0))
+    t = np.arange(0.0, 79.0, 0.01)
+    u, temp_c = unit.sample(t)
+    return Recorded(unit, t, u, temp_c)
+
+
+@pytest.fixture(scope="module")
+def poses(recorded: Recorded) -> Any:
+    return tc.find_poses(recorded.t, recorded.u, channels={"temp_c": recorded.temp_c})
+
+
+@pytest.fixture(scope="module")
+def diagnosed(poses: Any) -> tc.Diagnosis:
+    return tc.diagnose(poses, signs=MINUS, output_unit="V")
+
+
+# Poses
+
+
+def test_times_may_be_seconds_datetimes_or_integers_of_a_unit(recorded: Recorded, poses: Any) -> None:
+    ns = np.round(recorded.t * 1e9).astype(np.int64)
+    begun = np.datetime64("2026-03-01T08:00:00", "ns")
+    for t, unit in (
+        (ns, "ns"),
+        (ns // 1000, "us"),
+        (begun + ns, None),
+        (recorded.t * 1e3, "ms"),
+        (recorded.t + 1.7e9, None),
+    ):
+        found = tc.find_poses(t, recorded.u, time_unit=unit)
+        assert [p.start_s for p in found] == pytest.approx([p.start_s for p in poses], abs=1e-6)
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_a_data_frame_gives_the_same_poses(recorded: Recorded, poses: Any, library: str) -> None:
+    frame = recorded.frame()
+    table = frame if library == "pandas" else pl.from_pandas(frame)
+    found = tc.find_poses(table)
+    assert [p.mean.tolist() for p in found] == [p.mean.tolist() for p in poses]
+    assert found[0].channels == poses[0].channels
+    renamed = frame.rename(columns={"t_s": "time", "ux": "X", "temp_c": "T"})
+    named = renamed if library == "pandas" else pl.from_pandas(renamed)
+    found = tc.find_poses(named, columns={"t": "time", "ux": "X", "temp_c": "T"})
+    assert found[0].channels == poses[0].channels
+
+
+def test_what_a_stream_is_to_be_blamed_for_is_said(recorded: Recorded) -> None:
+    u = recorded.u.copy()
+    u[1000:1300, 1] = u[1000, 1]
+    found = tc.find_poses(recorded.t, u)
+    assert [line.split(":")[0] for line in found.data_quality] == ["stuck_output"]
+    assert {p.fault for p in found} - {""} <= set(UNTRUSTED)
+
+
+@pytest.mark.parametrize(
+    ("t", "u", "more", "said"),
+    [
+        (np.arange(9), np.zeros((9, 3)), {}, "t are integers: say their unit by time_unit, one of s, ms, us, ns"),
+        (np.arange(9.0), np.zeros((3, 9)), {}, r"u: expected shape \(n, 3\) or \(3,\), not \(3, 9\); transpose it"),
+        (np.arange(8.0), np.zeros((9, 3)), {}, "t has 8 times, and u has 9 samples"),
+        (np.arange(9.0), np.zeros(9), {}, r"u: expected shape \(n, 3\) or \(3,\), not \(9,\)"),
+        (
+            np.arange(9.0),
+            np.zeros((9, 3)),
+            {"channels": {"temp_c": np.zeros(8)}},
+            "channel temp_c: expected one number or 9",
+        ),
+        (np.arange(9.0), np.zeros((9, 3)), {"time_unit": "h"}, "time_unit: expected s, ms, us, ns, not 'h'"),
+        (1e9 * np.arange(1.0, 20.0), np.zeros((19, 3)), {}, "t goes to 1.9e.10, too much for seconds: say its unit"),
+        (np.arange(9.0), [["a", 1, 2]] * 9, {}, "u: expected numbers, not int and str"),
+        (np.zeros((9, 3)), None, {}, r"expected t \(n,\) and u \(n,3\), or a table"),
+        (pd.DataFrame({"t_s": [0.0], "ux": [0.0]}), None, {}, "the table has no column uy; it has t_s, ux"),
+        (np.array([0.0, 2.0, 1.0]), np.zeros((3, 3)), {}, "time does not increase at sample 2"),
+    ],
+)
+def test_what_cannot_be_samples_is_said_with_what_was_expected(t: Any, u: Any, more: dict[str, Any], said: str) -> None:
+    with pytest.raises(tc.InvalidData, match=said):
+        tc.find_poses(t, u, **more)
+
+
+# Calibrations
+
+
+def test_the_truth_is_recovered_and_the_linear_one_is_beside_it(recorded: Recorded, diagnosed: tc.Diagnosis) -> None:
+    found, truth = diagnosed.calibration, recorded.unit.sensor
+    assert found.terms == ("linear", "temperature_bias")
+    error = found.fitted.standard_errors
+    assert np.all(np.abs(found.scale_factor - truth.scale_factor) < 5 * error[:3])
+    assert np.all(np.abs(found.misalignment - truth.misalignment) < 5 * error[3:6])
+    assert found.linear_only.terms == ("linear",)
+    assert found.linear_only.residual.rms_g > 5 * found.residual.rms_g
+    assert diagnosed.before.residual == found.linear_only.residual
+
+
+def test_poses_samples_and_tables_give_the_same_calibration(recorded: Recorded, poses: Any) -> None:
+    by_poses = tc.calibrate(poses, signs=MINUS)
+    by_samples = tc.calibrate(recorded.t, recorded.u, signs=MINUS, channels={"temp_c": recorded.temp_c})
+    by_table = tc.calibrate(recorded.frame(), signs=MINUS)
+    assert by_poses.matrix.tolist() == by_samples.matrix.tolist() == by_table.matrix.tolist()
+
+
+def test_effects_are_fitted_by_name(poses: Any) -> None:
+    found = tc.calibrate(poses, signs=MINUS, effects=["temperature_bias"])
+    assert found.effects["temperature_bias"]["x"][0] == pytest.approx(4e-4, abs=2e-5)
+    with pytest.raises(tc.InvalidData, match="no effect of the name flat_earth"):
+        tc.calibrate(poses, effects=["flat_earth"])
+
+
+def test_poses_that_cannot_carry_it_are_refused(poses: Any) -> None:
+    with pytest.raises(tc.Refused) as caught:
+        tc.calibrate(poses[:6], signs=MINUS)
+    assert caught.value.wanted
+
+
+def test_a_calibration_is_verified_on_poses_that_no_fit_saw(recorded: Recorded, diagnosed: tc.Diagnosis) -> None:
+    t = recorded.t + 200.0
+    u, temp_c = recorded.unit.sample(t)
+    found = tc.verify(diagnosed.calibration, t, u, channels={"temp_c": temp_c})
+    assert len(found.poses) == len(found.error) >= 25
+    assert found.rms < 4 * found.noise_floor
+    assert tc.verify(diagnosed.before, t, u).rms > 5 * found.rms
+    with pytest.raises(tc.Refused, match="no still pose"):
+        tc.verify(diagnosed.calibration, [])
+
+
+def test_the_moment_for_which_it_holds_is_chosen(poses: Any) -> None:
+    held = {at: tc.diagnose(poses, signs=MINUS, at=at).calibration.holds_at for at in ("end", "mean", 12.5)}
+    assert [h.t_s for h in held.values() if h] == pytest.approx(
+        [poses[-1].end_s, np.mean([p.t_s for p in poses]), 12.5]
+    )
+    for wrong in ("later", "seconds", -1.0):
+        with pytest.raises(tc.InvalidData):
+            tc.diagnose(poses, signs=MINUS, at=wrong)
+
+
+def test_the_budget_is_that_of_the_fit_and_a_loaded_calibration_has_it_in_its_document(diagnosed: tc.Diagnosis) -> None:
+    found = tc.budget(diagnosed.calibration, tc.Stated(reference=1e-4))
+    assert "reference" in {line.source for line in found.components}
+    with pytest.raises(tc.InvalidData, match="to_dict"):
+        tc.budget(tc.Calibration.from_dict(diagnosed.calibration.to_dict()))
+
+
+def test_a_plan_comes_back_to_its_first_pose() -> None:
+    found = tc.plan(14)
+    assert len(found) == 15
+    assert found[0] == found[-1]
+    assert all(np.linalg.norm(p.up) == pytest.approx(1) for p in found)
+    with pytest.raises(tc.InvalidData):
+        tc.plan(3)

@@ -1,0 +1,225 @@
+"""From samples to a calibration, for whoever calls from Python: `import triaxcal as tc`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from triaxcal import loop, pose_fit, tables, text, uncertainty
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Moment
+from triaxcal.creep import with_creep_left
+from triaxcal.documents import Calibration
+from triaxcal.effects import effect_named
+from triaxcal.errors import InvalidData, Refused
+from triaxcal.findings import Finding
+from triaxcal.held_out import HeldOut, magnitude_errors
+from triaxcal.planning.directions import FULL, closed, directions
+from triaxcal.poses.pose import Pose, poses_of
+from triaxcal.quality import QualityDetector, untrusted_poses
+from triaxcal.samples import Samples
+from triaxcal.stillness.detector import StillnessDetector
+from triaxcal.unexplained import Unexplained
+
+
+class PlannedPose(NamedTuple):
+    """``label`` names the axes that point up ("+X-Y"); ``up`` (3,) is that direction in the sensor's frame."""
+
+    label: str
+    up: tuple[float, float, float]
+
+
+class Poses(tuple[Pose, ...]):
+    """Still poses, in order of time. ``data_quality`` has a line for everything that the raw stream is to be blamed
+    for."""
+
+    data_quality: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The closed loop: ``before`` is the linear calibration, ``calibration`` that with the effects that were found;
+    ``unexplained`` what is left, ``held_out`` the error in poses that no fit saw, ``advice`` what to do, a line
+    each."""
+
+    before: Calibration
+    calibration: Calibration
+    findings: tuple[Finding, ...]
+    unexplained: Unexplained
+    held_out: HeldOut | None
+    advice: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Errors |a| − reference (n,) of ``poses`` under a calibration, in the unit of the reference, with their standard
+    errors from noise (n,)."""
+
+    poses: tuple[Pose, ...]
+    error: Floats
+    standard_error: Floats
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt(np.mean(self.error**2)))
+
+    @property
+    def noise_floor(self) -> float:
+        return float(np.sqrt(np.mean(self.standard_error**2)))
+
+
+def find_poses(
+    t: Any,
+    u: Any = None,
+    *,
+    channels: Mapping[str, Any] | None = None,
+    time_unit: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    output_unit: str = "",
+) -> Poses:
+    """The still spans of a recording, without a threshold.
+
+    ``t`` (n,) floats in seconds, datetimes, or integers with ``time_unit`` (s, ms, us, ns); ``u`` (n,3) output units;
+    ``channels`` (n,) each by name. Or ``t`` a DataFrame with the columns t_s, ux, uy, uz and any further channels;
+    ``columns`` says how they are called where that is otherwise: {"t": "time", "ux": "ax", …}. Raises InvalidData.
+    """
+    samples = _samples(t, u, channels, time_unit, columns)
+    detector, judge = StillnessDetector(), QualityDetector()
+    detector.feed(samples.time_ns, samples.readings, samples.channels)
+    detector.finish()
+    judge.feed(samples.time_ns, samples.readings)
+    judge.finish()
+    windows, spans = detector.windows(), detector.spans()
+    seen = judge.findings(windows, spans)
+    found = Poses(poses_of(windows, spans, untrusted_poses(seen)) if windows is not None else ())
+    found.data_quality = tuple(text.quality_line(f, output_unit) for f in seen)
+    return found
+
+
+def calibrate(
+    poses: Any,
+    u: Any = None,
+    *,
+    signs: Sequence[float] = (1, 1, 1),
+    reference: float = 1.0,
+    effects: Sequence[str] = (),
+    channels: Mapping[str, Any] | None = None,
+    time_unit: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    output_unit: str = "",
+    reference_unit: str = "g",
+    stated: uncertainty.Stated | None = None,
+) -> Calibration:
+    """Fit the linear model, and the ``effects`` named, to still poses.
+
+    ``poses`` from `find_poses`; or what that takes. ``signs`` (3,) of the scale factors, which |a| does not show;
+    ``reference`` the magnitude of the reference vector in ``reference_unit``. Raises Refused where the poses cannot
+    carry the parameters, InvalidData.
+    """
+    found = _poses(poses, u, channels, time_unit, columns, output_unit)
+    try:
+        model = [effect_named(name) for name in effects]
+    except KeyError as e:
+        raise InvalidData(f"no effect of the name {e.args[0]} is known") from None
+    fitted = pose_fit.fit(found, signs=signs, reference=reference, effects=model)
+    return Calibration(fitted, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
+
+
+def diagnose(
+    poses: Any,
+    u: Any = None,
+    *,
+    signs: Sequence[float] = (1, 1, 1),
+    reference: float = 1.0,
+    check: Sequence[Pose] | None = None,
+    at: str | float = "end",
+    channels: Mapping[str, Any] | None = None,
+    time_unit: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    output_unit: str = "",
+    reference_unit: str = "g",
+    stated: uncertainty.Stated | None = None,
+) -> Diagnosis:
+    """Find what the poses show beyond the linear model, and add it.
+
+    As `calibrate`; ``check`` are poses of another recording, for the held-out error; ``at`` the moment for which
+    effects of time hold elsewhere: "end", "mean", or seconds from the first sample.
+    """
+    found = _poses(poses, u, channels, time_unit, columns, output_unit)
+    try:
+        moment = Moment(at) if isinstance(at, str) else float(at)
+    except ValueError:
+        raise InvalidData(f"at: expected 'end', 'mean' or seconds, not '{at}'") from None
+    if moment is Moment.SECONDS:
+        raise InvalidData("at: expected 'end', 'mean' or a number of seconds")
+    closed_loop = loop.diagnose(found, signs=signs, reference=reference, check=check, at=moment)
+    before, after = (
+        Calibration(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
+        for c in (closed_loop.before, closed_loop.after)
+    )
+    return Diagnosis(
+        before, after, closed_loop.findings, closed_loop.unexplained, closed_loop.held_out, closed_loop.advice
+    )
+
+
+def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> Verification:
+    """The errors of the magnitude in still poses of another recording, as `find_poses` gives them or takes samples.
+
+    Poses whose samples have a fault are left out. Raises Refused where none is left, InvalidData.
+    """
+    found = [p for p in _poses(poses, u, **how) if not p.fault]
+    if not found:
+        raise Refused("no still pose to verify by")
+    c = calibration.fitted
+    error, noise = magnitude_errors(
+        c.sensor,
+        with_creep_left(found, c, elsewhere=True),
+        channel_reference=c.channel_reference,
+        reference=c.reference,
+        moment=c.moment,
+    )
+    return Verification(tuple(found), error, noise)
+
+
+def plan(poses: int = FULL) -> tuple[PlannedPose, ...]:
+    """Where to point the unit, in an order in which attitude and time tell apart; the first pose comes once more at
+    the end, so there is one more than ``poses``. Raises InvalidData for fewer than 9."""
+    return tuple(PlannedPose(label, (float(x), float(y), float(z))) for label, (x, y, z) in closed(directions(poses)))
+
+
+def budget(calibration: Calibration, stated: uncertainty.Stated | None = None) -> uncertainty.Budget:
+    """The uncertainty budget by the GUM (JCGM 100). ``stated`` is what no recording can tell. Raises InvalidData where
+    the calibration is not of still poses, or was loaded: its document holds the budget then."""
+    if not calibration.poses:
+        raise InvalidData(
+            "no poses to evaluate: of a calibration that was loaded, to_dict()['uncertainty'] is the budget"
+        )
+    return uncertainty.budget(calibration.fitted, stated)
+
+
+def _samples(
+    t: Any, u: Any, channels: Mapping[str, Any] | None, time_unit: str | None, columns: Mapping[str, str] | None
+) -> Samples:
+    if tables.is_table(t):
+        if u is not None or channels:
+            raise InvalidData("a table holds its readings and channels itself; columns says how they are called")
+        return tables.samples_of_table(t, columns, time_unit)
+    if u is None:
+        raise InvalidData("expected t (n,) and u (n,3), or a table with the columns t_s, ux, uy, uz")
+    return tables.samples_of(t, u, channels, time_unit)
+
+
+def _poses(
+    poses: Any,
+    u: Any = None,
+    channels: Mapping[str, Any] | None = None,
+    time_unit: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    output_unit: str = "",
+) -> Sequence[Pose]:
+    if u is None and isinstance(poses, Sequence) and all(isinstance(p, Pose) for p in poses):
+        return list(poses)
+    return find_poses(poses, u, channels=channels, time_unit=time_unit, columns=columns, output_unit=output_unit)

@@ -1,0 +1,209 @@
+"""`triaxcal.poses/1` and `triaxcal.calibration/1`: the JSON documents that others script against."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from triaxcal import text
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration, Exclusion, HoldsAt, Residual
+from triaxcal.poses.pose import Pose
+from triaxcal.rounding import (
+    UNCERTAINTY_DIGITS,
+    correlation,
+    direction,
+    error,
+    number,
+    numbers,
+    probability,
+    uncertainty,
+)
+from triaxcal.uncertainty import Budget, Stated, budget
+from triaxcal.uncertainty.basis import Basis, UnmodelledTemperature
+from triaxcal.units import ErrorUnit, grouped, in_units_of
+
+Document = dict[str, Any]
+LINEAR = ("scale_factor", "misalignment", "bias")
+_LEFT_OUT = {Exclusion.OUTLIER: "spoiled", Exclusion.CALLER: "caller", Exclusion.UNKNOWN_HISTORY: "unknown_history"}
+"""As documents of 0.1 have it, beside ``excluded``; else the name of the fault."""
+
+
+def poses_document(poses: Sequence[Pose]) -> Document:
+    return {
+        "format": "triaxcal.poses/1",
+        "poses": [
+            {
+                "start_s": number(p.start_s),
+                "end_s": number(p.end_s),
+                "samples": p.samples,
+                "mean": numbers(p.mean),
+                "standard_error": numbers(p.standard_error, UNCERTAINTY_DIGITS),
+                "channels": {name: number(v) for name, v in p.channels.items()},
+            }
+            for p in poses
+        ],
+    }
+
+
+def residual_document(residual: Residual, reference: float = 1.0) -> Document:
+    return {
+        "rms_g": error(residual.rms_g, reference),
+        "max_abs_g": error(residual.max_abs_g, reference),
+        "cross_validated_rms_g": error(residual.cross_validated_rms_g, reference),
+        "noise_floor_g": error(residual.noise_floor_g, reference),
+        "lack_of_fit_p": probability(residual.lack_of_fit_p),
+    }
+
+
+def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, str]], reference_unit: str) -> Document:
+    """Of one effect; null for a standard error that the poses do not tell."""
+    return {
+        name: {
+            "value": number(value),
+            "standard_error": None if deviation is None else uncertainty(deviation),
+            "unit": in_units_of(unit, reference_unit),
+        }
+        for name, (value, deviation, unit) in coefficients.items()
+    }
+
+
+def holds_of(c: Calibration) -> list[str]:
+    """In words, under which conditions scale factor, misalignment and bias are all of a reading; none where always."""
+    several = any(p.pose.run.of > 1 for p in c.poses)
+    return list(text.holds([effect for effect, _ in c.sensor.effects], c.channel_reference, several=several))
+
+
+def calibration_document(
+    c: Calibration,
+    *,
+    output_unit: str = "",
+    reference_unit: str = "g",
+    stated: Stated | None = None,
+    budgeted: bool = True,
+) -> Document:
+    """``reference_unit`` names the unit of the reference vector; keys keep their ``_g`` whatever it is. ``stated`` are
+    uncertainties that no recording can tell. ``budgeted``: with the budget, which is that of a fit to still poses."""
+    whole = c.whole
+    errors = dict(zip(whole.parameters, whole.standard_errors, strict=True))
+    unit = output_unit or "output"
+
+    def group(name: str) -> list[Any]:
+        return numbers([errors[f"{name}.{axis}"] for axis in "xyz"], UNCERTAINTY_DIGITS)
+
+    return {
+        "format": "triaxcal.calibration/1",
+        "terms": list(c.terms),
+        "units": {
+            "output": output_unit,
+            "reference": reference_unit,
+            "scale_factor": f"{unit}/{grouped(reference_unit)}",
+            "misalignment": "rad",
+            "bias": reference_unit,
+        },
+        "reference": number(c.reference),
+        "channel_reference": {name: number(v) for name, v in c.channel_reference.items()},
+        "holds_at": _holds_at(c.holds_at),
+        "holds": holds_of(c),
+        "scale_factor": numbers(c.sensor.scale_factor),
+        "misalignment": numbers(c.sensor.misalignment),
+        "bias": numbers(c.sensor.bias),
+        "matrix": numbers(c.sensor.matrix),
+        "centre": numbers(c.sensor.centre),
+        "effects": {
+            effect.name: coefficients_document(whole.coefficients_of(effect.name), reference_unit)
+            for effect, _ in c.sensor.effects
+        },
+        "standard_error": {name: group(name) for name in LINEAR},
+        "parameters": list(whole.parameters),
+        "correlation": correlation(whole.covariance),
+        **({"uncertainty": budget_document(c, budget(c, stated), reference_unit)} if budgeted else {}),
+        "residual": residual_document(c.residual, c.reference),
+        "poses": [
+            {
+                "start_s": number(p.pose.start_s),
+                "end_s": number(p.pose.end_s),
+                "mean": numbers(p.pose.mean),
+                "direction": direction(p.direction),
+                "residual_g": error(p.residual_g, c.reference),
+                "standard_error_g": uncertainty(p.standard_error_g),
+                "studentized": uncertainty(p.studentized),
+                "leverage": uncertainty(p.leverage),
+                "used": p.used,
+                "excluded": p.excluded,
+                **({"left_out": _LEFT_OUT.get(p.excluded, p.pose.fault)} if p.excluded else {}),
+                "channels": {name: number(v) for name, v in p.pose.channels.items()},
+            }
+            for p in c.poses
+        ],
+        "trends": c.trends,
+        "condition": uncertainty(c.condition),
+        "dilution": uncertainty(c.dilution),
+        "blind_to": list(c.blind_to),
+        "warnings": [text.caution(caution) for caution in c.cautions],
+        **(
+            {
+                "linear_only": calibration_document(
+                    c.linear_only, output_unit=output_unit, reference_unit=reference_unit, stated=stated
+                )
+            }
+            if c.linear_only is not None
+            else {}
+        ),
+    }
+
+
+def _holds_at(moment: HoldsAt | None) -> Document | None:
+    if moment is None:
+        return None
+    clock = {} if moment.time_s == moment.t_s else {"since_middle_s": number(moment.time_s)}
+    return {"moment": moment.moment.value, "t_s": number(moment.t_s), **clock}
+
+
+def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
+    """Values in the order of `Calibration.parameters`, in groups as the coefficients stand in a document."""
+    held = dict(zip(c.parameters, values, strict=True))
+    groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
+    effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
+    return groups | ({"effects": effects} if effects else {})
+
+
+def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Document:
+    """Expanded uncertainties and where they come from. Standard uncertainties in the budget's lines."""
+
+    def by_name(values: Floats) -> Document:
+        return by_parameter(c, [uncertainty(float(v)) for v in values])
+
+    whole, small = b.magnitude, ErrorUnit.of(reference_unit, c.reference)
+    return {
+        "level": b.parameters.level,
+        "expanded": by_name(b.parameters.expanded),
+        "coverage_factor": by_name(b.parameters.coverage),
+        "magnitude": {
+            "standard_g": uncertainty(float(whole.standard)),
+            "coverage_factor": uncertainty(float(whole.coverage)),
+            "expanded_g": uncertainty(float(whole.expanded)),
+        },
+        "budget": [
+            {
+                "source": line.source,
+                "evaluation": line.evaluation,
+                "degrees_of_freedom": uncertainty(line.dof),
+                **by_name(line.parameters),
+                "magnitude_g": uncertainty(line.magnitude),
+                "share": uncertainty(b.share(line)),
+                "how": text.basis(line.basis),
+                **({"assumes": list(effects)} if (effects := assumed_in(line.basis)) else {}),
+            }
+            for line in b.components
+        ],
+        "dominant": b.dominant.source,
+        "halved_by": text.remedy(b.dominant.halved_by, small.figure),
+        "magnitude_if_halved_g": uncertainty(b.magnitude_if_halved),
+        "not_evaluated": [text.not_evaluated(source, small.figure) for source in b.not_evaluated],
+    }
+
+
+def assumed_in(basis: Basis) -> tuple[str, ...]:
+    """The effects whose size a line of the budget (`triaxcal.uncertainty.Component`) assumes."""
+    return basis.effects if isinstance(basis, UnmodelledTemperature) else ()

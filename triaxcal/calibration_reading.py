@@ -1,0 +1,147 @@
+"""The sensor that a document holds, of whoever wrote it: read with errors that name the file and the field."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration, HoldsAt, Moment, Residual
+from triaxcal.effects import Effect, effect_of
+from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
+from triaxcal.errors import InvalidData
+from triaxcal.sensor import Sensor
+from triaxcal.units import reference_unit_of
+
+
+def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str, Any]:
+    """The `triaxcal.calibration/1` in a calibration, loop or certificate document. Raises InvalidData."""
+    inner: Any = document
+    for key in ("result", "calibration"):
+        if isinstance(inner, Mapping) and isinstance(inner.get(key), Mapping):
+            inner = inner[key]
+    if not isinstance(inner, Mapping) or inner.get("format") != "triaxcal.calibration/1":
+        raise InvalidData(f"{where}: format: expected a triaxcal.calibration/1, .loop/1 or .certificate/1 document")
+    return inner
+
+
+def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: float) -> str:
+    """The unit of the reference that a calibration document says, or what it must be by its magnitude."""
+    units = calibration_part(document, where=where).get("units")
+    said = units.get("reference") if isinstance(units, Mapping) else None
+    return said if isinstance(said, str) and said else reference_unit_of(magnitude)
+
+
+def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[str, float], float]:
+    """Sensor, channel references and reference magnitude of a calibration document. Raises InvalidData."""
+    part = calibration_part(document, where=where)
+    try:
+        k, m, b = (np.array(part[name], dtype=float) for name in ("scale_factor", "misalignment", "bias"))
+        effects = []
+        for name, held in part.get("effects", {}).items():
+            effect, q = effect_of(name, {n: float(v["value"]) for n, v in held.items()})
+            lacking = [n for n in (*(c.name for c in effect.coefficients), *effect.shape) if n not in held]
+            if lacking:
+                raise KeyError(f"effects.{name}.{lacking[0]}")
+            effects.append((effect, q))
+        reference = {str(n): float(v) for n, v in part.get("channel_reference", {}).items()}
+        magnitude = float(part.get("reference", 1.0))
+    except KeyError as e:
+        raise InvalidData(f"{where}: {e.args[0]}: missing, or no effect of that name is known") from e
+    except (TypeError, ValueError, AttributeError, OverflowError) as e:
+        raise InvalidData(f"{where}: not numbers where numbers belong ({e})") from e
+    if any(v.shape != (3,) or not np.isfinite(v).all() for v in (k, m, b)) or not np.all(k):
+        raise InvalidData(
+            f"{where}: scale_factor, misalignment, bias: expected three numbers each, none zero in the first"
+        )
+    _require_finite(effects, reference, magnitude, where)
+    return Sensor(k, m, b, tuple(effects)), reference, magnitude
+
+
+def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
+    """The calibration in a calibration, loop or certificate document, as the model of other poses. What only its fit
+    could tell is not a number, and so is a covariance that the document does not hold. Raises InvalidData."""
+    part = calibration_part(document, where=where)
+    sensor, channel_reference, magnitude = sensor_of(document, where=where)
+    unknown = math.nan
+    return Calibration(
+        sensor=sensor,
+        covariance=covariance_of(part, sensor, where=where),
+        reference=magnitude,
+        channel_reference=channel_reference,
+        residual=_residual(part),
+        poses=(),
+        condition=_number(part.get("condition")),
+        dilution=_number(part.get("dilution")),
+        inflation=unknown,
+        dof=unknown,
+        holds_at=holds_at_of(part, where=where),
+    )
+
+
+def covariance_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Floats:
+    """(p,p) of the parameters; not numbers where the document has no standard errors. Without a correlation they count
+    as independent. Raises InvalidData."""
+    n = 9 + sum(len(q) for _, q in sensor.effects)
+    if not isinstance(part.get("standard_error"), Mapping):
+        return np.full((n, n), math.nan)
+    held = [part["effects"][e.name][k.name] for e, _ in sensor.effects for k in e.coefficients]
+    if any(isinstance(v, Mapping) and v.get("standard_error") is None for v in held):
+        return np.full((n, n), math.nan)  # only a combination of coefficients is known
+    sigma = np.concatenate([linear_errors_of(part, where=where), effect_errors_of(part, sensor, where=where)])
+    correlation = correlation_of(part, sensor, where=where)
+    if correlation is None:
+        return np.diag(sigma**2)
+    return np.asarray(correlation * np.outer(sigma, sigma))
+
+
+def holds_at_of(part: Mapping[str, Any], *, where: str) -> HoldsAt | None:
+    """None where the document, as those of 0.1, does not say. Raises InvalidData."""
+    held = part.get("holds_at")
+    if held is None:
+        return None
+    try:
+        moment, t_s = Moment(held["moment"]), float(held["t_s"])
+        time_s = float(held.get("since_middle_s", t_s))
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError):
+        t_s = time_s = math.nan
+    if not math.isfinite(t_s + time_s):
+        raise InvalidData(f"{where}: holds_at: expected a moment (end, mean or seconds) and t_s in seconds")
+    return HoldsAt(moment, t_s, time_s)
+
+
+def _residual(part: Mapping[str, Any]) -> Residual:
+    held = part.get("residual")
+    told = held if isinstance(held, Mapping) else {}
+    crossed, p = (_number(told.get(name)) for name in ("cross_validated_rms_g", "lack_of_fit_p"))
+    return Residual(
+        rms_g=_number(told.get("rms_g")),
+        max_abs_g=_number(told.get("max_abs_g")),
+        cross_validated_rms_g=None if math.isnan(crossed) else crossed,
+        noise_floor_g=_number(told.get("noise_floor_g")),
+        lack_of_fit_p=None if math.isnan(p) else p,
+    )
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+
+
+def _require_finite(
+    effects: Sequence[tuple[Effect, Floats]], reference: Mapping[str, float], magnitude: float, where: str
+) -> None:
+    """JSON as Python reads it has NaN."""
+    for effect, values in effects:
+        if not np.isfinite(values).all():
+            raise InvalidData(f"{where}: effects.{effect.name}: expected finite numbers")
+        for need in effect.needs:
+            if need not in reference:
+                raise InvalidData(f"{where}: channel_reference.{need}: missing; the effect {effect.name} needs it")
+    for name, value in reference.items():
+        if not math.isfinite(value):
+            raise InvalidData(f"{where}: channel_reference.{name}: expected a finite number")
+    if not 0 < magnitude < math.inf:
+        raise InvalidData(f"{where}: reference: expected a positive number")

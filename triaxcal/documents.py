@@ -1,0 +1,323 @@
+"""A calibration as callers have it: applied, shown, and kept as the JSON document that others script against.
+
+The one file of the metrology that opens files.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from triaxcal import tables, text
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration as Fitted
+from triaxcal.calibration import HoldsAt, PoseResult, Residual
+from triaxcal.calibration_document import LINEAR, Document, calibration_document
+from triaxcal.calibration_reading import calibration_of, calibration_part
+from triaxcal.effects.contract import TIME, channel_of, is_derived
+from triaxcal.errors import InvalidData, MissingChannel
+from triaxcal.uncertainty import Stated
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OUT = ("ax", "ay", "az")
+UNCERTAINTY = ("u_ax", "u_ay", "u_az")
+
+
+class Calibration:
+    """Scale factors, misalignments, biases and effects of one unit.
+
+    From `triaxcal.calibrate`, `triaxcal.diagnose`, or a file (`load`); of a file, what only a fit knows is NaN.
+    `apply` takes readings in output units and gives the specific force in the unit of the reference vector, in the
+    sensor's own orthogonal frame: ``a = A (u − c)`` for a linear one, with the matrix A (3,3) and the centre c (3,)
+    (paper, eq. 4).
+    """
+
+    def __init__(
+        self,
+        fitted: Fitted,
+        *,
+        output_unit: str = "",
+        reference_unit: str = "g",
+        stated: Stated | None = None,
+        document: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._fitted, self._stated = fitted, stated
+        self._document = None if document is None else copy.deepcopy(dict(document))
+        self.output_unit, self.reference_unit = output_unit, reference_unit
+
+    @property
+    def fitted(self) -> Fitted:
+        """The fit's own value, with its covariance."""
+        return self._fitted
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """ "linear", then the effects in the model."""
+        return self._fitted.terms
+
+    @property
+    def scale_factor(self) -> Floats:
+        """(3,) output per reference unit, signed."""
+        return self._fitted.sensor.scale_factor
+
+    @property
+    def misalignment(self) -> Floats:
+        """(3,) rad."""
+        return self._fitted.sensor.misalignment
+
+    @property
+    def bias(self) -> Floats:
+        """(3,) in the unit of the reference vector."""
+        return self._fitted.sensor.bias
+
+    @property
+    def matrix(self) -> Floats:
+        """A (3,3). Beside effects it is not a calibration without them: see `linear_only`."""
+        return self._fitted.sensor.matrix
+
+    @property
+    def centre(self) -> Floats:
+        """c (3,) output units."""
+        return self._fitted.sensor.centre
+
+    @property
+    def effects(self) -> dict[str, dict[str, tuple[float, float | None, str]]]:
+        """name → coefficient → (value, standard error, unit)."""
+        whole = self._fitted.whole
+        return {e.name: whole.coefficients_of(e.name) for e, _ in self._fitted.sensor.effects}
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """By parameter ("bias.x", "temperature_bias.x"), in its unit; NaN where they are not known."""
+        return dict(zip(self._fitted.parameters, map(float, self._fitted.standard_errors), strict=True))
+
+    @property
+    def residual(self) -> Residual:
+        return self._fitted.residual
+
+    @property
+    def poses(self) -> tuple[PoseResult, ...]:
+        """Those of the fit; none of a calibration that was loaded (`to_dict` has them)."""
+        return self._fitted.poses
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Every reason not to trust it in full."""
+        if self._document is not None:
+            part = calibration_part(self._document, where="document")
+            return tuple(map(str, part.get("warnings") or ()))
+        return tuple(map(text.caution, self._fitted.cautions))
+
+    @property
+    def holds_at(self) -> HoldsAt | None:
+        """The moment of its recording for which effects of time hold elsewhere."""
+        return self._fitted.holds_at
+
+    @property
+    def linear_only(self) -> Calibration:
+        """The linear calibration fitted by itself; this one where it has no effects. Raises InvalidData where nobody
+        fitted it."""
+        if not self._fitted.sensor.effects:
+            return self
+        if self._fitted.linear_only is not None:
+            return Calibration(
+                self._fitted.linear_only,
+                output_unit=self.output_unit,
+                reference_unit=self.reference_unit,
+                stated=self._stated,
+            )
+        part = calibration_part(self.to_dict(), where="document")
+        if not isinstance(part.get("linear_only"), Mapping):
+            raise InvalidData("this calibration has effects, and no linear one was fitted beside it: diagnose fits one")
+        return Calibration.from_dict(part["linear_only"])
+
+    def apply(
+        self,
+        u: Any,
+        *,
+        t: Any = None,
+        channels: Mapping[str, Any] | None = None,
+        own_recording: bool = False,
+        uncertainty: bool = False,
+        time_unit: str | None = None,
+    ) -> Any:
+        """Calibrated readings.
+
+        ``u`` (3,) or (n,3) in output units, or a DataFrame with the columns ux, uy, uz: then a DataFrame of the same
+        library with ax, ay, az, whose other columns serve as channels. ``channels`` are named as in
+        ``channel_reference`` of the document (temp_c, temp_c.rate, before_x, …), one number or (n,) each; one that an
+        effect needs and that is not given counts as at its reference, with a `MissingChannel` warning. Effects of time
+        hold at `holds_at`, or with ``own_recording`` at the times ``t`` (n,) from the first sample of the recording
+        that was fitted. ``uncertainty``: also the standard uncertainties that the calibration gives them, in the same
+        shape, without the noise of the readings. Raises InvalidData; Refused where the model has no inverse.
+        """
+        table = u if tables.is_table(u) else None
+        if table is not None:
+            u = np.stack([tables.column(table, name) for name in tables.OUTPUTS], axis=1)
+            channels = self._channels_in(table) | dict(channels or {})
+            if own_recording and t is None and tables.TIME_COLUMN in tables.names_of(table):
+                t = tables.column(table, tables.TIME_COLUMN)
+        readings = tables.readings_of(u)
+        rows = np.atleast_2d(readings)
+        times = self._times(t, own_recording, time_unit, len(rows))
+        held = self._conditions(len(rows), channels or {}, times)
+        sensor = self._fitted.sensor
+        a = sensor.specific_force(rows, held) if sensor.effects else (rows - sensor.centre) @ sensor.matrix.T
+        a = a.reshape(readings.shape)
+        errors = self._uncertainty(rows, held).reshape(readings.shape) if uncertainty else None
+        if table is None:
+            return a if errors is None else (a, errors)
+        out = dict(zip(OUT, a.T, strict=True))
+        return tables.like(table, out if errors is None else out | dict(zip(UNCERTAINTY, errors.T, strict=True)))
+
+    def _channels_in(self, table: Any) -> dict[str, Any]:
+        return {name: tables.column(table, name) for name in tables.names_of(table) if name in self._needed()}
+
+    def _needed(self) -> set[str]:
+        return {name if is_derived(name) else channel_of(name) for name in self._fitted.channel_reference} - {TIME}
+
+    def _times(self, t: Any, own_recording: bool, time_unit: str | None, n: int) -> Floats | None:
+        if not own_recording:
+            return None
+        if t is None:
+            raise InvalidData("own_recording: say by t when the readings were taken, from the recording's first sample")
+        times = tables.seconds(t, time_unit)
+        if len(times) != n:
+            raise InvalidData(f"t has {len(times)} times, and u has {n} samples")
+        return times
+
+    def _conditions(self, n: int, channels: Mapping[str, Any], times: Floats | None) -> dict[str, Floats]:
+        given = {name: tables.channel_of_samples(name, v, n) for name, v in channels.items()}
+        held, missing = self._fitted.conditions_of_readings(n, given, times)
+        missing = tuple(channel_of(name) if not is_derived(name) else name for name in missing)
+        if missing:
+            effects = [e.name for e, _ in self._fitted.sensor.effects if set(e.needs) & set(missing)]
+            warnings.warn(
+                f"{', '.join(missing)} not given, which {', '.join(effects)} goes with: taken at the reference",
+                MissingChannel,
+                stacklevel=3,
+            )
+        return held
+
+    def _uncertainty(self, u: Floats, held: Mapping[str, Floats]) -> Floats:
+        """(n,3): one standard error along each principal axis of the parameters' covariance, and what it does."""
+        c = self._fitted.whole
+        covariance = c.covariance * np.outer(*[self._beyond_the_fit(c)] * 2)
+        if not np.isfinite(covariance).all():
+            return np.full(u.shape, np.nan)
+        size, axes = np.linalg.eigh(covariance)
+        sensor, a = c.sensor, c.sensor.specific_force(u, held)
+        variance = np.zeros(u.shape)
+        for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
+            variance += (sensor.moved(step).specific_force(u, held) - a) ** 2
+        return np.sqrt(variance)
+
+    def _beyond_the_fit(self, c: Fitted) -> Floats:
+        """(p,) standard uncertainties over standard errors: what the budget has beside the fit."""
+        budget = calibration_part(self.to_dict(), where="document").get("uncertainty") or {}
+        return np.array(
+            [
+                _of(budget, "expanded", name) / _of(budget, "coverage_factor", name) / error if error > 0 else 1.0
+                for name, error in zip(c.parameters, c.standard_errors, strict=True)
+            ]
+        )
+
+    def to_dict(self) -> Document:
+        """The `triaxcal.calibration/1` document; as it was loaded, where it was."""
+        if self._document is None:
+            self._document = calibration_document(
+                self._fitted,
+                output_unit=self.output_unit,
+                reference_unit=self.reference_unit,
+                stated=self._stated,
+                budgeted=bool(self._fitted.poses),
+            )
+        return copy.deepcopy(self._document)
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any], *, where: str = "document") -> Calibration:
+        """Of a calibration, loop or certificate document, of 0.1 too. Raises InvalidData, which begins with
+        ``where``."""
+        part = calibration_part(document, where=where)
+        units = part.get("units")
+        named = units if isinstance(units, Mapping) else {}
+        return cls(
+            calibration_of(document, where=where),
+            output_unit=str(named.get("output") or ""),
+            reference_unit=str(named.get("reference") or "g"),
+            document=part,
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Whole or not at all. Raises OSError."""
+        write_text(Path(path), to_text(self.to_dict()))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Calibration:
+        """Raises InvalidData, which names the file, and OSError."""
+        return cls.from_dict(read_document(Path(path)), where=str(path))
+
+    def summary(self) -> str:
+        """A few lines: the coefficients with their standard errors, the residual, and what speaks against it."""
+        return text.summary(self._fitted, self.output_unit, self.reference_unit, self.warnings)
+
+    def plot(self) -> Figure:
+        """The residuals of the poses, and where these lie on the sphere. Raises InvalidData where there are none;
+        ModuleNotFoundError without matplotlib."""
+        from triaxcal.pictures import residuals_figure  # matplotlib, which nothing else needs
+
+        return residuals_figure(calibration_part(self.to_dict(), where="document"))
+
+    def __repr__(self) -> str:
+        return text.short(self._fitted, self.output_unit, self.reference_unit)
+
+    def _repr_html_(self) -> str:
+        return text.html(self._fitted, self.output_unit, self.reference_unit, self.warnings)
+
+
+def _of(budget: Mapping[str, Any], key: str, parameter: str) -> float:
+    """A figure of the budget by parameter, 1 where it has none."""
+    group, _, name = parameter.rpartition(".")
+    try:
+        of = budget[key]
+        return float(of[group]["xyz".index(name)] if group in LINEAR else of["effects"][group][name])
+    except (LookupError, TypeError, ValueError):
+        return 1.0
+
+
+def read_document(path: Path) -> Mapping[str, Any]:
+    """A JSON object. Raises InvalidData, which names file and line, and OSError."""
+    with path.open("rb") as file:
+        data = file.read()
+    try:
+        found = json.loads(data)
+    except json.JSONDecodeError as e:
+        raise InvalidData(f"{path}: line {e.lineno}: no JSON: {e.msg}") from None
+    except (ValueError, RecursionError) as e:
+        raise InvalidData(f"{path}: no JSON: {e}") from None
+    if not isinstance(found, Mapping):
+        raise InvalidData(f"{path}: expected a JSON object")
+    return found
+
+
+def to_text(document: Mapping[str, Any]) -> str:
+    """The document as it is written and compared: UTF-8, two spaces, one key a line, a newline at the end."""
+    return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def write_text(path: Path, content: str) -> None:
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_text(content, encoding="utf-8")
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)

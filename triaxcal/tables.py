@@ -1,0 +1,132 @@
+"""Samples as callers have them: arrays, or a DataFrame of pandas or polars, which neither is needed for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.errors import InvalidData
+from triaxcal.samples import Samples
+
+UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000, "ns": 1}
+TIME_COLUMN, OUTPUTS = "t_s", ("ux", "uy", "uz")
+SECONDS_MOST = 9.2e9
+"""Seconds that nanoseconds in 64 bits can count, from 1970 or from the first sample."""
+
+
+def is_table(value: object) -> bool:
+    """Whether it has named columns, as a DataFrame has."""
+    return hasattr(value, "columns") and hasattr(value, "__getitem__") and not isinstance(value, np.ndarray)
+
+
+def names_of(table: Any) -> list[str]:
+    return [str(name) for name in table.columns]
+
+
+def column(table: Any, name: str) -> Any:
+    """(n,) as numpy has it. Raises InvalidData where there is none of that name."""
+    if name not in names_of(table):
+        raise InvalidData(f"the table has no column {name}; it has {', '.join(names_of(table))}")
+    return np.asarray(table[name])
+
+
+def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_unit: str | None = None) -> Samples:
+    """Of a table with the columns t_s, ux, uy, uz; ``columns`` says how they are called where that is otherwise. All
+    other columns of finite numbers are channels, by their own names. Raises InvalidData."""
+    called = {name: name for name in (TIME_COLUMN, *OUTPUTS)}
+    for ours, theirs in (columns or {}).items():
+        name = TIME_COLUMN if ours == "t" else ours
+        called[name] = theirs
+    channels = {ours: column(table, theirs) for ours, theirs in called.items() if ours not in (TIME_COLUMN, *OUTPUTS)}
+    for name in names_of(table):
+        values = column(table, name)
+        if name not in called.values() and values.dtype.kind in "fiu" and np.isfinite(values).all():
+            channels[name] = values
+    u = np.stack([_numbers(column(table, called[name]), called[name]) for name in OUTPUTS], axis=1)
+    return samples_of(column(table, called[TIME_COLUMN]), u, channels, time_unit, called[TIME_COLUMN])
+
+
+def samples_of(
+    t: Any, u: Any, channels: Mapping[str, Any] | None = None, time_unit: str | None = None, name: str = "t"
+) -> Samples:
+    """``t`` (n,): floats are seconds, unless ``time_unit`` names another unit, datetimes are what they are, and of
+    integers the unit is asked for; ``u`` (n,3) output units; ``channels`` (n,) each. Raises InvalidData."""
+    readings = readings_of(u)
+    if readings.ndim != 2:
+        raise InvalidData(f"u: expected shape (n, 3), one row a sample, not {readings.shape}")
+    time_ns = _time_ns(t, time_unit, name)
+    if len(time_ns) != len(readings):
+        raise InvalidData(f"{name} has {len(time_ns)} times, and u has {len(readings)} samples")
+    return Samples(time_ns, readings, {n: channel_of_samples(n, v, len(readings)) for n, v in (channels or {}).items()})
+
+
+def readings_of(u: Any) -> Floats:
+    """(3,) or (n,3) as floats. Raises InvalidData."""
+    readings = _numbers(u, "u")
+    if readings.ndim not in (1, 2) or readings.shape[-1] != 3:
+        hint = "; transpose it" if readings.ndim == 2 and readings.shape[0] == 3 else ""
+        raise InvalidData(f"u: expected shape (n, 3) or (3,), not {readings.shape}{hint}")
+    return readings
+
+
+def channel_of_samples(name: str, values: Any, n: int) -> Floats:
+    """(n,) of a channel that is one number or (n,). Raises InvalidData."""
+    found = _numbers(values, f"channel {name}")
+    if found.shape not in ((), (n,)):
+        raise InvalidData(f"channel {name}: expected one number or {n}, not shape {found.shape}")
+    return np.broadcast_to(found, (n,))
+
+
+def like(table: Any, columns: Mapping[str, Floats]) -> Any:
+    """A DataFrame of the same library with these columns, and the same index where it has one."""
+    found = type(table)(dict(columns))
+    if hasattr(table, "index") and hasattr(found, "index"):
+        found.index = table.index
+    return found
+
+
+def seconds(t: Any, time_unit: str | None = None) -> Floats:
+    """(n,) s of times as `samples_of` takes them, as they are counted. Raises InvalidData."""
+    return np.asarray(_time_ns(np.atleast_1d(np.asarray(t)), time_unit, "t") * 1e-9)
+
+
+def _time_ns(t: Any, time_unit: str | None, name: str) -> Ints:
+    times = np.asarray(t)
+    if times.ndim != 1:
+        raise InvalidData(f"{name}: expected shape (n,), not {times.shape}")
+    if time_unit is not None and time_unit not in UNITS_NS:
+        raise InvalidData(f"time_unit: expected {', '.join(u for u in UNITS_NS if u != 'µs')}, not '{time_unit}'")
+    if times.dtype.kind == "M":
+        if np.isnat(times).any():
+            raise InvalidData(f"{name}: sample {int(np.flatnonzero(np.isnat(times))[0])} has no time")
+        return times.astype("datetime64[ns]").astype(np.int64)
+    if times.dtype.kind == "m":
+        return times.astype("timedelta64[ns]").astype(np.int64)
+    if times.dtype.kind in "iu":
+        if time_unit is None:
+            raise InvalidData(f"{name} are integers: say their unit by time_unit, one of s, ms, us, ns")
+        return times.astype(np.int64) * UNITS_NS[time_unit]
+    found = _numbers(times, name)
+    if not np.isfinite(found).all():
+        raise InvalidData(f"{name}: sample {int(np.flatnonzero(~np.isfinite(found))[0])} has no finite time")
+    scaled = found * (UNITS_NS[time_unit or "s"] / UNITS_NS["s"])
+    if np.abs(scaled).max(initial=0.0) > SECONDS_MOST:
+        raise InvalidData(f"{name} goes to {found.max():.6g}, too much for seconds: say its unit by time_unit")
+    whole = np.floor(scaled)  # apart, so that seconds since 1970 keep their nanoseconds as far as a float has them
+    ns = whole.astype(np.int64) * UNITS_NS["s"] + np.round((scaled - whole) * 1e9).astype(np.int64)
+    return np.asarray(ns)
+
+
+def _numbers(values: Any, name: str) -> Floats:
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise InvalidData(f"{name}: expected numbers, not {_kind(values)}") from None
+
+
+def _kind(values: Any) -> str:
+    kinds: Iterable[str] = {type(v).__name__ for v in np.ravel(np.asarray(values, dtype=object))[:10]}
+    return " and ".join(sorted(kinds)) or "nothing"
