@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import os
 import re
@@ -16,9 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
+import triaxcal as tc
 from triaxcal_drivers.profile import load_bundle
 from triaxcald.cli.commands import main, parser
 from triaxcald.documents import to_text
@@ -307,6 +310,63 @@ PYTHON = [b for b in all_blocks() if b.language == "python"]
 @pytest.mark.parametrize("block", PYTHON, ids=[f"{name_of(b.page)}, {b.text[:40]!r}" for b in PYTHON])
 def test_every_python_block_is_python(block: Block) -> None:
     compile(block.text, str(block.page), "exec")
+
+
+CALIBRATION_HOW_TO = PROJECT / "docs/how-to/use-a-calibration.md"
+
+
+def in_use(kind: str) -> tuple[tc.Calibration, Any, Any]:
+    """A calibration as the how-to uses one of that kind, readings (n,3), and the temperature of each (n,)."""
+    effects = {"second_order_nonlinearity": 5e-4, "temperature_bias": 3e-4} if kind == "effects" else {}
+    document = {
+        "format": "triaxcal.calibration/1",
+        "scale_factor": [-2.41, -2.4, -2.37],
+        "misalignment": [6e-3, 4e-3, -6e-4],
+        "bias": [5e-3, -3e-3, 4e-3],
+        "channel_reference": {"temp_c": 24.5},
+        "effects": {n: {i: {"value": q * (1 + "xyz".index(i))} for i in "xyz"} for n, q in effects.items()},
+    }
+    c = tc.Calibration.from_dict(document)
+    sensor = c.fitted.sensor
+    document |= {"matrix": sensor.matrix.tolist(), "centre": sensor.centre.tolist()}
+    rng = np.random.default_rng(0)
+    return tc.Calibration.from_dict(document), 2 * rng.standard_normal((50, 3)), rng.uniform(0, 60, 50)
+
+
+@pytest.mark.parametrize("kind", ["linear", "effects"])
+def test_the_formula_in_python_is_what_apply_does(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    c, u, temp_c = in_use(kind)
+    (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.language == "python" and b.note == kind]
+    monkeypatch.chdir(tmp_path)
+    c.save("cal.json")
+    names: dict[str, Any] = {"u": u, "T": temp_c[:, None]}
+    exec(compile(block.text, "how-to", "exec"), names)
+    assert names["a"] == pytest.approx(c.apply(u, channels={"temp_c": temp_c}), abs=1e-12)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="this machine has no C compiler")
+@pytest.mark.parametrize("kind", ["linear", "effects"])
+def test_the_formula_in_c_is_what_apply_does(kind: str, tmp_path: Path) -> None:
+    c, u, temp_c = in_use(kind)
+    (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.language == "c" and b.note == kind]
+    (tmp_path / "apply.c").write_text(block.text)
+    library = tmp_path / "apply.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "apply.c"], check=True)
+    function = ctypes.CDLL(str(library)).apply
+
+    def numbers(values: Any) -> Any:
+        flat = np.ravel(values).tolist()
+        return (ctypes.c_double * len(flat))(*flat)
+
+    s, a = c.fitted.sensor, (ctypes.c_double * 3)()
+    for row, t in zip(u, temp_c, strict=True):
+        if kind == "linear":
+            function(numbers(s.matrix), numbers(s.centre), numbers(row), a)
+        else:
+            q2, qt = (q for _, q in s.effects)
+            known = map(numbers, (s.scale_factor, s.misalignment, s.bias, q2, qt))
+            function(*known, ctypes.c_double(t - 24.5), numbers(row), a)
+        assert list(a) == pytest.approx(c.apply(row, channels={"temp_c": t}), abs=1e-12)
 
 
 def test_the_closed_form_can_be_redone_by_hand() -> None:

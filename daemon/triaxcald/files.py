@@ -105,6 +105,19 @@ def replace_bytes(path: Path, data: bytes) -> None:
 
 
 @contextmanager
+def new_beside(path: Path) -> Iterator[Path]:
+    """A temporary file beside ``path``, empty, which takes its place where the context comes to its end and is gone
+    where it does not. Raises OSError."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    with new_file(temporary) as file:
+        file.close()
+        yield temporary
+        os.replace(temporary, path)
+
+
+@contextmanager
 def new_file(path: Path) -> Iterator[BinaryIO]:
     """A file that was not there before. Nothing of it is left where the context does not come to its end.
 

@@ -21,6 +21,7 @@ ROOMS = {
     "line": ("demo", "run", "sim", "record"),
     "measuring": ("poses", "verify"),
     "fitting": ("fit", "diagnose"),
+    "applying": ("apply",),
     "framing": ("frame",),
     "planning": ("plan",),
     "provisioning": ("provision", "restore"),

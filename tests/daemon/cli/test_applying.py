@@ -1,0 +1,140 @@
+"""`triaxcal apply`, against the truth of a simulated unit."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import triaxcal as tc
+from triaxcal.effects import effect_of
+from triaxcal.planning.directions import directions
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
+
+GOLDEN = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"
+BEGIN_S = 12.5
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording whose times begin at 12.5 s, its calibration, and the specific force that the unit felt."""
+    folder = tmp_path_factory.mktemp("applying")
+    effect = effect_of("temperature_bias", {"x": 4e-4, "y": -2e-4, "z": 3e-4})
+    sensor = Sensor(
+        np.array([2.4, 2.41, 2.37]), np.array([6e-3, 4e-3, -6e-4]), np.array([5e-3, -3e-3, 4e-3]), (effect,)
+    )
+    unit = SyntheticUnit(
+        sensor,
+        Tumble(np.array([v for _, v in directions(26)]), 1.6, 0.9),
+        np.full(3, 1e-4),
+        Environment(25, 0.02, 4, 37),
+    )
+    t = np.arange(0.0, 65.0, 0.02)
+    u, temp_c = unit.sample(t)
+    table = pd.DataFrame({"t_s": t + BEGIN_S, "ux": u[:, 0], "uy": u[:, 1], "uz": u[:, 2], "temp_c": temp_c})
+    table.to_csv(folder / "rec.csv", index=False)
+    table.drop(columns="temp_c").to_csv(folder / "bare.csv", index=False)
+    found = tc.diagnose(table).calibration
+    assert found.terms == ("linear", "temperature_bias")
+    found.save(folder / "cal.json")
+    np.save(folder / "truth.npy", unit.path.specific_force(t))
+    return folder
+
+
+def test_the_columns_of_the_input_stay_and_the_calibrated_ones_are_behind_them(
+    folder: Path, triaxcal, tmp_path: Path
+) -> None:
+    done = triaxcal("apply", folder / "cal.json", folder / "rec.csv", "-o", tmp_path / "out.csv")
+    assert done.code == 0, done.err
+    assert "3250 samples, linear, temperature_bias, in g" in done.err
+    given, found = pd.read_csv(folder / "rec.csv"), pd.read_csv(tmp_path / "out.csv")
+    assert list(found.columns) == ["t_s", "ux", "uy", "uz", "temp_c", "ax", "ay", "az"]
+    assert found["t_s"].to_numpy() == pytest.approx(given["t_s"].to_numpy(), abs=1e-9)
+    assert np.array_equal(found["uy"], given["uy"])
+    off = found[["ax", "ay", "az"]].to_numpy() - np.load(folder / "truth.npy")
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(1e-4, rel=0.1)  # the noise of the readings, and hardly more
+
+
+@pytest.mark.parametrize("kind", ["csv.gz", "parquet"])
+def test_compressed_and_in_columns_it_says_the_same(folder: Path, triaxcal, tmp_path: Path, kind: str) -> None:
+    for name in (f"out.{kind}", "out.csv"):
+        done = triaxcal("apply", folder / "cal.json", folder / "rec.csv", "-o", tmp_path / name, "--uncertainty")
+        assert done.code == 0, done.err
+    plain = pd.read_csv(tmp_path / "out.csv")
+    other = pd.read_parquet(tmp_path / "out.parquet") if kind == "parquet" else pd.read_csv(tmp_path / "out.csv.gz")
+    assert list(other.columns) == list(plain.columns)
+    assert list(other.columns)[-3:] == ["u_ax", "u_ay", "u_az"]
+    assert other.to_numpy() == pytest.approx(plain.to_numpy(), abs=1e-12)
+    assert plain["u_ax"].between(1e-6, 1e-4).all()
+
+
+def test_a_recording_is_read_block_by_block_as_its_export_is(triaxcal, tmp_path: Path) -> None:
+    exported, cal = tmp_path / "rec.csv", tmp_path / "cal.json"
+    assert triaxcal("log", "export", GOLDEN, "-o", exported).code == 0
+    assert triaxcal("diagnose", GOLDEN, "-o", cal).code == 0
+    for name, rec in (("a.csv", GOLDEN), ("b.csv", exported)):
+        assert triaxcal("apply", cal, rec, "-o", tmp_path / name).code == 0
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    a = pd.read_csv(tmp_path / "a.csv")
+    still = np.abs(np.linalg.norm(a[["ax", "ay", "az"]], axis=1) - 1) < 2e-3
+    assert still.mean() > 0.3
+
+
+def test_a_channel_that_the_recording_lacks_is_said_once(folder: Path, triaxcal, tmp_path: Path) -> None:
+    done = triaxcal("apply", folder / "cal.json", folder / "bare.csv", "-o", tmp_path / "out.csv")
+    assert done.code == 0
+    assert done.err.count("warning: temp_c not given, which temperature_bias goes with: taken at the reference") == 1
+
+
+def test_effects_of_time_hold_at_each_time_of_their_own_recording(triaxcal, tmp_path: Path, folder: Path) -> None:
+    document = json.loads((folder / "cal.json").read_text())
+    per_axis = {axis: {"value": 1e-5 * (axis == "x"), "standard_error": 0, "unit": "g/s"} for axis in "xyz"}
+    document["effects"] = {"bias_drift": per_axis}
+    document["channel_reference"] = {"t_s": 0.0}
+    document["holds_at"] = {"moment": "seconds", "t_s": 0.0}
+    for key in ("correlation", "parameters", "linear_only"):
+        document.pop(key)
+    cal = tmp_path / "cal.json"
+    cal.write_text(json.dumps(document))
+    for name, more in (("at.csv", ()), ("own.csv", ("--own-recording",))):
+        done = triaxcal("apply", cal, folder / "rec.csv", "-o", tmp_path / name, *more)
+        assert done.code == 0, done.err
+    at, own = (pd.read_csv(tmp_path / n)["ax"].to_numpy() for n in ("at.csv", "own.csv"))
+    since_first = pd.read_csv(tmp_path / "own.csv")["t_s"].to_numpy() - BEGIN_S
+    assert at - own == pytest.approx(1e-5 * since_first, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("cal.json", "rec.csv", "-o", "out.txt"), 2, "expected a name that ends in .csv, .csv.gz, .parquet"),
+        (("cal.json", "rec.csv", "-o", "nowhere/out.csv"), 2, "there is no folder"),
+        (("rec.csv", "rec.csv", "-o", "out.csv"), 2, "rec.csv"),
+        (("cal.json", "gone.csv", "-o", "out.csv"), 2, "gone.csv"),
+        (("cal.json", "twice.csv", "-o", "out.csv"), 2, "it has a column ax already"),
+        (("cal.json", "rec.csv", "-o", "rec.csv"), 2, "it would overwrite what is read"),
+    ],
+)
+def test_what_cannot_be_done_is_said_and_leaves_nothing(
+    folder: Path, triaxcal, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], code: int, said: str
+) -> None:
+    (folder / "twice.csv").write_text("t_s,ux,uy,uz,ax\n0,0,0,1,0\n1,0,0,1,0\n")
+    monkeypatch.chdir(folder)
+    before = sorted(p.name for p in folder.iterdir())
+    triaxcal("apply", *arguments).failed(code, said)
+    assert sorted(p.name for p in folder.iterdir()) == before
+
+
+def test_an_earlier_result_stays_where_a_new_one_fails(folder: Path, triaxcal, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv.gz"
+    out.write_bytes(gzip.compress(b"t_s\n"))
+    cut = tmp_path / "cut.csv"
+    cut.write_text("t_s,ux,uy,uz\n0,0,0,1\n1,0,x,1\n")
+    triaxcal("apply", folder / "cal.json", cut, "-o", out).failed(2, "line 3")
+    assert gzip.decompress(out.read_bytes()) == b"t_s\n"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.csv", "out.csv.gz"]
