@@ -3,36 +3,47 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
+TOOLS = $(VENV)/.tools
 # The matrices are small: threads of linear algebra would only wait for each other.
 ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 .PHONY: demo test check format bench docs clean
 
+# An environment; the extras of $(1) in it, and $(2) says what for.
+define environment
+	@$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or later is needed, not " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
+	@test -x $(BIN)/python || { echo "Making an environment in $(VENV)"; $(PYTHON) -m venv $(VENV); }
+	@echo "Installing $(2) into $(VENV), once: a minute or so"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(1)]'
+	@touch $@
+endef
+
 $(READY): pyproject.toml
-	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or later is needed, not " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[station,test]'
-	touch $@
+	$(call environment,all,triaxcal and what a station needs)
+
+$(TOOLS): pyproject.toml | $(READY)
+	$(call environment,test,what the tests need)
 
 demo: $(READY)  ## the whole line on two simulated units
+	@echo "Calibrating two simulated units: half a minute"
 	$(BIN)/triaxcal demo --out demo-out
 
 # Two processes more than processors: some tests wait for a bus, and others work meanwhile.
 WORKERS = $(shell $(BIN)/python -c 'import os; print(min(os.cpu_count(), 8) + 2)')
-test: $(READY)  ## the whole test suite
+test: $(TOOLS)  ## the whole test suite
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 
-bench: $(READY)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
+bench: $(TOOLS)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)
 
-check: $(READY)  ## lint, format, types, import contracts
+check: $(TOOLS)  ## lint, format, types, import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-format: $(READY)
+format: $(TOOLS)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

@@ -8,6 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, cast
 
 from triaxcal_drivers.errors import DriverMissing
+from triaxcal_drivers.extras import lacking
 from triaxcal_drivers.nearest import clipped
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def driver_named(name: str, *, where: str = "") -> Driver:
     try:
         return cast("Driver", points[name].load()())
     except Exception as e:
-        raise DriverMissing(f"{lead}driver '{name}' ({points[name].value}) cannot be loaded: {e!r}") from e
+        why = (lacking(e) if isinstance(e, ModuleNotFoundError) else None) or repr(e)
+        raise DriverMissing(f"{lead}driver '{name}' ({points[name].value}) cannot be loaded: {why}") from e
 
 
 def listed() -> list[Listed]:

@@ -11,6 +11,7 @@ from importlib.metadata import version
 
 from triaxcal.errors import Refused, TriaxcalError
 from triaxcal_drivers.errors import DriverError, RegisterValueError
+from triaxcal_drivers.extras import lacking
 from triaxcald.cli.arguments import OneLineParser, keep_apart, parsed
 from triaxcald.cli.console import say
 from triaxcald.cli.interrupt import Interrupted
@@ -64,6 +65,11 @@ def main(arguments: Sequence[str]) -> int:
     except RegisterValueError as e:
         say(f"triaxcal: refused: {e}; nothing was written")
         return REFUSED
+    except ModuleNotFoundError as e:
+        if (what := lacking(e)) is None:
+            raise
+        say(f"triaxcal: {what}")
+        return BAD_INPUT
     except (TriaxcalError, DriverError, DaemonError) as e:
         say(f"triaxcal: {e}")
         return exit_code_of(e)

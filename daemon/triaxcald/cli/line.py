@@ -169,6 +169,7 @@ def demo_command(a: argparse.Namespace) -> int:
         for u in units:
             if u.outcome.error is None:
                 _show_demo(u)
+        _show_next(a.out, units)
     say_errors([u.outcome for u in units])
     return worst([u.outcome for u in units]) or (0 if all(u.found and u.kept for u in units) else 1)
 
@@ -182,6 +183,15 @@ def _demo_document(u: DemoUnit) -> dict[str, Any]:
         "kept": u.kept,
         "after_power_cycle_rms_g": number(cycled.rms_g) if cycled else None,
     }
+
+
+def _show_next(folder: Path, units: Sequence[DemoUnit]) -> None:
+    reports = [u.outcome.report for u in units if u.outcome.report is not None]
+    print("next:")
+    if reports:
+        print(f"  open {reports[0]} in a browser: what was found, with pictures")
+    print(f"  triaxcal audit {folder}: both results recomputed from the recordings alone")
+    print("  triaxcal diagnose and triaxcal apply: the same with a recording of your own (docs/tutorial)")
 
 
 def _show_demo(u: DemoUnit) -> None:

@@ -25,8 +25,6 @@ from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.profile import Bundle, Strict, load_bundle, parse_toml, validate
 from triaxcal_drivers.toml_text import SIZE_MOST
 from triaxcald.errors import InputError
-from triaxcald.simulation.can_unit import CanUnit
-from triaxcald.simulation.modbus_unit import ModbusUnit
 from triaxcald.simulation.time_base import ElasticTimeBase, TimeBase
 from triaxcald.simulation.unit import ReferenceUnit
 
@@ -200,8 +198,12 @@ class SimulatedUnit:
     def serve(self) -> AbstractAsyncContextManager[Any]:
         """On its bus, until the context ends. Raises BusError."""
         if isinstance(self.bus, CanBus):
+            from triaxcald.simulation.can_unit import CanUnit  # each with the packages of its bus
+
             return CanUnit(self.unit, self.time_base, self.bus)
         assert isinstance(self.bus, ModbusBus)
+        from triaxcald.simulation.modbus_unit import ModbusUnit
+
         return ModbusUnit(self.unit, self.time_base, self.bus.where, unit_id=self.bus.unit_id)
 
 

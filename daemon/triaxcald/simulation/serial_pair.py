@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import tty
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager, suppress
 from pathlib import Path
@@ -20,6 +19,8 @@ async def pty_pair(link: Path | None = None) -> AsyncIterator[tuple[str, str]]:
     What an end does not read in time is lost, as on a line. Raises BusError where ``link`` is in the way or
     cannot be made.
     """
+    import tty  # which Windows has not
+
     loop = asyncio.get_running_loop()
     with ExitStack() as stack:
         masters, paths = [], []

@@ -8,10 +8,7 @@ import logging
 import re
 from collections.abc import Mapping
 from functools import lru_cache
-
-from canopen import ObjectDictionary
-from canopen.objectdictionary import datatypes
-from canopen.objectdictionary.eds import import_eds
+from typing import TYPE_CHECKING
 
 from triaxcal_drivers.can.dbc import dbc_messages
 from triaxcal_drivers.can.layout import Layout, Message, Signal, arrange
@@ -19,6 +16,9 @@ from triaxcal_drivers.can.model import CanStream, DbcStream
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.files import size
 from triaxcal_drivers.nearest import clipped
+
+if TYPE_CHECKING:
+    from canopen import ObjectDictionary
 
 logging.getLogger("canopen").addHandler(logging.NullHandler())  # what it logs comes back as exceptions too
 
@@ -46,7 +46,10 @@ def _messages(data: bytes, dbc: bool, base_node_id: int | None, where: str) -> l
 
 
 def object_dictionary(data: bytes, *, node_id: int, where: str) -> ObjectDictionary:
-    """An EDS file's objects; ``$NODEID`` in it becomes ``node_id``. Raises ProfileError."""
+    """An EDS file's objects; ``$NODEID`` in it becomes ``node_id``. Raises ProfileError; ModuleNotFoundError without
+    canopen."""
+    from canopen.objectdictionary.eds import import_eds  # half a second, and only an EDS needs it
+
     text = _entries(data, where)
     try:
         objects: ObjectDictionary = import_eds(io.StringIO(text), node_id)  # type: ignore[no-untyped-call]
@@ -115,6 +118,8 @@ def _mapped(objects: ObjectDictionary, number: int, where: str) -> dict[str, Sig
 
 
 def _mapped_signal(objects: ObjectDictionary, index: int, subindex: int, start: int, length: int, where: str) -> Signal:
+    from canopen.objectdictionary import datatypes
+
     name = f"0x{index:04X}:{subindex:02X}"
     variable = objects.get_variable(index, subindex)
     if variable is None:

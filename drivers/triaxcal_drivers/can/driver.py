@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from triaxcal_drivers.can.decode import CanDecoder
 from triaxcal_drivers.can.description import stream_layout
-from triaxcal_drivers.can.device import CanDevice
 from triaxcal_drivers.can.layout import Layout
 from triaxcal_drivers.can.model import CanBus, CanProfile
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.profile import Bundle
+
+if TYPE_CHECKING:
+    from triaxcal_drivers.can.device import CanDevice
 
 
 class CanDriver:
@@ -22,6 +24,8 @@ class CanDriver:
 
     def device(self, bundle: Bundle, bus: CanBus) -> CanDevice:
         """Raises ProfileError where the profile's files do not hold what it names."""
+        from triaxcal_drivers.can.device import CanDevice  # python-can and canopen, which no recording needs
+
         profile = cast(CanProfile, bundle.profile)
         return CanDevice(profile, bus, {name: _layout(bundle, name) for name in profile.streams})
 

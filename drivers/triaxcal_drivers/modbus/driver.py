@@ -8,7 +8,6 @@ from typing import Any
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.interface import Decoder, Device
 from triaxcal_drivers.modbus.decoder import ModbusDecoder
-from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcal_drivers.modbus.model import ModbusBus, ModbusProfile
 from triaxcal_drivers.profile import Bundle
 
@@ -22,6 +21,8 @@ class ModbusDriver:
     def device(self, bundle: Bundle, bus: Any) -> Device:
         if not isinstance(bus, ModbusBus):
             raise TypeError(f"expected a ModbusBus, not {type(bus).__name__}")
+        from triaxcal_drivers.modbus.device import ModbusDevice  # pymodbus, which no recording needs
+
         return ModbusDevice(_profile(bundle), bus)
 
     def decoder(self, bundle: Bundle, stream: str) -> Decoder:
