@@ -7,6 +7,7 @@ import ctypes
 import json
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -496,3 +497,10 @@ def test_the_readme_tells_the_share_that_the_benchmark_measured() -> None:
 def test_the_documentation_speaks_of_no_machine() -> None:
     spoken = {name_of(p): re.findall(r"/(?:home|root)/\S+", p.read_text("utf-8"), re.I) for p in PAGES}
     assert not {page: found for page, found in spoken.items() if found}
+
+
+def test_the_page_of_the_python_names_is_that_of_their_docstrings() -> None:
+    script = PROJECT / "docs/reference/python.py"
+    names = runpy.run_path(str(script))
+    assert names["PAGE"].read_text("utf-8") == names["page"]()
+    assert {*names["FUNCTIONS"], *names["CLASSES"], *names["ERRORS"], "__version__"} == set(tc.__all__)

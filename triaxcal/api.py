@@ -10,13 +10,13 @@ import numpy as np
 
 from triaxcal import loop, pose_fit, tables, text, uncertainty
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Moment
 from triaxcal.creep import with_creep_left
 from triaxcal.documents import Calibration
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.findings import Finding
 from triaxcal.held_out import HeldOut, magnitude_errors
+from triaxcal.moment import Moment
 from triaxcal.planning.directions import FULL, closed, directions
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.quality import QualityDetector, untrusted_poses

@@ -16,6 +16,7 @@ from triaxcal.distributions import t_ppf
 from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.effects.part import Part, mix_of
 from triaxcal.errors import InvalidData
+from triaxcal.moment import Moment
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
@@ -34,14 +35,6 @@ class Residual:
     cross_validated_rms_g: float | None
     noise_floor_g: float
     lack_of_fit_p: float | None
-
-
-class Moment(StrEnum):
-    """Which moment of its recording a calibration holds for."""
-
-    END = "end"
-    MEAN = "mean"
-    SECONDS = "seconds"
 
 
 @dataclass(frozen=True)
@@ -225,6 +218,12 @@ class Calibration:
         """Lower and upper ends for `parameters`, each of which holds its truth with probability ``level``."""
         half = self.coverage_factor(level) * self.standard_errors
         return self.values - half, self.values + half
+
+    def specific_force(self, readings: Floats, channels: Mapping[str, Floats]) -> Floats:
+        """a (n,3) of single readings (n,3) in output units, with the ``channels`` (n,) that are known of them. Raises
+        Refused where the model has no inverse there."""
+        held, _ = self.conditions_of_readings(len(readings), channels)
+        return self.sensor.specific_force(readings, held)
 
     def conditions_of_readings(
         self, n: int, channels: Mapping[str, Floats], t_s: Floats | None = None

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 
 from triaxcal.errors import InvalidData
-from triaxcal.synthetic import STANDARD_GRAVITY
+
+STANDARD_GRAVITY = 9.80665
+"""m/s² in 1 g."""
 
 # Geodetic Reference System 1980 (Moritz 2000, J. Geodesy 74:128).
 _EQUATOR_MPS2 = 9.7803267715

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from triaxcal.aside import with_faulty
-from triaxcal.calibration import Calibration, Exclusion, HoldsAt, Moment, PoseResult
+from triaxcal.calibration import Calibration, Exclusion, HoldsAt, PoseResult
 from triaxcal.conditions import channels_of
 from triaxcal.creep import with_creep_left, without_creep
 from triaxcal.description import described
@@ -25,6 +25,7 @@ from triaxcal.extrapolation import extrapolated
 from triaxcal.figures import the_poses
 from triaxcal.findings import Finding, advice_of, description_of, finding_of, why_not_shown
 from triaxcal.held_out import HeldOut, better_of, held_out
+from triaxcal.moment import Moment
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import LACK_OF_FIT

@@ -10,10 +10,10 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SINCE_START, TIME, rate_of
+from triaxcal.gravity import STANDARD_GRAVITY
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
-STANDARD_GRAVITY = 9.80665
 CONDITIONS = frozenset({TEMPERATURE, rate_of(TEMPERATURE), TIME, SINCE_START, HELD, *BEFORE, *CHANGE})
 """What an effect of a synthetic unit may go with."""
 

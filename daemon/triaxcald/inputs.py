@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.calibration import Moment
 from triaxcal.errors import InvalidData
 from triaxcal.figures import plain
+from triaxcal.moment import Moment
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.quality import QualityDetector, untrusted_poses
 from triaxcal.stillness.detector import StillnessDetector, Windows

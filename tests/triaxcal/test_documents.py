@@ -14,11 +14,12 @@ import pytest
 
 import triaxcal as tc
 from triaxcal.calibration import Calibration as Fitted
-from triaxcal.calibration import HoldsAt, Moment, Residual
+from triaxcal.calibration import HoldsAt, Residual
 from triaxcal.effects import CATALOGUE, Effect
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import HELD, SINCE_START, TIME, is_derived
+from triaxcal.moment import Moment
 from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from triaxcal.calibration import Moment
 from triaxcal.gravity import HEIGHTS_M
+from triaxcal.moment import Moment
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 

@@ -1,47 +1,38 @@
-"""All commands, and the one place where errors become exit codes."""
+"""Runs one command; the one place where errors become exit codes."""
 
 from __future__ import annotations
 
+import argparse
+import difflib
 import io
-import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from importlib.metadata import version
+from typing import Any
 
-from triaxcal.errors import Refused, TriaxcalError
-from triaxcal_drivers.errors import DriverError, RegisterValueError
-from triaxcal_drivers.extras import lacking
 from triaxcald.cli.arguments import OneLineParser, keep_apart, parsed
-from triaxcald.cli.console import say
-from triaxcald.cli.interrupt import Interrupted
-from triaxcald.errors import DaemonError
-from triaxcald.exit_codes import BAD_INPUT, DONE, INTERRUPTED, REFUSED, exit_code_of
+from triaxcald.cli.syntax import register
 
-ROOMS = {
-    "line": ("demo", "run", "sim", "record"),
-    "measuring": ("poses", "verify"),
-    "fitting": ("fit", "diagnose"),
-    "applying": ("apply",),
-    "framing": ("frame",),
-    "planning": ("plan",),
-    "provisioning": ("provision", "restore"),
-    "devices": ("registers", "devices"),
-    "recordings": ("audit", "log"),
-}
-"""The modules beside this one and their commands. Only what is asked for is imported: all would take longer than most
-work."""
+BAD_INPUT = 2
 
 
-def parser(first: str = "") -> OneLineParser:
-    """Knows the commands of the room of ``first``, the first argument; all of them where no room has it."""
+def parser() -> OneLineParser:
     top = OneLineParser(prog="triaxcal", description="Calibrates three-axis accelerometers.")
-    top.add_argument("--version", action="version", version=f"triaxcal {version('triaxcal')}")
-    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    asked = [room for room, names in ROOMS.items() if first in names] or ([] if first == "--version" else ROOMS)
-    for room in asked:
-        import_module(f"triaxcald.cli.{room}").register(commands)
+    top.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    register(top.add_subparsers(dest="command", required=True, metavar="COMMAND"))
     return top
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        say_version()
+        parser.exit()
+
+
+def say_version() -> None:
+    from importlib.metadata import version  # a third of the time that this takes
+
+    print(f"triaxcal {version('triaxcal')}")
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -49,46 +40,36 @@ def main(arguments: Sequence[str]) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal that knows no µ shall not end the work
+    top = parser()
+    if not arguments:
+        top.print_help()
+        return 0
     try:
-        chosen = parsed(parser(*arguments[:1]), arguments)
+        _require_command(top, arguments[0])
+        chosen = parsed(top, arguments)
     except SystemExit as e:
         return int(e.code or 0)
-    code: int = DONE
-    try:
-        keep_apart(chosen)
-        code = chosen.run(chosen)
-        sys.stdout.flush()
-        return code
-    except Refused as e:
-        say(f"triaxcal: refused: {e}" + (f"; add the poses {', '.join(e.wanted)}" if e.wanted else ""))
-        return REFUSED
-    except RegisterValueError as e:
-        say(f"triaxcal: refused: {e}; nothing was written")
-        return REFUSED
-    except ModuleNotFoundError as e:
-        if (what := lacking(e)) is None:
-            raise
-        say(f"triaxcal: {what}")
-        return BAD_INPUT
-    except (TriaxcalError, DriverError, DaemonError) as e:
-        say(f"triaxcal: {e}")
-        return exit_code_of(e)
-    except Interrupted as e:
-        say(f"triaxcal: {e}")
-        return INTERRUPTED
-    except KeyboardInterrupt:
-        say("triaxcal: interrupted")
-        return INTERRUPTED
-    except BrokenPipeError:
-        # Whoever read our output has gone; nothing more can be said there.
-        _drop_output()
-        return code
-    except OSError as e:
-        _drop_output()
-        say(f"triaxcal: {e.filename or 'standard output'}: {e.strerror}")
-        return max(code, BAD_INPUT)
+    from triaxcald.cli.running import run  # what an error may be of, and what shows it
+
+    return run(lambda: keep_apart(chosen), _working(chosen))
 
 
-def _drop_output() -> None:
-    """What is still in the buffer, so that the interpreter does not stumble over it at its end."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _require_command(top: OneLineParser, word: str) -> None:
+    """Ends with what may have been meant where there is no such command."""
+    known = next(a.choices for a in top._actions if isinstance(a, argparse._SubParsersAction))
+    if word.startswith("-") or word in known:
+        return
+    close = difflib.get_close_matches(word, known, n=1)
+    hint = f"did you mean '{close[0]}'?" if close else f"there are {', '.join(known)}"
+    top.error(f"no command '{word}'; {hint}")
+
+
+def _working(chosen: argparse.Namespace) -> Callable[[], int]:
+    """The command, imported when it is called."""
+
+    def work() -> int:
+        module, _, name = chosen.run.partition(":")
+        code: int = getattr(import_module(f"triaxcald.cli.{module}"), name)(chosen)
+        return code
+
+    return work

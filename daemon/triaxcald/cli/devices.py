@@ -13,7 +13,6 @@ from triaxcal.rounding import REGISTER_DIGITS, number
 from triaxcal_drivers.catalogue import listed
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
 from triaxcal_drivers.profile import BUILT_IN, load_bundle
-from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import warn_of_a_journal
@@ -22,17 +21,6 @@ from triaxcald.provision.explain import explain
 from triaxcald.provision.identity import check_identity
 from triaxcald.provision.snapshot import take_snapshot
 from triaxcald.station.config import Place, load_station
-
-
-def register(commands: Any) -> None:
-    p = commands.add_parser("registers", help="read and explain the device's calibration registers")
-    p.add_argument("station", metavar="STATION.toml", type=Path)
-    p.add_argument("--unit", help="where the station has more than one")
-    add_json(p)
-    p.set_defaults(run=registers_command)
-    p = commands.add_parser("devices", help="drivers, profiles and effects found, broken ones with their reason")
-    add_json(p)
-    p.set_defaults(run=devices_command)
 
 
 def registers_command(a: argparse.Namespace) -> int:

@@ -6,18 +6,17 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from triaxcal import text
 from triaxcal.agreement import agreement
-from triaxcal.calibration import Moment
 from triaxcal.calibration_document import Document, calibration_document
 from triaxcal.errors import Refused
 from triaxcal.loop import Loop, diagnose
+from triaxcal.moment import Moment
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcald import documents
-from triaxcald.cli.arguments import add_recording, add_uncertainty, moment, positive, writable
+from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit
 from triaxcald.cli.results import show_calibration, show_loop
 from triaxcald.cli.several import (
@@ -32,39 +31,11 @@ from triaxcald.cli.several import (
     show_by_recording,
 )
 from triaxcald.cli.showing import Choice, chosen, judge, telling_data_quality, warn
-from triaxcald.cli.ways import Way, add_ways, chosen_way, telling_default_signs
+from triaxcald.cli.ways import Way, chosen_way, telling_default_signs
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured, measure
 from triaxcald.several import agreement_document, with_recordings
-
-
-def register(commands: Any) -> None:
-    p = commands.add_parser("fit", help="fit the linear model to a recording's still poses")
-    add_recording(p)
-    add_ways(p)
-    _add_results(p)
-    p.set_defaults(run=fit_command)
-    p = commands.add_parser("diagnose", help="find, add and judge effects that the linear model lacks")
-    add_recording(p, several="several are of one unit, in order of time")
-    _add_results(p)
-    p.add_argument(
-        "--units", action="store_true", help="each recording is of another unit: judge each, then whether they agree"
-    )
-    p.add_argument("--empirical", action="store_true", help="describe what no effect explains by a smooth term")
-    p.add_argument(
-        "--at", type=moment, metavar="end|mean|SECONDS",
-        help="of the recording: the moment for which effects of time hold elsewhere (default: end)",
-    )  # fmt: skip
-    p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
-    p.set_defaults(run=diagnose_command)
-
-
-def _add_results(p: argparse.ArgumentParser) -> None:
-    add_uncertainty(p)
-    p.add_argument("-o", "--output", type=Path, metavar="CAL.json")
-    p.add_argument("--report", type=Path, metavar="R.html")
-    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms residual is above this")
 
 
 def fit_command(a: argparse.Namespace) -> int:

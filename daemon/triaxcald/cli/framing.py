@@ -22,7 +22,7 @@ from triaxcal.planning.directions import directions
 from triaxcal.pose_fit import fit
 from triaxcal.units import reference_unit_of
 from triaxcald import documents
-from triaxcald.cli.arguments import add_recording, positive, within, writable
+from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.showing import chosen, warn
 from triaxcald.errors import InputError
@@ -32,72 +32,8 @@ from triaxcald.inputs import measure, read_document, require_unit
 
 OWN = "own"
 NO_FACE = "*"
-LABEL = re.compile(r"(\*|(?:[+-][XYZ]){1,3}|N[0-9]+)(?:@(-?[0-9]+(?:\.[0-9]+)?))?")
-LEAST_SQUARES = "least_squares"
 
 Labels = list[tuple[str, float | None]]
-
-
-def register(commands: Any) -> None:
-    p = commands.add_parser("frame", help="units on one fixture in the frame of its faces")
-    add_recording(p, several="one of each unit")
-    p.add_argument(
-        "--calibration",
-        action="append",
-        metavar="CAL.json|own",
-        help="one for each REC in order; default: each is fitted from its own recording",
-    )
-    known = p.add_mutually_exclusive_group()
-    known.add_argument(
-        "--faces",
-        action="append",
-        type=_faces,
-        metavar="L,L,…",
-        help="sides that were up in order of time, +X@90 with the heading in degrees, * for no face; once for all REC "
-        "or once for each; write --faces=-X,… with the equals sign",
-    )
-    known.add_argument("--plan", metavar="PLAN.json", help="a triaxcal.plan/1 document: its labels in order")
-    p.add_argument(
-        "--datum",
-        type=_datum,
-        default=Datum(),
-        metavar="FACE,FACE",
-        help="primary and secondary face, as --datum=-Z,-X; default least_squares",
-    )
-    p.add_argument("--table-tilt", type=_angle, metavar="RAD", help="how far the table may be from level, at most")
-    p.add_argument("--seating-error", type=_angle, metavar="RAD", help="standard error of one seating of the fixture")
-    p.add_argument("--turn-error", type=_angle, default=0.0, metavar="RAD", help="standard error of a turn; default 0")
-    p.add_argument("--limit", type=positive, metavar="RAD", help="exit 1 where a standard error is above this")
-    p.add_argument("-o", "--output", type=Path, metavar="FRAME.json")
-    p.set_defaults(run=frame_command)
-
-
-def _faces(text: str) -> Labels:
-    out: Labels = []
-    for word in text.split(","):
-        match = LABEL.fullmatch(word.strip().upper())
-        if not match:
-            raise argparse.ArgumentTypeError(f"expected labels as in +X,+X,-X@180,*, not '{word}'")
-        out.append((match[1], None if match[2] is None else math.radians(float(match[2]))))
-    return out
-
-
-def _datum(text: str) -> Datum:
-    if text == LEAST_SQUARES:
-        return Datum()
-    parts = [part.strip().upper() for part in text.split(",")]
-    try:
-        if len(parts) != 2:
-            raise InvalidData("")
-        return Datum((parts[0], parts[1]))
-    except InvalidData:
-        raise argparse.ArgumentTypeError(
-            f"expected {LEAST_SQUARES}, or two faces at right angles as in -Z,-X, not '{text}'"
-        ) from None
-
-
-def _angle(text: str) -> float:
-    return within(text, 0.0, math.nextafter(1.0, 0.0), "an angle of 0 to 1 rad")
 
 
 def frame_command(a: argparse.Namespace) -> int:
@@ -115,7 +51,7 @@ def frame_command(a: argparse.Namespace) -> int:
             source = _source(a, name, calibration, [s.name for s in sources])
             sources.append(source)
             standings.append(_stand(source, given, assumed))
-    result = frames(standings, datum=a.datum)
+    result = frames(standings, datum=Datum(a.datum) if a.datum else None)
     document = frame_document(sources, result)
     if a.output:
         write_text(a.output, documents.to_text(document))

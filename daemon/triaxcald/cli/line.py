@@ -14,7 +14,7 @@ from triaxcal import text as of_metrology
 from triaxcal.rounding import number
 from triaxcal_drivers.profile import READINGS
 from triaxcald import text
-from triaxcald.cli.arguments import add_force, add_json, positive, seed, writable
+from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import Bars, emit, micro, say, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.journals import warn_of_a_journal
@@ -30,28 +30,6 @@ if TYPE_CHECKING:  # a command imports its work once its file is known to be goo
     from triaxcald.demo import DemoUnit
     from triaxcald.simulation.bench import SimulatedUnit
     from triaxcald.station.line import Outcome, UnitRun
-
-
-def register(commands: Any) -> None:
-    p = commands.add_parser("demo", help="the whole line on two simulated units, in under a minute")
-    p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
-    p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses")
-    add_json(p)
-    p.set_defaults(run=demo_command)
-    p = commands.add_parser("run", help="the whole line on the devices of a station file")
-    p.add_argument("station", metavar="STATION.toml", type=Path)
-    add_force(p)
-    add_json(p)
-    p.set_defaults(run=run_command)
-    p = commands.add_parser("sim", help="serve a simulated unit on a bus until stopped")
-    p.add_argument("device", metavar="DEVICE.toml", type=Path)
-    p.set_defaults(run=sim_command)
-    p = commands.add_parser("record", help="record only")
-    p.add_argument("station", metavar="STATION.toml", type=Path)
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="REC.mcap")
-    p.add_argument("--seconds", type=positive, metavar="S", help="of the samples' time; default: until interrupted")
-    p.add_argument("--unit", help="where the station has more than one")
-    p.set_defaults(run=record_command)
 
 
 def run_command(a: argparse.Namespace) -> int:

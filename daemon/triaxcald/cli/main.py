@@ -17,14 +17,14 @@ LAST_THREADS_S = 1.0
 
 
 def entry() -> NoReturn:
-    """Console script. Needs the extra ``station``; says so where it is not installed."""
+    """Console script. Says what is not installed in one line."""
     heed_stop_signals()
     try:
         from triaxcald.cli.commands import main
 
         code = main(sys.argv[1:])
     except ModuleNotFoundError as e:
-        sys.stderr.write(f"triaxcal: the module {e.name} is missing; pip install 'triaxcal[station]' brings it\n")
+        sys.stderr.write(f"triaxcal: the module {e.name} is missing; pip install triaxcal brings it\n")
         code = 2
     _leave_nothing_unsaid()
     _end(code)

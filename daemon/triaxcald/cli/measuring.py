@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import Any
 
 import numpy as np
 
@@ -17,24 +16,12 @@ from triaxcal.errors import Refused
 from triaxcal.held_out import magnitude_errors
 from triaxcal.rounding import error
 from triaxcal.units import ErrorUnit
-from triaxcald.cli.arguments import add_recording, positive
 from triaxcald.cli.console import emit
 from triaxcald.cli.showing import counted, judge, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, read_document
 from triaxcald.likeness import shape_beside, shape_in, unlike_shapes
 from triaxcald.verification import Verification, pose_rows, trust, unlike
-
-
-def register(commands: Any) -> None:
-    p = commands.add_parser("poses", help="find the still spans of a recording")
-    add_recording(p)
-    p.set_defaults(run=poses)
-    p = commands.add_parser("verify", help="error of the magnitude in every pose under a calibration")
-    p.add_argument("calibration", metavar="CAL.json")
-    add_recording(p)
-    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this")
-    p.set_defaults(run=verify_command)
 
 
 def poses(a: argparse.Namespace) -> int:

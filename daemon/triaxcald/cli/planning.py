@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from itertools import groupby
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from triaxcal.planning.directions import FULL, LEAST, PAPER, Direction, closed, 
 from triaxcal.planning.optimal import OptimalPlan, optimal
 from triaxcal.rounding import number, numbers, uncertainty
 from triaxcal.visibility import Sight, sight, unseen_effects
-from triaxcald.cli.arguments import add_recording, count
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.lacking import Lacking, lacking
 from triaxcald.cli.showing import chosen, counted, telling_data_quality, warn
@@ -29,16 +27,6 @@ from triaxcald.errors import InputError
 from triaxcald.inputs import measure
 
 POSES_MOST, POSES_MOST_FOR = 1000, 200
-
-
-def register(commands: Any) -> None:
-    p = commands.add_parser("plan", help="a pose plan, and what it can and cannot see")
-    p.add_argument(
-        "--poses", type=count, metavar="14|26|N", help=f"distinct directions, the first repeated at the end; {FULL}"
-    )
-    p.add_argument("--for", dest="effects", nargs="+", metavar="EFFECT", default=[], help="effects it has to show")
-    add_recording(p, optional=True)
-    p.set_defaults(run=plan_command)
 
 
 def plan_command(a: argparse.Namespace) -> int:

@@ -13,7 +13,6 @@ from triaxcal.rounding import REGISTER_DIGITS, number
 from triaxcald import text
 from triaxcald.certificate import REFERENCE_TEMPERATURE, roles
 from triaxcald.choices import is_passing
-from triaxcald.cli.arguments import add_force, add_json
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.errors import InputError
@@ -24,32 +23,6 @@ from triaxcald.provision.procedure import Provisioning
 from triaxcald.station.config import Place, load_station
 from triaxcald.station.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
 from triaxcald.station.today import days_since_1970
-
-
-def register(commands: Any) -> None:
-    p = commands.add_parser("provision", help="write a calibration to the device's registers and verify it")
-    p.add_argument("calibration", metavar="CAL.json", nargs="?")
-    p.add_argument("station", metavar="STATION.toml", type=Path)
-    p.add_argument("--unit", help="where the station has more than one")
-    p.add_argument("--dry-run", action="store_true", help="read and compare, write nothing")
-    p.add_argument("--resume", action="store_true", help="finish a provisioning that was cut short, by its journal")
-    _add_power_cycle(p)
-    add_force(p)
-    add_json(p)
-    p.set_defaults(run=provision_command)
-    p = commands.add_parser("restore", help="put the registers back that a recording or a journal has kept")
-    p.add_argument("source", metavar="REC|JOURNAL", type=Path)
-    p.add_argument("station", metavar="STATION.toml", type=Path)
-    p.add_argument("--unit", help="where the station has more than one; by default the one of that name in the source")
-    _add_power_cycle(p)
-    add_json(p)
-    p.set_defaults(run=restore_command)
-
-
-def _add_power_cycle(p: argparse.ArgumentParser) -> None:
-    p.add_argument(
-        "--power-cycle", action="store_true", help="have the supply switched off and on where nothing else verifies"
-    )
 
 
 def provision_command(a: argparse.Namespace) -> int:

@@ -6,44 +6,17 @@ import argparse
 import dataclasses
 import io
 import sys
-from pathlib import Path
 from typing import Any
 
-from triaxcal_drivers.profile import READINGS
-from triaxcald.cli.arguments import add_json
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
 from triaxcald.files import new_file
-from triaxcald.inputs import CALIBRATION, bundle_of
+from triaxcald.inputs import bundle_of
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.export import write_csv
 from triaxcald.recording.info import describe
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
-
-
-def register(commands: Any) -> None:
-    p = commands.add_parser("audit", help="recompute results from recordings and compare")
-    p.add_argument("recordings", metavar="REC|FOLDER|GLOB", nargs="+", type=Path)
-    add_json(p)
-    p.set_defaults(run=audit_command)
-    log = commands.add_parser("log", help="a recording's contents; mend one; write CSV")
-    parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export")
-    p = parts.add_parser("info", help="what a recording holds")
-    p.add_argument("recording", metavar="REC", type=Path)
-    add_json(p)
-    p.set_defaults(run=info_command)
-    p = parts.add_parser("recover", help="mend a recording that was cut short, and say what was lost")
-    p.add_argument("recording", metavar="REC", type=Path)
-    p.add_argument("-o", "--output", type=Path, help="default: REC with .recovered before .mcap")
-    add_json(p)
-    p.set_defaults(run=recover_command)
-    p = parts.add_parser("export", help="write the samples as CSV")
-    p.add_argument("recording", metavar="REC", type=Path)
-    p.add_argument("-o", "--output", type=Path, help="default: standard output")
-    p.add_argument("--stream", default=READINGS)
-    p.add_argument("--phase", default=CALIBRATION, choices=["calibration", "verification"])
-    p.set_defaults(run=export_command)
 
 
 def audit_command(a: argparse.Namespace) -> int:

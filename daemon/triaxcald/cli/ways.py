@@ -19,7 +19,6 @@ from triaxcal.turning.moments import Moments
 from triaxcal.turning.rotation import RotationFit, fit_rotation
 from triaxcald import ways_in
 from triaxcald.attitudes import match, read_attitudes
-from triaxcald.cli.arguments import not_negative, within
 from triaxcald.cli.console import micro, table
 from triaxcald.cli.results import cross_validated, show_coefficients
 from triaxcald.cli.showing import Choice, chosen, telling_data_quality
@@ -29,25 +28,6 @@ from triaxcald.inputs import Measured, measure, read_document, require_unit
 POSES_ENOUGH = 9
 Way = tuple[Measured, Document, Calibration, Callable[[], None]]
 """What was measured, the document, the calibration, and how it is shown at the console."""
-
-
-def add_ways(parser: argparse.ArgumentParser) -> None:
-    ways = parser.add_mutually_exclusive_group()
-    ways.add_argument("--turning", action="store_true", help="the unit turned and never rested: fit all samples")
-    ways.add_argument("--attitudes", metavar="ATT.csv", help="which way was up in each pose, from a turntable")
-    ways.add_argument("--passport", metavar="CAL.json", help="values known from before, to be refined by the poses")
-    parser.add_argument(
-        "--attitude-error",
-        type=_angle,
-        metavar="RAD",
-        help="standard error of the attitudes by axis; default: estimated",
-    )
-    parser.add_argument(
-        "--passport-error",
-        type=_three_errors,
-        metavar="REL,RAD,G",
-        help="standard errors of the passport's scale factors (relative), misalignments, biases; default: its own",
-    )
 
 
 def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | None:
@@ -72,19 +52,6 @@ def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator
         if e.wanted and a.sign is None and measured.signs is None:
             raise Refused(f"{e}; no --sign was given, so +,+,+ is taken", wanted=e.wanted) from e
         raise
-
-
-def _angle(text: str) -> float:
-    return within(text, 0.0, 0.3, "radians between 0 and 0.3")
-
-
-def _three_errors(text: str) -> tuple[float, float, float]:
-    try:
-        relative, angle, bias = (not_negative(part) for part in text.split(","))
-    except (argparse.ArgumentTypeError, ValueError):
-        message = f"expected three numbers of at least 0 as in 1e-3,1e-3,2e-3, not '{text}'"
-        raise argparse.ArgumentTypeError(message) from None
-    return relative, angle, bias
 
 
 def _turning(a: argparse.Namespace) -> Way:

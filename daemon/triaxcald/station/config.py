@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, FailFast, Field, model_validator
 
-from triaxcal.calibration import Moment
 from triaxcal.effects import CATALOGUE
 from triaxcal.gravity import local_gravity_g
+from triaxcal.moment import Moment
 from triaxcal.uncertainty import Stated
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.claim import claim_of

@@ -217,8 +217,7 @@ def test_a_full_disk_for_the_result(finished_run: Any, tmp_path: Path, triaxcal:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "the following arguments are required: COMMAND"),
-        (["fitt"], "invalid choice: 'fitt'"),
+        (["fitt"], "no command 'fitt'; did you mean 'fit'?"),
         (["fit"], "the following arguments are required: REC"),
         (["fit", "a.csv", "--sign=-,-"], "expected three signs as in -,-,+, not '-,-'"),
         (["fit", "a.csv", "--sign=a,b,c"], "expected three signs"),

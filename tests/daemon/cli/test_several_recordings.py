@@ -85,9 +85,9 @@ def test_options_may_stand_between_recordings(runs: list[Path], triaxcal: Run) -
     one, two = runs
     between = ["diagnose", str(one), "--sign=+,+,+", str(two), "--json", "--output-unit", "V"]
     behind = ["diagnose", str(one), str(two), "--sign=+,+,+", "--output-unit", "V", "--json"]
-    assert parsed(parser("diagnose"), between) == parsed(parser("diagnose"), behind)
+    assert parsed(parser(), between) == parsed(parser(), behind)
     triaxcal("diagnose", one, "--sign=+,+,+", one, "--json").failed(2, "one.csv", "given twice")
-    audits = parsed(parser("audit"), ["audit", str(one), "--json", str(two)])
+    audits = parsed(parser(), ["audit", str(one), "--json", str(two)])
     assert (audits.recordings, audits.json) == (runs, True)
 
 

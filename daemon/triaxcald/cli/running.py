@@ -1,0 +1,58 @@
+"""Runs a command's work, and says in one line what went wrong with it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+
+from triaxcal.errors import Refused, TriaxcalError
+from triaxcal_drivers.errors import DriverError, RegisterValueError
+from triaxcal_drivers.extras import lacking
+from triaxcald.cli.console import say
+from triaxcald.cli.interrupt import Interrupted
+from triaxcald.errors import DaemonError
+from triaxcald.exit_codes import BAD_INPUT, DONE, INTERRUPTED, REFUSED, exit_code_of
+
+
+def run(check: Callable[[], None], work: Callable[[], int]) -> int:
+    """The exit code of ``work``, which is not begun where ``check`` raises."""
+    code: int = DONE
+    try:
+        check()
+        code = work()
+        sys.stdout.flush()
+        return code
+    except Refused as e:
+        say(f"triaxcal: refused: {e}" + (f"; add the poses {', '.join(e.wanted)}" if e.wanted else ""))
+        return REFUSED
+    except RegisterValueError as e:
+        say(f"triaxcal: refused: {e}; nothing was written")
+        return REFUSED
+    except ModuleNotFoundError as e:
+        if (what := lacking(e)) is None:
+            raise
+        say(f"triaxcal: {what}")
+        return BAD_INPUT
+    except (TriaxcalError, DriverError, DaemonError) as e:
+        say(f"triaxcal: {e}")
+        return exit_code_of(e)
+    except Interrupted as e:
+        say(f"triaxcal: {e}")
+        return INTERRUPTED
+    except KeyboardInterrupt:
+        say("triaxcal: interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output has gone; nothing more can be said there.
+        _drop_output()
+        return code
+    except OSError as e:
+        _drop_output()
+        say(f"triaxcal: {e.filename or 'standard output'}: {e.strerror}")
+        return max(code, BAD_INPUT)
+
+
+def _drop_output() -> None:
+    """What is still in the buffer, so that the interpreter does not stumble over it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,318 @@
+"""All commands with their arguments and help. Imports nothing that works: a command's own module is imported to run it.
+
+``run`` of what is parsed names module and function ("fitting:fit_command").
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from triaxcald.cli.arguments import (
+    add_force,
+    add_json,
+    add_recording,
+    add_uncertainty,
+    count,
+    moment,
+    not_negative,
+    positive,
+    seed,
+    within,
+)
+
+LABEL = re.compile(r"(\*|(?:[+-][XYZ]){1,3}|N[0-9]+)(?:@(-?[0-9]+(?:\.[0-9]+)?))?")
+LEAST_SQUARES = "least_squares"
+PHASES = ("calibration", "verification")
+READINGS = "readings"
+
+
+def register(commands: Any) -> None:
+    """In the order in which a newcomer meets them."""
+    _line(commands)
+    _on_recordings(commands)
+    _planning(commands)
+    _devices(commands)
+    _audits(commands)
+
+
+def _command(commands: Any, name: str, run: str, help_line: str, more: str = "", example: str = "") -> Any:
+    """``more`` follows the line in the command's own help, and the ``example`` stands below the options."""
+    p = commands.add_parser(
+        name,
+        help=help_line,
+        description=f"{help_line[:1].upper()}{help_line[1:]}." + (f" {more}" if more else ""),
+        epilog=f"example: triaxcal {example}" if example else None,
+    )
+    p.set_defaults(run=run)
+    return p
+
+
+def _line(commands: Any) -> None:
+    p = _command(
+        commands, "demo", "line:demo_command", "the whole line on two simulated units, in under a minute",
+        "A CAN and a Modbus unit with hidden effects are recorded, calibrated, written, power-cycled and verified.",
+        "demo --out demo-out",
+    )  # fmt: skip
+    p.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
+    p.add_argument("--seed", type=seed, default=1, help="of the units' hidden effects, noise and poses")
+    add_json(p)
+    p = _command(
+        commands, "run", "line:run_command", "the whole line on the devices of a station file",
+        "Guides the operator from pose to pose; records, calibrates, writes the registers and verifies them.",
+        "run station.toml",
+    )  # fmt: skip
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    add_force(p)
+    add_json(p)
+    p = _command(
+        commands, "sim", "line:sim_command", "serve a simulated unit on a bus until stopped", "", "sim device.toml"
+    )
+    p.add_argument("device", metavar="DEVICE.toml", type=Path)
+    p = _command(
+        commands, "record", "line:record_command", "record only", "", "record station.toml -o rec.mcap --seconds 120"
+    )
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="REC.mcap")
+    p.add_argument("--seconds", type=positive, metavar="S", help="of the samples' time; default: until interrupted")
+    p.add_argument("--unit", help="where the station has more than one")
+
+
+def _on_recordings(commands: Any) -> None:
+    p = _command(
+        commands, "poses", "measuring:poses", "find the still spans of a recording",
+        "Means and standard errors are in the output's unit, times in seconds from the first sample. No threshold is "
+        "set: the noise is learned from the recording.", "poses rec.csv",
+    )  # fmt: skip
+    add_recording(p)
+    p = _command(
+        commands, "fit", "fitting:fit_command", "fit the linear model to a recording's still poses",
+        "Scale factors, misalignments [rad] and biases [g] with their standard errors; at least 9 poses, better 14.",
+        "fit rec.csv --sign=-,-,- -o cal.json --report fit.html",
+    )  # fmt: skip
+    add_recording(p)
+    _add_ways(p)
+    _add_results(p)
+    p = _command(
+        commands, "diagnose", "fitting:diagnose_command", "find, add and judge effects that the linear model lacks",
+        "Nonlinearity, temperature, drift, hysteresis and more, with the error of the magnitude [g] before and after.",
+        "diagnose rec.csv --check other.csv -o cal.json --report loop.html",
+    )  # fmt: skip
+    add_recording(p, several="several are of one unit, in order of time")
+    _add_results(p)
+    p.add_argument(
+        "--units", action="store_true", help="each recording is of another unit: judge each, then whether they agree"
+    )
+    p.add_argument("--empirical", action="store_true", help="describe what no effect explains by a smooth term")
+    p.add_argument(
+        "--at", type=moment, metavar="end|mean|SECONDS",
+        help="of the recording: the moment for which effects of time hold elsewhere (default: end)",
+    )  # fmt: skip
+    p.add_argument("--check", metavar="REC2", help="another recording of the same unit, whose poses no fit sees")
+    p = _command(
+        commands, "apply", "applying:apply_command", "calibrated readings of a recording",
+        "Writes its samples with ax, ay, az behind them, in the unit of the reference vector (g, unless the "
+        "calibration names another), effects included.", "apply cal.json rec.csv -o calibrated.csv",
+    )  # fmt: skip
+    p.add_argument("calibration", metavar="CAL", help="a calibration, loop or certificate document")
+    p.add_argument("recording", metavar="REC", help=".mcap, .csv, .csv.gz or - for standard input")
+    p.add_argument("-o", "--output", metavar="OUT", type=Path, required=True, help=".csv, .csv.gz or .parquet")
+    p.add_argument("--uncertainty", action="store_true", help="also u_ax, u_ay, u_az: what the calibration leaves open")
+    p.add_argument(
+        "--own-recording", action="store_true",
+        help="REC is the recording that was calibrated: effects of time at each of its times",
+    )  # fmt: skip
+    p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="of an .mcap")
+    p = _command(
+        commands, "verify", "measuring:verify_command", "error of the magnitude in every pose under a calibration",
+        "Errors are |a| less the reference, in its unit, with the standard error that noise gives each.",
+        "verify cal.json rec.csv --limit 2e-4",
+    )  # fmt: skip
+    p.add_argument("calibration", metavar="CAL.json")
+    add_recording(p)
+    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms error is above this")
+    _frame(commands)
+
+
+def _add_ways(parser: argparse.ArgumentParser) -> None:
+    ways = parser.add_mutually_exclusive_group()
+    ways.add_argument("--turning", action="store_true", help="the unit turned and never rested: fit all samples")
+    ways.add_argument("--attitudes", metavar="ATT.csv", help="which way was up in each pose, from a turntable")
+    ways.add_argument("--passport", metavar="CAL.json", help="values known from before, to be refined by the poses")
+    parser.add_argument(
+        "--attitude-error", type=_attitude_error, metavar="RAD",
+        help="standard error of the attitudes by axis; default: estimated",
+    )  # fmt: skip
+    parser.add_argument(
+        "--passport-error", type=_three_errors, metavar="REL,RAD,G",
+        help="standard errors of the passport's scale factors (relative), misalignments, biases; default: its own",
+    )  # fmt: skip
+
+
+def _attitude_error(text: str) -> float:
+    return within(text, 0.0, 0.3, "radians between 0 and 0.3")
+
+
+def _three_errors(text: str) -> tuple[float, float, float]:
+    try:
+        relative, angle, bias = (not_negative(part) for part in text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
+        message = f"expected three numbers of at least 0 as in 1e-3,1e-3,5e-3, not '{text}'"
+        raise argparse.ArgumentTypeError(message) from None
+    return relative, angle, bias
+
+
+def _add_results(p: argparse.ArgumentParser) -> None:
+    add_uncertainty(p)
+    p.add_argument("-o", "--output", type=Path, metavar="CAL.json")
+    p.add_argument("--report", type=Path, metavar="R.html")
+    p.add_argument("--limit", type=positive, metavar="G", help="exit 1 where the rms residual is above this")
+
+
+def _frame(commands: Any) -> None:
+    p = _command(
+        commands, "frame", "framing:frame_command", "units on one fixture in the frame of its faces",
+        "Rotations from each sensor's frame to the fixture's, in rad.", "frame left.csv right.csv --datum=-Z,-X",
+    )  # fmt: skip
+    add_recording(p, several="one of each unit")
+    p.add_argument(
+        "--calibration",
+        action="append",
+        metavar="CAL.json|own",
+        help="one for each REC in order; default: each is fitted from its own recording",
+    )
+    known = p.add_mutually_exclusive_group()
+    known.add_argument(
+        "--faces",
+        action="append",
+        type=_faces,
+        metavar="L,L,…",
+        help="sides that were up in order of time, +X@90 with the heading in degrees, * for no face; once for all REC "
+        "or once for each; write --faces=-X,… with the equals sign",
+    )
+    known.add_argument("--plan", metavar="PLAN.json", help="a triaxcal.plan/1 document: its labels in order")
+    p.add_argument(
+        "--datum",
+        type=_datum,
+        metavar="FACE,FACE",
+        help="primary and secondary face, as --datum=-Z,-X; default least_squares",
+    )
+    p.add_argument("--table-tilt", type=_angle, metavar="RAD", help="how far the table may be from level, at most")
+    p.add_argument("--seating-error", type=_angle, metavar="RAD", help="standard error of one seating of the fixture")
+    p.add_argument("--turn-error", type=_angle, default=0.0, metavar="RAD", help="standard error of a turn; default 0")
+    p.add_argument("--limit", type=positive, metavar="RAD", help="exit 1 where a standard error is above this")
+    p.add_argument("-o", "--output", type=Path, metavar="FRAME.json")
+
+
+def _faces(text: str) -> list[tuple[str, float | None]]:
+    """Labels, each with its heading in rad."""
+    out: list[tuple[str, float | None]] = []
+    for word in text.split(","):
+        match = LABEL.fullmatch(word.strip().upper())
+        if not match:
+            raise argparse.ArgumentTypeError(f"expected labels as in +X,+X,-X@180,*, not '{word}'")
+        out.append((match[1], None if match[2] is None else math.radians(float(match[2]))))
+    return out
+
+
+def _datum(text: str) -> tuple[str, str] | None:
+    """Two faces; None for the least-squares frame."""
+    if text == LEAST_SQUARES:
+        return None
+    faces = [part.strip().upper() for part in text.split(",")]
+    square = len(faces) == 2 and all(re.fullmatch("[+-][XYZ]", f) for f in faces) and faces[0][1] != faces[1][1]
+    if not square:
+        wanted = f"expected {LEAST_SQUARES}, or two faces at right angles as in -Z,-X, not '{text}'"
+        raise argparse.ArgumentTypeError(wanted)
+    return faces[0], faces[1]
+
+
+def _angle(text: str) -> float:
+    return within(text, 0.0, math.nextafter(1.0, 0.0), "an angle of 0 to 1 rad")
+
+
+def _planning(commands: Any) -> None:
+    p = _command(
+        commands, "plan", "planning:plan_command", "a pose plan, and what it can and cannot see",
+        "With a recording: the poses that are still worth adding to it.", "plan --poses 26",
+    )  # fmt: skip
+    p.add_argument(
+        "--poses", type=count, metavar="14|26|N", help="distinct directions, the first repeated at the end; 26"
+    )
+    p.add_argument("--for", dest="effects", nargs="+", metavar="EFFECT", default=[], help="effects it has to show")
+    add_recording(p, optional=True)
+
+
+def _devices(commands: Any) -> None:
+    p = _command(
+        commands, "provision", "provisioning:provision_command",
+        "write a calibration to the device's registers and verify it",
+        "Unlocks, writes what differs, stores, restarts and reads back; what the device holds is said at every way "
+        "out.", "provision cal.json station.toml --dry-run",
+    )  # fmt: skip
+    p.add_argument("calibration", metavar="CAL.json", nargs="?")
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("--unit", help="where the station has more than one")
+    p.add_argument("--dry-run", action="store_true", help="read and compare, write nothing")
+    p.add_argument("--resume", action="store_true", help="finish a provisioning that was cut short, by its journal")
+    _add_power_cycle(p)
+    add_force(p)
+    add_json(p)
+    p = _command(
+        commands, "restore", "provisioning:restore_command",
+        "put the registers back that a recording or a journal has kept", "", "restore rec.mcap station.toml",
+    )  # fmt: skip
+    p.add_argument("source", metavar="REC|JOURNAL", type=Path)
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("--unit", help="where the station has more than one; by default the one of that name in the source")
+    _add_power_cycle(p)
+    add_json(p)
+    p = _command(
+        commands, "registers", "devices:registers_command", "read and explain the device's calibration registers",
+        "", "registers station.toml",
+    )  # fmt: skip
+    p.add_argument("station", metavar="STATION.toml", type=Path)
+    p.add_argument("--unit", help="where the station has more than one")
+    add_json(p)
+    p = _command(
+        commands, "devices", "devices:devices_command",
+        "drivers, profiles and effects found, broken ones with their reason",
+    )  # fmt: skip
+    add_json(p)
+
+
+def _add_power_cycle(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--power-cycle", action="store_true", help="have the supply switched off and on where nothing else verifies"
+    )
+
+
+def _audits(commands: Any) -> None:
+    p = _command(
+        commands, "audit", "recordings:audit_command", "recompute results from recordings and compare",
+        "A summary follows several; one unreadable file hides no other.", "audit recordings/",
+    )  # fmt: skip
+    p.add_argument("recordings", metavar="REC|FOLDER|GLOB", nargs="+", type=Path)
+    add_json(p)
+    log = commands.add_parser("log", help="a recording's contents; mend one; write CSV")
+    parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export")
+    p = _command(parts, "info", "recordings:info_command", "what a recording holds", "", "log info rec.mcap")
+    p.add_argument("recording", metavar="REC", type=Path)
+    add_json(p)
+    p = _command(
+        parts, "recover", "recordings:recover_command", "mend a recording that was cut short, and say what was lost",
+        "", "log recover rec.mcap",
+    )  # fmt: skip
+    p.add_argument("recording", metavar="REC", type=Path)
+    p.add_argument("-o", "--output", type=Path, help="default: REC with .recovered before .mcap")
+    add_json(p)
+    p = _command(
+        parts, "export", "recordings:export_command", "write the samples as CSV", "", "log export rec.mcap -o rec.csv"
+    )
+    p.add_argument("recording", metavar="REC", type=Path)
+    p.add_argument("-o", "--output", type=Path, help="default: standard output")
+    p.add_argument("--stream", default=READINGS)
+    p.add_argument("--phase", default=PHASES[0], choices=PHASES)

@@ -1,0 +1,70 @@
+"""Writes docs/reference/python.md from the docstrings of the public names: `python docs/reference/python.py`."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import triaxcal as tc
+
+PAGE = Path(__file__).with_suffix(".md")
+FUNCTIONS = ("find_poses", "calibrate", "diagnose", "verify", "plan", "budget")
+CLASSES = ("Calibration", "Diagnosis", "Verification", "Poses", "Pose", "PlannedPose", "Stated")
+ERRORS = ("TriaxcalError", "InvalidData", "Refused", "MissingChannel")
+HEAD = """# Python
+
+    import triaxcal as tc
+
+These names are public: what they take and give stays, and names and keyword arguments may be added. Everything else in the package can be imported, and may change. Made from the docstrings by `docs/reference/python.py`. [Use a calibration](../how-to/use-a-calibration.md) has an example.
+
+`tc.__version__` is the version.
+"""  # noqa: E501
+
+
+def page() -> str:
+    parts = [HEAD]
+    parts += [f"## tc.{name}\n\n{_call(name, getattr(tc, name))}\n\n{_text(getattr(tc, name))}\n" for name in FUNCTIONS]
+    parts += [_class(name, getattr(tc, name)) for name in CLASSES]
+    parts += ["## Errors\n", *(f"* `tc.{name}`: {' '.join(_text(getattr(tc, name)).split())}" for name in ERRORS), ""]
+    return "\n".join(parts)
+
+
+def _class(name: str, of: type[Any]) -> str:
+    lines = [f"## tc.{name}\n", _text(of), ""]
+    for key, member in vars(of).items():
+        if key.startswith("_") or not (inspect.isfunction(member) or isinstance(member, property | classmethod)):
+            continue
+        function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+        if isinstance(member, property):
+            lines.append(f"* `.{key}`: {' '.join(_text(function).split()) or '(see the class)'}")
+        else:
+            lines.append(f"* `{_signature(key, function)}`: {' '.join(_text(function).split())}")
+    return "\n".join(lines) + "\n"
+
+
+def _call(name: str, function: Any) -> str:
+    return f"    tc.{_signature(name, function)}"
+
+
+def _signature(name: str, function: Any) -> str:
+    """Names and defaults; the types stand in the text."""
+    shown = []
+    star = False
+    for p in inspect.signature(function).parameters.values():
+        if p.name in ("self", "cls"):
+            continue
+        if p.kind is p.KEYWORD_ONLY and not star:
+            shown.append("*")
+            star = True
+        prefix = "**" if p.kind is p.VAR_KEYWORD else ""
+        shown.append(prefix + p.name + ("" if p.default is p.empty else f"={p.default!r}"))
+    return f"{name}({', '.join(shown)})"
+
+
+def _text(of: Any) -> str:
+    return (inspect.getdoc(of) or "").replace("``", "`")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
