@@ -88,11 +88,14 @@ def find_poses(
     """
     samples = _samples(t, u, channels, time_unit, columns)
     detector, judge = StillnessDetector(), QualityDetector()
-    detector.feed(samples.time_ns, samples.readings, samples.channels)
-    detector.finish()
+    try:
+        detector.feed(samples.time_ns, samples.readings, samples.channels)
+        detector.finish()
+        windows, spans = detector.windows(), detector.spans()
+    except InvalidData as e:
+        raise InvalidData(f"{len(samples)} samples: {e}") from e
     judge.feed(samples.time_ns, samples.readings)
     judge.finish()
-    windows, spans = detector.windows(), detector.spans()
     seen = judge.findings(windows, spans)
     found = Poses(poses_of(windows, spans, untrusted_poses(seen)) if windows is not None else ())
     found.data_quality = tuple(text.quality_line(f, output_unit) for f in seen)

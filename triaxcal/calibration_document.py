@@ -108,6 +108,7 @@ def calibration_document(
         "scale_factor": numbers(c.sensor.scale_factor),
         "misalignment": numbers(c.sensor.misalignment),
         "bias": numbers(c.sensor.bias),
+        "use": text.use([effect for effect, _ in c.sensor.effects], linear_only=c.linear_only is not None),
         "matrix": numbers(c.sensor.matrix),
         "centre": numbers(c.sensor.centre),
         "effects": {

@@ -29,7 +29,10 @@ def names_of(table: Any) -> list[str]:
 def column(table: Any, name: str) -> Any:
     """(n,) as numpy has it. Raises InvalidData where there is none of that name."""
     if name not in names_of(table):
-        raise InvalidData(f"the table has no column {name}; it has {', '.join(names_of(table))}")
+        raise InvalidData(
+            f"the table has no column {name}; it has {', '.join(names_of(table))}"
+            + ("; say by columns how it is called" if name in (TIME_COLUMN, *OUTPUTS) else "")
+        )
     return np.asarray(table[name])
 
 
@@ -99,6 +102,8 @@ def _time_ns(t: Any, time_unit: str | None, name: str) -> Ints:
         raise InvalidData(f"{name}: expected shape (n,), not {times.shape}")
     if time_unit is not None and time_unit not in UNITS_NS:
         raise InvalidData(f"time_unit: expected {', '.join(u for u in UNITS_NS if u != 'µs')}, not '{time_unit}'")
+    if times.dtype.kind in "OU":
+        times = _datetimes(times, name)
     if times.dtype.kind == "M":
         if np.isnat(times).any():
             raise InvalidData(f"{name}: sample {int(np.flatnonzero(np.isnat(times))[0])} has no time")
@@ -118,6 +123,15 @@ def _time_ns(t: Any, time_unit: str | None, name: str) -> Ints:
     whole = np.floor(scaled)  # apart, so that seconds since 1970 keep their nanoseconds as far as a float has them
     ns = whole.astype(np.int64) * UNITS_NS["s"] + np.round((scaled - whole) * 1e9).astype(np.int64)
     return np.asarray(ns)
+
+
+def _datetimes(times: Any, name: str) -> Any:
+    """Datetimes of Python, of pandas with a zone, or as ISO text; those with a zone in UTC."""
+    utc = [t.replace(tzinfo=None) - t.utcoffset() if getattr(t, "tzinfo", None) else t for t in times.tolist()]
+    try:
+        return np.array(utc, dtype="datetime64[ns]")
+    except (TypeError, ValueError):
+        raise InvalidData(f"{name}: expected seconds or datetimes, not {_kind(times)}") from None
 
 
 def _numbers(values: Any, name: str) -> Floats:

@@ -59,6 +59,10 @@ def diagnosed(poses: Any) -> tc.Diagnosis:
 def test_times_may_be_seconds_datetimes_or_integers_of_a_unit(recorded: Recorded, poses: Any) -> None:
     ns = np.round(recorded.t * 1e9).astype(np.int64)
     begun = np.datetime64("2026-03-01T08:00:00", "ns")
+    zoned = pd.date_range("2026-03-01 10:00", periods=len(ns), freq="10ms", tz="Europe/Kyiv")
+    for times in (zoned, pd.Series(zoned), zoned.to_pydatetime().tolist(), [str(t) for t in begun + ns]):
+        found = tc.find_poses(times, recorded.u)
+        assert [p.start_s for p in found] == pytest.approx([p.start_s for p in poses], abs=1e-6)
     for t, unit in (
         (ns, "ns"),
         (ns // 1000, "us"),
@@ -94,6 +98,8 @@ def test_what_a_stream_is_to_be_blamed_for_is_said(recorded: Recorded) -> None:
 @pytest.mark.parametrize(
     ("t", "u", "more", "said"),
     [
+        (np.arange(9.0), np.zeros((9, 3)), {}, "9 samples: too few samples for one window .at least 64"),
+        (["early", "late"], np.zeros((2, 3)), {}, "t: expected seconds or datetimes, not str"),
         (np.arange(9), np.zeros((9, 3)), {}, "t are integers: say their unit by time_unit, one of s, ms, us, ns"),
         (np.arange(9.0), np.zeros((3, 9)), {}, r"u: expected shape \(n, 3\) or \(3,\), not \(3, 9\); transpose it"),
         (np.arange(8.0), np.zeros((9, 3)), {}, "t has 8 times, and u has 9 samples"),

@@ -6,10 +6,11 @@ line.
 
 from triaxcal.text.budget import basis, not_evaluated, remedy
 from triaxcal.text.cautions import caution
-from triaxcal.text.holds import holds
+from triaxcal.text.holds import holds, use
 from triaxcal.text.quality import quality, quality_line
 from triaxcal.text.summary import html, short, summary
 
 __all__ = [
     "basis", "caution", "holds", "html", "not_evaluated", "quality", "quality_line", "remedy", "short", "summary",
+    "use",
 ]  # fmt: skip

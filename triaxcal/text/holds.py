@@ -29,6 +29,14 @@ def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several:
     return tuple(dict.fromkeys(out))
 
 
+def use(effects: Iterable[Effect], *, linear_only: bool) -> str:
+    """How readings u become specific force a. ``linear_only``: the best linear calibration is in the document too."""
+    if not tuple(effects):
+        return "a = matrix (u - centre)"
+    linear = "; linear_only is the best linear calibration" if linear_only else ""
+    return f"matrix and centre alone are not the calibration: it has effects, which triaxcal apply adds{linear}"
+
+
 def _at(name: str, value: float, several: bool) -> str:
     if name == SINCE_START:
         return "long after the start"

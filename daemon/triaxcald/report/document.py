@@ -118,6 +118,7 @@ class Outcome:
     effects: tuple[tuple[str, tuple[Coefficient, ...]], ...]
     matrix: tuple[Vector, ...] | None
     centre: Vector | None
+    use: str
     output_unit: str
     reference_unit: str
     reference: float | None
@@ -176,6 +177,7 @@ def read_document(document: Mapping[str, object]) -> Outcome:
         effects=tuple((name, _coefficients(values)) for name, values in effects.items()),
         matrix=matrix,
         centre=centre,
+        use=str(calibration.get("use") or ""),
         output_unit=_output_unit(units),
         reference_unit=clean(mapping(units).get("reference") or "g"),
         reference=number(calibration.get("reference")),

@@ -20,7 +20,7 @@ from triaxcal.effects.temperature_scale_factor import TemperatureScaleFactor
 from triaxcal.effects.thermal_gradient import ThermalGradient
 from triaxcal.effects.vibration_rectification import VibrationRectification
 from triaxcal.effects.warm_up import WarmUp
-from triaxcal.text import holds
+from triaxcal.text import holds, use
 
 S = np.array([[0.6, -0.64, 0.48], [0.0, 0.8, -0.6]])
 HOLDING: list[tuple[Effect, str, dict[str, list[float]]]] = [
@@ -76,3 +76,11 @@ def test_each_condition_is_told_once_and_effects_of_directions_have_none() -> No
 def test_no_effect_of_the_catalogue_is_said_to_hold_at_a_derived_conditions_zero() -> None:
     said = " ".join(holds(CATALOGUE, REFERENCE))
     assert not [name for name in (SINCE_START, HELD, RUN, "before_", "change_", "scatter_", ".rate") if name in said]
+
+
+def test_with_effects_the_matrix_alone_is_said_not_to_be_the_calibration() -> None:
+    assert use([], linear_only=False) == "a = matrix (u - centre)"
+    said = use([BiasDrift()], linear_only=True)
+    assert said.startswith("matrix and centre alone are not the calibration")
+    assert "linear_only" in said
+    assert "linear_only" not in use([BiasDrift()], linear_only=False)
