@@ -123,11 +123,14 @@ def calibrate(
     carry the parameters, InvalidData.
     """
     found = _poses(poses, u, channels, time_unit, columns, output_unit)
+    names = [effects] if isinstance(effects, str) else list(effects)
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InvalidData(f"effects: {twice} is asked for twice")
     try:
-        model = [effect_named(name) for name in effects]
+        model = [effect_named(name) for name in names]
     except KeyError as e:
         raise InvalidData(f"no effect of the name {e.args[0]} is known") from None
-    fitted = pose_fit.fit(found, signs=signs, reference=reference, effects=model)
+    fitted = pose_fit.fit(found, signs=_signs(signs), reference=reference, effects=model)
     return Calibration(fitted, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
 
 
@@ -137,7 +140,7 @@ def diagnose(
     *,
     signs: Sequence[float] = (1, 1, 1),
     reference: float = 1.0,
-    check: Sequence[Pose] | None = None,
+    check: Any = None,
     at: str | float = "end",
     channels: Mapping[str, Any] | None = None,
     time_unit: str | None = None,
@@ -148,17 +151,18 @@ def diagnose(
 ) -> Diagnosis:
     """Find what the poses show beyond the linear model, and add it.
 
-    As `calibrate`; ``check`` are poses of another recording, for the held-out error; ``at`` the moment for which
-    effects of time hold elsewhere: "end", "mean", or seconds from the first sample.
+    As `calibrate`; ``check`` are poses of another recording, or a table of its samples, for the held-out error; ``at``
+    the moment for which effects of time hold elsewhere: "end", "mean", or seconds from the first sample.
     """
     found = _poses(poses, u, channels, time_unit, columns, output_unit)
     try:
         moment = Moment(at) if isinstance(at, str) else float(at)
-    except ValueError:
+    except (TypeError, ValueError):
         raise InvalidData(f"at: expected 'end', 'mean' or seconds, not '{at}'") from None
     if moment is Moment.SECONDS:
         raise InvalidData("at: expected 'end', 'mean' or a number of seconds")
-    closed_loop = loop.diagnose(found, signs=signs, reference=reference, check=check, at=moment)
+    others = None if check is None else _poses(check)
+    closed_loop = loop.diagnose(found, signs=_signs(signs), reference=reference, check=others, at=moment)
     before, after = (
         Calibration(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
         for c in (closed_loop.before, closed_loop.after)
@@ -194,8 +198,10 @@ def plan(poses: int = FULL) -> tuple[PlannedPose, ...]:
 
 
 def budget(calibration: Calibration, stated: uncertainty.Stated | None = None) -> uncertainty.Budget:
-    """The uncertainty budget by the GUM (JCGM 100). ``stated`` is what no recording can tell. Raises InvalidData where
+    """The uncertainty budget by the GUM (JCGM 100). ``stated`` is what no recording can tell, by default what the
+    calibration was made with. Raises InvalidData where
     the calibration is not of still poses, or was loaded: its document holds the budget then."""
+    stated = calibration.stated if stated is None else stated
     if not calibration.poses:
         raise InvalidData(
             "no poses to evaluate: of a calibration that was loaded, to_dict()['uncertainty'] is the budget"
@@ -215,6 +221,14 @@ def _samples(
     return tables.samples_of(t, u, channels, time_unit)
 
 
+def _signs(signs: Any) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(s) for s in signs)
+    except (TypeError, ValueError):
+        raise InvalidData(f"signs: expected three of 1 and -1, not {signs!r}") from None
+    return x, y, z
+
+
 def _poses(
     poses: Any,
     u: Any = None,
@@ -224,5 +238,8 @@ def _poses(
     output_unit: str = "",
 ) -> Sequence[Pose]:
     if u is None and isinstance(poses, Sequence) and all(isinstance(p, Pose) for p in poses):
+        given = {"channels": channels, "time_unit": time_unit, "columns": columns}
+        if told := next((name for name, value in given.items() if value is not None), None):
+            raise InvalidData(f"{told}: the poses are found already; give it to find_poses")
         return list(poses)
     return find_poses(poses, u, channels=channels, time_unit=time_unit, columns=columns, output_unit=output_unit)

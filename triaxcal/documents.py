@@ -22,12 +22,16 @@ from triaxcal.calibration import HoldsAt, PoseResult, Residual
 from triaxcal.calibration_document import LINEAR, Document, calibration_document
 from triaxcal.calibration_reading import calibration_of, calibration_part
 from triaxcal.effects.contract import TIME, channel_of, is_derived
-from triaxcal.errors import InvalidData, MissingChannel
+from triaxcal.errors import InvalidData, MissingChannel, Refused
 from triaxcal.uncertainty import Stated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+RETURNS = 1e-6
+"""How far a reading may be off, relative to its size, that is made from its own specific force."""
+BESIDE, BESIDE_S = 1.2, 60.0
+"""A recording ends after its last pose: by a fifth of its length and a minute at most."""
 OUT = ("ax", "ay", "az")
 UNCERTAINTY = ("u_ax", "u_ay", "u_az")
 
@@ -52,7 +56,20 @@ class Calibration:
     ) -> None:
         self._fitted, self._stated = fitted, stated
         self._document = None if document is None else copy.deepcopy(dict(document))
-        self.output_unit, self.reference_unit = output_unit, reference_unit
+        self._units = output_unit, reference_unit
+
+    @property
+    def output_unit(self) -> str:
+        return self._units[0]
+
+    @property
+    def reference_unit(self) -> str:
+        return self._units[1]
+
+    @property
+    def stated(self) -> Stated | None:
+        """What was stated that no recording can tell; None of a calibration that was loaded."""
+        return self._stated
 
     @property
     def fitted(self) -> Fitted:
@@ -67,17 +84,17 @@ class Calibration:
     @property
     def scale_factor(self) -> Floats:
         """(3,) output per reference unit, signed."""
-        return self._fitted.sensor.scale_factor
+        return self._fitted.sensor.scale_factor.copy()
 
     @property
     def misalignment(self) -> Floats:
         """(3,) rad."""
-        return self._fitted.sensor.misalignment
+        return self._fitted.sensor.misalignment.copy()
 
     @property
     def bias(self) -> Floats:
         """(3,) in the unit of the reference vector."""
-        return self._fitted.sensor.bias
+        return self._fitted.sensor.bias.copy()
 
     @property
     def matrix(self) -> Floats:
@@ -114,7 +131,8 @@ class Calibration:
         """Every reason not to trust it in full."""
         if self._document is not None:
             part = calibration_part(self._document, where="document")
-            return tuple(map(str, part.get("warnings") or ()))
+            told = part.get("warnings")
+            return tuple(map(str, told)) if isinstance(told, list) else ()
         return tuple(map(text.caution, self._fitted.cautions))
 
     @property
@@ -165,13 +183,16 @@ class Calibration:
             u = np.stack([tables.column(table, name) for name in tables.OUTPUTS], axis=1)
             channels = self._channels_in(table) | dict(channels or {})
             if own_recording and t is None and tables.TIME_COLUMN in tables.names_of(table):
-                t = tables.column(table, tables.TIME_COLUMN)
+                t = tables.seconds(tables.column(table, tables.TIME_COLUMN), time_unit)
+                t, time_unit = t - t[:1], None
         readings = tables.readings_of(u)
         rows = np.atleast_2d(readings)
         times = self._times(t, own_recording, time_unit, len(rows))
         held = self._conditions(len(rows), channels or {}, times)
         sensor = self._fitted.sensor
         a = sensor.specific_force(rows, held) if sensor.effects else (rows - sensor.centre) @ sensor.matrix.T
+        if sensor.effects:
+            self._require_inverse(rows, a, held)
         a = a.reshape(readings.shape)
         errors = self._uncertainty(rows, held).reshape(readings.shape) if uncertainty else None
         if table is None:
@@ -193,9 +214,37 @@ class Calibration:
         times = tables.seconds(t, time_unit)
         if len(times) != n:
             raise InvalidData(f"t has {len(times)} times, and u has {n} samples")
+        end_s = self._end_s()
+        most = np.inf if end_s is None else BESIDE * end_s + BESIDE_S
+        if n and not (times.min() >= -BESIDE_S and times.max() <= most):
+            raise InvalidData(
+                f"t goes from {times.min():.6g} to {times.max():.6g} s, and the recording that was fitted from 0 to "
+                f"{end_s:.6g} s: count from its first sample"
+            )
         return times
 
+    def _end_s(self) -> float | None:
+        """When the last pose of the recording that was fitted ended; None where that is not known."""
+        poses = calibration_part(self.to_dict(), where="document").get("poses")
+        ends = [p.get("end_s") for p in poses if isinstance(p, Mapping)] if isinstance(poses, list) else []
+        known = [float(e) for e in ends if isinstance(e, int | float)]
+        return max(known) if known else None
+
+    def _require_inverse(self, u: Floats, a: Floats, held: Mapping[str, Floats]) -> None:
+        """Raises Refused where the readings do not come out of what they were made into."""
+        with np.errstate(all="ignore"):
+            back = self._fitted.sensor.output(a, held)
+            wrong = ~(np.abs(back - u).max(axis=1) <= RETURNS * (1 + np.abs(u).max(axis=1)))
+        wrong &= np.isfinite(u).all(axis=1)
+        if wrong.any():
+            raise Refused(
+                f"the model has no inverse at reading {int(np.flatnonzero(wrong)[0])}: it lies far beyond what the "
+                "effects hold for, or is in another unit"
+            )
+
     def _conditions(self, n: int, channels: Mapping[str, Any], times: Floats | None) -> dict[str, Floats]:
+        if not isinstance(channels, Mapping):
+            raise InvalidData("channels: expected values by name, as in {'temp_c': 25.0}")
         given = {name: tables.channel_of_samples(name, v, n) for name, v in channels.items()}
         held, missing = self._fitted.conditions_of_readings(n, given, times)
         missing = tuple(channel_of(name) if not is_derived(name) else name for name in missing)
@@ -224,12 +273,14 @@ class Calibration:
     def _beyond_the_fit(self, c: Fitted) -> Floats:
         """(p,) standard uncertainties over standard errors: what the budget has beside the fit."""
         budget = calibration_part(self.to_dict(), where="document").get("uncertainty") or {}
-        return np.array(
-            [
-                _of(budget, "expanded", name) / _of(budget, "coverage_factor", name) / error if error > 0 else 1.0
-                for name, error in zip(c.parameters, c.standard_errors, strict=True)
-            ]
-        )
+        out = []
+        for name, error in zip(c.parameters, c.standard_errors, strict=True):
+            expanded, coverage = (_of(budget, key, name) for key in ("expanded", "coverage_factor"))
+            if expanded is None or not coverage or not error > 0:
+                out.append(1.0)
+            else:
+                out.append(expanded / coverage / error)
+        return np.array(out)
 
     def to_dict(self) -> Document:
         """The `triaxcal.calibration/1` document; as it was loaded, where it was."""
@@ -258,8 +309,12 @@ class Calibration:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Whole or not at all. Raises OSError."""
-        write_text(Path(path), to_text(self.to_dict()))
+        """Whole or not at all. Raises OSError; InvalidData where the document cannot be written as JSON."""
+        try:
+            content = to_text(self.to_dict()).encode()
+        except ValueError as e:
+            raise InvalidData(f"{path}: the document cannot be written: {e}") from None
+        write_bytes(Path(path), content)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Calibration:
@@ -284,14 +339,14 @@ class Calibration:
         return text.html(self._fitted, self.output_unit, self.reference_unit, self.warnings)
 
 
-def _of(budget: Mapping[str, Any], key: str, parameter: str) -> float:
-    """A figure of the budget by parameter, 1 where it has none."""
+def _of(budget: Mapping[str, Any], key: str, parameter: str) -> float | None:
+    """A figure of the budget by parameter, None where it has none."""
     group, _, name = parameter.rpartition(".")
     try:
         of = budget[key]
         return float(of[group]["xyz".index(name)] if group in LINEAR else of["effects"][group][name])
     except (LookupError, TypeError, ValueError):
-        return 1.0
+        return None
 
 
 def read_document(path: Path) -> Mapping[str, Any]:
@@ -314,10 +369,10 @@ def to_text(document: Mapping[str, Any]) -> str:
     return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def write_text(path: Path, content: str) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+def write_bytes(path: Path, content: bytes) -> None:
+    beside = path.parent / f".{path.name}.{os.getpid()}"
     try:
-        beside.write_text(content, encoding="utf-8")
+        beside.write_bytes(content)
         beside.replace(path)
     finally:
         beside.unlink(missing_ok=True)

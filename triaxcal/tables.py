@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.errors import InvalidData
+from triaxcal.errors import InvalidData, MissingChannel
 from triaxcal.samples import Samples
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000, "ns": 1}
@@ -23,7 +24,10 @@ def is_table(value: object) -> bool:
 
 
 def names_of(table: Any) -> list[str]:
-    return [str(name) for name in table.columns]
+    names = [str(name) for name in table.columns]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InvalidData(f"the table has two columns {twice}")
+    return names
 
 
 def column(table: Any, name: str) -> Any:
@@ -33,7 +37,7 @@ def column(table: Any, name: str) -> Any:
             f"the table has no column {name}; it has {', '.join(names_of(table))}"
             + ("; say by columns how it is called" if name in (TIME_COLUMN, *OUTPUTS) else "")
         )
-    return np.asarray(table[name])
+    return np.asarray(table[next(key for key in table.columns if str(key) == name)])
 
 
 def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_unit: str | None = None) -> Samples:
@@ -46,8 +50,15 @@ def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_
     channels = {ours: column(table, theirs) for ours, theirs in called.items() if ours not in (TIME_COLUMN, *OUTPUTS)}
     for name in names_of(table):
         values = column(table, name)
-        if name not in called.values() and values.dtype.kind in "fiu" and np.isfinite(values).all():
+        if name in called.values() or values.dtype.kind not in "fiu":
+            continue
+        if np.isfinite(values).all():
             channels[name] = values
+        else:
+            gaps = int(np.count_nonzero(~np.isfinite(values)))
+            warnings.warn(
+                f"channel {name} left out: {gaps} of {len(values)} values missing", MissingChannel, stacklevel=4
+            )
     u = np.stack([_numbers(column(table, called[name]), called[name]) for name in OUTPUTS], axis=1)
     return samples_of(column(table, called[TIME_COLUMN]), u, channels, time_unit, called[TIME_COLUMN])
 
@@ -63,7 +74,14 @@ def samples_of(
     time_ns = _time_ns(t, time_unit, name)
     if len(time_ns) != len(readings):
         raise InvalidData(f"{name} has {len(time_ns)} times, and u has {len(readings)} samples")
-    return Samples(time_ns, readings, {n: channel_of_samples(n, v, len(readings)) for n, v in (channels or {}).items()})
+    if channels is not None and not isinstance(channels, Mapping):
+        raise InvalidData("channels: expected values by name, as in {'temp_c': temperature}")
+    found = {n: channel_of_samples(n, v, len(readings)) for n, v in (channels or {}).items()}
+    for channel, values in found.items():
+        if not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise InvalidData(f"channel {channel}: value {row} is not a finite number")
+    return Samples(time_ns, readings, found)
 
 
 def readings_of(u: Any) -> Floats:
@@ -78,7 +96,7 @@ def readings_of(u: Any) -> Floats:
 def channel_of_samples(name: str, values: Any, n: int) -> Floats:
     """(n,) of a channel that is one number or (n,). Raises InvalidData."""
     found = _numbers(values, f"channel {name}")
-    if found.shape not in ((), (n,)):
+    if values is None or found.shape not in ((), (n,)):
         raise InvalidData(f"channel {name}: expected one number or {n}, not shape {found.shape}")
     return np.broadcast_to(found, (n,))
 
@@ -113,7 +131,10 @@ def _time_ns(t: Any, time_unit: str | None, name: str) -> Ints:
     if times.dtype.kind in "iu":
         if time_unit is None:
             raise InvalidData(f"{name} are integers: say their unit by time_unit, one of s, ms, us, ns")
-        return times.astype(np.int64) * UNITS_NS[time_unit]
+        scale = UNITS_NS[time_unit]
+        if len(times) and max(abs(int(times.min())), abs(int(times.max()))) > SECONDS_MOST * 1e9 / scale:
+            raise InvalidData(f"{name} goes to {int(times.max()):d} {time_unit}, beyond what can be counted in ns")
+        return times.astype(np.int64) * scale
     found = _numbers(times, name)
     if not np.isfinite(found).all():
         raise InvalidData(f"{name}: sample {int(np.flatnonzero(~np.isfinite(found))[0])} has no finite time")

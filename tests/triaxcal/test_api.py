@@ -192,3 +192,61 @@ def test_a_plan_comes_back_to_its_first_pose() -> None:
     assert all(np.linalg.norm(p.up) == pytest.approx(1) for p in found)
     with pytest.raises(tc.InvalidData):
         tc.plan(3)
+
+
+# What is given and cannot be taken
+
+
+def test_a_channel_with_gaps_is_left_out_of_a_table_and_that_is_said(recorded: Recorded) -> None:
+    table = recorded.frame()
+    table.loc[5, "temp_c"] = np.nan
+    with pytest.warns(tc.MissingChannel, match="channel temp_c left out: 1 of 7900 values missing"):
+        assert tc.find_poses(table)[0].channels == {}
+    with pytest.raises(tc.InvalidData, match="channel temp_c: value 5 is not a finite number"):
+        tc.find_poses(recorded.t, recorded.u, channels={"temp_c": table["temp_c"]})
+
+
+@pytest.mark.parametrize("given", [{"channels": {"temp_c": 25.0}}, {"time_unit": "ms"}, {"columns": {"t": "time"}}])
+def test_what_belongs_to_samples_is_not_dropped_where_poses_are_given(poses: Any, given: dict[str, Any]) -> None:
+    with pytest.raises(tc.InvalidData, match=f"{next(iter(given))}: the poses are found already"):
+        tc.calibrate(poses, **given)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"signs": (1, 1)}, "signs: expected three of 1 and -1"),
+        ({"signs": None}, "signs: expected three of 1 and -1"),
+        ({"effects": ["warm_up", "warm_up"]}, "warm_up is asked for twice"),
+    ],
+)
+def test_wrong_options_of_a_calibration_are_said(poses: Any, more: dict[str, Any], said: str) -> None:
+    with pytest.raises(tc.InvalidData, match=said):
+        tc.calibrate(poses, **more)
+
+
+def test_one_effect_may_be_named_without_a_list(poses: Any) -> None:
+    assert tc.calibrate(poses, signs=MINUS, effects="temperature_bias").terms == ("linear", "temperature_bias")
+
+
+def test_a_check_recording_may_be_a_table(recorded: Recorded, poses: Any) -> None:
+    assert tc.diagnose(poses, signs=MINUS, check=recorded.frame()).held_out is not None
+
+
+def test_integer_times_beyond_what_can_be_counted_are_refused(recorded: Recorded) -> None:
+    with pytest.raises(tc.InvalidData, match="beyond what can be counted in ns"):
+        tc.find_poses(np.round(recorded.t * 1e9).astype(np.int64), recorded.u, time_unit="s")
+
+
+def test_a_table_with_two_columns_of_a_name_is_refused_and_one_with_a_number_for_a_name_is_not(
+    recorded: Recorded,
+) -> None:
+    table = recorded.frame()
+    assert len(tc.find_poses(table.assign(ignored=1.0).rename(columns={"ignored": 0}))) > 20
+    with pytest.raises(tc.InvalidData, match="two columns ux"):
+        tc.find_poses(table.rename(columns={"uy": "ux"}))
+
+
+def test_the_budget_counts_what_the_calibration_was_made_with(poses: Any) -> None:
+    found = tc.calibrate(poses, signs=MINUS, stated=tc.Stated(reference=1e-3))
+    assert float(tc.budget(found).magnitude.standard) > 1e-3

@@ -139,6 +139,45 @@ def test_what_the_budget_has_beside_the_fit_is_in_the_uncertainties(paper_unit: 
     assert stated[0, 2] == pytest.approx(1e-3, rel=0.1)
 
 
+def test_without_a_budget_the_uncertainties_are_those_of_the_standard_errors(paper_unit: Sensor) -> None:
+    c = calibration_with(paper_unit, ChannelBias("temp_c"), np.random.default_rng(1))
+    assert "uncertainty" not in c.to_dict()
+    _, stated = c.apply(paper_unit.output(np.array([[0.0, 0.0, 1.0]]), {}), channels={"temp_c": 20.0}, uncertainty=True)
+    assert np.all((stated > 1e-6) & (stated < 1e-4))  # standard errors of 1e-5
+
+
+def test_times_that_are_not_of_the_recording_are_refused_and_those_of_a_table_count_from_its_first_row(
+    paper_unit: Sensor, twenty_six: np.ndarray
+) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, 1e-5, np.random.default_rng(1))
+    c = tc.calibrate(poses, signs=(-1, -1, -1), effects=["bias_drift"])
+    u = paper_unit.output(twenty_six, {})
+    t = np.arange(26.0)
+    for times in (t + 1.7e9, np.datetime64("2026-01-01", "ns") + np.arange(26), t - 100.0):
+        with pytest.raises(tc.InvalidData, match="count from its first sample"):
+            c.apply(u, t=times, own_recording=True)
+    table = pd.DataFrame(dict(zip(("ux", "uy", "uz"), u.T, strict=True)) | {"t_s": t + 1.7e9})
+    found = c.apply(table, own_recording=True)[["ax", "ay", "az"]].to_numpy()
+    assert found == pytest.approx(c.apply(u, t=t, own_recording=True), abs=1e-12)
+
+
+def test_readings_far_beyond_what_an_effect_holds_for_are_refused(paper_unit: Sensor) -> None:
+    c = calibration_with(
+        paper_unit, next(f for f in FORMS if f.name == "second_order_nonlinearity"), np.random.default_rng(0)
+    )
+    with pytest.raises(tc.Refused, match="no inverse at reading 1"):
+        c.apply(np.array([[0.0, 0.0, 2.4], [2.4e7, 2.4e7, 2.4e7]]))
+
+
+def test_what_is_read_off_a_calibration_can_be_changed_without_changing_it(calibration: tc.Calibration) -> None:
+    before = calibration.apply([0.0, 0.0, 2.4]).tolist()
+    for values in (calibration.scale_factor, calibration.misalignment, calibration.bias):
+        values *= 0
+    assert calibration.apply([0.0, 0.0, 2.4]).tolist() == before
+    with pytest.raises(AttributeError):
+        calibration.output_unit = "mV"  # type: ignore[misc]
+
+
 # Documents
 
 

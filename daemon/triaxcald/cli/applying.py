@@ -14,7 +14,7 @@ from triaxcald.cli.console import say
 from triaxcald.cli.showing import warn
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside
-from triaxcald.inputs import read_document
+from triaxcald.inputs import CALIBRATION, read_document
 from triaxcald.recording.columns import write_parquet
 from triaxcald.recording.export import write_csv
 
@@ -25,6 +25,8 @@ def apply_command(a: argparse.Namespace) -> int:
     if not a.output.name.endswith(KINDS):
         raise InputError(f"{a.output}: expected a name that ends in {', '.join(KINDS)}")
     writable(a.output)
+    if a.own_recording and a.phase != CALIBRATION:
+        raise InputError(f"--own-recording: the {a.phase} phase has no times of the recording that was fitted")
     calibration = Calibration.from_dict(read_document(a.calibration), where=a.calibration)
     found = applied(calibration, a.recording, uncertainty=a.uncertainty, own_recording=a.own_recording, phase=a.phase)
     with new_beside(a.output) as path:
@@ -38,6 +40,6 @@ def _written(found: Applied, path: Path, name: str) -> int:
     if name.endswith(".parquet"):
         return write_parquet(path, found.blocks, found.start_ns)
     with path.open("wb") as file:
-        packed = gzip.GzipFile(fileobj=file, mode="wb", mtime=0) if name.endswith(".gz") else file
+        packed = gzip.GzipFile(filename="", fileobj=file, mode="wb", mtime=0) if name.endswith(".gz") else file
         with io.TextIOWrapper(packed, "utf-8", newline="\n") as out:
             return write_csv(out, found.blocks, found.start_ns)

@@ -109,9 +109,23 @@ def test_effects_of_time_hold_at_each_time_of_their_own_recording(triaxcal, tmp_
     assert at - own == pytest.approx(1e-5 * since_first, abs=1e-6)
 
 
+def test_compressed_twice_it_is_the_same_file(folder: Path, triaxcal, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        assert (
+            triaxcal("apply", folder / "cal.json", folder / "rec.csv", "-o", tmp_path / name / "out.csv.gz").code == 0
+        )
+    assert (tmp_path / "one/out.csv.gz").read_bytes() == (tmp_path / "two/out.csv.gz").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
+        (
+            ("cal.json", "rec.csv", "-o", "out.csv", "--own-recording", "--phase", "verification"),
+            2,
+            "the verification phase has no times of the recording that was fitted",
+        ),
         (("cal.json", "rec.csv", "-o", "out.txt"), 2, "expected a name that ends in .csv, .csv.gz, .parquet"),
         (("cal.json", "rec.csv", "-o", "nowhere/out.csv"), 2, "there is no folder"),
         (("rec.csv", "rec.csv", "-o", "out.csv"), 2, "rec.csv"),
