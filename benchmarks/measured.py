@@ -20,7 +20,7 @@ from triaxcal.errors import Refused
 from triaxcal.loop import Loop, diagnose
 from triaxcal.text import caution
 from triaxcald.inputs import Measured, measure
-from triaxcald.recording.csv_text import read_csv
+from triaxcald.tables.own_text import read_csv
 
 PROJECT = Path(__file__).parents[1]
 PICTURES = PROJECT / "docs" / "pictures"

@@ -16,9 +16,9 @@ from triaxcal_drivers.profile import READINGS
 from triaxcald.errors import InputError
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import Pipeline
-from triaxcald.recording.csv_text import read_csv
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import Phase
+from triaxcald.tables.samples import Reading, read_table
 
 BLOCK = 65536
 """Samples at a time, of a text: its effects take some hundred bytes for each."""
@@ -28,11 +28,12 @@ BLOCK = 65536
 class Applied:
     """``blocks`` have the calibrated readings among their channels, behind those of the input; ``start_ns`` is where
     their seconds begin, None for the first sample. ``missing`` has, once they are through, what the calibration needs
-    and the recording lacks."""
+    and the recording lacks; ``remarks`` say how a table was read."""
 
     blocks: Iterator[SampleBlock]
     start_ns: int | None
     missing: list[str] = field(default_factory=list)
+    remarks: tuple[str, ...] = ()
 
 
 def applied(
@@ -42,14 +43,19 @@ def applied(
     uncertainty: bool = False,
     own_recording: bool = False,
     phase: Phase = CALIBRATION,
+    reading: Reading | None = None,
 ) -> Applied:
-    """Of the recording ``name``. Raises InputError, RecordingError; where its blocks are read, also Refused."""
+    """Of the recording ``name``; ``reading`` says how a table is read.
+
+    Raises InputError, RecordingError; where its blocks are read, also Refused.
+    """
     found = Applied(iter(()), None)
     if name.endswith(".mcap"):
         blocks = _of_recording(Path(name), phase)
     else:
-        samples = read_csv(name)
-        found.start_ns = 0
+        table = read_table(name, reading)
+        samples = table.samples
+        found.start_ns, found.remarks = 0, table.remarks
         blocks = (
             SampleBlock(
                 samples.time_ns[at : at + BLOCK],

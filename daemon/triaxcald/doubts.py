@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-TIME_UNIT = "time_unit: "
-"""How a line of ``data_quality`` begins."""
 UNIT = "unit"
 """Under ``doubts``: recordings, or a calibration and a recording, may not be of one unit."""
 
 
-def doubts_of(data_quality: Iterable[str], doubts: Iterable[str]) -> list[str]:
+def doubts_of(doubts: Iterable[str]) -> list[str]:
     """What to ask, each once."""
-    times = any(TIME_UNIT in line for line in data_quality)
-    return ["are the times in seconds?"] * times + ["is it the same unit?"] * (UNIT in doubts)
+    return ["is it the same unit?"] * (UNIT in doubts)

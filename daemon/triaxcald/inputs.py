@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from triaxcal.errors import InvalidData
-from triaxcal.figures import plain
 from triaxcal.moment import Moment
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.quality import QualityDetector, untrusted_poses
@@ -23,13 +19,12 @@ from triaxcal.uncertainty import Stated
 from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
-from triaxcald.doubts import TIME_UNIT
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline, creeping, together
-from triaxcald.recording.csv_text import read_csv
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, Phase
 from triaxcald.station.config import parse_station
+from triaxcald.tables.samples import Reading, read_table
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
 PROFILE = "profile.toml"
@@ -37,12 +32,6 @@ PROFILE = "profile.toml"
 STATION_FILE = "station.toml"
 CALIBRATION: Phase = "calibration"
 VERIFICATION: Phase = "verification"
-HELD_MOST_S, TURNED_MOST_S, TURNED_SAMPLES, PERIOD_MOST_S = 2000.0, 500.0, 30, 0.5
-"""Times are in milliseconds, say, where all of these are exceeded: how long a pose is held, from one to the next in
-seconds and in samples, and from sample to sample."""
-LONG_LEAST = 4
-"""So many poses that long, or all there are: a slow logger rests over night, but does not turn the unit for minutes
-between one such rest and the next, time and again."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +39,8 @@ class Measured:
     """The still poses of a recording. ``windows`` are for pictures.
 
     ``profile``, ``signs`` of the scale factors and ``reference`` are what the recording was made with, where it says;
-    ``unit`` is its name and serial.
+    ``unit`` is its name and serial; ``output_unit`` what the header of a table says. ``remarks`` say how a table was
+    read.
     """
 
     name: str
@@ -63,12 +53,20 @@ class Measured:
     unit: Mapping[str, str] | None = None
     stated: Stated | None = None
     holds_at: Moment | float | None = None
+    output_unit: str = ""
+    remarks: tuple[str, ...] = ()
 
 
 def measure(
-    name: str, *, phase: Phase = CALIBRATION, stream: str = READINGS, moments: Moments | None = None
+    name: str,
+    *,
+    phase: Phase = CALIBRATION,
+    stream: str = READINGS,
+    moments: Moments | None = None,
+    reading: Reading | None = None,
 ) -> Measured:
-    """``name`` is a path to an `.mcap`, `.csv` or `.csv.gz`, or `-`. Raises InputError, RecordingError.
+    """``name`` is a path to an `.mcap`, a text table or a Parquet file, or `-`; ``reading`` says how a table is to be
+    read. Raises InputError, RecordingError.
 
     ``moments`` are fed all raw samples on the way, block by block: of a unit that turns, where what turns slowly enough
     would pass for a pose that creeps.
@@ -76,7 +74,8 @@ def measure(
     if name.endswith(".mcap"):
         with Recording.open(Path(name)) as recording:
             return _measure_recording(recording, phase, stream, moments)
-    samples = read_csv(name)
+    table = read_table(name, reading)
+    samples = table.samples
     detector, judge = StillnessDetector(), QualityDetector()
     try:
         detector.feed(samples.time_ns, samples.readings, samples.channels)
@@ -94,29 +93,7 @@ def measure(
     counted = {"duplicate_samples": str(samples.duplicates)} if samples.duplicates else {}
     quality = together(counted, seen)
     creep = [] if moments is not None else creeping(poses)
-    return Measured(name, poses, windows, quality + creep + _not_seconds(poses))
-
-
-def _not_seconds(poses: Sequence[Pose]) -> list[str]:
-    """A line where the times of a text can hardly be seconds. A real recording may be sampled that slowly, or its poses
-    held that long, but then it takes few samples to turn the unit from one to the next.
-
-    A trembling hand leaves short still spans within a move: only the long ones are poses here, and of what lies between
-    two of them the longest stretch in motion is the move.
-    """
-    held = [i for i, p in enumerate(poses) if p.end_s - p.start_s >= HELD_MOST_S]
-    if len(held) < max(2, min(LONG_LEAST, len(poses))):
-        return []
-    lasted = float(np.median([poses[i].end_s - poses[i].start_s for i in held]))
-    period = float(np.median([(poses[i].end_s - poses[i].start_s) / max(poses[i].samples - 1, 1) for i in held]))
-    moved = [b.start_s - a.end_s for a, b in pairwise(poses)]
-    turned = float(np.median([max(moved[i:j]) for i, j in pairwise(held)]))
-    if period < PERIOD_MOST_S or turned < max(TURNED_MOST_S, TURNED_SAMPLES * period):
-        return []
-    return [
-        f"{TIME_UNIT}a sample every {plain(period)} s, poses of {plain(lasted)} s, {plain(turned)} s from one to the "
-        "next: is t_s in seconds?"
-    ]
+    return Measured(name, poses, windows, quality + creep, output_unit=table.output_unit, remarks=table.remarks)
 
 
 def _measure_recording(recording: Recording, phase: Phase, stream: str, moments: Moments | None) -> Measured:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from triaxcal.synthetic import SyntheticUnit, Tumble
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.inputs import VERIFICATION, bundle_of, measure, parse_document, read_document
 from triaxcald.recording.reader import Recording
+from triaxcald.tables.samples import Reading
 
 
 def test_a_recording_brings_its_profile_with_it(finished_run: Any) -> None:
@@ -156,49 +156,27 @@ def _written(path: Path, t_s: Floats, readings: Floats) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize(("rate_hz", "hold_s", "move_s"), [(25.0, 6.0, 1.0), (200.0, 3.0, 0.8)])
-def test_times_in_milliseconds_are_asked_about(tmp_path: Path, rate_hz: float, hold_s: float, move_s: float) -> None:
-    asked = measure(_tumbled(tmp_path / "ms.csv", rate_hz, hold_s, move_s, times=1000.0)).data_quality
-    assert asked[-1].startswith(f"time_unit: a sample every {1000 / rate_hz:g} s, poses of ")
-    assert asked[-1].endswith(" s from one to the next: is t_s in seconds?")
-    assert measure(_tumbled(tmp_path / "s.csv", rate_hz, hold_s, move_s)).data_quality == asked[:-1]
+@pytest.mark.parametrize(("rate_hz", "times"), [(25.0, 1e3), (200.0, 1e6), (200.0, 200.0), (1.0, 1.0)])
+def test_times_that_may_be_in_another_unit_are_asked_about(tmp_path: Path, rate_hz: float, times: float) -> None:
+    path = _tumbled(tmp_path / "unit.csv", rate_hz, 30.0 / rate_hz**0.5, 1.0, times)
+    with pytest.raises(InputError, match=r"column t_s: integers in steps of .*--time-unit s, ms, us or ns"):
+        measure(path)
 
 
 @pytest.mark.parametrize(("rate_hz", "hold_s", "move_s"), [(1 / 60, 7200.0, 5.0), (0.1, 2400.0, 60.0), (1, 3600.0, 60)])
-def test_a_recording_that_is_really_so_slow_is_asked_nothing(
-    tmp_path: Path, rate_hz: float, hold_s: float, move_s: float
-) -> None:
-    measured = measure(_tumbled(tmp_path / "slow.csv", rate_hz, hold_s, move_s))
+def test_a_slow_logger_is_read_as_it_says(tmp_path: Path, rate_hz: float, hold_s: float, move_s: float) -> None:
+    path = _tumbled(tmp_path / "slow.csv", rate_hz, hold_s, move_s)
+    measured = measure(path, reading=Reading(time_unit="s"))
     assert len(measured.poses) == 6
     assert measured.data_quality == []
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_milliseconds_are_asked_about_though_still_spans_are_found_within_moves(tmp_path: Path, seed: int) -> None:
-    """A hand that trembles while it turns the unit leaves such spans; most spans are then short."""
-    rng = np.random.default_rng(seed)
-    pieces = []
-    for one, other in pairwise(spiral(10)):
-        pieces.append(np.repeat(one[None], rng.integers(500, 800), axis=0))
-        along = np.linspace(0, 1, rng.integers(200, 300))[:, None]
-        way = (1 - along) * one + along * other
-        pieces.append(way / np.linalg.norm(way, axis=1)[:, None] + rng.normal(0, 0.03, way.shape))
-    readings = np.concatenate(pieces)
-    readings += rng.normal(0, 3e-4, readings.shape)
-    measured = measure(_written(tmp_path / "ms.csv", 10.0 * np.arange(len(readings)), readings))
-    assert np.median([p.samples for p in measured.poses]) < 60
-    assert measured.data_quality[-1].startswith("time_unit: a sample every 10 s, poses of ")
-
-
-def test_a_slow_logger_that_rests_for_nights_and_is_carried_about_between_is_asked_nothing(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    night, carried = np.repeat([[0.0, 0.0, 1.0]], 9000, axis=0), rng.normal(0.5, 0.3, (900, 3))
-    session = [np.concatenate([np.repeat(v[None], 90, axis=0), rng.normal(0, 0.5, (8, 3))]) for v in spiral(10)]
-    readings = np.concatenate([night, carried, *session, carried, night, carried, night])
-    readings += rng.normal(0, 3e-4, readings.shape)
-    measured = measure(_written(tmp_path / "nights.csv", np.arange(len(readings)) * 1.0, readings))
-    assert sum(p.end_s - p.start_s > 2000 for p in measured.poses) == 3
-    assert not [line for line in measured.data_quality if line.startswith("time_unit")]
+def test_a_table_of_milliseconds_gives_the_poses_that_seconds_give(tmp_path: Path) -> None:
+    seconds = measure(_tumbled(tmp_path / "s.csv", 200.0, 3.0, 0.8))
+    millis = measure(_tumbled(tmp_path / "ms.csv", 200.0, 3.0, 0.8, 1000.0), reading=Reading(time_unit="ms"))
+    assert [p.start_s for p in millis.poses] == [p.start_s for p in seconds.poses]
+    assert [p.mean.tolist() for p in millis.poses] == [p.mean.tolist() for p in seconds.poses]
+    assert len(seconds.poses) == 6
 
 
 @pytest.mark.parametrize(

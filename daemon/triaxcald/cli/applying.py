@@ -11,12 +11,12 @@ from triaxcal.documents import Calibration
 from triaxcald.applied import Applied, applied
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import say
-from triaxcald.cli.showing import warn
+from triaxcald.cli.showing import reading_of, warn
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside
 from triaxcald.inputs import CALIBRATION, read_document
-from triaxcald.recording.columns import write_parquet
 from triaxcald.recording.export import write_csv
+from triaxcald.tables.arrow import write_parquet
 
 KINDS = (".csv", ".csv.gz", ".parquet")
 
@@ -28,7 +28,16 @@ def apply_command(a: argparse.Namespace) -> int:
     if a.own_recording and a.phase != CALIBRATION:
         raise InputError(f"--own-recording: the {a.phase} phase has no times of the recording that was fitted")
     calibration = Calibration.from_dict(read_document(a.calibration), where=a.calibration)
-    found = applied(calibration, a.recording, uncertainty=a.uncertainty, own_recording=a.own_recording, phase=a.phase)
+    found = applied(
+        calibration,
+        a.recording,
+        uncertainty=a.uncertainty,
+        own_recording=a.own_recording,
+        phase=a.phase,
+        reading=reading_of(a, a.recording),
+    )
+    for remark in found.remarks:
+        say(f"{a.recording}: {remark}")
     with new_beside(a.output) as path:
         samples = _written(found, path, a.output.name)
     warn(found.missing)

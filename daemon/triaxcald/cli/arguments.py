@@ -12,6 +12,9 @@ from triaxcal.gravity import HEIGHTS_M
 from triaxcal.moment import Moment
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
+from triaxcald.tables.naming import TIME_UNITS, parse_columns
+
+RECORDING = ".mcap, a table (.csv, .csv.gz, .txt, .parquet) or - for text on standard input"
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -110,8 +113,9 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, several: str = "") -> None:
     """``several`` says of what there may be several recordings."""
-    what = ".mcap, .csv, .csv.gz or - for standard input"
-    recording = parser.add_argument("recording", metavar="REC", help=f"{what}; {several}" if several else what)
+    recording = parser.add_argument(
+        "recording", metavar="REC", help=f"{RECORDING}; {several}" if several else RECORDING
+    )
     if optional:
         recording.nargs, recording.required = "?", False
     if several:
@@ -126,6 +130,36 @@ def add_recording(parser: argparse.ArgumentParser, *, optional: bool = False, se
     )
     parser.add_argument("--reference-unit", metavar="UNIT", help="that unit, for the documents")
     add_json(parser)
+    add_table(parser)
+
+
+def add_table(parser: argparse.ArgumentParser) -> None:
+    """How a table is to be read that is no recording of ours."""
+    g = parser.add_argument_group("tables", "text with separators, or Parquet; what is clear is guessed and said")
+    g.add_argument(
+        "--columns", type=_columns, metavar="t=T,ux=X,uy=Y,uz=Z",
+        help="columns by name, or by number from 1 where there is no header; also channels, as temp_c=T1",
+    )  # fmt: skip
+    g.add_argument("--time-unit", choices=TIME_UNITS, help="of the column of time; index: samples, with --rate")
+    g.add_argument("--rate", type=positive, metavar="HZ", help="samples a second, where no times are told")
+    g.add_argument("--skip-bad", action="store_true", help="leave lines out that lack a number; they are counted")
+    g.add_argument(
+        "--where", type=_condition, action="append", metavar="NAME=VALUE", help="only the rows with that in the column"
+    )
+
+
+def _columns(text: str) -> dict[str, str]:
+    try:
+        return parse_columns(text)
+    except ValueError as e:
+        raise argparse.ArgumentTypeError(str(e)) from None
+
+
+def _condition(text: str) -> tuple[str, str]:
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not equals or not name:
+        raise argparse.ArgumentTypeError(f"expected NAME=VALUE as in sensor=ACC, not '{text}'")
+    return name, value
 
 
 def add_uncertainty(parser: argparse.ArgumentParser) -> None:

@@ -30,11 +30,11 @@ from triaxcald.cli.several import (
     show_agreement,
     show_by_recording,
 )
-from triaxcald.cli.showing import Choice, chosen, judge, telling_data_quality, warn
+from triaxcald.cli.showing import Choice, chosen, judge, read_recording, telling_data_quality, warn
 from triaxcald.cli.ways import Way, chosen_way, telling_default_signs
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
-from triaxcald.inputs import Measured, measure
+from triaxcald.inputs import Measured
 from triaxcald.several import agreement_document, with_recordings
 
 
@@ -44,7 +44,7 @@ def fit_command(a: argparse.Namespace) -> int:
     way = chosen_way(a)
     if way is not None:
         return _fit_by(way, a)
-    measured = measure(a.recording)
+    measured = read_recording(a, a.recording)
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
         calibration = fit(measured.poses, signs=choice.signs, reference=choice.reference)

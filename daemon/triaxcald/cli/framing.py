@@ -24,11 +24,11 @@ from triaxcal.units import reference_unit_of
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say, table
-from triaxcald.cli.showing import chosen, warn
+from triaxcald.cli.showing import chosen, read_recording, warn
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.framing import Source, frame_document, own_source, source_under
-from triaxcald.inputs import measure, read_document, require_unit
+from triaxcald.inputs import read_document, require_unit
 
 OWN = "own"
 NO_FACE = "*"
@@ -111,7 +111,7 @@ def _of(name: str) -> Iterator[None]:
 
 
 def _source(a: argparse.Namespace, name: str, calibration: str, taken: Sequence[str]) -> Source:
-    measured = measure(name)
+    measured = read_recording(a, name)
     choice = chosen(a, measured)
     unit = measured.unit or {}
     called = unit.get("serial") or re.sub(r"(\.csv\.gz|\.csv|\.mcap)$", "", Path(name).name)

@@ -17,15 +17,15 @@ from triaxcal.held_out import magnitude_errors
 from triaxcal.rounding import error
 from triaxcal.units import ErrorUnit
 from triaxcald.cli.console import emit
-from triaxcald.cli.showing import counted, judge, show_poses, telling_data_quality, warn
+from triaxcald.cli.showing import counted, judge, read_recording, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
-from triaxcald.inputs import Measured, measure, read_document
+from triaxcald.inputs import Measured, read_document
 from triaxcald.likeness import shape_beside, shape_in, unlike_shapes
 from triaxcald.verification import Verification, pose_rows, trust, unlike
 
 
 def poses(a: argparse.Namespace) -> int:
-    measured = measure(a.recording)
+    measured = read_recording(a, a.recording)
     document = poses_document(measured.poses)
     for row, p in zip(document["poses"], measured.poses, strict=True):
         row |= trust(p)
@@ -61,7 +61,7 @@ def verify_command(a: argparse.Namespace) -> int:
         raise InputError(f"--sign: the scale factors in {a.calibration} have other signs")
     if a.reference and not math.isclose(a.reference, reference, rel_tol=1e-9):
         raise InputError(f"--reference {a.reference:g}: {a.calibration} was made for {reference:g}")
-    measured = measure(a.recording)
+    measured = read_recording(a, a.recording)
     with telling_data_quality(measured):
         _require_trusted(measured)
     found = _verified(measured, model, where=a.calibration)

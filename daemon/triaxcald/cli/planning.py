@@ -22,9 +22,8 @@ from triaxcal.rounding import number, numbers, uncertainty
 from triaxcal.visibility import Sight, sight, unseen_effects
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.lacking import Lacking, lacking
-from triaxcald.cli.showing import chosen, counted, telling_data_quality, warn
+from triaxcald.cli.showing import chosen, counted, read_recording, telling_data_quality, warn
 from triaxcald.errors import InputError
-from triaxcald.inputs import measure
 
 POSES_MOST, POSES_MOST_FOR = 1000, 200
 
@@ -200,7 +199,7 @@ def _never_seen(document: Document) -> list[str]:
 
 
 def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
-    measured = measure(a.recording)
+    measured = read_recording(a, a.recording)
     choice = chosen(a, measured)
     had = [p for p in measured.poses if not p.fault]
     with telling_data_quality(measured):

@@ -15,9 +15,9 @@ from triaxcal.loop import Loop
 from triaxcal.runs import residuals_by_run, together
 from triaxcal.search.alternatives import NEAR
 from triaxcald.cli.console import table
-from triaxcald.cli.showing import Choice, chosen, warn
+from triaxcald.cli.showing import Choice, chosen, read_recording, warn
 from triaxcald.errors import InputError
-from triaxcald.inputs import Measured, measure
+from triaxcald.inputs import Measured
 from triaxcald.likeness import shape_by_poses, shape_of, unlike_shapes
 from triaxcald.verification import unlike
 
@@ -43,7 +43,7 @@ def measured_each(a: argparse.Namespace) -> list[Measured]:
         raise InputError(f"{twice}: given twice; a recording counts once")
     if a.check and _place(a.check) in places:
         raise InputError(f"--check {a.check}: is what is diagnosed; held-out poses are of another recording")
-    out = [measure(name) for name in names]
+    out = [read_recording(a, name) for name in names]
     empty = next((m for m in out if not m.poses), None)
     if empty is not None and len(out) > 1:
         warn(named_quality(empty))
@@ -55,7 +55,7 @@ def measured_check(measured: Measured, a: argparse.Namespace) -> Measured | None
     """The recording of the held-out poses, where the arguments name one. Raises InputError where it is not alike."""
     if not a.check:
         return None
-    check = measure(a.check)
+    check = read_recording(a, a.check)
     _require_alike(measured, check, a)
     return check
 

@@ -11,11 +11,13 @@ from typing import Any
 from triaxcal.errors import Refused
 from triaxcal.gravity import local_gravity_g
 from triaxcal.poses.pose import Pose
+from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
 from triaxcal.units import ErrorUnit, reference_unit_of
 from triaxcald.cli.console import say, table
 from triaxcald.errors import InputError
-from triaxcald.inputs import Measured
+from triaxcald.inputs import Measured, measure
+from triaxcald.tables.samples import Reading
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,24 @@ class Choice:
         return ErrorUnit.of(self.reference_unit, self.reference)
 
 
+def read_recording(a: argparse.Namespace, name: str, moments: Moments | None = None) -> Measured:
+    """The still poses of the recording ``name``, read as the arguments say; how a table was read is told."""
+    found = measure(name, moments=moments, reading=reading_of(a, name))
+    for remark in found.remarks:
+        say(f"{found.name}: {remark}")
+    if not found.poses and moments is None:
+        say(f"{found.name}: the unit never rests; `triaxcal fit --turning` is for a unit that turns all the time")
+    return found
+
+
+def reading_of(a: argparse.Namespace, name: str) -> Reading:
+    """How a table is to be read. Raises InputError where the recording is none."""
+    said = Reading(a.columns or {}, a.time_unit, a.rate, a.skip_bad, dict(a.where or ()))
+    if name.endswith(".mcap") and said != Reading():
+        raise InputError(f"{name}: --columns, --time-unit, --rate, --skip-bad and --where are for tables")
+    return said
+
+
 def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
     """Raises InputError where what was said of the reference does not go together."""
     latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
@@ -47,7 +67,7 @@ def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
     return Choice(
         a.sign or measured.signs or (1, 1, 1),
         reference,
-        a.output_unit or (measured.profile.output.unit if measured.profile else ""),
+        a.output_unit or (measured.profile.output.unit if measured.profile else measured.output_unit),
         a.reference_unit or reference_unit_of(reference),
         _stated(a, measured),
     )

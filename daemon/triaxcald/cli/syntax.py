@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from triaxcald.cli.arguments import (
+    RECORDING,
     add_force,
     add_json,
     add_recording,
+    add_table,
     add_uncertainty,
     count,
     moment,
@@ -118,7 +120,7 @@ def _on_recordings(commands: Any) -> None:
         "calibration names another), effects included.", "apply cal.json rec.csv -o calibrated.csv",
     )  # fmt: skip
     p.add_argument("calibration", metavar="CAL", help="a calibration, loop or certificate document")
-    p.add_argument("recording", metavar="REC", help=".mcap, .csv, .csv.gz or - for standard input")
+    p.add_argument("recording", metavar="REC", help=RECORDING)
     p.add_argument("-o", "--output", metavar="OUT", type=Path, required=True, help=".csv, .csv.gz or .parquet")
     p.add_argument("--uncertainty", action="store_true", help="also u_ax, u_ay, u_az: what the calibration leaves open")
     p.add_argument(
@@ -126,6 +128,7 @@ def _on_recordings(commands: Any) -> None:
         help="REC is the recording that was calibrated: effects of time at each of its times",
     )  # fmt: skip
     p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="of an .mcap")
+    add_table(p)
     p = _command(
         commands, "verify", "measuring:verify_command", "error of the magnitude in every pose under a calibration",
         "Errors are |a| less the reference, in its unit, with the standard error that noise gives each.",

@@ -21,9 +21,9 @@ from triaxcald import ways_in
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import micro, table
 from triaxcald.cli.results import cross_validated, show_coefficients
-from triaxcald.cli.showing import Choice, chosen, telling_data_quality
+from triaxcald.cli.showing import Choice, chosen, read_recording, telling_data_quality
 from triaxcald.errors import InputError
-from triaxcald.inputs import Measured, measure, read_document, require_unit
+from triaxcald.inputs import Measured, read_document, require_unit
 
 POSES_ENOUGH = 9
 Way = tuple[Measured, Document, Calibration, Callable[[], None]]
@@ -56,7 +56,7 @@ def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator
 
 def _turning(a: argparse.Namespace) -> Way:
     moments = Moments()
-    measured = measure(a.recording, moments=moments)
+    measured = read_recording(a, a.recording, moments)
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
         found = fit_rotation(moments, signs=choice.signs, reference=choice.reference)
@@ -82,7 +82,7 @@ def _show_turning(found: RotationFit, choice: Choice) -> None:
 
 def _attitudes(a: argparse.Namespace) -> Way:
     rows = read_attitudes(a.attitudes)
-    measured = measure(a.recording)
+    measured = read_recording(a, a.recording)
     choice = chosen(a, measured)
     poses, rows = match(rows, measured.poses, path=a.attitudes, recording=measured.name)
     with telling_data_quality(measured):
@@ -140,7 +140,7 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
 
 def _passport(a: argparse.Namespace) -> Way:
     held = read_document(a.passport)
-    measured = measure(a.recording)
+    measured = read_recording(a, a.recording)
     require_unit(held, measured, where=a.passport)
     choice = chosen(a, measured)
     said = a.reference or measured.reference or getattr(a, "latitude", None)

@@ -169,7 +169,6 @@ QUALITY = {
     "mains_pickup": "Mains hum",
     "coarse_quantization": "Steps of the output too coarse",
     "creeping_pose": "Outputs creep while the pose is held",
-    "time_unit": "Times that can hardly be seconds",
 }
 _NAME = re.compile(
     r"\b(?:(?:channel_bias|channel_scale_factor):[^\s,;]+?(?=[:,;.]?(?:\s|$))|"

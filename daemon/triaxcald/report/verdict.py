@@ -73,7 +73,7 @@ def judge(
     """
     failed = final is not None and final.verdict == "fail"
     found = _concluded(_judged(outcome, certificate_limits, expanded_g, failed), final)
-    if not (doubts := doubts_of(outcome.data_quality, outcome.doubts)):
+    if not (doubts := doubts_of(outcome.doubts)):
         return found
     kind: Kind = "unexplained" if found.kind == "within" else found.kind
     return replace(found, kind=kind, headline="; ".join([found.headline, *doubts]))

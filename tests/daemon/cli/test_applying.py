@@ -137,7 +137,7 @@ def test_compressed_twice_it_is_the_same_file(folder: Path, triaxcal, tmp_path: 
 def test_what_cannot_be_done_is_said_and_leaves_nothing(
     folder: Path, triaxcal, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], code: int, said: str
 ) -> None:
-    (folder / "twice.csv").write_text("t_s,ux,uy,uz,ax\n0,0,0,1,0\n1,0,0,1,0\n")
+    (folder / "twice.csv").write_text("t_s,ux,uy,uz,ax\n0,0,0,1,0\n0.5,0,0,1,0\n")
     monkeypatch.chdir(folder)
     before = sorted(p.name for p in folder.iterdir())
     triaxcal("apply", *arguments).failed(code, said)

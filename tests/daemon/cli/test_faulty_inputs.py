@@ -29,18 +29,40 @@ CSV_FAULTS = [
     (HEADER + "0,1,2,3\n\n1,,2,3\n", "line 4: field ux: empty, expected a number"),
     (HEADER + "0,1,2\n", "line 2: 3 fields, expected 4"),
     (HEADER + "0,1,2,3,4\n", "line 2: 5 fields, expected 4"),
-    ("t,ux,uy,uz\n" + ROWS, "line 1: field 1 of the header is 't' instead of 't_s'"),
-    ("t_s,x,y,z\n" + ROWS, "line 1: field 2 of the header is 'x' instead of 'ux'"),
-    (ROWS, "line 1: no header, expected the header t_s,ux,uy,uz"),
-    ("All is well that ends well.\n", "line 1: field 1 of the header is"),
+    ("time,left,up,ahead\n" + ROWS, "no three outputs among the columns time, left, up, ahead; name them: --columns"),
+    ("sample,ax,ay,az\n" + ROWS.replace("0.", ""), "column sample is an index, and nothing states a rate: --rate HZ"),
+    (ROWS, "no header over 4 columns; name the columns by number: --columns t=1,ux=2,uy=3,uz=4"),
+    ("t,x,y,z,temp\n" + ROWS, "line 1: 5 names, and 4 fields in the lines of numbers below"),
+    ("All is well that ends well.\n", "no line with three numbers, expected a table of samples"),
     ("", "empty file, expected the header t_s,ux,uy,uz"),
     (HEADER, "line 1: no samples after the header"),
-    ("# nothing\n", "only comments, expected the header"),
+    ("# nothing\n", "no line with three numbers, expected a table of samples"),
+    (HEADER + "0,1,2,3\n1,1,2,3\n", "column t_s: integers in steps of 1 in a unit that nothing states"),
     (HEADER + ROWS + "0.5,1,2,3\n", "line 102: field t_s: 0.5 follows 0.99, expected times that rise"),
     (HEADER + "0,1,2,3\n0,1,2,4\n", "line 3: field t_s: 0.0 comes twice with different values"),
-    ("\0\0\0\0", "line 1: binary data, expected CSV text"),
+    ("\0\0\0\0", "binary data, expected a text table"),
     (HEADER.encode() + b"0,1,2,\xff\n", "line 2: byte 0xff, expected UTF-8 text"),
 ]
+
+
+def test_a_stream_that_never_rests_is_told_of_turning(tmp_path: Path, triaxcal: Run) -> None:
+    t = np.arange(2000) * 0.01
+    u = np.stack([np.sin(t), np.cos(1.3 * t), np.sin(0.7 * t)], axis=1)
+    rows = "".join(f"{s:.2f},{x:.5f},{y:.5f},{z:.5f}\n" for s, (x, y, z) in zip(t, u, strict=True))
+    (tmp_path / "turning.csv").write_text(HEADER + rows)
+    found = triaxcal("fit", str(tmp_path / "turning.csv"))
+    assert found.code == 3
+    assert "turning.csv: the unit never rests; `triaxcal fit --turning`" in found.err
+
+
+def test_options_for_tables_are_refused_for_recordings(tmp_path: Path, triaxcal: Run) -> None:
+    triaxcal("fit", "a.mcap", "--rate", "100").failed(
+        2, "a.mcap: --columns, --time-unit, --rate, --skip-bad and --where"
+    )
+    triaxcal("fit", "a.csv", "--columns", "ax").failed(
+        2, "expected ROLE=COLUMN as in t=time,ux=ax,uy=ay,uz=az, not 'ax'"
+    )
+    triaxcal("fit", "a.csv", "--where", "ACC").failed(2, "expected NAME=VALUE as in sensor=ACC, not 'ACC'")
 
 
 @pytest.mark.parametrize(("content", "words"), CSV_FAULTS)

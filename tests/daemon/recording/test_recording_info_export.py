@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.errors import RecordingError
-from triaxcald.recording.csv_text import read_csv
 from triaxcald.recording.export import write_csv
 from triaxcald.recording.info import describe
 from triaxcald.recording.recover import recover
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.tables.own_text import read_csv
 
 T0_NS = 1_700_000_000_000_000_000
 

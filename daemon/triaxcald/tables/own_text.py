@@ -1,13 +1,10 @@
-"""Reads samples from CSV text: fast where all is well, and exact about the first fault where it is not."""
+"""Reads samples from text of our own layout: fast where all is well, exact about the first fault where it is not."""
 
 from __future__ import annotations
 
-import gzip
 import io
 import re
-import sys
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, NoReturn
@@ -15,20 +12,17 @@ from typing import BinaryIO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal_drivers.files import open_file
 from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
+from triaxcald.tables.source import blocks, label_of
 
 REQUIRED = ("t_s", "ux", "uy", "uz")
-_BLOCK = 2**22
 _LINE_LIMIT = 2**20  # bytes; no line of numbers is that long
 _VALUE_LIMIT = 1e100  # squares of values, and sums of them, have to be numbers too
 _TIME_LIMIT_S = 9.2e9  # beyond, nanoseconds do not fit 64 bits
 _FIELDS_MOST = 1000  # a table of numbers has some ten
 _NUMBER_MOST = 400  # characters of a number; those of the longest are its zeros, 308 of them
-_EXPANSION_MOST = 200
-"""So many times what is read of it may a gzip file unpack to, and one block. Text of numbers comes to a third or a
-tenth, with two hundred columns that never change to a hundredth; nothing but one and the same, to a thousandth."""
+_SKIP = "--skip-bad leaves such lines out"
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COMMENTS = re.compile(r"^(?:[ \t]*#[^\n]*(?:\n|\Z))++", re.MULTILINE)
 _NOTHING = re.compile(r"(?:[ \t\r]*(?:#[^\n]*)?\n)*+")
@@ -52,29 +46,27 @@ def read_csv(source: Path | str | BinaryIO, name: str | None = None) -> CsvSampl
 
     ``name`` stands for the input in messages. Raises InputError: file, line, field, what was expected.
     """
-    if not isinstance(source, Path | str):
-        return _Parse(name or "CSV").run(source)
-    if str(source) == "-":
-        return _Parse(name or "standard input").run(sys.stdin.buffer)
-    label = name or str(source)
-    try:
-        packed = str(source).endswith(".gz")
-        with open_file(Path(source), pipe=not packed) as file:
-            if packed:
-                with gzip.GzipFile(fileobj=file) as unzipped:
-                    return _Parse(label, file).run(unzipped)
-            return _Parse(label).run(file)
-    except OSError as e:
-        raise InputError(f"{label}: cannot be read: {e.strerror or e}") from e
+    label = name or (label_of(str(source)) if isinstance(source, Path | str) else "CSV")
+    return samples_of_blocks(blocks(source, label), label)
+
+
+def samples_of_blocks(data: Iterable[bytes], label: str) -> CsvSamples:
+    """The same of bytes as they are read."""
+    return _Parse(label).run(data)
+
+
+def is_own(head: bytes) -> bool:
+    """Whether text that begins so has our header, behind comments at most."""
+    lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n")
+    first = next((line for line in map(bytes.strip, lines) if line and not line.startswith(b"#")), b"")
+    return [field.strip() for field in first.split(b",")][: len(REQUIRED)] == [n.encode() for n in REQUIRED]
 
 
 class _Parse:
     """One reading of one file: where it is, and what it has found."""
 
-    def __init__(self, name: str, packed: BinaryIO | None = None) -> None:
+    def __init__(self, name: str) -> None:
         self._name = name
-        self._packed = packed
-        self._unpacked = 0  # bytes
         self._line = 0  # lines done with
         self._fields: list[str] = []
         self._before: NDArray[np.float64] | None = None  # the last row
@@ -82,9 +74,9 @@ class _Parse:
         self._times: list[NDArray[np.int64]] = []
         self._duplicates = 0
 
-    def run(self, stream: BinaryIO | gzip.GzipFile) -> CsvSamples:
+    def run(self, data: Iterable[bytes]) -> CsvSamples:
         empty = True
-        for text in self._texts(stream):
+        for text in self._texts(data):
             empty = False
             self._take(text)
         if empty:
@@ -100,11 +92,11 @@ class _Parse:
     def _fail(self, line: int, what: str) -> NoReturn:
         raise InputError(f"{self._name}: line {line}: {what}")
 
-    def _texts(self, stream: BinaryIO | gzip.GzipFile) -> Iterator[str]:
-        """Whole lines, a few MiB at a time."""
+    def _texts(self, data: Iterable[bytes]) -> Iterator[str]:
+        """Whole lines."""
         rest = b""
         first = True
-        while block := self._read(stream):
+        for block in data:
             if first:
                 block = block.removeprefix(b"\xef\xbb\xbf")
                 first = False
@@ -117,18 +109,6 @@ class _Parse:
                 yield self._decode(block[:end])
         if rest:
             yield self._decode(rest)
-
-    def _read(self, stream: BinaryIO | gzip.GzipFile) -> bytes:
-        try:
-            block = stream.read(_BLOCK)
-        except EOFError:
-            raise InputError(f"{self._name}: the gzip data end too early, expected a whole file") from None
-        except (gzip.BadGzipFile, zlib.error) as e:
-            raise InputError(f"{self._name}: not readable as gzip: {e}") from e
-        self._unpacked += len(block)
-        if self._packed is not None and self._unpacked > _EXPANSION_MOST * self._packed.tell() + _BLOCK:
-            raise InputError(f"{self._name}: unpacks to more than {_EXPANSION_MOST} times its size")
-        return block
 
     def _decode(self, data: bytes) -> str:
         nul = data.find(b"\0")
@@ -209,14 +189,15 @@ class _Parse:
         texts = line.split(",")
         if len(texts) != len(self._fields):
             names = ",".join(self._fields)
-            self._fail(number, f"{len(texts)} fields, expected {len(self._fields)} ({clipped(names)})")
+            what = f"{len(texts)} fields, expected {len(self._fields)} ({clipped(names)})"
+            self._fail(number, f"{what}; {_SKIP}")
         row = []
         for field, text in zip(self._fields, map(str.strip, texts), strict=True):
             if not text:
-                self._fail(number, f"field {clipped(field)}: empty, expected a number")
+                self._fail(number, f"field {clipped(field)}: empty, expected a number; {_SKIP}")
             value = float(text) if len(text) <= _NUMBER_MOST and _NUMBER.fullmatch(text) else float("nan")
             if not abs(value) < _VALUE_LIMIT:
-                self._fail(number, f"field {clipped(field)}: '{text[:40]}', expected a finite number")
+                self._fail(number, f"field {clipped(field)}: '{text[:40]}', expected a finite number; {_SKIP}")
             row.append(value)
         if abs(row[0]) >= _TIME_LIMIT_S:
             self._fail(number, f"field t_s: {texts[0].strip()[:40]}, expected seconds below {_TIME_LIMIT_S:g}")

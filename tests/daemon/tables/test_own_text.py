@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from triaxcald.errors import InputError
-from triaxcald.recording import csv_text
-from triaxcald.recording.csv_text import CsvSamples, read_csv
+from triaxcald.tables import source
+from triaxcald.tables.own_text import CsvSamples, read_csv
 
 HEAD = b"t_s,ux,uy,uz\n"
 DATASETS = Path(__file__).parents[4] / "shared" / "datasets"
@@ -96,7 +96,7 @@ def test_a_fault_is_told_with_its_line_its_field_and_what_was_expected(text: byt
 
 
 def test_a_fault_far_into_a_long_file_has_the_right_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_text, "_BLOCK", 64)
+    monkeypatch.setattr(source, "BLOCK", 64)
     good = HEAD + b"# c\n" + b"".join(b"%d.5,1,2,3\n" % i for i in range(500))
     assert len(read(good).time_ns) == 500
     with pytest.raises(InputError, match=r"line 503: field uy: 'x'"):
@@ -110,7 +110,7 @@ def test_a_fault_far_into_a_long_file_has_the_right_line(monkeypatch: pytest.Mon
 def test_rows_that_repeat_exactly_are_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     text = HEAD + b"0,1,2,3\n" * 3 + b"1,4,5,6\n" * 2
     for block in (2**22, 8):
-        monkeypatch.setattr(csv_text, "_BLOCK", block)
+        monkeypatch.setattr(source, "BLOCK", block)
         found = read(text)
         assert found.time_ns.tolist() == [0, 1_000_000_000]
         assert found.duplicates == 3
@@ -128,7 +128,7 @@ def test_the_samples_do_not_depend_on_how_the_text_is_cut(
     for at in comments:
         lines.insert(min(at, len(lines)), "# a comment\n")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(csv_text, "_BLOCK", block)
+        patch.setattr(source, "BLOCK", block)
         found = read(HEAD + "".join(lines).encode())
     assert found.readings.tolist() == [list(row) for row in readings]
 
@@ -154,7 +154,9 @@ def test_gzip_is_read_and_its_faults_are_told(tmp_path: Path) -> None:
 
 def test_a_dash_is_standard_input(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(HEAD + b"0,1,2,x\n")))
-    with pytest.raises(InputError, match=r"^standard input: line 2: field uz: 'x', expected a finite number$"):
+    with pytest.raises(
+        InputError, match=r"^standard input: line 2: field uz: 'x', expected a finite number; --skip-bad"
+    ):
         read_csv("-")
 
 

@@ -1,0 +1,234 @@
+"""Tables by pyarrow, behind the one file that knows it: text and Parquet in, Parquet out."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triaxcal_drivers.interface import SampleBlock
+from triaxcald.errors import InputError
+from triaxcald.recording.export import columns_of, require_alike
+from triaxcald.tables.layout import DAY_TIME, MISSING, MOMENT
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
+_NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table of n rows.
+
+    ``numbers`` (n,), NaN where a cell holds none; ``moments_ns`` (n,) where the cells are moments, from 1970 or from
+    midnight. ``gaps`` (n,) are cells that hold nothing, and ``strange`` (n,) those with something else than a number or
+    a moment. ``whole`` are all numbers without a fraction, exactly, as far as they fit 64 bits.
+    """
+
+    numbers: NDArray[np.float64]
+    gaps: NDArray[np.bool_]
+    strange: NDArray[np.bool_]
+    moments_ns: NDArray[np.int64] | None = None
+    whole: NDArray[np.int64] | None = None
+    texts: Any = None
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        return ~(self.gaps | self.strange)
+
+    def text(self, row: int) -> str:
+        return "" if self.texts is None else str(self.texts[row])
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """A line that has another number of fields than the others: its index among the lines read."""
+
+    row: int
+    fields: int
+
+
+def read_text(text: str, separator: str, decimal: str, fields: int) -> tuple[list[Column], list[Ragged]]:
+    """The columns of lines of ``fields`` fields each, and the lines that have another number, which are left out.
+
+    Raises ValueError for what is no table at all.
+    """
+    import pyarrow as pa
+    import pyarrow.csv as pc
+
+    ragged: list[Ragged] = []
+
+    def note(row: Any) -> str:
+        ragged.append(Ragged(row.number - 1, row.actual_columns))
+        return "skip"
+
+    names = [str(i) for i in range(fields)]
+    try:
+        table = pc.read_csv(
+            io.BytesIO(text.encode()),
+            pc.ReadOptions(column_names=names, use_threads=False, block_size=max(2**20, min(len(text) + 1, 2**30))),
+            pc.ParseOptions(delimiter=separator, invalid_row_handler=note),
+            pc.ConvertOptions(
+                column_types=dict.fromkeys(names, pa.string()),
+                strings_can_be_null=False,
+                quoted_strings_can_be_null=False,
+            ),
+        )
+    except pa.ArrowInvalid as e:
+        raise ValueError(str(e).splitlines()[0]) from e
+    return [_of_text(column.combine_chunks(), decimal) for column in table.columns], ragged
+
+
+def read_parquet(path: Path) -> tuple[list[str], list[Column]]:
+    """Names and columns, nested ones by their path as in a.b. Raises InputError."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.ParquetFile(path).read().flatten()
+        while any(pa.types.is_struct(t) for t in table.schema.types):
+            table = table.flatten()
+        return list(table.column_names), [_of_array(column.combine_chunks()) for column in table.columns]
+    except FileNotFoundError:
+        raise InputError(f"{path}: cannot be read: No such file or directory") from None
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read: {e.strerror or str(e).splitlines()[0]}") from e
+    except (pa.ArrowException, ValueError) as e:
+        raise InputError(f"{path}: not readable as Parquet: {str(e).splitlines()[0]}") from e
+
+
+def _of_array(array: pa.Array) -> Column:
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    kind = array.type
+    if isinstance(kind, pa.DictionaryType):
+        array = array.dictionary_decode()
+        kind = array.type
+    gaps = np.asarray(array.is_null())
+    n = len(array)
+    if pa.types.is_integer(kind):
+        filled = pc.fill_null(array, 0)
+        numbers = np.asarray(filled).astype(float)
+        fits = not pa.types.is_uint64(kind) or bool((np.asarray(filled) < 2**63).all())
+        numbers[gaps] = np.nan
+        whole = np.asarray(filled).astype(np.int64) if fits else None
+        return Column(numbers, gaps, np.zeros(n, bool), whole=whole)
+    if pa.types.is_floating(kind) or pa.types.is_decimal(kind):
+        numbers = np.asarray(pc.fill_null(pc.cast(array, pa.float64()), np.nan)).copy()
+        bad = ~np.isfinite(numbers)
+        numbers[bad] = np.nan
+        return Column(numbers, bad, np.zeros(n, bool), whole=_whole(numbers, ~bad))
+    if pa.types.is_temporal(kind) and not pa.types.is_interval(kind):
+        if pa.types.is_date(kind):
+            array, kind = pc.cast(array, pa.timestamp("ms")), pa.timestamp("ms")
+        counts = np.asarray(pc.fill_null(array.cast(pa.int32() if array.type.bit_width == 32 else pa.int64()), 0))
+        moments = counts.astype(np.int64) * _NANOSECONDS[kind.unit]
+        return Column(np.full(n, np.nan), gaps, np.zeros(n, bool), moments)
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        return _of_text(pc.fill_null(array, "").cast(pa.string()), ".")
+    return Column(np.full(n, np.nan), gaps, ~gaps)
+
+
+def _of_text(texts: pa.StringArray, decimal: str) -> Column:
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    texts = pc.utf8_trim_whitespace(texts)
+    missing = pa.array(sorted(MISSING), pa.string())
+    gaps = np.asarray(pc.or_(pc.is_in(pc.utf8_lower(texts), missing), pc.starts_with(texts, "#")))
+    moments = _moments(texts, gaps)
+    if moments is not None:
+        values, strange = moments
+        return Column(np.full(len(texts), np.nan), gaps, strange, values, texts=texts)
+    pointed = pc.replace_substring(texts, ",", ".") if decimal == "," else texts
+    fine = pc.match_substring_regex(pointed, _NUMBER)
+    numbers = np.asarray(pc.cast(pc.if_else(fine, pointed, "nan"), pa.float64())).copy()
+    strange = ~np.asarray(fine) & ~gaps
+    numbers[~np.isfinite(numbers)] = np.nan  # 1e999
+    strange |= np.isnan(numbers) & np.asarray(fine)
+    return Column(numbers, gaps, strange, whole=_whole_of_text(pointed, ~(gaps | strange), numbers), texts=texts)
+
+
+def _whole(numbers: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.int64] | None:
+    held = np.where(usable, numbers, 0.0)
+    if not (held == np.rint(held)).all() or np.abs(held).max(initial=0.0) >= 2**63:
+        return None
+    return held.astype(np.int64)
+
+
+def _whole_of_text(
+    texts: pa.StringArray, usable: NDArray[np.bool_], numbers: NDArray[np.float64]
+) -> NDArray[np.int64] | None:
+    """Exactly: nanoseconds since 1970 have more digits than a float."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    whole = _whole(numbers, usable)
+    if whole is None or np.abs(whole).max(initial=0) < 2**53:
+        return whole
+    try:
+        return np.asarray(pc.cast(pc.if_else(pa.array(usable), pc.utf8_ltrim(texts, characters="+"), "0"), pa.int64()))
+    except pa.ArrowInvalid:
+        return whole
+
+
+def _moments(texts: pa.StringArray, gaps: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.bool_]] | None:
+    """Nanoseconds where the first cells are moments or times of day, and which cells hold none of these."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    first = next((str(texts[int(i)]) for i in np.flatnonzero(~gaps)[:1]), "")
+    of_day = bool(DAY_TIME.fullmatch(first))
+    if not of_day and not MOMENT.fullmatch(first):
+        return None
+    fine = pc.match_substring_regex(texts, f"^(?:{(DAY_TIME if of_day else MOMENT).pattern})$")
+    strange = ~np.asarray(fine) & ~gaps
+    if of_day:
+        texts = pc.binary_join_element_wise("1970-01-01", texts, " ")
+        texts = pc.replace_substring_regex(texts, r" (\d:)", r" 0\1")
+    texts = pc.replace_substring(texts, ",", ".")
+    texts = pc.replace_substring_regex(texts, r" ?UTC$", "Z")
+    texts = pc.replace_substring_regex(texts, r" (Z|[+-]\d\d(?::?\d\d)?)$", r"\1")
+    zoned = bool(re.search(r":\d\d(?:\.\d+)?(?:Z|[+-]\d\d(?::?\d\d)?)$", str(texts[int(np.flatnonzero(~gaps)[0])])))
+    held = pc.if_else(fine, texts, "1970-01-01T00:00:00" + ("Z" if zoned else ""))
+    try:
+        found = pc.cast(held, pa.timestamp("ns", "UTC" if zoned else None))
+    except pa.ArrowInvalid:
+        return np.zeros(len(texts), np.int64), ~gaps
+    return np.asarray(found.cast(pa.int64())), strange
+
+
+def write_parquet(path: Path, blocks: Iterable[SampleBlock], start_ns: int | None = None) -> int:
+    """As `triaxcald.recording.export.write_csv`, times in seconds as floats; the number of samples. ``path`` is
+    overwritten. Raises RecordingError, OSError."""
+    import pyarrow as pa  # 50 MB that nothing else needs
+    import pyarrow.parquet as pq
+
+    samples, names, writer = 0, None, None
+    try:
+        for block in blocks:
+            names = require_alike(block, names, samples)
+            if not len(block):
+                continue
+            start_ns = int(block.time_ns[0]) if start_ns is None else start_ns
+            columns = {"t_s": (block.time_ns - start_ns) * 1e-9, **columns_of(block)}
+            table = pa.table({name: pa.array(np.ascontiguousarray(v)) for name, v in columns.items()})
+            writer = writer or pq.ParquetWriter(path, table.schema)
+            writer.write_table(table)
+            samples += len(block)
+        if writer is None:
+            empty = {name: pa.array([], pa.float64()) for name in ("t_s", "ux", "uy", "uz", *(names or ()))}
+            writer = pq.ParquetWriter(path, pa.table(empty).schema)
+    finally:
+        if writer is not None:
+            writer.close()
+    return samples

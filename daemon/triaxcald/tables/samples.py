@@ -1,0 +1,507 @@
+"""Samples from a table of anybody's making: what is clear is read and said, what is not is asked for by its option."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain, product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triaxcal.figures import plain
+from triaxcal_drivers.nearest import clipped
+from triaxcald.errors import InputError
+from triaxcald.tables import arrow, clock
+from triaxcald.tables.arrow import Column
+from triaxcald.tables.layout import Layout, decoded, layout_of
+from triaxcald.tables.naming import INDEX, ISO, OUTPUTS, TIME, Name, Roles, Unclear, are_seconds_and_rest, roles_of
+from triaxcald.tables.own_text import CsvSamples, is_own, samples_of_blocks
+from triaxcald.tables.source import blocks, label_of
+
+HEAD = 2**20
+"""Characters in which the layout is looked for."""
+VALUE_LIMIT = 1e100
+"""Squares of values, and sums of them, have to be numbers too."""
+COMPUTED_LEAST = 0.999
+"""Correlation with the magnitude of the outputs above which a column is computed from them; a temperature that is
+measured has not a thousandth of it."""
+CELSIUS = (-60.0, 150.0)
+"""A thermometer of degrees Celsius beside a sensor shows no other; counts of a converter are beyond."""
+_SENSORS = re.compile(r"acc|gyr|mag|baro|grav|rotat|orient|linear", re.IGNORECASE)
+_LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*)?(?:\n|\Z)"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a table is to be read, where the user says so. ``columns`` are names or numbers (from 1) of the table's by
+    role (t, ux, uy, uz, or a channel's name); ``time_unit`` one of `naming.TIME_UNITS`; ``rate`` in Hz; ``where`` are
+    values that the rows to be read have in a column."""
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    time_unit: str | None = None
+    rate: float | None = None
+    skip_bad: bool = False
+    where: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Table:
+    """``remarks`` say what was guessed and what was left out, a line each; ``output_unit`` is what the header says."""
+
+    samples: CsvSamples
+    remarks: tuple[str, ...] = ()
+    output_unit: str = ""
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Columns of n rows with their names. ``line_of`` says where a row stands, as in "line 17"."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    named: bool
+    columns: tuple[Column, ...]
+    line_of: Callable[[int], str]
+    head: tuple[str, ...] = ()
+    ragged: tuple[tuple[str, int], ...] = ()
+
+    def called(self, column: int) -> str:
+        return f"column {clipped(self.names[column])}" if self.named else f"column {column + 1}"
+
+
+def read_table(name: str, reading: Reading | None = None) -> Table:
+    """Of a path, or of text on standard input (``-``). Raises InputError: file, line, field, what was expected."""
+    reading = reading or Reading()
+    label = label_of(name)
+    try:
+        if name.endswith((".parquet", ".pq")):
+            names, columns = arrow.read_parquet(Path(name))
+            grid = _Grid(tuple(names), ("",) * len(names), True, tuple(columns), lambda row: f"row {row + 1}")
+            return _assembled(grid, reading)
+        data = blocks(name, label)
+        first = next(data, b"")
+        if (reading == Reading() and is_own(first)) or not first:
+            samples = samples_of_blocks(chain((first,), data) if first else (), label)
+            clock.require_seconds(samples.time_ns, "t_s")
+            return Table(samples)
+        return _assembled(_grid(first, data), reading)
+    except Unclear as e:
+        raise InputError(f"{label}: {e}") from None
+
+
+def _grid(first: bytes, rest: Iterator[bytes]) -> _Grid:
+    whole = b"".join(chain((first,), rest))
+    if whole.startswith((b"\x1f\x8b", b"\x89MCAP", b"PAR1", b"PK\x03\x04")):
+        raise Unclear(f"binary data ({_kind(whole)}), expected a text table")
+    try:
+        text = decoded(whole)
+    except ValueError:
+        raise Unclear("binary data, expected a text table") from None
+    if not text.strip():
+        raise Unclear("empty file, expected a text table")
+    head = text[:HEAD].split("\n")
+    if len(text) > HEAD and len(head) > 1:
+        head.pop()
+    layout = layout_of(head)
+    if layout is None:
+        raise Unclear("no line with three numbers, expected a table of samples")
+    if layout.unlike is not None:
+        line, count = layout.unlike
+        raise Unclear(f"line {line + 1}: {count} names, and {layout.fields} fields in the lines of numbers below")
+    at = _offset(text, layout.first)
+    left = re.compile(_LEFT.replace("//", "//" if layout.separator == ";" else "//|;"), re.MULTILINE)
+    body = left.sub("", text[at:])
+    if layout.separator == " ":
+        body = re.sub(r"^ +| +$", "", re.sub(r"[ \t]+", " ", body), flags=re.MULTILINE)
+    columns, ragged = _read(body, layout)
+    columns, names, units = _without_empty(columns, layout)
+    left_out = {r.row for r in ragged}
+    line_of = _lines(text, layout.first, left, left_out)
+    every = _lines(text, layout.first, left, set())
+    return _Grid(
+        names, units, layout.header is not None, tuple(columns), line_of, layout.remarks,
+        tuple((every(r.row), r.fields) for r in ragged),
+    )  # fmt: skip
+
+
+def _kind(data: bytes) -> str:
+    return {b"\x1f\x8b": "gzip; name it .gz", b"\x89M": "MCAP; name it .mcap", b"PA": "Parquet; name it .parquet"}.get(
+        data[:2], "a ZIP archive or a spreadsheet; save it as CSV"
+    )
+
+
+def _offset(text: str, line: int) -> int:
+    at = 0
+    for _ in range(line):
+        at = text.index("\n", at) + 1
+    return at
+
+
+def _read(body: str, layout: Layout) -> tuple[list[Column], list[arrow.Ragged]]:
+    try:
+        columns, ragged = arrow.read_text(body, layout.separator, layout.decimal, layout.fields)
+        if any(r.fields > layout.fields for r in ragged):  # some programs end the first line, or some, with separators
+            s = re.escape(layout.separator)
+            ended = re.compile(rf"^((?:[^{s}\n]*{s}){{{layout.fields - 1}}}[^{s}\n]*){s}+$", re.MULTILINE)
+            columns, ragged = arrow.read_text(ended.sub(r"\1", body), layout.separator, layout.decimal, layout.fields)
+    except ValueError as e:
+        raise Unclear(f"not readable as a table: {e}") from e
+    return columns, ragged
+
+
+def _without_empty(columns: list[Column], layout: Layout) -> tuple[list[Column], tuple[str, ...], tuple[str, ...]]:
+    """Without the columns that trailing separators make."""
+    names = list(layout.header or (str(i + 1) for i in range(layout.fields)))
+    units = list(layout.units or ("",) * layout.fields)
+    while columns and columns[-1].gaps.all() and (layout.header is None or not names[-1].strip()):
+        columns, names, units = columns[:-1], names[:-1], units[:-1]
+    return columns, tuple(names), tuple(units)
+
+
+def _lines(text: str, first: int, left: re.Pattern[str], left_out: set[int]) -> Callable[[int], str]:
+    def line_of(row: int) -> str:
+        at = -1
+        read = -1
+        for number, line in enumerate(text.split("\n")[first:], start=first + 1):
+            if not left.fullmatch(line):
+                at += 1
+                read += at not in left_out
+                if read == row:
+                    return f"line {number}"
+        return "the last line"
+
+    return line_of
+
+
+def _assembled(grid: _Grid, reading: Reading) -> Table:
+    chosen = _rows_where(grid, reading.where)
+    if grid.named and TIME not in reading.columns:
+        grid = _with_joined_times(grid)
+    roles = roles_of(grid.names, grid.units, reading.columns, named=grid.named)
+    _require_one_sensor(grid, chosen)
+    for i in roles.outputs:
+        _require_numbers(grid, i, chosen)
+    parsed = [Name.of(n, u) for n, u in zip(grid.names, grid.units, strict=True)]
+    timing = _timing(grid, roles, parsed, reading, chosen)
+    needed = [*roles.outputs, *roles.channels.values(), *([] if timing.column is None else [timing.column])]
+    keep, skipped = _kept(grid, needed, chosen, reading)
+    rows = np.flatnonzero(keep)
+    if not len(rows):
+        raise Unclear("no samples, expected some")
+    readings = np.stack([grid.columns[i].numbers[rows] for i in roles.outputs], axis=1)
+    for axis, i in zip(range(3), roles.outputs, strict=True):
+        if (np.abs(readings[:, axis]) >= VALUE_LIMIT).any():
+            row = int(rows[int(np.argmax(np.abs(readings[:, axis])))])
+            raise Unclear(f"{grid.line_of(row)}: {grid.called(i)}: a value of {VALUE_LIMIT:g} or more")
+    time_ns = timing.time_ns[rows] if timing.time_ns is not None else _counted(grid, timing, rows)
+    channels, left_out = _channels(grid, roles, parsed, timing, rows, readings)
+    once = _rising(grid, timing, rows, time_ns, readings, channels)
+    samples = CsvSamples(
+        time_ns[once], readings[once], {n: v[once] for n, v in channels.items()}, int(len(once) - once.sum())
+    )
+    remarks = [_read_as(grid, roles, timing, reading)]
+    remarks += [f"left out: {'; '.join(left_out)}"] if left_out else []
+    return Table(samples, (*remarks, *skipped), _unit_of(roles, parsed))
+
+
+def _with_joined_times(grid: _Grid) -> _Grid:
+    """Seconds and nanoseconds in two columns, as ROS has them, as one of nanoseconds."""
+    for i, j in product(range(len(grid.names)), repeat=2):
+        seconds, rest = grid.columns[i], grid.columns[j]
+        if seconds.whole is None or rest.whole is None or not are_seconds_and_rest(grid.names[i], grid.names[j]):
+            continue
+        whole = seconds.whole * 10**9 + rest.whole
+        joined = Column(whole.astype(float), seconds.gaps | rest.gaps, seconds.strange | rest.strange, whole=whole)
+        name = f"{grid.names[i]} + {grid.names[j]} (ns)"
+        return replace(
+            grid,
+            names=(*(name if k == i else n for k, n in enumerate(grid.names) if k != j),),
+            units=(*(u for k, u in enumerate(grid.units) if k != j),),
+            columns=(*(joined if k == i else c for k, c in enumerate(grid.columns) if k != j),),
+        )
+    return grid
+
+
+def _rows_where(grid: _Grid, where: Mapping[str, str]) -> NDArray[np.bool_]:
+    n = len(grid.columns[0].numbers) if grid.columns else 0
+    chosen = np.ones(n, bool)
+    for name, value in where.items():
+        found = [i for i, held in enumerate(grid.names) if name in (held, Name.of(held).text)]
+        if len(found) != 1:
+            raise Unclear(f"--where {name}={value}: the table has {len(found)} columns of that name")
+        column = grid.columns[found[0]]
+        chosen &= np.array([column.text(row) == value for row in range(n)], bool)
+        if not chosen.any():
+            raise Unclear(f"--where {name}={value}: no row has that; it has {clipped(', '.join(_distinct(column)))}")
+    return chosen
+
+
+def _distinct(column: Column, most: int = 20) -> list[str]:
+    return sorted({column.text(row) for row in range(len(column.numbers))})[:most]
+
+
+def _require_one_sensor(grid: _Grid, chosen: NDArray[np.bool_]) -> None:
+    """Rows of several sensors below each other, as some phones write them, would be read as one that jumps."""
+    for i, column in enumerate(grid.columns):
+        if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > 0.5:
+            continue
+        texts = {column.text(int(row)) for row in np.flatnonzero(chosen)}
+        if 1 < len(texts) <= 50 and sum(bool(_SENSORS.search(t)) for t in texts) > 1:
+            wanted = next((t for t in sorted(texts) if re.search("acc", t, re.IGNORECASE)), min(texts))
+            raise Unclear(
+                f"rows of several sensors ({grid.called(i)}: {clipped(', '.join(sorted(texts)))}); choose "
+                f"those of one: --where {Name.of(grid.names[i]).text}={wanted}"
+            )
+
+
+def _require_numbers(grid: _Grid, i: int, chosen: NDArray[np.bool_]) -> None:
+    column = grid.columns[i]
+    if column.moments_ns is not None or (chosen & column.usable).sum() * 2 <= (chosen & column.strange).sum():
+        row = int(np.flatnonzero(chosen & (column.strange | (column.moments_ns is not None)))[0])
+        raise Unclear(f"{grid.line_of(row)}: {grid.called(i)}: '{column.text(row)[:40]}', expected a finite number")
+
+
+@dataclass(frozen=True)
+class _Timing:
+    """``time_ns`` (n,), None where the samples are counted, by ``index`` where that is a column; ``column`` is the one
+    that the times are of. ``said`` is what is to be said of it."""
+
+    time_ns: NDArray[np.int64] | None
+    column: int | None
+    said: str
+    rate: float = 0.0
+    index: int | None = None
+
+
+def _timing(grid: _Grid, roles: Roles, names: Sequence[Name], reading: Reading, chosen: NDArray[np.bool_]) -> _Timing:
+    rate, where = reading.rate, "--rate"
+    if reading.time_unit not in (None, INDEX) and rate is not None:
+        raise Unclear(f"--rate, --time-unit {reading.time_unit}: give one or the other")
+    by_index = reading.time_unit == INDEX
+    candidates = [i for i in roles.time if _rises_at_all(grid.columns[i], chosen)]
+    if not roles.time and grid.named:
+        moments = [i for i, c in enumerate(grid.columns) if c.moments_ns is not None and _rises_at_all(c, chosen)]
+        candidates = moments if len(moments) == 1 else []
+    if TIME in roles.said:
+        candidates = list(roles.time)
+    if rate is None and (by_index or not candidates):
+        stated = clock.stated_rate(grid.head)
+        if stated is None:
+            raise Unclear(_no_time(grid, roles, by_index))
+        rate, where = stated[0], f"'{clipped(stated[1])}'"
+    if rate is not None:
+        index = next(iter([*([roles.time[0]] if by_index or TIME in roles.said else []), *roles.indices][:1]), None)
+        return _Timing(None, None, f"{plain(rate, 6)} Hz by {where}", rate, index)
+    return _timed(grid, candidates, names, reading.time_unit, chosen)
+
+
+def _no_time(grid: _Grid, roles: Roles, by_index: bool) -> str:
+    if by_index:
+        return "--time-unit index: say how many samples a second it counts: --rate HZ"
+    if roles.indices:
+        return f"{grid.called(roles.indices[0])} is an index, and nothing states a rate: --rate HZ"
+    which = "t=NAME" if grid.named else "t=NUMBER"
+    return f"no column of time; name it (--columns {which},…), or say how many samples a second there are: --rate HZ"
+
+
+def _rises_at_all(column: Column, chosen: NDArray[np.bool_]) -> bool:
+    rows = chosen & column.usable
+    if rows.sum() * 2 < chosen.sum():
+        return False
+    values = column.moments_ns if column.moments_ns is not None else column.numbers
+    held = values[rows]
+    return len(held) < 2 or held[-1] > held[0]
+
+
+def _timed(
+    grid: _Grid, candidates: Sequence[int], names: Sequence[Name], unit: str | None, chosen: NDArray[np.bool_]
+) -> _Timing:
+    """Of the candidates whose unit is clear the first whose times all rise; they have to agree about how long the
+    recording took."""
+    unstated = [i for i in candidates if names[i].time_unit is None and grid.columns[i].moments_ns is None]
+    of_unit = (unstated or list(candidates))[0] if unit is not None else None
+    found: list[tuple[bool, int, NDArray[np.int64], str]] = []
+    unclear: Unclear | None = None
+    for i in [of_unit] if of_unit is not None else candidates:
+        column = grid.columns[i]
+        try:
+            time_ns, known = clock.nanoseconds(_of_rows(column, chosen), names[i], unit)
+        except Unclear as e:
+            unclear = unclear or e
+            continue
+        whole = np.zeros(len(chosen), np.int64)
+        whole[chosen] = time_ns
+        steps = np.diff(whole[chosen & column.usable])
+        found.append((bool((steps > 0).all()), i, whole, known))
+    if not found:
+        assert unclear is not None
+        raise unclear
+    rising = [f for f in found if f[0]] or found
+    lasted = {i: _lasted_s(t, chosen & grid.columns[i].usable) for _, i, t, _ in rising}
+    longest, shortest = max(lasted.values()), min(lasted.values())
+    if longest - shortest > 2 + 0.01 * longest:
+        both = ", ".join(f"{grid.called(i)} {plain(s)} s" for i, s in lasted.items())
+        raise Unclear(f"columns of time that do not agree how long it took ({both}); choose one: --columns t=NAME")
+    _, i, time_ns, known = rising[0]
+    return _Timing(time_ns, i, "dates" if known == ISO else known)
+
+
+def _of_rows(column: Column, chosen: NDArray[np.bool_]) -> Column:
+    return Column(
+        column.numbers[chosen],
+        column.gaps[chosen],
+        column.strange[chosen],
+        None if column.moments_ns is None else column.moments_ns[chosen],
+        None if column.whole is None else column.whole[chosen],
+    )
+
+
+def _lasted_s(time_ns: NDArray[np.int64], rows: NDArray[np.bool_]) -> float:
+    held = time_ns[rows]
+    return float(held[-1] - held[0]) * 1e-9 if len(held) else 0.0
+
+
+def _counted(grid: _Grid, timing: _Timing, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+    index = None if timing.index is None else grid.columns[timing.index]
+    every = np.zeros(len(grid.columns[0].numbers), bool)
+    every[rows] = True
+    if index is not None:
+        time_ns, counted = clock.of_index(_of_rows(index, every), len(rows), timing.rate)
+        if counted:
+            return time_ns
+    n = int(rows[-1]) - int(rows[0]) + 1
+    span = n if not grid.ragged else len(rows)
+    return clock.of_index(None, span, timing.rate)[0][rows - rows[0] if span == n else slice(None)]
+
+
+def _kept(
+    grid: _Grid, needed: Sequence[int], chosen: NDArray[np.bool_], reading: Reading
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """The rows with a number in each of the columns that are needed. Raises Unclear where there are others, unless they
+    are to be skipped; what to say of them."""
+    usable = chosen.copy()
+    for i in needed:
+        usable &= grid.columns[i].usable
+    bad = chosen & ~usable
+    faults = []
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        i = next(i for i in needed if not grid.columns[i].usable[row])
+        held = grid.columns[i].text(row)
+        what = f"'{held[:40]}'" if held else "empty"
+        faults.append(f"{grid.line_of(row)}: {grid.called(i)}: {what}, expected a finite number")
+    for line, fields in grid.ragged[:1]:
+        faults.append(f"{line}: {fields} fields, expected {len(grid.columns)}")
+    count = int(bad.sum()) + len(grid.ragged)
+    if not count:
+        return usable, []
+    if not reading.skip_bad:
+        raise Unclear(f"{faults[0]}; {count} such lines: --skip-bad leaves them out")
+    return usable, [f"{count} of {int(chosen.sum()) + len(grid.ragged)} lines left out (--skip-bad); {faults[0]}"]
+
+
+def _channels(
+    grid: _Grid,
+    roles: Roles,
+    names: Sequence[Name],
+    timing: _Timing,
+    rows: NDArray[np.intp],
+    readings: NDArray[np.float64],
+) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
+    """All other columns of numbers without gaps, and why the others are not among them."""
+    channels = {role: grid.columns[i].numbers[rows] for role, i in roles.channels.items()}
+    left_out: list[str] = []
+    used = {*roles.outputs, *roles.channels.values(), timing.column, timing.index}
+    celsius = [i for i, n in enumerate(names) if n.is_celsius and i not in used]
+    magnitude = np.linalg.norm(readings, axis=1)
+    for i, column in enumerate(grid.columns):
+        if i in used:
+            continue
+        name = re.sub(r'[,\s"]+', " ", names[i].text if grid.named else f"column {i + 1}").strip()
+        values = column.numbers[rows]
+        reason = _unfit(column, rows, magnitude)
+        if i in roles.time or column.moments_ns is not None:
+            reason = "another time"
+        elif i in roles.indices:
+            reason = "an index"
+        elif i in roles.rivals:
+            reason = "other outputs"
+        elif grid.named and names[i].is_computed:
+            reason = "computed from the outputs"
+        elif reason is None and (not name or name in (*OUTPUTS, "t_s") or name in channels):
+            reason = "its name is taken" if name else "it has no name"
+        if reason is None and [i] == celsius and "temp_c" not in channels and _as_celsius(values):
+            name = "temp_c"
+        if reason is None:
+            channels[name] = values
+        else:
+            left_out.append(f"{name or f'column {i + 1}'} ({reason})")
+    return channels, left_out
+
+
+def _unfit(column: Column, rows: NDArray[np.intp], magnitude: NDArray[np.float64]) -> str | None:
+    if column.strange[rows].any():
+        return "no numbers"
+    if column.gaps[rows].any():
+        return f"{int(column.gaps[rows].sum())} of {len(rows)} cells empty"
+    values = column.numbers[rows]
+    if (np.abs(values) >= VALUE_LIMIT).any():
+        return "values too large"
+    if len(rows) > 2 and np.ptp(values) > 0 and np.ptp(magnitude) > 0:
+        with np.errstate(all="ignore"):
+            correlation = np.corrcoef(values, magnitude)[0, 1]
+        if abs(correlation) > COMPUTED_LEAST:
+            return "computed from the outputs"
+    return None
+
+
+def _as_celsius(values: NDArray[np.float64]) -> bool:
+    return bool(CELSIUS[0] <= values.min() and values.max() <= CELSIUS[1])
+
+
+def _rising(
+    grid: _Grid,
+    timing: _Timing,
+    rows: NDArray[np.intp],
+    time_ns: NDArray[np.int64],
+    readings: NDArray[np.float64],
+    channels: Mapping[str, NDArray[np.float64]],
+) -> NDArray[np.bool_]:
+    """Which rows are no exact repetition of the one before. Raises Unclear where times do not rise."""
+    step = np.diff(time_ns)
+    values = np.column_stack([readings, *channels.values()])
+    repeated = (step == 0) & (values[1:] == values[:-1]).all(axis=1)
+    wrong = np.flatnonzero((step <= 0) & ~repeated)
+    if len(wrong):
+        at = int(wrong[0]) + 1
+        what = "is that of the line before" if step[at - 1] == 0 else "is before that of the line before"
+        column = "the time" if timing.column is None else f"{grid.called(timing.column)}: the time"
+        raise Unclear(
+            f"{grid.line_of(int(rows[at]))}: {column} {what} ({len(wrong)} such lines), expected times that rise; "
+            "where samples are evenly spaced, --rate HZ counts them instead"
+        )
+    return np.concatenate(([True], ~repeated))
+
+
+def _read_as(grid: _Grid, roles: Roles, timing: _Timing, reading: Reading) -> str:
+    parts = []
+    if timing.column is not None:
+        parts.append(f"t = {_shown(grid, timing.column)} [{timing.said}]")
+    elif timing.index is not None:
+        parts.append(f"t = {_shown(grid, timing.index)}, {timing.said}")
+    else:
+        parts.append(f"t = rows, {timing.said}")
+    parts += [f"{axis} = {_shown(grid, i)}" for axis, i in zip(OUTPUTS, roles.outputs, strict=True)]
+    return f"read as {', '.join(parts)}" + ("" if set(reading.columns) >= {*OUTPUTS} else " (else: --columns)")
+
+
+def _shown(grid: _Grid, column: int) -> str:
+    return clipped(Name.of(grid.names[column]).text) if grid.named else f"column {column + 1}"
+
+
+def _unit_of(roles: Roles, names: Sequence[Name]) -> str:
+    units = {names[i].unit for i in roles.outputs}
+    return units.pop() if len(units) == 1 else ""

@@ -1,0 +1,185 @@
+"""Tables as programs write them are read rightly, or asked about; none is read wrongly without a word."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.daemon.tables.exports import EXPORTS, Export
+from triaxcald.errors import InputError
+from triaxcald.tables.samples import Reading, Table, read_table
+
+CLEAR = [e for e in EXPORTS if e.hint is None]
+ASKED = [e for e in EXPORTS if e.hint is not None]
+
+
+def written(folder: Path, export: Export) -> str:
+    path = folder / f"export{export.suffix}"
+    path.write_bytes(export.data)
+    return str(path)
+
+
+def require_right(table: Table, export: Export) -> None:
+    times = (table.samples.time_ns - table.samples.time_ns[0]) * 1e-6
+    np.testing.assert_allclose(times, export.times_ms() - export.times_ms()[0], atol=1e-3)
+    np.testing.assert_allclose(table.samples.readings, export.outputs(), rtol=1e-9, atol=6e-5)
+    if export.channels is not None:
+        assert tuple(table.samples.channels) == export.channels
+
+
+@pytest.mark.parametrize("export", CLEAR, ids=lambda e: e.program)
+def test_a_clear_table_is_read_and_how_is_said(tmp_path: Path, export: Export) -> None:
+    table = read_table(written(tmp_path, export))
+    require_right(table, export)
+    assert table.remarks[0].startswith("read as t = ")
+
+
+@pytest.mark.parametrize("export", ASKED, ids=lambda e: e.program)
+def test_a_table_with_two_readings_is_asked_about_and_read_as_the_option_says(tmp_path: Path, export: Export) -> None:
+    path = written(tmp_path, export)
+    with pytest.raises(InputError) as caught:
+        read_table(path)
+    assert export.asked in str(caught.value)
+    require_right(read_table(path, export.hint), export)
+
+
+def read(folder: Path, content: str | bytes, reading: Reading | None = None, name: str = "a.csv") -> Table:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_table(str(path), reading)
+
+
+def asked(folder: Path, content: str | bytes, reading: Reading | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        read(folder, content, reading)
+    return str(caught.value).removeprefix(f"{folder / 'a.csv'}: ")
+
+
+GOOD = "time,ax,ay,az\n0.00,1,2,3\n0.01,1,2,3.5\n0.02,1,2,4\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "fault", "left"),
+    [
+        (GOOD + "0.03,1,NaN,4\n0.04,1,2,5\n", "line 5: column ay: 'NaN', expected a finite number", 4),
+        (GOOD + "0.03,1,,4\n0.04,1,2,5\n", "line 5: column ay: empty, expected a finite number", 4),
+        (GOOD + "0.03,1,#N/A,4\n0.04,1,2,5\n", "line 5: column ay: '#N/A', expected a finite number", 4),
+        (GOOD + "# pause\n\n0.03,1,2x,4\n", "line 7: column ay: '2x', expected a finite number", 3),
+        (GOOD + "0.03,1,2,4\n0.04,1", "line 6: 2 fields, expected 4", 4),
+        (GOOD + "0.03,1,2,4,5,6\n0.04,1,2,7\n", "line 5: 6 fields, expected 4", 4),
+        (GOOD.replace("0.00,1,2,3", "0.00,,,"), "line 2: column ax: empty, expected a finite number", 2),
+        (GOOD + "End of file\n", "line 5: 1 fields, expected 4", 3),
+    ],
+)
+def test_lines_that_lack_a_number_are_named_and_left_out_where_the_user_says(
+    tmp_path: Path, content: str, fault: str, left: int
+) -> None:
+    assert asked(tmp_path, content) == f"{fault}; 1 such lines: --skip-bad leaves them out"
+    table = read(tmp_path, content, Reading(skip_bad=True))
+    assert len(table.samples.time_ns) == left
+    assert table.remarks[-1] == f"1 of {left + 1} lines left out (--skip-bad); {fault}"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("time,ax,ay,az\n0.01,1,2,3\n0.00,1,2,4\n0.02,1,2,5\n", "line 3: column time: the time is before that"),
+        ("time,ax,ay,az\n0.00,1,2,3\n0.00,1,2,4\n0.02,1,2,5\n", "line 3: column time: the time is that of the line"),
+        ("time,ax,ay,az\n0.0,low,2,3\n0.1,low,2,3\n0.2,low,2,3\n", "line 2: column ax: 'low', expected a finite"),
+        ("time,ax,ay,az\n0.0,1e300,2,3\n0.1,1,2,3\n0.2,1,2,3\n", "line 2: column ax: a value of 1e+100 or more"),
+        ("a,b,c\nx,y,z\n", "no line with three numbers"),
+        ('{"a": [1, 2, 3]}', "no line with three numbers"),
+        ("", "empty file, expected"),
+        ("  \n \n", "empty file, expected"),
+        (b"PK\x03\x04\x00\x00", "binary data (a ZIP archive or a spreadsheet; save it as CSV)"),
+        (b"\x1f\x8b\x08\x00", "binary data (gzip; name it .gz)"),
+        (b"PAR1\x00\x00", "binary data (Parquet; name it .parquet)"),
+        (b"\x00\x01\x02\x03" * 50, "binary data, expected a text table"),
+        ("time,ax,ay,az\n0,01,0,98,0,03,-0,11\n0,02,0,97,0,03,-0,10\n", "line 1: 4 names, and 8 fields in the lines"),
+        ("t,ax,ay,az,bx,by,bz\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n", None),
+        ("t,left_x,left_y,left_z,right_x,right_y,right_z\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n",
+         "2 triples of outputs (left_x, left_y, left_z; right_x, right_y, right_z); choose by --columns ux=left_x,"),
+        ("t,x,y,z,x,y,z\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n", "choose by --columns ux=2,uy=3,uz=4"),
+        ("t,gx,gy,gz\n0.0,1,2,3\n0.1,1,2,3\n", "no column that is called as an accelerometer's output; if gx, gy, gz"),
+        ("t,linear_x,linear_y,linear_z\n0.0,1,2,3\n0.1,1,2,3\n", "linear_z seem to be without gravity"),
+        ("t,ch3,ch2,ch1\n0.0,1,2,3\n0.1,1,2,3\n", "no three outputs among the columns t, ch3, ch2, ch1"),
+        ("ax,ay,az\n1,2,3\n1,2,3\n", "no column of time; name it (--columns t=NAME,…), or say how many samples"),
+        ("time,clock,ax,ay,az\n0.0,0.0,1,2,3\n0.1,0.7,1,2,3\n0.2,1.4,1,2,3\n10.3,22.1,1,2,3\n",
+         "columns of time that do not agree how long it took (column time 10.3 s, column clock 22.1 s)"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_in_one_way_alone_is_said(tmp_path: Path, content: str | bytes, words: str | None) -> None:
+    if words is None:
+        assert read(tmp_path, content).remarks[0].endswith("ux = ax, uy = ay, uz = az (else: --columns)")
+    else:
+        assert words in asked(tmp_path, content)
+
+
+@pytest.mark.parametrize(
+    ("reading", "words"),
+    [
+        (Reading({"t": "tim"}), "--columns: the table has no column tim; it has time, ax, ay, az"),
+        (Reading({"ux": "ax"}), "--columns names no uy, uz; name all three outputs"),
+        (Reading({"ux": "ax", "uy": "ax", "uz": "az"}), "--columns: ux and uy are the same column ax"),
+        (Reading(rate=100.0, time_unit="ms"), "--rate, --time-unit ms: give one or the other"),
+        (Reading(time_unit="iso"), "--time-unit iso: column time holds numbers, no dates"),
+        (Reading(time_unit="index"), "--time-unit index: say how many samples a second it counts: --rate HZ"),
+        (Reading(where={"unit": "A"}), "--where unit=A: the table has 0 columns of that name"),
+        (Reading(where={"ax": "7"}), "--where ax=7: no row has that; it has 1"),
+    ],
+)
+def test_an_option_that_does_not_fit_the_table_is_said(tmp_path: Path, reading: Reading, words: str) -> None:
+    assert asked(tmp_path, GOOD, reading).startswith(words)
+
+
+def test_names_may_be_given_without_the_blanks_quotes_and_marks_of_the_file(tmp_path: Path) -> None:
+    content = "#  t ; Acc X ; Acc Y ; Acc Z \n0,00;1;2;3\n0,01;1;2;3,5\n"
+    for names in (("t", "Acc X", "Acc Y", "Acc Z"), ("# t", "acc x", " Acc Y ", "Acc Z"), ("1", "2", "3", "4")):
+        reading = Reading(dict(zip(("t", "ux", "uy", "uz"), names, strict=True)))
+        assert read(tmp_path, content, reading).samples.readings.tolist() == [[1, 2, 3], [1, 2, 3.5]]
+
+
+def test_an_index_with_gaps_shows_the_samples_that_were_lost(tmp_path: Path) -> None:
+    content = "index,ax,ay,az\n10,1,2,3\n11,1,2,3\n14,1,2,3\n15,1,2,3\n"
+    assert read(tmp_path, content, Reading(rate=10.0)).samples.time_ns.tolist() == [0, 10**8, 4 * 10**8, 5 * 10**8]
+
+
+def test_other_columns_are_channels_where_they_are_whole_and_measured(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    u, supply = rng.normal(size=(50, 3)), rng.normal(5, 0.1, 50)
+    rows = [
+        f"{i * 0.01:.2f},{i},{x:.6f},{y:.6f},{z:.6f},{np.hypot(np.hypot(x, y), z):.6f},{s:.4f},,ok,{i % 7}"
+        for i, ((x, y, z), s) in enumerate(zip(u, supply, strict=True))
+    ]
+    content = "\n".join(["time,counter,ax,ay,az,strength,Supply (V),gap,status,phase", *rows])
+    table = read(tmp_path, content)
+    assert list(table.samples.channels) == ["Supply (V)", "phase"]
+    assert table.remarks[1] == (
+        "left out: counter (an index); strength (computed from the outputs); gap (50 of 50 cells empty); "
+        "status (no numbers)"
+    )
+
+
+def test_rows_that_repeat_exactly_count_once(tmp_path: Path) -> None:
+    table = read(tmp_path, GOOD + "0.02,1,2,4\n0.03,1,2,4\n")
+    assert table.samples.duplicates == 1
+    assert len(table.samples.time_ns) == 4
+
+
+def test_nanoseconds_since_1970_keep_their_last_digits(tmp_path: Path) -> None:
+    content = "ns,ax,ay,az\n1700000000000000001,1,2,3\n1700000000010000003,1,2,4\n"
+    assert read(tmp_path, content).samples.time_ns.tolist() == [1700000000000000001, 1700000000010000003]
+
+
+def test_times_with_a_zone_are_compared_as_what_they_are(tmp_path: Path) -> None:
+    content = (
+        "when,x,y,z\n2026-01-31T12:00:00.5+01:00,1,2,3\n2026-01-31T11:00:01Z,1,2,4\n2026-01-31 11:00:01.25 UTC,1,2,5\n"
+    )
+    assert np.diff(read(tmp_path, content).samples.time_ns).tolist() == [500_000_000, 250_000_000]
+
+
+def test_forty_exports_and_more_are_tried_each_of_another_program() -> None:
+    assert len(EXPORTS) >= 40
+    assert len({e.program for e in EXPORTS}) == len(EXPORTS)
