@@ -37,6 +37,11 @@ test: $(TOOLS)  ## the whole test suite
 bench: $(TOOLS)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)
 
+docs: $(TOOLS)  ## pages made from the code, and the notebook with its outputs
+	$(BIN)/python docs/reference/python.py
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	$(BIN)/jupyter execute --inplace docs/tutorial/*.ipynb
+
 check: $(TOOLS)  ## lint, format, types, import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

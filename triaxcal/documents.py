@@ -167,11 +167,13 @@ class Calibration:
         own_recording: bool = False,
         uncertainty: bool = False,
         time_unit: str | None = None,
+        columns: Mapping[str, str] | None = None,
     ) -> Any:
         """Calibrated readings.
 
         ``u`` (3,) or (n,3) in output units, or a DataFrame with the columns ux, uy, uz: then a DataFrame of the same
-        library with ax, ay, az, whose other columns serve as channels. ``channels`` are named as in
+        library with ax, ay, az, whose other columns serve as channels; ``columns`` says how it calls them where that is
+        otherwise, as in `find_poses`. ``channels`` are named as in
         ``channel_reference`` of the document (temp_c, temp_c.rate, before_x, …), one number or (n,) each; one that an
         effect needs and that is not given counts as at its reference, with a `MissingChannel` warning. Effects of time
         hold at `holds_at`, or with ``own_recording`` at the times ``t`` (n,) from the first sample of the recording
@@ -179,11 +181,14 @@ class Calibration:
         shape, without the noise of the readings. Raises InvalidData; Refused where the model has no inverse.
         """
         table = u if tables.is_table(u) else None
+        if table is None and columns is not None:
+            raise InvalidData("columns: for a DataFrame; channels names channels of arrays")
         if table is not None:
-            u = np.stack([tables.column(table, name) for name in tables.OUTPUTS], axis=1)
-            channels = self._channels_in(table) | dict(channels or {})
-            if own_recording and t is None and tables.TIME_COLUMN in tables.names_of(table):
-                t = tables.seconds(tables.column(table, tables.TIME_COLUMN), time_unit)
+            by_ours = tables.called(columns)
+            u = np.stack([tables.column(table, by_ours[name]) for name in tables.OUTPUTS], axis=1)
+            channels = self._channels_in(table, by_ours) | dict(channels or {})
+            if own_recording and t is None and by_ours[tables.TIME_COLUMN] in tables.names_of(table):
+                t = tables.seconds(tables.column(table, by_ours[tables.TIME_COLUMN]), time_unit)
                 t, time_unit = t - t[:1], None
         readings = tables.readings_of(u)
         rows = np.atleast_2d(readings)
@@ -200,8 +205,11 @@ class Calibration:
         out = dict(zip(OUT, a.T, strict=True))
         return tables.like(table, out if errors is None else out | dict(zip(UNCERTAINTY, errors.T, strict=True)))
 
-    def _channels_in(self, table: Any) -> dict[str, Any]:
-        return {name: tables.column(table, name) for name in tables.names_of(table) if name in self._needed()}
+    def _channels_in(self, table: Any, by_ours: Mapping[str, str]) -> dict[str, Any]:
+        """Of those that the model needs: under their own names, and under those that they are called by."""
+        needed = self._needed()
+        found = {name: tables.column(table, name) for name in tables.names_of(table) if name in needed}
+        return found | {name: tables.column(table, theirs) for name, theirs in by_ours.items() if name in needed}
 
     def _needed(self) -> set[str]:
         return {name if is_derived(name) else channel_of(name) for name in self._fitted.channel_reference} - {TIME}

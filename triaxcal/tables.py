@@ -40,17 +40,21 @@ def column(table: Any, name: str) -> Any:
     return np.asarray(table[next(key for key in table.columns if str(key) == name)])
 
 
+def called(columns: Mapping[str, str] | None) -> dict[str, str]:
+    """The names that a table has for t_s, ux, uy, uz and the channels that ``columns`` names, by ours."""
+    return {name: name for name in (TIME_COLUMN, *OUTPUTS)} | {
+        TIME_COLUMN if ours == "t" else ours: theirs for ours, theirs in (columns or {}).items()
+    }
+
+
 def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_unit: str | None = None) -> Samples:
     """Of a table with the columns t_s, ux, uy, uz; ``columns`` says how they are called where that is otherwise. All
     other columns of finite numbers are channels, by their own names. Raises InvalidData."""
-    called = {name: name for name in (TIME_COLUMN, *OUTPUTS)}
-    for ours, theirs in (columns or {}).items():
-        name = TIME_COLUMN if ours == "t" else ours
-        called[name] = theirs
-    channels = {ours: column(table, theirs) for ours, theirs in called.items() if ours not in (TIME_COLUMN, *OUTPUTS)}
+    by_ours = called(columns)
+    channels = {ours: column(table, theirs) for ours, theirs in by_ours.items() if ours not in (TIME_COLUMN, *OUTPUTS)}
     for name in names_of(table):
         values = column(table, name)
-        if name in called.values() or values.dtype.kind not in "fiu":
+        if name in by_ours.values() or values.dtype.kind not in "fiu":
             continue
         if np.isfinite(values).all():
             channels[name] = values
@@ -59,8 +63,8 @@ def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_
             warnings.warn(
                 f"channel {name} left out: {gaps} of {len(values)} values missing", MissingChannel, stacklevel=4
             )
-    u = np.stack([_numbers(column(table, called[name]), called[name]) for name in OUTPUTS], axis=1)
-    return samples_of(column(table, called[TIME_COLUMN]), u, channels, time_unit, called[TIME_COLUMN])
+    u = np.stack([_numbers(column(table, by_ours[name]), by_ours[name]) for name in OUTPUTS], axis=1)
+    return samples_of(column(table, by_ours[TIME_COLUMN]), u, channels, time_unit, by_ours[TIME_COLUMN])
 
 
 def samples_of(

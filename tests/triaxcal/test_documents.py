@@ -113,6 +113,11 @@ def test_a_data_frame_comes_back_as_one_of_its_own_kind(library: Any, paper_unit
     assert np.stack([found[n] for n in ("ax", "ay", "az")], axis=1) == pytest.approx(a, abs=1e-8)
     if library is pd:
         assert list(found.index) == list(table.index)
+    renamed = table.rename({"ux": "x", "uy": "y", "uz": "z", "temp_c": "T"}, **({"axis": 1} if library is pd else {}))
+    again = c.apply(renamed, columns={"ux": "x", "uy": "y", "uz": "z", "temp_c": "T"})
+    assert again.to_numpy().tolist() == found[["ax", "ay", "az"]].to_numpy().tolist()
+    with pytest.raises(tc.InvalidData, match="columns: for a DataFrame"):
+        c.apply(u, columns={"ux": "x"})
 
 
 def test_uncertainties_are_those_that_the_errors_of_a_calibration_scatter_with(
