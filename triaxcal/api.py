@@ -16,6 +16,7 @@ from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.findings import Finding
 from triaxcal.held_out import HeldOut, magnitude_errors
+from triaxcal.means import poses_of_means
 from triaxcal.moment import Moment
 from triaxcal.planning.directions import FULL, closed, directions
 from triaxcal.poses.pose import Pose, poses_of
@@ -37,6 +38,31 @@ class Poses(tuple[Pose, ...]):
     for."""
 
     data_quality: tuple[str, ...] = ()
+
+    @classmethod
+    def of_means(
+        cls,
+        u: Any,
+        *,
+        t: Any = None,
+        standard_errors: Any = None,
+        channels: Mapping[str, Any] | None = None,
+        time_unit: str | None = None,
+    ) -> Poses:
+        """One pose a row, where only means are known: ``u`` (n,3) in output units, ``standard_errors`` (n,3) of them,
+        ``t`` (n,) as in `find_poses`, ``channels`` (n,) each. Without standard errors the noise is told from the
+        residuals of the linear model, so that no lack of fit can show. Raises Refused, InvalidData."""
+        readings = tables.readings_of(u)
+        if readings.ndim != 2:
+            raise InvalidData(f"u: expected shape (n, 3), one row a pose, not {readings.shape}")
+        errors = None if standard_errors is None else tables.readings_of(standard_errors)
+        if errors is not None and errors.shape != readings.shape:
+            raise InvalidData(f"standard_errors: expected shape {readings.shape}, not {errors.shape}")
+        seconds = None if t is None else tables.seconds(t, time_unit)
+        if seconds is not None and len(seconds) != len(readings):
+            raise InvalidData(f"t has {len(seconds)} times, and u has {len(readings)} poses")
+        held = {n: tables.channel_of_samples(n, v, len(readings)) for n, v in (channels or {}).items()}
+        return cls(poses_of_means(readings, seconds, errors, held))
 
 
 @dataclass(frozen=True)

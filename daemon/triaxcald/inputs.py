@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from triaxcal.errors import InvalidData
+from triaxcal.means import poses_of_means
 from triaxcal.moment import Moment
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.quality import QualityDetector, untrusted_poses
@@ -24,12 +27,14 @@ from triaxcald.pipeline import Pipeline, creeping, together
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, Phase
 from triaxcald.station.config import parse_station
-from triaxcald.tables.samples import Reading, read_table
+from triaxcald.tables.naming import ERRORS
+from triaxcald.tables.samples import Reading, Table, read_table
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
 PROFILE = "profile.toml"
 """Name under which a recording carries the profile; the files it names stand beside it under ``profile/``."""
 STATION_FILE = "station.toml"
+UNKNOWN_NOISE = "unknown_noise"
 CALIBRATION: Phase = "calibration"
 VERIFICATION: Phase = "verification"
 
@@ -76,6 +81,8 @@ def measure(
             return _measure_recording(recording, phase, stream, moments)
     table = read_table(name, reading)
     samples = table.samples
+    if reading is not None and reading.pose_means:
+        return _of_means(name, table)
     detector, judge = StillnessDetector(), QualityDetector()
     try:
         detector.feed(samples.time_ns, samples.readings, samples.channels)
@@ -94,6 +101,23 @@ def measure(
     quality = together(counted, seen)
     creep = [] if moments is not None else creeping(poses)
     return Measured(name, poses, windows, quality + creep, output_unit=table.output_unit, remarks=table.remarks)
+
+
+def _of_means(name: str, table: Table) -> Measured:
+    """Raises InputError, Refused."""
+    held = dict(table.samples.channels)
+    columns = [held.pop(error, None) for error in ERRORS]
+    errors = [c for c in columns if c is not None]
+    if errors and len(errors) < len(columns):
+        raise InputError(f"{name}: standard errors for {len(errors)} outputs, expected {', '.join(ERRORS)} or none")
+    try:
+        poses = poses_of_means(
+            table.samples.readings, table.samples.time_ns * 1e-9, np.stack(errors, axis=1) if errors else None, held
+        )
+    except InvalidData as e:
+        raise InputError(f"{name}: {e}") from e
+    quality = [] if errors else [f"{UNKNOWN_NOISE}: told from the residuals, so that no lack of fit can show"]
+    return Measured(name, poses, None, quality, output_unit=table.output_unit, remarks=table.remarks)
 
 
 def _measure_recording(recording: Recording, phase: Phase, stream: str, moments: Moments | None) -> Measured:

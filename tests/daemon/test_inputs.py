@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from triaxcal.arrays import Floats
-from triaxcal.planning.directions import spiral
+from triaxcal.planning.directions import FULL, directions, spiral
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import SyntheticUnit, Tumble
 from triaxcald.errors import InputError, RecordingError
@@ -169,6 +169,23 @@ def test_a_slow_logger_is_read_as_it_says(tmp_path: Path, rate_hz: float, hold_s
     measured = measure(path, reading=Reading(time_unit="s"))
     assert len(measured.poses) == 6
     assert measured.data_quality == []
+
+
+def test_a_table_of_pose_means_is_poses_with_the_noise_that_it_states(tmp_path: Path) -> None:
+    u = 2 * np.array([v for _, v in directions(FULL)])
+    rows = [f"{x:.9f},{y:.9f},{z:.9f}" for x, y, z in u + np.random.default_rng(1).normal(0, 1e-4, u.shape)]
+    path = tmp_path / "means.csv"
+    path.write_text("\n".join(["x,y,z", *rows]))
+    bare = measure(str(path), reading=Reading(pose_means=True))
+    assert len(bare.poses) == len(u)
+    assert bare.data_quality == ["unknown_noise: told from the residuals, so that no lack of fit can show"]
+    path.write_text("\n".join(["x,y,z,se_ux,se_uy,se_uz", *(f"{row},1e-4,2e-4,3e-4" for row in rows)]))
+    stated = measure(str(path), reading=Reading(pose_means=True))
+    assert stated.data_quality == []
+    np.testing.assert_allclose([p.standard_error for p in stated.poses], np.tile([1e-4, 2e-4, 3e-4], (len(u), 1)))
+    path.write_text("\n".join(["x,y,z,se_ux", *(f"{row},1e-4" for row in rows)]))
+    with pytest.raises(InputError, match="standard errors for 1 outputs, expected se_ux, se_uy, se_uz or none"):
+        measure(str(path), reading=Reading(pose_means=True))
 
 
 def test_a_table_of_milliseconds_gives_the_poses_that_seconds_give(tmp_path: Path) -> None:

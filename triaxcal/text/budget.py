@@ -70,6 +70,8 @@ def _(b: of.ThermometerAt) -> str:
 def remedy(r: of.Remedy, small: Callable[[float], str] = micro_g) -> str:
     """What would halve a component. ``small`` writes an error of the magnitude in the reference's unit."""
     match r:
+        case of.LongerOrMorePoses(hold_s, poses) if hold_s <= 0:  # of poses of which only the means are known
+            return f"record {poses} poses"
         case of.LongerOrMorePoses(hold_s, poses):
             return f"hold each pose for {hold_s:.2g} s, or record {poses} poses (against 1/f noise the latter)"
         case of.CreepHalved():

@@ -142,6 +142,7 @@ def add_table(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     g.add_argument("--time-unit", choices=TIME_UNITS, help="of the column of time; index: samples, with --rate")
     g.add_argument("--rate", type=positive, metavar="HZ", help="samples a second, where no times are told")
+    g.add_argument("--pose-means", action="store_true", help="each row is the mean of a pose, and needs no time")
     g.add_argument("--skip-bad", action="store_true", help="leave lines out that lack a number; they are counted")
     g.add_argument(
         "--where", type=_condition, action="append", metavar="NAME=VALUE", help="only the rows with that in the column"

@@ -47,9 +47,9 @@ def read_recording(a: argparse.Namespace, name: str, moments: Moments | None = N
 
 def reading_of(a: argparse.Namespace, name: str) -> Reading:
     """How a table is to be read. Raises InputError where the recording is none."""
-    said = Reading(a.columns or {}, a.time_unit, a.rate, a.skip_bad, dict(a.where or ()))
+    said = Reading(a.columns or {}, a.time_unit, a.rate, a.skip_bad, dict(a.where or ()), a.pose_means)
     if name.endswith(".mcap") and said != Reading():
-        raise InputError(f"{name}: --columns, --time-unit, --rate, --skip-bad and --where are for tables")
+        raise InputError(f"{name}: --columns, --time-unit, --rate, --skip-bad, --where and --pose-means are for tables")
     return said
 
 

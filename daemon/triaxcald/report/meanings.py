@@ -169,6 +169,7 @@ QUALITY = {
     "mains_pickup": "Mains hum",
     "coarse_quantization": "Steps of the output too coarse",
     "creeping_pose": "Outputs creep while the pose is held",
+    "unknown_noise": "Noise of the pose means not known",
 }
 _NAME = re.compile(
     r"\b(?:(?:channel_bias|channel_scale_factor):[^\s,;]+?(?=[:,;.]?(?:\s|$))|"

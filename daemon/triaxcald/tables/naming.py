@@ -14,6 +14,8 @@ from enum import Enum, auto
 from triaxcald.tables import words as known
 
 OUTPUTS = ("ux", "uy", "uz")
+ERRORS = ("se_ux", "se_uy", "se_uz")
+"""Standard errors of pose means."""
 TIME = "t"
 AXES = "xyz"
 NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
@@ -86,7 +88,9 @@ class Name:
 
     @property
     def is_computed(self) -> bool:
-        return "angular" not in self.words and bool(set(self.words) & (known.COMPUTED | known.WITHOUT_GRAVITY))
+        return "angular" not in self.words and bool(
+            set(self.words) & (known.COMPUTED | known.WITHOUT_GRAVITY | known.ERRORS)
+        )
 
     @property
     def is_celsius(self) -> bool:
@@ -168,6 +172,9 @@ def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str]
         called = [i for i in others if named and parsed[i].is_time and i not in indices]
         time = tuple(sorted(called, key=lambda i: parsed[i].is_of_another_sensor))
     channels = {role: i for role, i in given.items() if role not in (TIME, *OUTPUTS)}
+    for i in others:  # standard errors by our own names
+        if named and parsed[i].text in ERRORS:
+            channels[parsed[i].text] = i
     return Roles(outputs, time, indices, channels, frozenset(said), rivals)
 
 
@@ -279,6 +286,8 @@ def _triple(names: Sequence[Name], columns: tuple[int, ...], at: int) -> Triple:
 
 
 def _kind(words: set[str], unit: str) -> Kind:
+    if words & known.ERRORS:
+        return Kind.COMPUTED
     if words & known.WITHOUT_GRAVITY:
         return Kind.WITHOUT_GRAVITY
     if words & (known.COMPUTED - {"velocity"}) or ("velocity" in words and "angular" not in words):

@@ -38,13 +38,15 @@ _LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*)?(?:\n|\Z)"
 class Reading:
     """How a table is to be read, where the user says so. ``columns`` are names or numbers (from 1) of the table's by
     role (t, ux, uy, uz, or a channel's name); ``time_unit`` one of `naming.TIME_UNITS`; ``rate`` in Hz; ``where`` are
-    values that the rows to be read have in a column."""
+    values that the rows to be read have in a column; with ``pose_means`` each row is the mean of a pose, and needs no
+    time."""
 
     columns: Mapping[str, str] = field(default_factory=dict)
     time_unit: str | None = None
     rate: float | None = None
     skip_bad: bool = False
     where: Mapping[str, str] = field(default_factory=dict)
+    pose_means: bool = False
 
 
 @dataclass(frozen=True)
@@ -287,6 +289,8 @@ def _timing(grid: _Grid, roles: Roles, names: Sequence[Name], reading: Reading, 
         candidates = moments if len(moments) == 1 else []
     if TIME in roles.said:
         candidates = list(roles.time)
+    if reading.pose_means and rate is None and not candidates:
+        return _Timing(None, None, "one pose a second", 1.0)
     if rate is None and (by_index or not candidates):
         stated = clock.stated_rate(grid.head)
         if stated is None:
@@ -304,7 +308,10 @@ def _no_time(grid: _Grid, roles: Roles, by_index: bool) -> str:
     if roles.indices:
         return f"{grid.called(roles.indices[0])} is an index, and nothing states a rate: --rate HZ"
     which = "t=NAME" if grid.named else "t=NUMBER"
-    return f"no column of time; name it (--columns {which},…), or say how many samples a second there are: --rate HZ"
+    return (
+        f"no column of time; name it (--columns {which},…), or say how many samples a second there are: --rate HZ; "
+        "if each row is the mean of a pose: --pose-means"
+    )
 
 
 def _rises_at_all(column: Column, chosen: NDArray[np.bool_]) -> bool:
@@ -425,7 +432,7 @@ def _channels(
         reason = _unfit(column, rows, magnitude)
         if i in roles.time or column.moments_ns is not None:
             reason = "another time"
-        elif i in roles.indices:
+        elif i in roles.indices or _counts(column, rows):
             reason = "an index"
         elif i in roles.rivals:
             reason = "other outputs"
@@ -456,6 +463,11 @@ def _unfit(column: Column, rows: NDArray[np.intp], magnitude: NDArray[np.float64
         if abs(correlation) > COMPUTED_LEAST:
             return "computed from the outputs"
     return None
+
+
+def _counts(column: Column, rows: NDArray[np.intp]) -> bool:
+    """Whether it numbers the rows, whatever its name: as a channel it would be the time again."""
+    return column.whole is not None and len(rows) > 2 and bool((np.diff(column.whole[rows]) == np.diff(rows)).all())
 
 
 def _as_celsius(values: NDArray[np.float64]) -> bool:

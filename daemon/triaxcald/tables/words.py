@@ -19,7 +19,7 @@ TIMES = frozenset((
 ))  # fmt: skip
 INDICES = frozenset((
     "index", "idx", "sample", "samples", "count", "counter", "n", "no", "nr", "num", "number", "nummer", "id", "row",
-    "frame", "packet", "seq", "sequence", "record", "unnamed", "level", "lfd", "i", "k",
+    "frame", "packet", "pose", "poses", "seq", "sequence", "record", "unnamed", "level", "lfd", "i", "k",
 ))  # fmt: skip
 ACCELERATION = frozenset((
     "a", "acc", "accel", "accelero", "acceleration", "accelerometer", "accelerations", "accelerometers", "gforce", "gf",
@@ -43,6 +43,7 @@ COMPUTED = frozenset((
     "vm", "enmo", "vel", "velocity", "pos", "position", "displacement", "jerk", "delta",
 ))  # fmt: skip
 """Of columns that are computed from the outputs, or from the motion of the whole."""
+ERRORS = frozenset(("se", "sem", "std", "sd", "stderr", "stdev", "sigma", "error", "err", "unc", "uncertainty", "var"))
 WITHOUT_GRAVITY = frozenset(
     ("linear", "lin", "linacc", "linaccel", "user", "useracceleration", "free", "freeacc", "dynamic")
 )

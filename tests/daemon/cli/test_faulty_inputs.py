@@ -57,7 +57,7 @@ def test_a_stream_that_never_rests_is_told_of_turning(tmp_path: Path, triaxcal: 
 
 def test_options_for_tables_are_refused_for_recordings(tmp_path: Path, triaxcal: Run) -> None:
     triaxcal("fit", "a.mcap", "--rate", "100").failed(
-        2, "a.mcap: --columns, --time-unit, --rate, --skip-bad and --where"
+        2, "a.mcap: --columns, --time-unit, --rate, --skip-bad, --where and"
     )
     triaxcal("fit", "a.csv", "--columns", "ax").failed(
         2, "expected ROLE=COLUMN as in t=time,ux=ax,uy=ay,uz=az, not 'ax'"

@@ -180,6 +180,22 @@ def test_times_with_a_zone_are_compared_as_what_they_are(tmp_path: Path) -> None
     assert np.diff(read(tmp_path, content).samples.time_ns).tolist() == [500_000_000, 250_000_000]
 
 
+def test_rows_that_are_means_of_poses_need_no_time(tmp_path: Path) -> None:
+    content = "pose;X [V];Y [V];Z [V];std X;std Y;std Z;se_ux;se_uy;se_uz\n" + "".join(
+        f"{i};{i};{-i};{i * i};0,1;0,1;0,1;0,01;0,02;0,03\n" for i in range(1, 5)
+    )
+    assert "if each row is the mean of a pose: --pose-means" in asked(tmp_path, "x,y,z\n1,2,3\n1,2,4\n")
+    table = read(tmp_path, content, Reading(pose_means=True))
+    assert table.samples.time_ns.tolist() == [0, 10**9, 2 * 10**9, 3 * 10**9]
+    assert sorted(table.samples.channels) == ["se_ux", "se_uy", "se_uz"]
+    assert table.output_unit == "V"
+
+
+def test_a_column_that_numbers_the_rows_is_no_channel_whatever_its_name(tmp_path: Path) -> None:
+    table = read(tmp_path, "time,ax,ay,az,foo\n0.00,1,2,3,7\n0.01,1,2,3.5,8\n0.02,1,2,4,9\n")
+    assert table.remarks[1] == "left out: foo (an index)"
+
+
 def test_forty_exports_and_more_are_tried_each_of_another_program() -> None:
     assert len(EXPORTS) >= 40
     assert len({e.program for e in EXPORTS}) == len(EXPORTS)

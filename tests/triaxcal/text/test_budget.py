@@ -29,6 +29,7 @@ BASES: list[tuple[of.Basis, str]] = [
     (of.ThermometerAt(25.0), "thermal effects, counted from 25 °C"),
 ]
 REMEDIES: list[tuple[of.Remedy, str]] = [
+    (of.LongerOrMorePoses(0.0, 104), "record 104 poses"),
     (of.LongerOrMorePoses(16.0, 104), "hold each pose for 16 s, or record 104 poses (against 1/f noise the latter)"),
     (of.CreepHalved(), "wait before each pose until the outputs creep by half as much"),
     (
