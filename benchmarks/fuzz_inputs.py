@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+import pandas as pd
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
@@ -127,6 +128,20 @@ def _table() -> bytes:
     return f"# a table\nt_s,ux,uy,uz,temp_c\n{rows}".encode()
 
 
+def _foreign_table() -> bytes:
+    """The same as a spreadsheet in German writes it."""
+    lines = _table().decode().splitlines()[2:]
+    rows = "".join(line.replace(",", ";").replace(".", ",") + ";\r\n" for line in lines)
+    return f"Protokoll\r\n\r\nZeit [s];X [V];Y [V];Z [V];Temp [°C];\r\n{rows}".encode("cp1252")
+
+
+def _parquet() -> bytes:
+    values = np.loadtxt(io.BytesIO(_table()), delimiter=",", skiprows=2)
+    out = io.BytesIO()
+    pd.DataFrame(values, columns=["time", "ax", "ay", "az", "temp"]).to_parquet(out)
+    return out.getvalue()
+
+
 def _calibration() -> dict[str, bytes]:
     document = {
         "format": "triaxcal.calibration/1",
@@ -207,6 +222,7 @@ def _zipped(folder: Path, rng: random.Random) -> int:
 
 
 _TABLE_COMMANDS = (*[["poses"]] * 12, ["fit", "-o", "out.json"], ["plan"], ["fit", "--turning"], ["diagnose"])
+_READ = (["poses"], ["poses", "--skip-bad"], ["poses", "--rate", "30"], ["poses", "--pose-means"])
 _RECORDING_COMMANDS = (["log", "info"], ["log", "recover"], ["log", "export", "-o", "o"], ["poses"], ["audit"])
 KINDS = (
     Kind("CAN profile", partial(_station, "triax-ref-can.toml", CAN_UNIT), _load_station),
@@ -217,6 +233,10 @@ KINDS = (
     Kind("EDS", partial(_description, ".eds"), partial(_lay_out, ".eds")),
     Kind("CSV", lambda: {"a.csv": _table()},
          lambda f, r: _run(f, r, *([*c, "a.csv"] for c in _TABLE_COMMANDS)), share=1),
+    Kind("table", lambda: {"a.txt": _foreign_table()},
+         lambda f, r: _run(f, r, *([*c, "a.txt"] for c in _READ)), share=1),
+    Kind("Parquet", lambda: {"a.parquet": _parquet()}, lambda f, r: _run(f, r, *([*c, "a.parquet"] for c in _READ)),
+         structural=False, share=1),
     Kind("CSV, gzip", lambda: {"a.csv.gz": _table()}, _zipped, share=2),
     Kind("calibration", _calibration, lambda f, r: _run(f, r, ["verify", "cal.json", "a.csv", "--json"],
          ["verify", "cal.json", "a.csv"], ["fit", "a.csv", "--passport", "cal.json", "-o", "out.json"]), share=2),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from triaxcal_drivers.files import open_file
 from triaxcal_drivers.interface import SampleBlock
 from triaxcald.errors import InputError
 from triaxcald.recording.export import columns_of, require_alike
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
+CELLS_MOST = 2**28
+"""A number that never changes takes no room in a Parquet file, and 8 bytes here."""
 _NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 
@@ -45,7 +48,8 @@ class Column:
         return ~(self.gaps | self.strange)
 
     def text(self, row: int) -> str:
-        return "" if self.texts is None else str(self.texts[row])
+        """On one line, though a stray quote may have drawn several into the cell."""
+        return "" if self.texts is None else " ".join(str(self.texts[row]).split())
 
 
 @dataclass(frozen=True)
@@ -93,12 +97,14 @@ def read_parquet(path: Path) -> tuple[list[str], list[Column]]:
     import pyarrow.parquet as pq
 
     try:
-        table = pq.ParquetFile(path).read().flatten()
+        with open_file(path) as opened:
+            file = pq.ParquetFile(opened)
+            if file.metadata.num_rows * file.metadata.num_columns > CELLS_MOST:
+                raise InputError(f"{path}: more than {CELLS_MOST} cells")
+            table = file.read().flatten()
         while any(pa.types.is_struct(t) for t in table.schema.types):
             table = table.flatten()
         return list(table.column_names), [_of_array(column.combine_chunks()) for column in table.columns]
-    except FileNotFoundError:
-        raise InputError(f"{path}: cannot be read: No such file or directory") from None
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror or str(e).splitlines()[0]}") from e
     except (pa.ArrowException, ValueError) as e:

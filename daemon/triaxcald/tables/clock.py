@@ -104,7 +104,7 @@ def _scaled(column: Column, name: Name, unit: str) -> NDArray[np.int64]:
     scale = UNITS[unit]
     usable = column.usable
     held = np.where(usable, column.numbers, 0.0)
-    if np.abs(held).max(initial=0.0) * scale >= 2**63:
+    if np.abs(held).max(initial=0.0) >= 2**63 / scale:
         raise Unclear(f"{_called(name)} goes to {plain(float(np.abs(held).max()))}, which are too many {unit}")
     if column.whole is not None:
         return np.where(usable, column.whole, 0) * scale

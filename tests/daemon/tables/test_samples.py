@@ -9,6 +9,7 @@ import pytest
 
 from tests.daemon.tables.exports import EXPORTS, Export
 from triaxcald.errors import InputError
+from triaxcald.tables import arrow
 from triaxcald.tables.samples import Reading, Table, read_table
 
 CLEAR = [e for e in EXPORTS if e.hint is None]
@@ -194,6 +195,25 @@ def test_rows_that_are_means_of_poses_need_no_time(tmp_path: Path) -> None:
 def test_a_column_that_numbers_the_rows_is_no_channel_whatever_its_name(tmp_path: Path) -> None:
     table = read(tmp_path, "time,ax,ay,az,foo\n0.00,1,2,3,7\n0.01,1,2,3.5,8\n0.02,1,2,4,9\n")
     assert table.remarks[1] == "left out: foo (an index)"
+
+
+def test_what_is_no_parquet_file_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a\.parquet: not readable as Parquet: "):
+        read(tmp_path, b"PAR1 and no more", name="a.parquet")
+    with pytest.raises(InputError, match=r"b\.parquet: cannot be read: No such file or directory"):
+        read_table(str(tmp_path / "b.parquet"))
+    (tmp_path / "c.parquet").mkdir()
+    with pytest.raises(InputError, match=r"c\.parquet: cannot be read: "):
+        read_table(str(tmp_path / "c.parquet"))
+
+
+def test_a_parquet_file_of_more_cells_than_memory_holds_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(arrow, "CELLS_MOST", 100)
+    (tmp_path / "a.parquet").write_bytes(next(e.data for e in EXPORTS if e.suffix == ".parquet"))
+    with pytest.raises(InputError, match=r"a\.parquet: more than 100 cells"):
+        read_table(str(tmp_path / "a.parquet"))
 
 
 def test_forty_exports_and_more_are_tried_each_of_another_program() -> None:
