@@ -78,6 +78,20 @@ class Diagnosis:
     held_out: HeldOut | None
     advice: tuple[str, ...]
 
+    def summary(self) -> str:
+        """What was found, the error before and after, what is left and what to do, a line each."""
+        fitted, left = self.calibration.fitted, self.unexplained
+        return text.loop(
+            [(f.effect, f.verdict, f.alternatives) for f in self.findings],
+            (self.before.residual, fitted.residual),
+            (self.calibration.reference_unit, fitted.reference),
+            left.rms_g if left.significant else None,
+            self.advice,
+        )
+
+    def __repr__(self) -> str:
+        return self.summary()
+
 
 @dataclass(frozen=True)
 class Verification:
@@ -156,7 +170,7 @@ def calibrate(
         model = [effect_named(name) for name in names]
     except KeyError as e:
         raise InvalidData(f"no effect of the name {e.args[0]} is known") from None
-    fitted = pose_fit.fit(found, signs=_signs(signs), reference=reference, effects=model)
+    fitted = pose_fit.fit(found, signs=_signs(signs), reference=_positive(reference), effects=model)
     return Calibration(fitted, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
 
 
@@ -188,7 +202,7 @@ def diagnose(
     if moment is Moment.SECONDS:
         raise InvalidData("at: expected 'end', 'mean' or a number of seconds")
     others = None if check is None else _poses(check)
-    closed_loop = loop.diagnose(found, signs=_signs(signs), reference=reference, check=others, at=moment)
+    closed_loop = loop.diagnose(found, signs=_signs(signs), reference=_positive(reference), check=others, at=moment)
     before, after = (
         Calibration(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
         for c in (closed_loop.before, closed_loop.after)
@@ -253,6 +267,13 @@ def _signs(signs: Any) -> tuple[float, float, float]:
     except (TypeError, ValueError):
         raise InvalidData(f"signs: expected three of 1 and -1, not {signs!r}") from None
     return x, y, z
+
+
+def _positive(reference: Any) -> float:
+    known = isinstance(reference, int | float | np.floating | np.integer) and not isinstance(reference, bool)
+    if not known or not 0 < reference < np.inf:
+        raise InvalidData(f"reference: expected a positive number, not {reference!r}")
+    return float(reference)
 
 
 def _poses(

@@ -25,12 +25,15 @@ def residuals_figure(document: Mapping[str, Any]) -> Figure:
     poses = document.get("poses") or []
     if not poses:
         raise InvalidData("there is no pose to plot: this calibration is not of still poses")
-    reference_unit = str((document.get("units") or {}).get("reference") or "g")
-    small = ErrorUnit.of(reference_unit, float(document.get("reference", 1.0)))
-    used = np.array([bool(p["used"]) for p in poses])
-    residual = np.array([small.count(p["residual_g"]) for p in poses])
-    error = np.array([small.count(p["standard_error_g"]) for p in poses])
-    up = np.array([p["direction"] for p in poses], dtype=float)
+    try:
+        reference_unit = str((document.get("units") or {}).get("reference") or "g")
+        small = ErrorUnit.of(reference_unit, float(document.get("reference", 1.0)))
+        used = np.array([bool(p["used"]) for p in poses])
+        residual = np.array([small.count(float(p["residual_g"])) for p in poses])
+        error = np.array([small.count(float(p["standard_error_g"])) for p in poses])
+        up = np.array([p["direction"] for p in poses], dtype=float).reshape(len(poses), 3)
+    except (AttributeError, KeyError, TypeError, ValueError) as e:
+        raise InvalidData(f"poses that cannot be plotted: {e!r}") from None
     figure = Figure(figsize=SIZE_IN, layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[3, 2])
     number = np.arange(1, len(poses) + 1)

@@ -19,12 +19,14 @@ SECONDS_MOST = 9.2e9
 
 
 def is_table(value: object) -> bool:
-    """Whether it has named columns, as a DataFrame has."""
+    """Whether it has named columns, as a DataFrame has. Raises InvalidData for one that is not computed yet."""
+    if hasattr(value, "collect") and not hasattr(value, "__len__"):
+        raise InvalidData("a lazy table: collect it first")
     return hasattr(value, "columns") and hasattr(value, "__getitem__") and not isinstance(value, np.ndarray)
 
 
 def names_of(table: Any) -> list[str]:
-    names = [str(name) for name in table.columns]
+    names = [str(name) for name in _keys(table)]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InvalidData(f"the table has two columns {twice}")
     return names
@@ -37,7 +39,12 @@ def column(table: Any, name: str) -> Any:
             f"the table has no column {name}; it has {', '.join(names_of(table))}"
             + ("; say by columns how it is called" if name in (TIME_COLUMN, *OUTPUTS) else "")
         )
-    return np.asarray(table[next(key for key in table.columns if str(key) == name)])
+    return np.asarray(table[next(key for key in _keys(table) if str(key) == name)])
+
+
+def _keys(table: Any) -> Iterable[Any]:
+    """Of an Arrow table ``columns`` are the columns themselves."""
+    return table.column_names if hasattr(table, "column_names") else table.columns  # type: ignore[no-any-return]
 
 
 def called(columns: Mapping[str, str] | None) -> dict[str, str]:
@@ -107,7 +114,8 @@ def channel_of_samples(name: str, values: Any, n: int) -> Floats:
 
 def like(table: Any, columns: Mapping[str, Floats]) -> Any:
     """A DataFrame of the same library with these columns, and the same index where it has one."""
-    found = type(table)(dict(columns))
+    kind = type(table)
+    found = kind.from_pydict(dict(columns)) if hasattr(kind, "from_pydict") else kind(dict(columns))
     if hasattr(table, "index") and hasattr(found, "index"):
         found.index = table.index
     return found

@@ -110,6 +110,8 @@ def new_beside(path: Path) -> Iterator[Path]:
     where it does not. Raises OSError."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "no regular file, which alone can be replaced", str(path))
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     with new_file(temporary) as file:
         file.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from triaxcald.errors import InputError
-from triaxcald.files import new_file, write_text
+from triaxcald.files import new_beside, new_file, write_text
 
 
 def test_a_file_is_written_as_utf8_and_readable_by_all(tmp_path: Path) -> None:
@@ -101,3 +101,12 @@ def test_a_new_file_is_gone_after_a_failure_and_never_replaces_one(tmp_path: Pat
     path.symlink_to("nothing")
     with pytest.raises(FileExistsError), new_file(path):
         pass
+
+
+def test_a_pipe_or_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.csv"
+    os.mkfifo(pipe)
+    with pytest.raises(OSError, match="no regular file"), new_beside(pipe):
+        pass
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["pipe.csv"]

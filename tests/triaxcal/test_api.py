@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import polars as pl
+import pyarrow as pa
 import pytest
 
 import triaxcal as tc
@@ -250,3 +251,24 @@ def test_a_table_with_two_columns_of_a_name_is_refused_and_one_with_a_number_for
 def test_the_budget_counts_what_the_calibration_was_made_with(poses: Any) -> None:
     found = tc.calibrate(poses, signs=MINUS, stated=tc.Stated(reference=1e-3))
     assert float(tc.budget(found).magnitude.standard) > 1e-3
+
+
+def test_a_diagnosis_says_itself_in_a_few_lines(diagnosed: tc.Diagnosis) -> None:
+    lines = repr(diagnosed).splitlines()
+    assert lines[0] == "Diagnosis"
+    assert lines[1] == f"  {diagnosed.findings[0].effect}: {diagnosed.findings[0].verdict}"
+    assert any(line.startswith("  residual rms ") and line.endswith(" after") for line in lines)
+
+
+@pytest.mark.parametrize("reference", ["1", None, 0.0, -1.0, float("nan"), [1.0]])
+def test_a_reference_that_is_no_positive_number_is_said(poses: tc.Poses, reference: Any) -> None:
+    with pytest.raises(tc.InvalidData, match="reference: expected a positive number"):
+        tc.calibrate(poses, signs=MINUS, reference=reference)
+
+
+def test_an_arrow_table_is_taken_and_a_lazy_one_is_to_be_collected(recorded: Recorded) -> None:
+    frame = recorded.frame()
+    found = tc.find_poses(pa.Table.from_pandas(frame, preserve_index=False))
+    assert [p.samples for p in found] == [p.samples for p in tc.find_poses(frame)]
+    with pytest.raises(tc.InvalidData, match="a lazy table: collect it first"):
+        tc.find_poses(pl.LazyFrame({"t_s": [0.0]}))

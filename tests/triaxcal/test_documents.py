@@ -20,6 +20,7 @@ from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import HELD, SINCE_START, TIME, is_derived
 from triaxcal.moment import Moment
+from triaxcal.pictures import residuals_figure
 from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
@@ -282,3 +283,11 @@ def test_residuals_are_plotted_loaded_or_not_and_without_a_window(calibration: t
 def test_without_poses_there_is_nothing_to_plot(paper_unit: Sensor) -> None:
     with pytest.raises(tc.InvalidData, match="no pose to plot"):
         calibration_with(paper_unit, FORMS[0], np.random.default_rng(1)).plot()
+
+
+@pytest.mark.parametrize("spoiled", [{"poses": [{}]}, {"poses": [5]}, {"poses": "all"}, {"units": 5}])
+def test_a_document_whose_poses_cannot_be_plotted_is_said(paper_unit: Sensor, spoiled: dict[str, Any]) -> None:
+    document = calibration_with(paper_unit, FORMS[0], np.random.default_rng(1)).to_dict()
+    document |= {"poses": [{"used": True, "residual_g": 0.0, "standard_error_g": 1e-5, "direction": [0, 0, 1]}]}
+    with pytest.raises(tc.InvalidData, match="cannot be plotted"):
+        residuals_figure({**document, **spoiled})

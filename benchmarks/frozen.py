@@ -1,0 +1,250 @@
+"""What a method makes of the benchmark's recordings, one line each, to set another method beside it by the seed.
+
+    python -m benchmarks.frozen --write benchmarks/frozen/loop.jsonl.gz [--jobs 2] [--range development]
+    python -m benchmarks.frozen --show benchmarks/frozen/loop.jsonl.gz
+
+A recording is one of `tests/undeclared`; what is inside, and the error of |a| in fifteen poses of another recording,
+before and after, with and without the noise of these poses, are in its line. Methods are made on the development range
+of seeds alone, and judged on the test range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.table import Table
+from benchmarks.undeclared import LARGE, NOISES, PAIR
+from tests.undeclared import physics, uncatalogued
+from tests.undeclared.examine import Case, still_poses
+from tests.undeclared.generator import CannotShow, Recording
+from tests.undeclared.told import rms_g
+from triaxcal.calibration import Calibration
+from triaxcal.held_out import magnitude_errors
+from triaxcal.loop import diagnose
+from triaxcal.poses.pose import Pose
+
+RANGES = {"development": 0, "test": 500_000}
+"""First seeds; the test range is not looked at while a method is made."""
+WORSE = 1.05
+"""An error after that is larger than so many times the one before has become worse."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a method says: findings (name, verdict, alternatives), whether something is left, and the calibrations."""
+
+    found: tuple[tuple[str, str, tuple[str, ...]], ...]
+    unexplained: bool
+    before: Calibration
+    after: Calibration
+
+
+Method = Callable[[Sequence[Pose], Sequence[float]], Judged]
+
+
+@dataclass(frozen=True)
+class Line:
+    """``names`` are the truth's that a catalogue has; ``before_g`` and ``after_g`` errors of |a| in the poses
+    of another recording, NaN where the poses found are not those made; ``quiet`` are those without the noise of these
+    poses; ``seconds`` of processor time."""
+
+    section: str
+    kind: str
+    seed: int
+    poses: int
+    noise: str
+    names: tuple[str, ...] = ()
+    size: float = 0.0
+    found: tuple[tuple[str, str, tuple[str, ...]], ...] = ()
+    unexplained: bool = False
+    before_g: float = float("nan")
+    after_g: float = float("nan")
+    quiet_before_g: float = float("nan")
+    quiet_after_g: float = float("nan")
+    noise_floor_g: float = float("nan")
+    seconds: float = float("nan")
+    error: str = ""
+
+    @property
+    def unique(self) -> tuple[str, ...]:
+        return tuple(name for name, verdict, _ in self.found if verdict == "adopted")
+
+    @property
+    def right(self) -> bool:
+        return bool(set(self.unique) & set(self.names))
+
+    @property
+    def wrong(self) -> bool:
+        return bool(set(self.unique) - set(self.names))
+
+    @property
+    def listed(self) -> bool:
+        listed = {n for name, verdict, others in self.found if verdict != "adopted" for n in (name, *others)}
+        return not self.right and bool(listed & set(self.names))
+
+
+def of_loop(poses: Sequence[Pose], signs: Sequence[float]) -> Judged:
+    loop = diagnose(poses, signs=signs)
+    found = tuple((f.effect, f.verdict, tuple(f.alternatives)) for f in loop.findings)
+    return Judged(found, bool(loop.unexplained.significant), loop.before, loop.after)
+
+
+def cases(first: int, share: float = 1.0) -> Iterator[tuple[str, Case]]:
+    """With their section. ``share`` of the usual number."""
+
+    def seeds(count: int) -> range:
+        return range(first, first + max(round(count * share), 1))
+
+    def turn(kinds: Sequence[str], i: int) -> tuple[str, int, str]:
+        return kinds[i % len(kinds)], i, NOISES[(i + i // len(kinds)) % len(NOISES)]
+
+    for section, kinds, count_26, count_14 in (
+        ("catalogue", physics.KINDS, 165, 165),
+        ("outside", uncatalogued.KINDS, 150, 150),
+    ):
+        for poses, count in ((26, count_26), (14, count_14)):
+            for kind, i, noise in (turn(kinds, i) for i in seeds(count)):
+                yield section, Case(kind, i, LARGE, poses, noise)
+    for i in seeds(120):
+        yield "nothing", Case("none", i, (1.0, 1.0), 14 if i % 4 == 3 else 26, NOISES[i % 3])
+    for i in seeds(60):
+        yield "two", Case("two", i, PAIR, 14 if i % 3 == 2 else 26, NOISES[i % 3])
+
+
+def line(method: Method, asked: tuple[str, Case]) -> Line:
+    """Whatever goes wrong in the method is an outcome too."""
+    section, case = asked
+    bare = Line(section, case.kind, case.seed, case.poses, case.noise)
+    try:
+        r = case.make()
+    except CannotShow as e:
+        return replace(bare, error=f"not drawn: {e}")
+    bare = replace(bare, names=r.names, size=max(r.sizes, default=0.0))
+    try:
+        poses = still_poses(r.samples())
+        begin = time.process_time()
+        judged = method(poses, r.signs)
+        seconds = time.process_time() - begin
+        check = still_poses(r.held_out_samples())
+        (before, quiet_before), (after, quiet_after) = (errors_g(r, check, c) for c in (judged.before, judged.after))
+    except Exception as e:  # noqa: BLE001 -- a benchmark goes on
+        return replace(bare, error=f"{type(e).__name__}: {e}")
+    floor = judged.before.residual.noise_floor_g
+    return replace(
+        bare,
+        found=judged.found,
+        unexplained=judged.unexplained,
+        before_g=before,
+        after_g=after,
+        quiet_before_g=quiet_before,
+        quiet_after_g=quiet_after,
+        noise_floor_g=floor,
+        seconds=seconds,
+    )
+
+
+def errors_g(r: Recording, check: Sequence[Pose], c: Calibration) -> tuple[float, float]:
+    """Of |a| in the poses of the other recording: of their means, and of these without noise."""
+    there = r.held_out.scene
+    if len(check) != there.poses:
+        return float("nan"), float("nan")
+    means = r.triad.outputs(there.pose_force + there.by_pose(r.held_out.added_g))
+    quiet = [replace(p, mean=u) for p, u in zip(check, means, strict=True)]
+
+    def error(poses: Sequence[Pose]) -> float:
+        miss, _ = magnitude_errors(
+            c.sensor, poses, channel_reference=c.channel_reference, reference=c.reference, moment=c.moment
+        )
+        return rms_g(r, miss)
+
+    return error(check), error(quiet)
+
+
+def write(path: Path, lines: Sequence[Line]) -> None:
+    text = "".join(json.dumps(_plain(asdict(one))) + "\n" for one in lines)
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(gzip.compress(text.encode(), 9, mtime=0))
+
+
+def read(path: Path) -> list[Line]:
+    rows = [json.loads(row) for row in gzip.decompress(path.read_bytes()).decode().splitlines()]
+    return [Line(**{k: _of_plain(k, v) for k, v in row.items()}) for row in rows]
+
+
+def _plain(row: dict[str, Any]) -> dict[str, Any]:
+    """Six digits are enough of an error, and NaN is no JSON."""
+    return {
+        k: (float(f"{v:.6g}") if np.isfinite(v) else None) if isinstance(v, float) else v
+        for k, v in row.items()
+        if v not in ("", ()) and v is not False
+    }
+
+
+def _of_plain(key: str, value: Any) -> Any:
+    if value is None:
+        return float("nan")
+    if key == "names":
+        return tuple(value)
+    return tuple((name, verdict, tuple(others)) for name, verdict, others in value) if key == "found" else value
+
+
+def table(lines: Sequence[Line]) -> Table:
+    """The rows of the comparison: names, and the error after over that before."""
+    rows = []
+    for section in ("catalogue", "outside", "two", "nothing"):
+        for poses in (26, 14):
+            group = [one for one in lines if one.section == section and one.poses == poses and not one.error]
+            if not group:
+                continue
+            ratios = np.array([one.after_g / one.before_g for one in group])
+            ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
+            seconds = float(np.median([one.seconds for one in group]))
+            rows.append([
+                section, str(poses), str(len(group)), str(sum(one.right for one in group)),
+                str(sum(one.listed for one in group)), str(sum(one.wrong for one in group)),
+                str(sum(one.unexplained for one in group)), f"{np.exp(np.mean(np.log(ratios))):.3f}",
+                f"{int((ratios > WORSE).sum())} ({ratios.max():.1f})", f"{seconds:.2f}",
+            ])  # fmt: skip
+    head = ["truth", "poses", "n", "unique right", "listed", "unique wrong", "unexplained"]
+    return Table("By section", [*head, "after / before", "worse by 5 % (worst)", "s"], rows)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", type=Path, metavar="FILE", help="run the loop and freeze its results")
+    parser.add_argument("--show", type=Path, metavar="FILE", help="the table of frozen results")
+    parser.add_argument("--range", choices=RANGES, default="development", help="of seeds")
+    parser.add_argument("--share", type=float, default=1.0, help="of the recordings; default all")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    options = parser.parse_args(arguments)
+    if options.show:
+        print(table(read(options.show)))
+    if options.write:
+        with ProcessPoolExecutor(options.jobs, initializer=_one_thread) as pool:
+            asked = list(cases(RANGES[options.range], options.share))
+            lines = list(pool.map(partial(line, of_loop), asked, chunksize=2))
+        write(options.write, lines)
+        print(table(lines))
+    return 0
+
+
+def _one_thread() -> None:
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
