@@ -6,7 +6,7 @@ import gzip
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -264,12 +264,16 @@ DOCUMENTS = [
 # Text tables
 
 
-def table(content: str | bytes, name: str = "a.csv") -> Callable[[Path], list[str]]:
+def table(content: str | bytes, name: str = "a.csv", options: Sequence[str] = ()) -> Callable[[Path], list[str]]:
     def make(folder: Path) -> list[str]:
         put(content)(folder / name)
-        return ["poses", name]
+        return ["poses", name, *options]
 
     return make
+
+
+def _wide(columns: int) -> str:
+    return ";".join(["n"] * columns) + "\n" + (";".join(["1"] * columns) + "\n") * 3
 
 
 def _long_line(folder: Path) -> list[str]:
@@ -289,9 +293,16 @@ TABLES = [
     Row("a gzip bomb of samples", table(gzip.compress((HEADER + "0,1,2,3\n" * 500_000).encode(), 9)
         + gzip.compress(b"0,1,2,3\n" * 500_000, 9) * 100, "a.csv.gz"), 2, "unpacks to more than 200 times its size"),
     Row("a gzip bomb of comments", table(gzip.compress(b"#\n" * 2_000_000, 9) * 100, "a.csv.gz"), 2, "unpacks to more"),
-    Row("a gzip bomb of NULs", table(gzip.compress(bytes(2**26)), "a.csv.gz"), 2, "no end of line"),
-    Row("quotes", table('"t_s","ux","uy","uz"\n0,1,2,3\n'), 2, "line 1"),
-    Row("times 300 years apart", table(HEADER + "".join(f"{i * 9e6!r},1,2,3\n" for i in range(1000))), 0, ""),
+    Row("a gzip bomb of NULs", table(gzip.compress(bytes(2**26)), "a.csv.gz"), 2, "unpacks to more than 200 times"),
+    Row("quotes", table('"t_s","ux","uy","uz"\n' + '"' * 100_000 + "0,1,2,3\n0,1,2,3\n"), 2, "a finite number"),
+    Row("times 300 years apart", table(HEADER + "".join(f"{i * 9e6!r},1,2,3\n" for i in range(1000)),
+        options=("--time-unit", "s")), 0, ""),
+    Row("a foreign table of 100,000 columns", table(_wide(100_000)), 2, "100000 fields, expected at most 1000"),
+    Row("900 columns with one name", table(_wide(900)), 2, "no three outputs among the columns"),
+    Row("a foreign table in one line", table("a;b;c;d;" + "1;" * 5_000_000), 2, "fields, expected at most 1000"),
+    Row("a foreign table of quotes", table("t;x;y;z\n0;1;2;3\n" + '"' * 5_000_000 + "\n0,1;1;2;3\n"), 2, ""),
+    Row("a foreign table of blanks", table("t x y z\n0 1 2 3\n" + " " * 20_000_000 + "\n0.1 1 2 3\n"), 2, "too few"),
+    Row("100,000 words", table("t;x;y;z;w\n" + "".join(f"{i / 100};1;2;3;a{i}\n" for i in range(100_000))), 0, ""),
     Row("a gap after each sample", table(HEADER + "".join(f"{(i + 9 * (i % 3)) / 10!r},1,2,3\n"
         for i in range(0, 60_000, 3))), 0, ""),
     Row("a pipe for a table", lambda f: (os.mkfifo(f / "a.csv"), ["poses", "a.csv"])[1], 2, "empty file"),

@@ -47,6 +47,17 @@ class Column:
     def usable(self) -> NDArray[np.bool_]:
         return ~(self.gaps | self.strange)
 
+    def equals(self, value: str) -> NDArray[np.bool_]:
+        """(n,) whether a cell has this text, or in a file of typed columns this number."""
+        import pyarrow.compute as pc
+
+        if self.texts is not None:
+            return np.asarray(pc.equal(self.texts, value))
+        try:
+            return np.asarray(self.numbers == float(value))
+        except ValueError:
+            return np.zeros(len(self.numbers), bool)
+
     def text(self, row: int) -> str:
         """On one line, though a stray quote may have drawn several into the cell."""
         return "" if self.texts is None else " ".join(str(self.texts[row]).split())

@@ -102,9 +102,11 @@ def layout_of(lines: Sequence[str]) -> Layout | None:
 
 def split(line: str, separator: str) -> list[str]:
     """The fields of a line (RFC 4180), without blanks about them."""
-    if separator == " ":
-        return next(csv.reader([" ".join(line.split())], delimiter=" "), [])
-    fields = next(csv.reader([line.strip(" ")], delimiter=separator, skipinitialspace=separator != "\t"), [])
+    line = " ".join(line.split()) if separator == " " else line.strip(" ")
+    try:
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=separator != "\t"), [])
+    except csv.Error:  # a field of more than 128 KiB
+        return []
     return [field.strip() for field in fields]
 
 

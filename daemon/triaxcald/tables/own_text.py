@@ -20,7 +20,7 @@ REQUIRED = ("t_s", "ux", "uy", "uz")
 _LINE_LIMIT = 2**20  # bytes; no line of numbers is that long
 _VALUE_LIMIT = 1e100  # squares of values, and sums of them, have to be numbers too
 _TIME_LIMIT_S = 9.2e9  # beyond, nanoseconds do not fit 64 bits
-_FIELDS_MOST = 1000  # a table of numbers has some ten
+FIELDS_MOST = 1000  # a table of numbers has some ten
 _NUMBER_MOST = 400  # characters of a number; those of the longest are its zeros, 308 of them
 _SKIP = "--skip-bad leaves such lines out"
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -152,8 +152,8 @@ class _Parse:
             if i >= len(fields) or fields[i] != name:
                 found = f"'{fields[i][:40]}'" if i < len(fields) else "nothing"
                 self._fail(self._line, f"field {i + 1} of the header is {found} instead of '{name}', {expected}")
-        if len(fields) > _FIELDS_MOST:
-            self._fail(self._line, f"{len(fields)} fields in the header, expected at most {_FIELDS_MOST}")
+        if len(fields) > FIELDS_MOST:
+            self._fail(self._line, f"{len(fields)} fields in the header, expected at most {FIELDS_MOST}")
         for i, field in enumerate(fields):
             if not field:
                 self._fail(self._line, f"field {i + 1} of the header has no name, {expected}")

@@ -18,11 +18,13 @@ from triaxcald.tables import arrow, clock
 from triaxcald.tables.arrow import Column
 from triaxcald.tables.layout import Layout, decoded, layout_of
 from triaxcald.tables.naming import INDEX, ISO, OUTPUTS, TIME, Name, Roles, Unclear, are_seconds_and_rest, roles_of
-from triaxcald.tables.own_text import CsvSamples, is_own, samples_of_blocks
+from triaxcald.tables.own_text import FIELDS_MOST, CsvSamples, is_own, samples_of_blocks
 from triaxcald.tables.source import blocks, label_of
 
 HEAD = 2**20
 """Characters in which the layout is looked for."""
+ROWS_LOOKED_AT = 10_000
+"""For the words in a column: those that come in turn come early."""
 VALUE_LIMIT = 1e100
 """Squares of values, and sums of them, have to be numbers too."""
 COMPUTED_LEAST = 0.999
@@ -113,6 +115,8 @@ def _grid(first: bytes, rest: Iterator[bytes]) -> _Grid:
     if layout.unlike is not None:
         line, count = layout.unlike
         raise Unclear(f"line {line + 1}: {count} names, and {layout.fields} fields in the lines of numbers below")
+    if layout.fields > FIELDS_MOST:
+        raise Unclear(f"{layout.fields} fields, expected at most {FIELDS_MOST}")
     at = _offset(text, layout.first)
     left = re.compile(_LEFT.replace("//", "//" if layout.separator == ";" else "//|;"), re.MULTILINE)
     body = left.sub("", text[at:])
@@ -235,14 +239,14 @@ def _rows_where(grid: _Grid, where: Mapping[str, str]) -> NDArray[np.bool_]:
         if len(found) != 1:
             raise Unclear(f"--where {name}={value}: the table has {len(found)} columns of that name")
         column = grid.columns[found[0]]
-        chosen &= np.array([column.text(row) == value for row in range(n)], bool)
+        chosen &= column.equals(value)
         if not chosen.any():
             raise Unclear(f"--where {name}={value}: no row has that; it has {clipped(', '.join(_distinct(column)))}")
     return chosen
 
 
 def _distinct(column: Column, most: int = 20) -> list[str]:
-    return sorted({column.text(row) for row in range(len(column.numbers))})[:most]
+    return sorted({column.text(row) for row in range(min(len(column.numbers), ROWS_LOOKED_AT))})[:most]
 
 
 def _require_one_sensor(grid: _Grid, chosen: NDArray[np.bool_]) -> None:
@@ -250,7 +254,7 @@ def _require_one_sensor(grid: _Grid, chosen: NDArray[np.bool_]) -> None:
     for i, column in enumerate(grid.columns):
         if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > 0.5:
             continue
-        texts = {column.text(int(row)) for row in np.flatnonzero(chosen)}
+        texts = {column.text(int(row)) for row in np.flatnonzero(chosen)[:ROWS_LOOKED_AT]}
         if 1 < len(texts) <= 50 and sum(bool(_SENSORS.search(t)) for t in texts) > 1:
             wanted = next((t for t in sorted(texts) if re.search("acc", t, re.IGNORECASE)), min(texts))
             raise Unclear(
