@@ -16,7 +16,7 @@ from triaxcal_drivers.files import open_file
 from triaxcal_drivers.interface import SampleBlock
 from triaxcald.errors import InputError
 from triaxcald.recording.export import columns_of, require_alike
-from triaxcald.tables.layout import DAY_TIME, MISSING, MOMENT
+from triaxcald.tables.layout import DATED, DAY_TIME, MISSING, MOMENT
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -199,25 +199,37 @@ def _whole_of_text(
 
 
 def _moments(texts: pa.StringArray, gaps: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.bool_]] | None:
-    """Nanoseconds where the first cells are moments or times of day, and which cells hold none of these."""
+    """Nanoseconds where the first cells are moments or times of day, and which cells hold none of these.
+
+    Of dates that are not those of ISO 8601 nothing is understood: where all rows have the same, the time of day is the
+    time.
+    """
     import pyarrow as pa
     import pyarrow.compute as pc
 
     first = next((str(texts[int(i)]) for i in np.flatnonzero(~gaps)[:1]), "")
-    of_day = bool(DAY_TIME.fullmatch(first))
-    if not of_day and not MOMENT.fullmatch(first):
-        return None
-    fine = pc.match_substring_regex(texts, f"^(?:{(DAY_TIME if of_day else MOMENT).pattern})$")
-    strange = ~np.asarray(fine) & ~gaps
-    if of_day:
+    if MOMENT.fullmatch(first):
+        fine = pc.match_substring_regex(texts, f"^(?:{MOMENT.pattern})$")
+        zoned = bool(re.search(r":\d\d(?:[.,]\d+)? ?(?:Z|UTC|[+-]\d\d(?::?\d\d)?)$", first))
+        texts = pc.replace_substring_regex(texts, r" ?UTC$", "Z")
+        texts = pc.replace_substring_regex(texts, r" (Z|[+-]\d\d(?::?\d\d)?)$", r"\1")
+    elif DAY_TIME.fullmatch(first) or DATED.fullmatch(first):
+        dated = DATED.fullmatch(first)
+        before, after = (dated[1], dated[3] or "") if dated else ("", "")
+        fine = pc.match_substring_regex(texts, f"^{re.escape(before)}[ T]*{DAY_TIME.pattern}{re.escape(after)}$")
+        zoned = False
+        texts = pc.replace_substring_regex(texts, f"^{re.escape(before)}[ T]*(.*?){re.escape(after)}$", r"\1")
+        texts = pc.replace_substring_regex(texts, r":(\d{3})$", r".\1")
+        if after:  # by the clock of twelve hours, noon and midnight are its zero
+            texts = pc.replace_substring_regex(texts, "^12:", "0:")
         texts = pc.binary_join_element_wise("1970-01-01", texts, " ")
         texts = pc.replace_substring_regex(texts, r" (\d:)", r" 0\1")
+    else:
+        return None
     texts = pc.replace_substring(texts, ",", ".")
-    texts = pc.replace_substring_regex(texts, r" ?UTC$", "Z")
-    texts = pc.replace_substring_regex(texts, r" (Z|[+-]\d\d(?::?\d\d)?)$", r"\1")
-    zoned = bool(re.search(r":\d\d(?:\.\d+)?(?:Z|[+-]\d\d(?::?\d\d)?)$", str(texts[int(np.flatnonzero(~gaps)[0])])))
-    held = pc.if_else(fine, texts, "1970-01-01T00:00:00" + ("Z" if zoned else ""))
+    strange = ~np.asarray(fine) & ~gaps
     try:
+        held = pc.if_else(fine, texts, "1970-01-01T00:00:00" + ("Z" if zoned else ""))
         found = pc.cast(held, pa.timestamp("ns", "UTC" if zoned else None))
     except pa.ArrowInvalid:
         return np.zeros(len(texts), np.int64), ~gaps

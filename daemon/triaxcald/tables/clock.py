@@ -45,7 +45,10 @@ def nanoseconds(column: Column, name: Name, unit: str | None) -> tuple[NDArray[n
         return column.moments_ns, ISO
     if unit == ISO:
         raise Unclear(f"--time-unit iso: {_called(name)} holds numbers, no dates as 2026-01-31 12:00:00.25")
-    unit = unit or name.time_unit or _evident(column.numbers[usable], column.whole is not None, name)
+    if unit is None and name.time_unit is None:
+        numbers = column.numbers if column.whole is None else column.whole
+        unit = _evident(numbers[usable], column.whole is not None, name)
+    unit = unit or name.time_unit or "s"
     return _scaled(column, name, unit), unit
 
 
@@ -74,10 +77,10 @@ def _evenly(counted: NDArray[np.int64], rate: float) -> NDArray[np.int64]:
     return np.asarray(np.rint(counted * (UNITS["s"] / rate)).astype(np.int64))
 
 
-def _evident(times: NDArray[np.float64], whole: bool, name: Name) -> str:
+def _evident(times: NDArray[np.float64] | NDArray[np.int64], whole: bool, name: Name) -> str:
     if name.other_time_unit:
         raise Unclear(f"{_called(name)} is in {name.other_time_unit}; convert it to seconds, or give --rate HZ")
-    steps: NDArray[np.float64] = np.diff(times)
+    steps = np.diff(times)
     rising = steps[steps > 0]
     if not len(rising):
         return "s"

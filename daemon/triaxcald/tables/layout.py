@@ -22,12 +22,14 @@ SEPARATORS = ("\t", ";", ",", "|", " ")
 MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "inf", "+inf", "-inf", "infinity", "-infinity", "-nan"))
 """Texts in lower case that stand for no number; so do all that begin with # (#N/A, #NV, #DIV/0!)."""
 NUMBER = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-DAY_TIME = re.compile(r"\d{1,2}:\d\d:\d\d(?:[.,]\d{1,9})?", re.ASCII)
+DAY_TIME = re.compile(r"\d{1,2}:\d\d:\d\d(?:[.,]\d{1,9}|:\d{3})?", re.ASCII)
+DATED = re.compile(r"(\S+(?: \S+)?)[ T]+(\d{1,2}:\d\d:\d\d(?:[.,]\d{1,9}|:\d{3})?)( ?[AaPp][Mm])?", re.ASCII)
+"""A date as nobody else writes it, and the time of day."""
 MOMENT = re.compile(
     r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)?(?: ?(?:Z|UTC|[+-]\d\d(?::?\d\d)?))?", re.ASCII
 )
 UNIT_TEXT = re.compile(
-    r"[\[(<{][^\])>}]*[\])>}]|m/s(?:\^2|\*\*2|2|²)|m/s/s|m\*s\^-2|m/\(s\^2\)|[kmµμu]?g|mG|G|[mµμun]?s|sec|seconds|ms|°C|degC|C|K|[mµu]?V|Hz|"
+    r"[\[(<{][^\])>}]*[\])>}]|m/s(?:\^2|\*\*2|2|²)|m/s/s|m\*s\^-2|m/\(s\^2\)|[kmµμu]?g|mG|G|[mµμun]?s|sec|seconds|ms|°C|degC|C|K|[mµu]?V|volts?|Hz|"
     r"(?:deg|rad|°)/s|dps|[mµμu]?T|uT|gauss|counts?|lsb|-|1|",
     re.IGNORECASE,
 )
@@ -139,7 +141,9 @@ def _is_sample(line: str, separator: str) -> bool:
 
 def _numeric(row: Sequence[str], separator: str) -> int:
     """How many fields are numbers or moments; 0 where that are fewer than three."""
-    count = sum(is_number(f, separator) or bool(MOMENT.fullmatch(f)) or bool(DAY_TIME.fullmatch(f)) for f in row)
+    count = sum(
+        is_number(f, separator) or bool(MOMENT.fullmatch(f) or DATED.fullmatch(f) or DAY_TIME.fullmatch(f)) for f in row
+    )
     return count if count >= NUMERIC_LEAST else 0
 
 

@@ -59,7 +59,8 @@ class Name:
 
     @property
     def is_time(self) -> bool:
-        return bool(set(self.words) & known.TIMES) or self.words == ("x", "value") or self.time_unit is not None
+        called = {w for w in self.words if len(w) > 2 or len(self.words) == 1} & known.TIMES
+        return bool(called) or self.words == ("x", "value") or self.time_unit is not None
 
     @property
     def is_index(self) -> bool:
@@ -309,13 +310,13 @@ def _numbered(names: Sequence[Name], free: Sequence[int]) -> list[Triple]:
     for i in free:
         text = re.sub(r"[\[(<{]\D*[\])>}]", "", names[i].text).strip()
         if m := re.fullmatch(r"(.*\D)[\[(]?(\d+)[\])]?", text):
-            found.setdefault(m[1].strip(" _-.[(").lower(), []).append((int(m[2]), i))
+            found.setdefault(m[1].strip(" _-.[("), []).append((int(m[2]), i))
     triples = []
     for stem, numbered in found.items():
         numbers, columns = [n for n, _ in numbered], [i for _, i in numbered]
         in_order = len(numbers) == len(AXES) and numbers == list(range(numbers[0], numbers[0] + len(AXES)))
         words = set(Name.of(stem).words)
-        if in_order and (stem in known.NUMBERED or words & known.ACCELERATION):
+        if in_order and (stem.lower() in known.NUMBERED or words & known.ACCELERATION):
             kind = _kind(words, names[columns[0]].unit.lower())
             triples.append(Triple((columns[0], columns[1], columns[2]), kind, not words))
     return triples

@@ -27,6 +27,8 @@ ROWS_LOOKED_AT = 10_000
 """For the words in a column: those that come in turn come early."""
 VALUE_LIMIT = 1e100
 """Squares of values, and sums of them, have to be numbers too."""
+FAR = 1e4
+"""Times what nine in ten samples reach: more is no reading, as a knock reaches the end of the range."""
 COMPUTED_LEAST = 0.999
 """Correlation with the magnitude of the outputs above which a column is computed from them; a temperature that is
 measured has not a thousandth of it."""
@@ -311,6 +313,11 @@ def _no_time(grid: _Grid, roles: Roles, by_index: bool) -> str:
         return "--time-unit index: say how many samples a second it counts: --rate HZ"
     if roles.indices:
         return f"{grid.called(roles.indices[0])} is an index, and nothing states a rate: --rate HZ"
+    for i in roles.time:
+        if grid.columns[i].strange.any():
+            row = int(np.flatnonzero(grid.columns[i].strange)[0])
+            held = grid.columns[i].text(row)[:40]
+            return f"{grid.called(i)}: '{held}' is no time (dates as 2026-01-31 12:00:00.25); convert it, or --rate HZ"
     which = "t=NAME" if grid.named else "t=NUMBER"
     return (
         f"no column of time; name it (--columns {which},…), or say how many samples a second there are: --rate HZ; "
@@ -396,14 +403,17 @@ def _kept(
     usable = chosen.copy()
     for i in needed:
         usable &= grid.columns[i].usable
+    far = usable & _far(grid, needed[: len(OUTPUTS)], usable)
+    usable &= ~far
     bad = chosen & ~usable
     faults = []
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
-        i = next(i for i in needed if not grid.columns[i].usable[row])
+        i = next((i for i in needed if not grid.columns[i].usable[row]), needed[0])
         held = grid.columns[i].text(row)
         what = f"'{held[:40]}'" if held else "empty"
-        faults.append(f"{grid.line_of(row)}: {grid.called(i)}: {what}, expected a finite number")
+        expected = f"a number within {FAR:g} times most others" if far[row] else "a finite number"
+        faults.append(f"{grid.line_of(row)}: {grid.called(i)}: {what}, expected {expected}")
     for line, fields in grid.ragged[:1]:
         faults.append(f"{line}: {fields} fields, expected {len(grid.columns)}")
     count = int(bad.sum()) + len(grid.ragged)
@@ -412,6 +422,14 @@ def _kept(
     if not reading.skip_bad:
         raise Unclear(f"{faults[0]}; {count} such lines: --skip-bad leaves them out")
     return usable, [f"{count} of {int(chosen.sum()) + len(grid.ragged)} lines left out (--skip-bad); {faults[0]}"]
+
+
+def _far(grid: _Grid, outputs: Sequence[int], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Rows that hold something else than outputs: a line garbled on its way, a moment in the place of a header."""
+    sizes = np.max([np.abs(np.nan_to_num(grid.columns[i].numbers)) for i in outputs], axis=0)
+    if not usable.any():
+        return np.zeros(len(sizes), bool)
+    return np.asarray(sizes > FAR * np.quantile(sizes[usable], 0.9))
 
 
 def _channels(
@@ -515,7 +533,8 @@ def _read_as(grid: _Grid, roles: Roles, timing: _Timing, reading: Reading) -> st
 
 
 def _shown(grid: _Grid, column: int) -> str:
-    return clipped(Name.of(grid.names[column]).text) if grid.named else f"column {column + 1}"
+    name = Name.of(grid.names[column]).text if grid.named else ""
+    return clipped(name) if name else f"column {column + 1}"
 
 
 def _unit_of(roles: Roles, names: Sequence[Name]) -> str:

@@ -14,7 +14,7 @@ OTHER_UNITS_OF_TIME = frozenset(
 )
 TIMES = frozenset((
     "t", "ts", "time", "times", "timestamp", "timestamps", "zeit", "zeitstempel", "uhrzeit", "temps", "tiempo", "tempo",
-    "elapsed", "date", "datetime", "epoch", "epoc", "clock", "heure", "hora", "stamp", "uptime",
+    "elapsed", "date", "datetime", "epoch", "epoc", "clock", "heure", "hora", "stamp", "uptime", "utc",
     *(word for word in UNITS_OF_TIME if len(word) > 3),
 ))  # fmt: skip
 INDICES = frozenset((
@@ -40,7 +40,7 @@ OTHER_UNITS = frozenset(("v", "mv", "uv", "µv", "a", "ma", "hz", "counts", "cou
 COMPUTED = frozenset((
     "gravity", "grav", "quat", "quaternion", "q", "orientation", "attitude", "euler", "roll", "pitch", "yaw", "heading",
     "azimuth", "tilt", "inclination", "angle", "norm", "magnitude", "absolute", "abs", "total", "resultant", "svm",
-    "vm", "enmo", "vel", "velocity", "pos", "position", "displacement", "jerk", "delta",
+    "vm", "enmo", "vel", "velocity", "pos", "position", "displacement", "jerk", "delta", "dt",
 ))  # fmt: skip
 """Of columns that are computed from the outputs, or from the motion of the whole."""
 ERRORS = frozenset(("se", "sem", "std", "sd", "stderr", "stdev", "sigma", "error", "err", "unc", "uncertainty", "var"))
