@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import argparse
 import gzip
+import itertools
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,31 +25,45 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from benchmarks.undeclared import LARGE, NOISES, PAIR
 from tests.undeclared import physics, uncatalogued
 from tests.undeclared.examine import Case, still_poses
 from tests.undeclared.generator import CannotShow, Recording
 from tests.undeclared.told import rms_g
-from triaxcal.calibration import Calibration
+from triaxcal.calibration import Calibration, HoldsAt
 from triaxcal.held_out import magnitude_errors
 from triaxcal.loop import diagnose
+from triaxcal.moment import Moment
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
+from triaxcal.posterior import average, posterior, refusal
 
 RANGES = {"development": 0, "test": 500_000}
 """First seeds; the test range is not looked at while a method is made."""
+CERTAIN = 0.99
+"""What a verdict of the loop is taken to say."""
+LEAST = 1e-4
+"""What a statement is taken to leave open, or one false certainty would make the score infinite."""
+TOLD = 1e-3
+"""Names of less probability are not kept."""
+LEVELS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
+"""Of the reliability table."""
 WORSE = 1.05
 """An error after that is larger than so many times the one before has become worse."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What a method says: findings (name, verdict, alternatives), whether something is left, and the calibrations."""
+    """What a method says: findings (name, verdict, alternatives), whether something is left, the calibrations, and the
+    probability of names, where it says so."""
 
     found: tuple[tuple[str, str, tuple[str, ...]], ...]
     unexplained: bool
     before: Calibration
     after: Calibration
+    probabilities: tuple[tuple[str, float], ...] = ()
 
 
 Method = Callable[[Sequence[Pose], Sequence[float]], Judged]
@@ -77,6 +91,19 @@ class Line:
     noise_floor_g: float = float("nan")
     seconds: float = float("nan")
     error: str = ""
+    probabilities: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """The probability of each name; of verdicts what they amount to: a name adopted has 0.99, and those that are
+        alternatives share it."""
+        if self.probabilities:
+            return dict(self.probabilities)
+        out: dict[str, float] = {}
+        for name, verdict, others in self.found:
+            group = (name,) if verdict == "adopted" else (name, *others)
+            out |= dict.fromkeys(group, CERTAIN / len(group))
+        return out
 
     @property
     def unique(self) -> tuple[str, ...]:
@@ -100,6 +127,23 @@ def of_loop(poses: Sequence[Pose], signs: Sequence[float]) -> Judged:
     loop = diagnose(poses, signs=signs)
     found = tuple((f.effect, f.verdict, tuple(f.alternatives)) for f in loop.findings)
     return Judged(found, bool(loop.unexplained.significant), loop.before, loop.after)
+
+
+def of_posterior(poses: Sequence[Pose], signs: Sequence[float]) -> Judged:
+    before = replace(fit(poses, signs=signs), holds_at=HoldsAt.of(poses, Moment.END))
+    seen = posterior(poses, before, signs=signs)
+    found = tuple((g[0], "adopted" if len(g) == 1 else "confounded", g[1:]) for g in seen.certain)
+    after = before
+    if refusal(seen) is None:
+        assert before.holds_at is not None
+        made = average(seen, before.holds_at)
+        reference = seen.evidence.rows.problem.channel_reference
+        after = replace(before, sensor=made.sensor, channel_reference=reference)
+    told = tuple((name, float(f"{p:.4g}")) for name, p in seen.of_names.items() if p >= TOLD)
+    return Judged(found, seen.of_unmodelled >= seen.evidence.odds.refused, before, after, told)
+
+
+METHODS: dict[str, Method] = {"loop": of_loop, "posterior": of_posterior}
 
 
 def cases(first: int, share: float = 1.0) -> Iterator[tuple[str, Case]]:
@@ -153,6 +197,7 @@ def line(method: Method, asked: tuple[str, Case]) -> Line:
         quiet_after_g=quiet_after,
         noise_floor_g=floor,
         seconds=seconds,
+        probabilities=judged.probabilities,
     )
 
 
@@ -198,6 +243,8 @@ def _of_plain(key: str, value: Any) -> Any:
         return float("nan")
     if key == "names":
         return tuple(value)
+    if key == "probabilities":
+        return tuple((name, p) for name, p in value)
     return tuple((name, verdict, tuple(others)) for name, verdict, others in value) if key == "found" else value
 
 
@@ -222,28 +269,49 @@ def table(lines: Sequence[Line]) -> Table:
     return Table("By section", [*head, "after / before", "worse by 5 % (worst)", "s"], rows)
 
 
+def reliability(lines: Sequence[Line]) -> Table:
+    """Of what was stated with a probability the share that is true, and the scores of all of it: a name acts or not.
+
+    The population: one effect of s = 20 to 200, of the catalogue or of none, pairs of 20 to 40, and nothing.
+    """
+    stated = [(p, name in one.names) for one in lines if not one.error for name, p in one.stated.items()]
+    missed = sum(name not in one.stated for one in lines if not one.error for name in one.names)
+    p, true = np.clip([s for s, _ in stated], LEAST, 1 - LEAST), np.array([t for _, t in stated])
+    rows = []
+    for low, high in itertools.pairwise(LEVELS):
+        inside = (p >= low) & ((p < high) | (high == LEVELS[-1]))
+        if inside.any():
+            n, share = int(inside.sum()), float(true[inside].mean())
+            error = np.sqrt(max(share * (1 - share), 1 / n) / n)
+            rows.append([f"{low:g} to {high:g}", str(n), f"{p[inside].mean():.3f}", f"{share:.3f} ± {error:.3f}"])
+    count = len([one for one in lines if not one.error])
+    brier = float(np.sum((p - true) ** 2) + missed) / count
+    log = float(-np.sum(np.log(np.where(true, p, 1 - p))) - missed * np.log(TOLD)) / count
+    rows.append(["Brier score a recording", str(count), f"{brier:.4f}", ""])
+    rows.append(["log score a recording", str(count), f"{log:.3f}", ""])
+    return Table("Reliability of stated probabilities", ["stated", "n", "mean", "true"], rows)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", type=Path, metavar="FILE", help="run the loop and freeze its results")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="run a method and freeze its results")
     parser.add_argument("--show", type=Path, metavar="FILE", help="the table of frozen results")
+    parser.add_argument("--method", choices=METHODS, default="loop")
     parser.add_argument("--range", choices=RANGES, default="development", help="of seeds")
     parser.add_argument("--share", type=float, default=1.0, help="of the recordings; default all")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     options = parser.parse_args(arguments)
     if options.show:
         print(table(read(options.show)))
+        print(reliability(read(options.show)))
     if options.write:
-        with ProcessPoolExecutor(options.jobs, initializer=_one_thread) as pool:
+        with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
             asked = list(cases(RANGES[options.range], options.share))
-            lines = list(pool.map(partial(line, of_loop), asked, chunksize=2))
+            lines = list(pool.map(partial(line, METHODS[options.method]), asked, chunksize=2))
         write(options.write, lines)
         print(table(lines))
+        print(reliability(lines))
     return 0
-
-
-def _one_thread() -> None:
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ[name] = "1"
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ and the told-in-advance optimum: docs/explanation/undeclared-effects.md.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -19,6 +18,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from tests.undeclared import physics, uncatalogued
 from tests.undeclared.examine import Case, Outcome, describe, examine
@@ -275,7 +275,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     counts = Counts.of(options.seeds or (45 if options.quick else 330))
     report = Report()
-    with ProcessPoolExecutor(options.jobs, initializer=_one_thread) as pool:
+    with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
         for section in options.only:
             report.outcomes[section] = list(pool.map(examine, cases(counts, section), chunksize=4))
     for table in report.tables():
@@ -285,11 +285,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"\nMissed, {section}:")
             print("\n".join(misses(section, outcomes)) or "none")
     return 0
-
-
-def _one_thread() -> None:
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ[name] = "1"
 
 
 if __name__ == "__main__":

@@ -1,0 +1,122 @@
+"""What the posterior says of poses whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.triaxcal.posterior.conftest import MINUS
+from tests.undeclared.examine import Case, still_poses
+from triaxcal.pose_fit import fit
+from triaxcal.poses.pose import Pose
+from triaxcal.posterior import Posterior, Refusal, posterior, refusal
+
+Poses = Callable[..., list[Pose]]
+
+
+def found(poses: list[Pose]) -> Posterior:
+    return posterior(poses, fit(poses, signs=MINUS), signs=MINUS)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_named_where_nothing_acts(poses_with: Poses, seed: int) -> None:
+    seen = found(poses_with(seed))
+    assert max(seen.of_names.values(), default=0.0) < 0.3
+    assert max(seen.of_outliers) < 0.3
+    assert seen.of_unmodelled < 0.3
+
+
+@pytest.mark.parametrize(
+    ("name", "coefficients"),
+    [
+        ("third_order_nonlinearity", [3e-3, -2e-3, 2.5e-3]),
+        ("second_order_nonlinearity", [0.0, 1e-3, 0.0]),
+        ("scale_factor_asymmetry", [1e-3, 8e-4, -9e-4]),
+        ("temperature_bias", [5e-4, -4e-4, 6e-4]),
+        ("temperature_scale_factor", [5e-4, 4e-4, -6e-4]),
+        ("hysteresis", [8e-4, -7e-4, 9e-4]),
+        ("cross_coupling", [9e-4, -8e-4, 7e-4, 6e-4, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_what_acts_is_named(poses_with: Poses, name: str, coefficients: list[float]) -> None:
+    seen = found(poses_with(11, **{name: coefficients}))
+    assert next(iter(seen.of_names)) == name
+    assert seen.of_names[name] > 0.99
+    assert seen.without_any_pose(name) > 0.99
+    assert seen.of_unmodelled < 0.2
+
+
+def test_two_effects_at_once_are_both_named(poses_with: Poses) -> None:
+    seen = found(poses_with(5, hysteresis=[8e-4, -7e-4, 9e-4], temperature_bias=[5e-4, -4e-4, 6e-4]))
+    names, probability = next(iter(seen.of_sets_of_names.items()))
+    assert names == {"hysteresis", "temperature_bias"}
+    assert probability > 0.9
+
+
+def test_a_knocked_pose_is_an_outlier_and_nothing_else(
+    poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]]
+) -> None:
+    seen = found(knocked(poses_with(2), 7, 5e-4))
+    assert seen.of_outliers[7] > 0.99
+    assert np.delete(seen.of_outliers, 7).max() < 0.2
+    assert max(seen.of_names.values(), default=0.0) < 0.3
+
+
+def test_a_name_that_one_pose_decides_does_not_survive_its_loss(
+    poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]]
+) -> None:
+    """A single knock looks like many things; whatever is made of it, nothing is certain without that pose."""
+    for seed in range(3):
+        seen = found(knocked(poses_with(seed), 12, 3e-4))
+        assert all(seen.without_any_pose(name) < 0.5 for name in seen.of_names)
+
+
+@pytest.mark.parametrize("kind", ["dead_zone", "random_walk", "magnetic_field"])
+def test_what_is_in_no_catalogue_is_unmodelled(kind: str) -> None:
+    recording = Case(kind, 1, (100.0, 200.0), 26, "white").make()
+    poses = still_poses(recording.samples())
+    seen = posterior(poses, fit(poses, signs=recording.signs), signs=recording.signs)
+    assert seen.of_unmodelled > 0.5
+    assert all(seen.without_any_pose(name) < 0.99 for name in seen.of_names)
+
+
+def test_probabilities_are_those_of_a_partition(poses_with: Poses) -> None:
+    seen = found(poses_with(1, warm_up=[2e-4, 3e-4, -2e-4]))
+    assert seen.weight.sum() == pytest.approx(1.0)
+    assert seen.of_parts.sum() == pytest.approx(1.0)
+    assert sum(seen.of_sets_of_names.values()) == pytest.approx(1.0)
+    assert seen.of_unmodelled <= sum(seen.of_kinds.values()) + 1e-12
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_channels_that_were_exchanged_on_the_way_are_seen_with_the_pose(poses_with: Poses, seed: int) -> None:
+    first = 9 + 4 * seed
+    poses = poses_with(seed)
+    late = [replace(p, mean=p.mean[[1, 0, 2]]) for p in poses[first:]]
+    seen = found([*poses[:first], *late])
+    assert int(np.argmax(seen.of_another)) == first
+    assert seen.of_another[first] > 0.9
+    assert refusal(seen) is Refusal.ANOTHER
+
+
+def test_another_unit_from_some_pose_on_is_seen(poses_with: Poses) -> None:
+    poses = poses_with(3)
+    scale = np.array([1.004, 0.995, 1.002])
+    seen = found([*poses[:14], *(replace(p, mean=p.mean * scale) for p in poses[14:])])
+    assert seen.of_another[12:17].sum() > 0.9
+
+
+def test_one_unit_all_through_is_no_other(poses_with: Poses) -> None:
+    for effects in ({}, {"bias_step": [4e-4, 3e-4, -5e-4]}, {"warm_up": [4e-4, 3e-4, -5e-4]}):
+        assert found(poses_with(6, **effects)).of_another.sum() < 0.05
+
+
+def test_the_unit_of_the_reference_changes_no_probability(poses_with: Poses) -> None:
+    poses = poses_with(9, second_order_nonlinearity=[2e-4, 1e-4, -2e-4], hysteresis=[6e-5, -5e-5, 4e-5])
+    in_g, in_si = (posterior(poses, fit(poses, signs=MINUS, reference=r), signs=MINUS).of_names for r in (1.0, 9.80665))
+    assert {n: p for n, p in in_si.items() if p > 1e-3} == pytest.approx(
+        {n: p for n, p in in_g.items() if p > 1e-3}, rel=1e-3, abs=1e-6
+    )

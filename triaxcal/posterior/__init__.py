@@ -1,0 +1,15 @@
+"""What acts beyond the linear model, with which probability: one evidence for effects, outliers and what has no name.
+
+Grows beside the loop (`triaxcal.loop`), and is measured against it by `benchmarks.frozen`; nothing uses it yet.
+"""
+
+from triaxcal.posterior.average import Average, Refusal, average, refusal
+from triaxcal.posterior.findings import Another, Findings, Named, Unmodelled, findings
+from triaxcal.posterior.odds import Odds
+from triaxcal.posterior.posterior import Posterior, posterior
+from triaxcal.posterior.together import Together, together
+
+__all__ = [
+    "Another", "Average", "Findings", "Named", "Odds", "Posterior", "Refusal", "Together", "Unmodelled", "average",
+    "findings", "posterior", "refusal", "together",
+]  # fmt: skip

@@ -1,0 +1,262 @@
+"""What is corrected: the linear parameters and the effects' coefficients, averaged over all likely sets.
+
+A document has one form and one shape for each effect. So every shape of a name is carried over to the likeliest one:
+the coefficients are those that come nearest, in the poses and in the next recording, to what all shapes together do.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from scipy.special import logsumexp
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import HoldsAt
+from triaxcal.conditions import at_reference, of_moment
+from triaxcal.effects.contract import Effect
+from triaxcal.planning.directions import directions
+from triaxcal.posterior.evidence import SetEvidence
+from triaxcal.posterior.posterior import Posterior
+from triaxcal.posterior.unmodelled import What, place
+from triaxcal.problem import State, everything, parameters_by_theta
+from triaxcal.sensor import Sensor
+
+NEGLIGIBLE = 1e-6
+"""The probability of a set that moves no average."""
+LISTED = 0.01
+"""The probability of a name that a document lists."""
+CELLS = 400
+"""Sets, with one part and one choice of sizes each, whose covariances are mixed: the likeliest. The others are as these
+are."""
+STEPS = 3
+"""Of Newton's method, for nine parameters a few parts in a thousand from where they go."""
+SPHERE = 26
+"""Directions in which the next recording is asked about."""
+
+
+_Elsewhere = tuple[Floats, Floats, Floats, dict[str, Floats]]
+"""As `_elsewhere` has it."""
+
+
+class Refusal(StrEnum):
+    """Why no effect is corrected."""
+
+    UNMODELLED = "unmodelled"
+    """Something that no name describes probably acts: an average over names would go with it where it must not."""
+    ANOTHER = "another"
+    """One calibration does not hold in all poses: a unit was exchanged on the way, or its channels."""
+    ONE_POSE = "one_pose"
+    """A name is certain, and hangs on a single pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Average:
+    """``sensor`` has one entry for each likely name, by the mean of its coefficients: sets without the effect count,
+    with zero. ``covariance`` (9+p,9+p) is that of its scale factors, misalignments, biases and coefficients, within
+    the sets and between them; ``weights`` the probability of each name. ``wander`` (3,) g, which the biases hold, is
+    what a process in time adds to them at the moment for which all this holds."""
+
+    sensor: Sensor
+    covariance: Floats
+    weights: Mapping[str, float]
+    wander: Floats
+
+
+def refusal(seen: Posterior) -> Refusal | None:
+    odds = seen.evidence.odds
+    if seen.of_another.sum() >= odds.refused:
+        return Refusal.ANOTHER
+    if seen.of_unmodelled >= odds.refused:
+        return Refusal.UNMODELLED
+    certain = [name for name, p in seen.of_names.items() if p >= odds.certain]
+    if any(seen.without_any_pose(name) < odds.certain for name in certain):
+        return Refusal.ONE_POSE
+    return None
+
+
+def average(seen: Posterior, at: HoldsAt) -> Average:
+    """Over all sets, sizes and parts; it holds for another recording as at a moment of this one."""
+    carried = _Carried.of(seen, at)
+    mean, left = _mean(seen, carried)
+    state = _settled(seen, mean, carried)
+    G = parameters_by_theta(seen.evidence.rows.problem, state)
+    sensor = state.sensor(seen.evidence.rows.problem)
+    wander = _wander(seen, left, at.t_s)
+    return Average(
+        Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + wander, sensor.effects),
+        G @ _covariance(seen, mean, carried) @ G.T,
+        {effect.name: seen.of_names[effect.name] for effect in carried.effects},
+        wander,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Carried:
+    """``effects`` in the form and the shape that stands for each name, ``columns`` (N,p) theirs. ``by_term`` (9+p,C)
+    are the parameters, as deviations, by the scaled coefficients of all terms; zero for outliers."""
+
+    effects: tuple[Effect, ...]
+    columns: Floats
+    by_term: Floats
+
+    @classmethod
+    def of(cls, seen: Posterior, at: HoldsAt) -> _Carried:
+        evidence = seen.evidence
+        rows = evidence.rows
+        likeliest = _likeliest(seen)
+        there = _elsewhere(seen, at)
+        each = [_both(seen, effect, there) for effect in likeliest]
+        ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
+        linear = np.concatenate([rows.linear, there[0]])
+        by_term = np.zeros((9 + ends[-1], evidence.columns.shape[1]))
+        of_name = {effect.name: k for k, effect in enumerate(likeliest)}
+        known: dict[int, Floats] = {}
+        for i, term in enumerate(evidence.terms):
+            k = of_name.get(term.name)
+            if k is None or term.effect is None:
+                continue
+            if id(term.effect) not in known:
+                known[id(term.effect)] = _carry(linear, each[k], _both(seen, term.effect, there))
+            found = known[id(term.effect)][:, list(term.kept)] * term.mix
+            by_term[np.ix_([*range(9), *range(9 + ends[k], 9 + ends[k + 1])], evidence.places([i]))] = found
+        by_term[:9] /= rows.lengths[:, None]
+        columns = np.concatenate([np.empty((len(rows.y), 0)), *(c[: len(rows.y)] for c in each)], axis=1)
+        return cls(tuple(likeliest), columns, by_term)
+
+
+def _likeliest(seen: Posterior) -> list[Effect]:
+    """Of each name that is listed the form and the shape of the greatest weight, the likeliest name first."""
+    weight: dict[int, float] = defaultdict(float)
+    effects: dict[int, Effect] = {}
+    for w, found in zip(seen.weight, seen.sets, strict=True):
+        for i in found.members:
+            effect = seen.evidence.terms[i].effect
+            if effect is not None:
+                weight[id(effect)] += float(w)
+                effects[id(effect)] = effect
+    out: dict[str, Effect] = {}
+    for key in sorted(weight, key=lambda key: -weight[key]):
+        out.setdefault(effects[key].name, effects[key])
+    return [out[name] for name, p in seen.of_names.items() if p > LISTED]
+
+
+def _carry(linear: Floats, to: Floats, of: Floats) -> Floats:
+    """(9+p,q): the deviation of the linear parameters, and the coefficients, that come nearest to a unit of each."""
+    size = np.maximum(np.linalg.norm(to, axis=0), 1e-300)
+    found = np.linalg.lstsq(np.concatenate([linear, to / size], axis=1), of, rcond=1e-9)[0]
+    found[linear.shape[1] :] /= size[:, None]
+    return np.asarray(found)
+
+
+def _both(seen: Posterior, effect: Effect, elsewhere: _Elsewhere) -> Floats:
+    """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of |a| in the next recording."""
+    rows = seen.evidence.rows
+    _, J, _ = everything(rows.problem, rows.state.extended([effect]))
+    _, along, by_v, held = elsewhere
+    there = -np.einsum("ni,nip->np", by_v, effect.basis(along, held)) / rows.of_a_pose
+    return np.concatenate([J[:, 9:] / rows.error[:, None], there])
+
+
+def _elsewhere(seen: Posterior, at: HoldsAt) -> _Elsewhere:
+    """Of M readings all over the sphere, as of the next recording: derivatives by the linear parameters (M,9) over the
+    error of a pose, readings along the axes and derivatives by the biases (M,3), and the conditions."""
+    rows = seen.evidence.rows
+    up = np.array([v for _, v in directions(SPHERE)]) * rows.problem.reference
+    found = place(rows, rows.state.sensor(rows.problem).output(up, {}))
+    reference = rows.problem.channel_reference
+    held = at_reference(reference, len(up))
+    clocks = of_moment(reference, at.clocks)
+    held |= {name: np.full(len(up), v - reference[name]) for name, v in clocks.items() if name in reference}
+    return found.linear / rows.of_a_pose, found.along, -found.by_v, held
+
+
+def _mean(seen: Posterior, carried: _Carried) -> tuple[Floats, dict[int, Floats]]:
+    """(9+p,) deviations; and by part the rows that are left, weighted by the inverse of their covariance."""
+    evidence = seen.evidence
+    rows = evidence.rows
+    scaled = np.zeros(evidence.columns.shape[1])
+    by_part: dict[int, Floats] = defaultdict(lambda: np.zeros(len(rows.y)))
+    for found, weight in zip(seen.sets, seen.weight, strict=True):
+        if weight < NEGLIGIBLE:
+            continue
+        share = np.exp(found.log - found.total) * weight
+        mean = np.einsum("ps,psq->pq", share, found.mean)
+        places = evidence.places(found.members)
+        scaled[places] += mean.sum(axis=0)
+        for part, of_part, q in zip(found.parts, share.sum(axis=1), mean, strict=True):
+            by_part[part] += of_part * rows.y - evidence.columns[:, places] @ q
+    deviation = carried.by_term @ scaled
+    left: dict[int, Floats] = {}
+    for part, target in by_part.items():
+        inverse = np.linalg.inv(evidence.covariance(part))
+        solved = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ inverse @ target)
+        deviation[:9] += solved / rows.lengths
+        left[part] = inverse @ (target - rows.linear @ solved)
+    return deviation, left
+
+
+def _covariance(seen: Posterior, mean: Floats, carried: _Carried) -> Floats:
+    """(9+p,9+p): within each set, part and choice of sizes, and between them."""
+    evidence = seen.evidence
+    rows = evidence.rows
+    inverse: dict[int, Floats] = {}
+    total, out = 0.0, np.zeros((len(mean), len(mean)))
+    for log_share, found, row, cell in _likely_cells(seen):
+        part = found.parts[row]
+        if part not in inverse:
+            inverse[part] = np.linalg.inv(evidence.covariance(part))
+        places = evidence.places(found.members)
+        design = np.concatenate([rows.linear, evidence.columns[:, places]], axis=1)
+        precision = design.T @ inverse[part] @ design
+        sizes = np.repeat(found.sizes[cell], [evidence.terms[i].rank for i in found.members])
+        precision[9:, 9:] += np.diag(sizes**-2.0)
+        within = np.linalg.inv(precision)
+        here = within @ (design.T @ (inverse[part] @ rows.y))
+        chi2 = float(rows.y @ inverse[part] @ (rows.y - design @ here))
+        to = np.concatenate([np.zeros((len(mean), 9)), carried.by_term[:, places]], axis=1)
+        to[:9, :9] += np.diag(1 / rows.lengths)
+        off = to @ here - mean
+        share = float(np.exp(log_share))
+        total += share
+        out += share * (to @ within @ to.T * rows.noise_given(chi2) + np.outer(off, off))
+    return out / total
+
+
+def _likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
+    """The logarithm of its probability, the set, and the places of part and sizes."""
+    total = float(logsumexp([found.total for found in seen.sets]))
+    cells = []
+    for found in seen.sets:
+        if found.total - total < np.log(NEGLIGIBLE):
+            break
+        for flat in np.argsort(-found.log, axis=None)[: CELLS // 4]:
+            row, cell = divmod(int(flat), found.log.shape[1])
+            cells.append((float(found.log[row, cell]) - total, found, row, cell))
+    return sorted(cells, key=lambda cell: -cell[0])[:CELLS]
+
+
+def _settled(seen: Posterior, deviation: Floats, carried: _Carried) -> State:
+    """Where residuals are those of the linearisation: the nine parameters take up what the effects are in truth beside
+    what they are to first order."""
+    rows = seen.evidence.rows
+    wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + carried.columns @ deviation[9:]
+    state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), carried.effects)
+    for _ in range(STEPS):
+        r, _, _ = everything(rows.problem, state, jacobian=False)
+        step = np.linalg.lstsq(rows.linear, wanted - r / rows.error, rcond=None)[0] / rows.lengths
+        state = State(state.theta + np.concatenate([step, np.zeros(len(deviation) - 9)]), carried.effects)
+    return state
+
+
+def _wander(seen: Posterior, left: Mapping[int, Floats], t_s: float) -> Floats:
+    evidence = seen.evidence
+    out = np.zeros(3)
+    for part, weighted in left.items():
+        assumed = evidence.parts[part]
+        if assumed.kind is not None and assumed.kind.what is What.TIME:
+            out += assumed.tau**2 * assumed.kind.bias_at(evidence.rows, t_s) @ weighted
+    return out

@@ -1,0 +1,200 @@
+"""How well a set of terms, beside an unmodelled part, accounts for the rows: the logarithm of its evidence.
+
+All is conjugate: coefficients are normal of a size ρ, sizes lie on a grid with even shares, the nine parameters are
+flat and projected out, and the size of the noise is integrated over what the poses tell of it. All evidences are
+of the same rows, linearised at the same point, and so compare.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.posterior.odds import Odds
+from triaxcal.posterior.rows import Rows
+from triaxcal.posterior.terms import Term
+from triaxcal.posterior.unmodelled import Kind, kinds_of
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The assumption on what no term describes: nothing, or one ``kind`` of size ``tau`` standard errors."""
+
+    kind: Kind | None
+    tau: float
+    log_prior: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """The projected data in the axes of one kind: ``variance`` (m,) there, terms' columns (m,C), misfits (m,)."""
+
+    variance: Floats
+    columns: Floats
+    z: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class SetEvidence:
+    """Of one set, by the ``parts`` (P,) reckoned and sizes (S,k) of its k terms: ``log`` (P,S) joint with the priors of
+    part, sizes and members, ``mean`` (P,S,q) of the scaled coefficients of all members."""
+
+    members: tuple[int, ...]
+    parts: tuple[int, ...]
+    sizes: Floats
+    log: Floats
+    mean: Floats
+
+    @property
+    def total(self) -> float:
+        return float(logsumexp(self.log))
+
+    @property
+    def by_part(self) -> Floats:
+        """(P,) logarithms."""
+        return np.asarray(logsumexp(self.log, axis=1))
+
+
+class Evidence:
+    """The rows, the ``terms`` a set may have with the ``columns`` (N,C) of them all, the ``parts`` (the first is none),
+    and the grid of ``sizes`` (R,) in g."""
+
+    def __init__(self, rows: Rows, terms: Sequence[Term], odds: Odds, smallest_g: float | None = None) -> None:
+        """Sizes begin at ``smallest_g``, by default at that share of the noise of a pose which the odds have."""
+        self.rows, self.terms, self.odds = rows, terms, odds
+        self.parts = _parts(rows, odds)
+        least = odds.smallest * rows.of_a_pose if smallest_g is None else smallest_g
+        self.sizes = np.geomspace(least, odds.largest_g * rows.problem.reference, odds.sizes)
+        self.log_prior = np.array([term.log_prior for term in terms])
+        self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
+        self.columns = np.concatenate([np.empty((len(rows.y), 0)), *(term.columns for term in terms)], axis=1)
+        projected = rows.beside.T @ self.columns
+        kinds = list(dict.fromkeys(part.kind for part in self.parts))
+        self._turned = [_turned(kind, projected, rows.z) for kind in kinds]
+        self._which = [kinds.index(part.kind) for part in self.parts]
+        turned = (self._turned[which] for which in self._which)
+        self._weight = [1 / (1 + part.tau**2 * t.variance) for part, t in zip(self.parts, turned, strict=True)]
+        ranks = np.array([term.rank for term in terms], dtype=int)
+        self._by_rank: list[tuple[Ints, Ints]] = []
+        for rank in np.unique(ranks):
+            index = np.flatnonzero(ranks == rank)
+            self._by_rank.append((index, self._ends[index][:, None] + np.arange(rank)))
+
+    def covariance(self, part: int) -> Floats:
+        """(N,N) of the rows over their errors: noise and unmodelled part."""
+        assumed = self.parts[part]
+        noise = np.eye(len(self.rows.y))
+        return noise if assumed.kind is None else noise + assumed.tau**2 * assumed.kind.covariance
+
+    def places(self, members: Sequence[int]) -> Ints:
+        """Where the scaled coefficients of these terms stand among those of all, and their ``columns``."""
+        ranges = [np.arange(self._ends[i], self._ends[i + 1]) for i in members]
+        return np.concatenate([np.empty(0, dtype=int), *ranges])
+
+    def each_with(self, part: int, members: Sequence[int] = (), sizes: Sequence[float] = ()) -> tuple[Floats, float]:
+        """Logarithms (T,R) of the evidence of each term at each size beside ``members`` of given sizes, and that of
+        these alone; with the priors of the part and of the term's size, without those of names."""
+        turned, weight = self._turned[self._which[part]], self._weight[part]
+        score, chi2, shared, log_det = self._beside(part, members, sizes)
+        base = self.parts[part].log_prior + 0.5 * float(np.log(weight).sum()) - log_det
+        out = np.empty((len(self.terms), len(self.sizes)))
+        for index, places in self._by_rank:
+            information, along = self._in_own_axes(turned, weight, shared, places, score)
+            spread = 1 + self.sizes[None, :, None] ** 2 * information[:, None, :]
+            gain = np.sum(self.sizes[None, :, None] ** 2 / spread * along[:, None, :], axis=2)
+            out[index] = self.rows.log_likelihood(chi2 - gain) - 0.5 * np.log(spread).sum(axis=2)
+        alone = float(self.rows.log_likelihood(np.array(chi2))) + base
+        return out + base - np.log(len(self.sizes)), alone
+
+    def _in_own_axes(
+        self, turned: _Turned, weight: Floats, shared: Floats, places: Ints, score: Floats
+    ) -> tuple[Floats, Floats]:
+        """Eigenvalues (t,q) of the information of each term's coefficients, and the squared scores along its axes."""
+        columns = turned.columns[:, places]
+        if places.shape[1] == 1:
+            information = weight @ columns[:, :, 0] ** 2 - np.sum(shared[:, places[:, 0]] ** 2, axis=0)
+            return np.maximum(information, 0.0)[:, None], score[places] ** 2
+        stacked = np.sqrt(weight)[:, None, None] * columns
+        matrix = np.einsum("mtq,mtr->tqr", stacked, stacked, optimize=True)
+        if len(shared):
+            beside = shared[:, places]
+            matrix = matrix - np.einsum("ktq,ktr->tqr", beside, beside, optimize=True)
+        information, axes = np.linalg.eigh(matrix)
+        return np.maximum(information, 0.0), np.einsum("tqr,tq->tr", axes, score[places]) ** 2
+
+    def normal_equations(
+        self, part: int, members: Sequence[int], sizes: Sequence[float]
+    ) -> tuple[Floats, Floats, float]:
+        """Information (C,C) and score (C,) of the scaled coefficients of all terms beside ``members`` of these sizes,
+        and the sum of squares that these leave."""
+        turned, weight = self._turned[self._which[part]], self._weight[part]
+        score, chi2, shared, _ = self._beside(part, members, sizes)
+        return turned.columns.T @ (weight[:, None] * turned.columns) - shared.T @ shared, score, chi2
+
+    def _beside(self, part: int, members: Sequence[int], sizes: Sequence[float]) -> tuple[Floats, float, Floats, float]:
+        """What ``members`` of these sizes leave: the score (C,) of all terms and the sum of squares; (k,C) whose square
+        is the information that they take; and half the logarithm of the determinant of their precision."""
+        turned, weight = self._turned[self._which[part]], self._weight[part]
+        index = self.places(members)
+        scale = np.repeat(np.asarray(sizes, dtype=float), [self.terms[i].rank for i in members])
+        own = turned.columns[:, index] * scale
+        lower = np.linalg.cholesky(np.eye(len(index)) + own.T @ (weight[:, None] * own))
+        shared = np.linalg.solve(lower, (own * weight[:, None]).T @ turned.columns)
+        absorbed = np.linalg.solve(lower, own.T @ (weight * turned.z))
+        score = turned.columns.T @ (weight * turned.z) - shared.T @ absorbed
+        chi2 = float(turned.z @ (weight * turned.z)) - float(absorbed @ absorbed)
+        return score, chi2, shared, float(np.log(np.diag(lower)).sum())
+
+    def with_further(self, found: SetEvidence, row: int, cells: int) -> Floats:
+        """(T,R) about the logarithm of the evidence of a set with each further term at each size, under the part in
+        this ``row`` of it: at those ``cells`` of the members' sizes that are best without the term."""
+        best = np.argsort(-found.log[row])[:cells]
+        share = found.by_part[row] - logsumexp(found.log[row][best])
+        each = []
+        for cell in best:
+            with_each, without = self.each_with(found.parts[row], found.members, found.sizes[cell])
+            each.append(found.log[row][cell] + share + with_each - without)
+        return np.asarray(logsumexp(each, axis=0))
+
+    def of_set(self, members: tuple[int, ...], parts: Sequence[int]) -> SetEvidence:
+        """Sizes of three and more terms go by every second step of the grid."""
+        coarse = self.sizes if len(members) < 3 else self.sizes[1::2]
+        sizes = np.array(list(itertools.product(coarse, repeat=len(members)))).reshape(len(coarse) ** len(members), -1)
+        index = self.places(members)
+        scale = np.repeat(sizes, [self.terms[i].rank for i in members], axis=1)
+        prior = float(self.log_prior[list(members)].sum()) - len(members) * np.log(len(coarse))
+        information = np.empty((len(parts), len(index), len(index)))
+        score = np.empty((len(parts), len(index)))
+        chi2, base = np.empty((2, len(parts), 1))
+        for row, part in enumerate(parts):
+            turned, weight = self._turned[self._which[part]], self._weight[part]
+            own = turned.columns[:, index]
+            weighted = (weight[:, None] * own).T
+            information[row], score[row] = weighted @ own, weighted @ turned.z
+            chi2[row] = turned.z @ (weight * turned.z)
+            base[row] = self.parts[part].log_prior + 0.5 * np.log(weight).sum() + prior
+        precision = np.eye(len(index)) + scale[:, :, None] * information[:, None] * scale[:, None, :]
+        scores = scale * score[:, None]
+        found = np.linalg.solve(precision, scores[..., None])[..., 0]
+        chi2 = chi2 - np.sum(found * scores, axis=2)
+        log = self.rows.log_likelihood(chi2) - 0.5 * np.linalg.slogdet(precision)[1] + base
+        return SetEvidence(members, tuple(parts), sizes, log, scale * found)
+
+
+def _parts(rows: Rows, odds: Odds) -> list[Part]:
+    kinds = kinds_of(rows)
+    sizes = np.geomspace(odds.unmodelled_smallest, odds.unmodelled_largest, odds.unmodelled_sizes)
+    share = float(np.log(odds.unmodelled / len(kinds) / len(sizes)))
+    none = Part(None, 0.0, float(np.log1p(-odds.unmodelled)))
+    return [none, *(Part(kind, float(tau), share) for kind in kinds for tau in sizes)]
+
+
+def _turned(kind: Kind | None, projected: Floats, z: Floats) -> _Turned:
+    if kind is None:
+        return _Turned(np.zeros(len(z)), projected, z)
+    return _Turned(kind.variance, kind.axes.T @ projected, kind.axes.T @ z)

@@ -1,0 +1,180 @@
+"""The posterior: how probable each name, each outlier and an unmodelled part are, over all likely sets of terms."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import logsumexp
+
+from triaxcal.arrays import Floats
+from triaxcal.calibration import Calibration
+from triaxcal.conditions import channels_of
+from triaxcal.effects import catalogue_for
+from triaxcal.effects.contract import Effect
+from triaxcal.poses.pose import Pose
+from triaxcal.posterior.evidence import Evidence, SetEvidence
+from triaxcal.posterior.odds import Odds
+from triaxcal.posterior.rows import Rows
+from triaxcal.posterior.sets import likely_sets
+from triaxcal.posterior.terms import terms_of
+from triaxcal.posterior.unmodelled import What
+from triaxcal.runs import by_run
+from triaxcal.search.candidates import still_conditions
+
+ALTERNATIVES = 8
+"""Names at most among which alternatives are looked for, the likeliest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """``sets`` are all likely sets of terms, the best first."""
+
+    evidence: Evidence
+    sets: Sequence[SetEvidence]
+
+    @cached_property
+    def weight(self) -> Floats:
+        """(S,) probability of each set."""
+        total = np.array([found.total for found in self.sets])
+        return np.asarray(np.exp(total - logsumexp(total)))
+
+    def names_of(self, found: SetEvidence) -> frozenset[str]:
+        """The effects in a set."""
+        terms = (self.evidence.terms[i] for i in found.members)
+        return frozenset(term.name for term in terms if term.effect is not None)
+
+    def poses_of(self, found: SetEvidence) -> frozenset[int]:
+        """The outliers in a set."""
+        poses = (self.evidence.terms[i].pose for i in found.members)
+        return frozenset(pose for pose in poses if pose >= 0)
+
+    @cached_property
+    def of_names(self) -> Mapping[str, float]:
+        """The probability that each effect acts, whatever acts beside it, the likeliest first."""
+        out: dict[str, float] = defaultdict(float)
+        for w, found in zip(self.weight, self.sets, strict=True):
+            for name in self.names_of(found):
+                out[name] += float(w)
+        return dict(sorted(out.items(), key=lambda item: -item[1]))
+
+    @cached_property
+    def of_sets_of_names(self) -> Mapping[frozenset[str], float]:
+        """The probability that these effects act and no other, the likeliest first."""
+        out: dict[frozenset[str], float] = defaultdict(float)
+        for w, found in zip(self.weight, self.sets, strict=True):
+            out[self.names_of(found)] += float(w)
+        return dict(sorted(out.items(), key=lambda item: -item[1]))
+
+    @cached_property
+    def of_outliers(self) -> Floats:
+        """(n,) the probability that each pose is an outlier."""
+        out = np.zeros(self.evidence.rows.n)
+        for w, found in zip(self.weight, self.sets, strict=True):
+            out[list(self.poses_of(found))] += w
+        return out
+
+    @cached_property
+    def of_another(self) -> Floats:
+        """(n,) the probability that from each pose on there is another unit, or another mounting."""
+        out = np.zeros(self.evidence.rows.n)
+        for w, found in zip(self.weight, self.sets, strict=True):
+            for i in found.members:
+                if self.evidence.terms[i].another >= 0:
+                    out[self.evidence.terms[i].another] += w
+        return out
+
+    @cached_property
+    def of_parts(self) -> Floats:
+        """(P,) the probability of each part of the evidence, the first that there is none."""
+        out = np.zeros(len(self.evidence.parts))
+        for found in self.sets:
+            out[list(found.parts)] += np.exp(found.by_part - self._total)
+        return out
+
+    @property
+    def of_unmodelled(self) -> float:
+        """The probability that something acts on the means which no name describes."""
+        parts = zip(self.of_parts, self.evidence.parts, strict=True)
+        return float(sum(p for p, part in parts if part.kind is not None and part.kind.what != What.INSIDE))
+
+    @property
+    def of_kinds(self) -> Mapping[What, float]:
+        """The probability of each kind of unmodelled part, the likeliest first."""
+        out: dict[What, float] = defaultdict(float)
+        for p, part in zip(self.of_parts, self.evidence.parts, strict=True):
+            if part.kind is not None:
+                out[part.kind.what] += float(p)
+        return dict(sorted(out.items(), key=lambda item: -item[1]))
+
+    def any_of(self, names: Collection[str]) -> float:
+        """The probability that at least one of these effects acts."""
+        wanted = frozenset(names)
+        return float(sum(p for held, p in self.of_sets_of_names.items() if held & wanted))
+
+    @cached_property
+    def certain(self) -> tuple[tuple[str, ...], ...]:
+        """Groups of names, in each of which one acts for certain. A name alone is known, whichever pose were an
+        outlier; of several it is known that one of them acts."""
+        level = self.evidence.odds.certain
+        out: list[tuple[str, ...]] = []
+        rest: list[str] = []
+        for name, p in self.of_names.items():
+            if p >= level and self.without_any_pose(name) >= level:
+                out.append((name,))
+            elif 1 - level <= p < level:
+                rest.append(name)
+        while group := self._alternatives(rest):
+            out.append(group)
+            rest = [name for name in rest if name not in group]
+        return tuple(out)
+
+    def _alternatives(self, names: Sequence[str]) -> tuple[str, ...]:
+        """The fewest of these of which one acts for certain, the likeliest first; none where nothing is certain."""
+        for size in range(2, min(len(names), ALTERNATIVES) + 1):
+            groups = itertools.combinations(names[:ALTERNATIVES], size)
+            best = max(groups, key=self.any_of)
+            if self.any_of(best) >= self.evidence.odds.certain:
+                return best
+        return ()
+
+    def without_any_pose(self, name: str) -> float:
+        """The probability of a name if that pose were an outlier which it takes most to explain."""
+        worst = self.of_names.get(name, 0.0)
+        for pose in range(self.evidence.rows.n):
+            names = [
+                (w, self.names_of(found))
+                for w, found in zip(self.weight, self.sets, strict=True)
+                if pose in self.poses_of(found)
+            ]
+            out = sum(w for w, _ in names)
+            if out > 0:
+                worst = min(worst, float(sum(w for w, held in names if name in held) / out))
+        return worst
+
+    @cached_property
+    def _total(self) -> float:
+        return float(logsumexp([found.total for found in self.sets]))
+
+
+def posterior(
+    poses: Sequence[Pose],
+    linear: Calibration,
+    *,
+    signs: Sequence[float] = (1, 1, 1),
+    catalogue: Sequence[Effect] | None = None,
+    odds: Odds | None = None,
+    smallest_g: float | None = None,
+) -> Posterior:
+    """Of what acts beside the ``linear`` fit of these poses. ``smallest_g`` is the least size of an effect that is
+    asked about; several units that are compared have one."""
+    odds = odds or Odds()
+    rows = Rows.of(poses, linear, signs)
+    moving = set(channels_of(rows.poses)) - still_conditions(rows.poses)
+    effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, rows.poses)
+    evidence = Evidence(rows, terms_of(rows, effects, odds), odds, smallest_g)
+    return Posterior(evidence, likely_sets(evidence))

@@ -1,0 +1,109 @@
+"""The data: misfits of |a| in the pose means and slopes of |a| inside the poses, linearised once for all hypotheses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.calibration import Calibration
+from triaxcal.creep import without_creep
+from triaxcal.errors import Refused
+from triaxcal.poses.noise_levels import NoiseLevels
+from triaxcal.poses.pose import Pose
+from triaxcal.problem import Problem, State, everything
+from triaxcal.pure_error import noise_levels
+from triaxcal.start import begun
+from triaxcal.trends import Trends
+
+QUIETEST = 0.1
+"""Of the median: a pose without scatter (a logger's dead band) would weigh without end."""
+CHI2_LOG = np.linspace(-8.0, 70.0, 12000)
+"""Where the likelihood of a sum of squares is looked up, by its logarithm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """N rows, first the n means, then the n slopes where the poses know theirs, each over its standard error.
+
+    ``places`` (n,) are those of the poses among all that were given. ``y`` (N,) misfits, ``linear`` (N,9)
+    derivatives by the nine parameters with columns of length one, ``lengths`` (9,) what they were divided by,
+    ``error`` (N,) standard errors in units of the reference. ``beside`` (N,m) is an orthonormal basis of what the
+    nine leave, m = N − 9, and ``z`` (m,) the misfits in it. ``state`` is where all was linearised.
+    """
+
+    poses: Sequence[Pose]
+    places: Ints
+    problem: Problem
+    state: State
+    y: Floats
+    linear: Floats
+    lengths: Floats
+    error: Floats
+    beside: Floats
+    z: Floats
+    noise: NoiseLevels
+    likelihood: Floats
+
+    @classmethod
+    def of(cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float]) -> Rows:
+        """About the ``linear`` fit of these poses, which leaves outliers out. Poses with a fault are left out. Raises
+        as `triaxcal.start.begun` does."""
+        places = np.array([i for i, p in enumerate(poses) if not p.fault], dtype=int)
+        sound = [poses[i] for i in places]
+        poses = without_creep(sound) if np.isfinite([p.trend_error for p in sound]).all() else sound
+        problem, _ = begun(poses, signs=signs, reference=linear.reference)
+        state = State.of(problem, replace(linear.sensor, effects=()))
+        trends = Trends.of(problem, poses)
+        problem = problem if trends is None else replace(problem, further=trends)
+        r, J, error = everything(problem, state)
+        n = len(poses)
+        if len(r) <= J.shape[1]:
+            raise Refused(f"{n} poses leave nothing over the nine parameters to judge effects by")
+        error = np.concatenate([_not_too_quiet(error[:n]), _not_too_quiet(error[n:])])
+        columns = J / error[:, None]
+        lengths = np.linalg.norm(columns, axis=0)
+        columns = columns / lengths
+        beside = np.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
+        y, noise = -r / error, noise_levels(poses)
+        likelihood = noise.log_likelihood(np.exp(CHI2_LOG), beside.shape[1])
+        return cls(poses, places, problem, state, y, columns, lengths, error, beside, beside.T @ y, noise, likelihood)
+
+    @property
+    def n(self) -> int:
+        return len(self.poses)
+
+    @property
+    def slopes(self) -> bool:
+        return len(self.y) > self.n
+
+    @property
+    def of_a_pose(self) -> float:
+        """The median standard error of a pose's mean, in units of the reference."""
+        return float(np.median(self.error[: self.n]))
+
+    @property
+    def t_s(self) -> Floats:
+        """(n,)"""
+        return np.array([p.t_s for p in self.poses])
+
+    @property
+    def held_s(self) -> Floats:
+        """(n,)"""
+        return np.array([p.end_s - p.start_s for p in self.poses])
+
+    def noise_given(self, chi2: float) -> float:
+        """The mean variance of the noise over the one stated, where a model leaves this sum of squares."""
+        known = self.noise.students_dof
+        return (known + chi2) / (known + len(self.z))
+
+    def log_likelihood(self, chi2: Floats) -> Floats:
+        """Of sums of squares in m degrees of freedom (any shape), but for a constant; the size of the noise is known as
+        far as the poses tell it."""
+        return np.interp(np.log(np.maximum(chi2, 1e-3)), CHI2_LOG, self.likelihood)
+
+
+def _not_too_quiet(error: Floats) -> Floats:
+    return np.maximum(error, QUIETEST * np.median(error)) if len(error) else error
