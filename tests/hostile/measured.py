@@ -20,9 +20,7 @@ def main() -> None:
     from triaxcald.cli import commands
 
     commands.parser()
-    before = resource.getrusage(resource.RUSAGE_SELF)
-    import_s = before.ru_utime + before.ru_stime
-    sys.stdout.write(json.dumps([{**_run(*row), "import_s": import_s} for row in json.load(sys.stdin)]))
+    sys.stdout.write(json.dumps([_run(*row) for row in json.load(sys.stdin)]))
 
 
 def _run(folder: str, words: list[str]) -> dict[str, Any]:

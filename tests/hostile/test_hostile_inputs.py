@@ -12,13 +12,22 @@ import pytest
 
 from tests.hostile.rows import ROWS, SECRET, Row
 
-SECONDS_MOST = 3.0  # of processor time, the import of the program and all
+TIMES_MOST = 4.0  # what refusing an empty file takes, about 0.7 s of processor time with the imports that it needs
 BYTES_MOST = 300 * 10**6
 BATCHES = 4
 
 
-def run(rows: list[Row], folder: Path) -> list[dict[str, Any]]:
-    """What came of each row."""
+def _empty(folder: Path) -> list[str]:
+    (folder / "empty.csv").touch()
+    return ["poses", "empty.csv"]
+
+
+ORDINARY = Row("an empty file", _empty, 2, "empty file")
+
+
+def run(hostile: list[Row], folder: Path) -> list[dict[str, Any]]:
+    """What came of each row, its time in that of an ordinary refusal on the same machine in the same minute."""
+    rows = [ORDINARY, *hostile]
     given, before = [], []
     for i, row in enumerate(rows):
         own = folder / str(i)
@@ -37,7 +46,9 @@ def run(rows: list[Row], folder: Path) -> list[dict[str, Any]]:
     for i, (outcome, names) in enumerate(zip(found, before, strict=True)):
         left = {p for p in (folder / str(i)).rglob("*") if p.name not in (".out", ".err")}
         outcome["left"] = sorted(str(p) for p in left - set(names))
-    return found
+    ordinary, *others = found
+    assert faults(ORDINARY, ordinary) == []
+    return [{**o, "times": o["seconds"] / ordinary["seconds"]} for o in others]
 
 
 def faults(row: Row, outcome: dict[str, Any]) -> list[str]:
@@ -50,8 +61,8 @@ def faults(row: Row, outcome: dict[str, Any]) -> list[str]:
         found.append(f"said {told[-1500:]!r}, expected one line with {row.words!r}")
     if SECRET[:8] in told:
         found.append("showed what is in a foreign file")
-    if (seconds := outcome["seconds"] + outcome["import_s"]) > SECONDS_MOST:
-        found.append(f"took {seconds:.1f} s of processor time")
+    if (times := outcome.get("times", 1.0)) > TIMES_MOST:
+        found.append(f"took {times:.1f} times the processor time of {ORDINARY.what}")
     if outcome["bytes"] > BYTES_MOST:
         found.append(f"took {outcome['bytes'] / 1e6:.0f} MB")
     if outcome["left"]:
