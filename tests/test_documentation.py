@@ -340,7 +340,7 @@ def test_the_formula_in_python_is_what_apply_does(kind: str, tmp_path: Path, mon
     (block,) = [b for b in blocks(CALIBRATION_HOW_TO) if b.language == "python" and b.note == kind]
     monkeypatch.chdir(tmp_path)
     c.save("cal.json")
-    names: dict[str, Any] = {"u": u, "T": temp_c[:, None]}
+    names: dict[str, Any] = {"u": u, "T": temp_c}
     exec(compile(block.text, "how-to", "exec"), names)
     assert names["a"] == pytest.approx(c.apply(u, channels={"temp_c": temp_c}), abs=1e-12)
 

@@ -35,9 +35,13 @@ class PlannedPose(NamedTuple):
 
 class Poses(tuple[Pose, ...]):
     """Still poses, in order of time. ``data_quality`` has a line for everything that the raw stream is to be blamed
-    for."""
+    for; ``output_unit`` is what `find_poses` was told."""
 
     data_quality: tuple[str, ...] = ()
+    output_unit: str = ""
+
+    def __repr__(self) -> str:
+        return text.poses(self, self.data_quality)
 
     @classmethod
     def of_means(
@@ -96,11 +100,14 @@ class Diagnosis:
 @dataclass(frozen=True)
 class Verification:
     """Errors |a| − reference (n,) of ``poses`` under a calibration, in the unit of the reference, with their standard
-    errors from noise (n,)."""
+    errors from noise (n,), and the standard uncertainty of |a| that the calibration leaves there (n,)."""
 
     poses: tuple[Pose, ...]
     error: Floats
     standard_error: Floats
+    uncertainty: Floats
+    reference: tuple[str, float] = ("g", 1.0)
+    """Its unit and magnitude."""
 
     @property
     def rms(self) -> float:
@@ -109,6 +116,17 @@ class Verification:
     @property
     def noise_floor(self) -> float:
         return float(np.sqrt(np.mean(self.standard_error**2)))
+
+    @property
+    def expected(self) -> float:
+        """The rms error that noise and the uncertainty of the calibration make."""
+        return float(np.sqrt(np.mean(self.standard_error**2 + self.uncertainty**2)))
+
+    def summary(self) -> str:
+        return text.verification(f"{len(self.poses)} poses", self.rms, self.noise_floor, self.expected, self.reference)
+
+    def __repr__(self) -> str:
+        return self.summary()
 
 
 def find_poses(
@@ -139,6 +157,7 @@ def find_poses(
     seen = judge.findings(windows, spans)
     found = Poses(poses_of(windows, spans, untrusted_poses(seen)) if windows is not None else ())
     found.data_quality = tuple(text.quality_line(f, output_unit) for f in seen)
+    found.output_unit = output_unit
     return found
 
 
@@ -171,6 +190,7 @@ def calibrate(
     except KeyError as e:
         raise InvalidData(f"no effect of the name {e.args[0]} is known") from None
     fitted = pose_fit.fit(found, signs=_signs(signs), reference=_positive(reference), effects=model)
+    output_unit = output_unit or _unit_of(poses)
     return Calibration(fitted, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
 
 
@@ -202,6 +222,7 @@ def diagnose(
     if moment is Moment.SECONDS:
         raise InvalidData("at: expected 'end', 'mean' or a number of seconds")
     others = None if check is None else _poses(check)
+    output_unit = output_unit or _unit_of(poses)
     closed_loop = loop.diagnose(found, signs=_signs(signs), reference=_positive(reference), check=others, at=moment)
     before, after = (
         Calibration(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
@@ -228,7 +249,8 @@ def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> V
         reference=c.reference,
         moment=c.moment,
     )
-    return Verification(tuple(found), error, noise)
+    reference = (calibration.reference_unit, c.reference)
+    return Verification(tuple(found), error, noise, calibration.uncertainty_in(found), reference)
 
 
 def plan(poses: int = FULL) -> tuple[PlannedPose, ...]:
@@ -247,6 +269,11 @@ def budget(calibration: Calibration, stated: uncertainty.Stated | None = None) -
             "no poses to evaluate: of a calibration that was loaded, to_dict()['uncertainty'] is the budget"
         )
     return uncertainty.budget(calibration.fitted, stated)
+
+
+def _unit_of(poses: Any) -> str:
+    """What `find_poses` was told, where the poses are still as it gave them."""
+    return poses.output_unit if isinstance(poses, Poses) else ""
 
 
 def _samples(

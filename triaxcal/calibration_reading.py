@@ -36,14 +36,22 @@ def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: flo
     return said if isinstance(said, str) and said else reference_unit_of(magnitude)
 
 
+def _floats(value: Any) -> Floats:
+    """Raises ValueError for what is no number in JSON."""
+    found = np.asarray(value)
+    if found.dtype.kind not in "iuf":
+        raise ValueError(f"{value!r} is no number")
+    return found.astype(float)
+
+
 def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[str, float], float]:
     """Sensor, channel references and reference magnitude of a calibration document. Raises InvalidData."""
     part = calibration_part(document, where=where)
     try:
-        k, m, b = (np.array(part[name], dtype=float) for name in ("scale_factor", "misalignment", "bias"))
+        k, m, b = (_floats(part[name]) for name in ("scale_factor", "misalignment", "bias"))
         effects = []
         for name, held in part.get("effects", {}).items():
-            effect, q = effect_of(name, {n: float(v["value"]) for n, v in held.items()})
+            effect, q = effect_of(name, {n: float(_floats(v["value"])) for n, v in held.items()})
             lacking = [n for n in (*(c.name for c in effect.coefficients), *effect.shape) if n not in held]
             if lacking:
                 raise KeyError(f"effects.{name}.{lacking[0]}")
@@ -58,6 +66,10 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
         raise InvalidData(
             f"{where}: scale_factor, misalignment, bias: expected three numbers each, none zero in the first"
         )
+    named = part.get("terms")
+    terms = set(map(str, named)) - {"linear"} if isinstance(named, list) else set()
+    if terms and not effects:  # without its effects a matrix is another calibration
+        raise InvalidData(f"{where}: effects: no coefficients of {', '.join(sorted(terms))}, which terms has")
     _require_finite(effects, reference, magnitude, where)
     return Sensor(k, m, b, tuple(effects)), reference, magnitude
 

@@ -6,10 +6,11 @@ The one file of the metrology that opens files.
 from __future__ import annotations
 
 import copy
+import errno
 import json
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +22,10 @@ from triaxcal.calibration import Calibration as Fitted
 from triaxcal.calibration import HoldsAt, PoseResult, Residual
 from triaxcal.calibration_document import LINEAR, Document, calibration_document
 from triaxcal.calibration_reading import calibration_of, calibration_part
-from triaxcal.effects.contract import TIME, channel_of, is_derived
+from triaxcal.conditions import conditions_elsewhere
+from triaxcal.effects.contract import TIME, channel_of, condition_of, is_derived
 from triaxcal.errors import InvalidData, MissingChannel, Refused
+from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Stated
 
 if TYPE_CHECKING:
@@ -32,6 +35,8 @@ RETURNS = 1e-6
 """How far a reading may be off, relative to its size, that is made from its own specific force."""
 BESIDE, BESIDE_S = 1.2, 60.0
 """A recording ends after its last pose: by a fifth of its length and a minute at most."""
+HOLD_S = 1.0
+"""By so much a recording may end before its last pose seemed to."""
 OUT = ("ax", "ay", "az")
 UNCERTAINTY = ("u_ax", "u_ay", "u_az")
 
@@ -190,6 +195,7 @@ class Calibration:
             if own_recording and t is None and by_ours[tables.TIME_COLUMN] in tables.names_of(table):
                 t = tables.seconds(tables.column(table, by_ours[tables.TIME_COLUMN]), time_unit)
                 t, time_unit = t - t[:1], None
+                self.require_whole(t)
         readings = tables.readings_of(u)
         rows = np.atleast_2d(readings)
         times = self._times(t, own_recording, time_unit, len(rows))
@@ -231,6 +237,15 @@ class Calibration:
             )
         return times
 
+    def require_whole(self, t: Floats) -> None:
+        """Raises InvalidData where times from a table's own first row cannot be those of the whole recording."""
+        end_s = self._end_s()
+        if end_s is not None and len(t) and t[-1] < end_s - HOLD_S:
+            raise InvalidData(
+                f"the table spans {t[-1]:.6g} s, and the recording that was fitted {end_s:.6g} s: give t, counted from "
+                "that recording's first sample"
+            )
+
     def _end_s(self) -> float | None:
         """When the last pose of the recording that was fitted ended; None where that is not known."""
         poses = calibration_part(self.to_dict(), where="document").get("poses")
@@ -244,6 +259,8 @@ class Calibration:
             back = self._fitted.sensor.output(a, held)
             wrong = ~(np.abs(back - u).max(axis=1) <= RETURNS * (1 + np.abs(u).max(axis=1)))
         wrong &= np.isfinite(u).all(axis=1)
+        for name in {n for e, _ in self._fitted.sensor.effects for n in e.needs} & held.keys():
+            wrong &= ~np.isnan(held[name])
         if wrong.any():
             raise Refused(
                 f"the model has no inverse at reading {int(np.flatnonzero(wrong)[0])}: it lies far beyond what the "
@@ -258,25 +275,47 @@ class Calibration:
         missing = tuple(channel_of(name) if not is_derived(name) else name for name in missing)
         if missing:
             effects = [e.name for e, _ in self._fitted.sensor.effects if set(e.needs) & set(missing)]
+            known = {name: self._fitted.channel_reference.get(condition_of(name), 0.0) for name in missing}
+            at = ", ".join(f"{value:g}" for value in known.values()) if any(known.values()) else ""
             warnings.warn(
-                f"{', '.join(missing)} not given, which {', '.join(effects)} goes with: taken at the reference",
+                f"{', '.join(missing)} not given, which {', '.join(effects)} goes with: taken at the reference"
+                + (f" ({at})" if at else ""),
                 MissingChannel,
                 stacklevel=3,
             )
         return held
 
+    def uncertainty_in(self, poses: Sequence[Pose]) -> Floats:
+        """(n,) standard uncertainty of |a| in poses of another recording that the calibration leaves, without the
+        noise of these poses. Raises InvalidData where a channel that the effects need is missing."""
+        c = self._fitted
+        u = np.array([p.mean for p in poses])
+        held = conditions_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
+        a = c.sensor.specific_force(u, held)
+        up = a / np.linalg.norm(a, axis=1, keepdims=True)
+        variance = np.zeros(len(u))
+        for step in self._steps(u, held):
+            variance += np.sum(step * up, axis=1) ** 2
+        return np.sqrt(variance)
+
     def _uncertainty(self, u: Floats, held: Mapping[str, Floats]) -> Floats:
-        """(n,3): one standard error along each principal axis of the parameters' covariance, and what it does."""
+        """(n,3)"""
+        variance = np.zeros(u.shape)
+        for step in self._steps(u, held):
+            variance += step**2
+        return np.sqrt(variance)
+
+    def _steps(self, u: Floats, held: Mapping[str, Floats]) -> Iterator[Floats]:
+        """(n,3) each: one standard error along each principal axis of the parameters' covariance, and what it does."""
         c = self._fitted.whole
         covariance = c.covariance * np.outer(*[self._beyond_the_fit(c)] * 2)
         if not np.isfinite(covariance).all():
-            return np.full(u.shape, np.nan)
+            yield np.full(u.shape, np.nan)
+            return
         size, axes = np.linalg.eigh(covariance)
         sensor, a = c.sensor, c.sensor.specific_force(u, held)
-        variance = np.zeros(u.shape)
         for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
-            variance += (sensor.moved(step).specific_force(u, held) - a) ** 2
-        return np.sqrt(variance)
+            yield sensor.moved(step).specific_force(u, held) - a
 
     def _beyond_the_fit(self, c: Fitted) -> Floats:
         """(p,) standard uncertainties over standard errors: what the budget has beside the fit."""
@@ -318,6 +357,8 @@ class Calibration:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Whole or not at all. Raises OSError; InvalidData where the document cannot be written as JSON."""
+        if not Path(path).parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, "there is no folder", str(Path(path).parent))
         try:
             content = to_text(self.to_dict()).encode()
         except ValueError as e:

@@ -31,7 +31,9 @@ class Samples:
             raise InvalidData(f"time does not increase at sample {int(backwards[0]) + 1}")
         bad = np.flatnonzero(~np.isfinite(self.readings).all(axis=1))
         if len(bad):
-            raise InvalidData(f"reading {int(bad[0])} is not a finite number")
+            axis = "xyz"[int(np.argmin(np.isfinite(self.readings[bad[0]])))]
+            more = f" ({len(bad)} such readings)" if len(bad) > 1 else ""
+            raise InvalidData(f"reading {int(bad[0])}: {axis} is not a finite number{more}; leave such rows out first")
 
     def __len__(self) -> int:
         return len(self.time_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -14,6 +15,13 @@ from triaxcal.samples import Samples
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000, "ns": 1}
 TIME_COLUMN, OUTPUTS = "t_s", ("ux", "uy", "uz")
+NO_ROLES = frozenset(
+    ("x", "y", "z", "ax", "ay", "az", "u_x", "u_y", "u_z", "acc_x", "acc_y", "acc_z", "time", "timestamp", "time_s")
+)
+"""Names that are meant as those of time or outputs, and would be channels."""
+_UNIT_IN_NAME = re.compile(
+    r"(?:^|[^a-z])(ms|msecs?|millis\w*|[uµ]s|usecs?|micros\w*|ns|nsecs?|nanos\w*)[^a-z]*$", re.IGNORECASE
+)
 SECONDS_MOST = 9.2e9
 """Seconds that nanoseconds in 64 bits can count, from 1970 or from the first sample."""
 
@@ -33,8 +41,10 @@ def names_of(table: Any) -> list[str]:
 
 
 def column(table: Any, name: str) -> Any:
-    """(n,) as numpy has it. Raises InvalidData where there is none of that name."""
+    """(n,) as numpy has it, of a column or of the index of that name. Raises InvalidData where there is none."""
     if name not in names_of(table):
+        if str(getattr(getattr(table, "index", None), "name", "")) == name:
+            return np.asarray(table.index)
         raise InvalidData(
             f"the table has no column {name}; it has {', '.join(names_of(table))}"
             + ("; say by columns how it is called" if name in (TIME_COLUMN, *OUTPUTS) else "")
@@ -48,7 +58,10 @@ def _keys(table: Any) -> Iterable[Any]:
 
 
 def called(columns: Mapping[str, str] | None) -> dict[str, str]:
-    """The names that a table has for t_s, ux, uy, uz and the channels that ``columns`` names, by ours."""
+    """The names that a table has for t_s, ux, uy, uz and the channels that ``columns`` names, by ours. Raises
+    InvalidData for names that are meant as one of these and are none."""
+    if unknown := next((ours for ours in columns or {} if ours in NO_ROLES), None):
+        raise InvalidData(f"columns: {unknown} is no role; expected t, ux, uy, uz, or the name a channel is to have")
     return {name: name for name in (TIME_COLUMN, *OUTPUTS)} | {
         TIME_COLUMN if ours == "t" else ours: theirs for ours, theirs in (columns or {}).items()
     }
@@ -56,14 +69,17 @@ def called(columns: Mapping[str, str] | None) -> dict[str, str]:
 
 def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_unit: str | None = None) -> Samples:
     """Of a table with the columns t_s, ux, uy, uz; ``columns`` says how they are called where that is otherwise. All
-    other columns of finite numbers are channels, by their own names. Raises InvalidData."""
+    other columns of finite numbers are channels, by their own names, but for those that number the rows. Raises
+    InvalidData."""
     by_ours = called(columns)
     channels = {ours: column(table, theirs) for ours, theirs in by_ours.items() if ours not in (TIME_COLUMN, *OUTPUTS)}
     for name in names_of(table):
         values = column(table, name)
         if name in by_ours.values() or values.dtype.kind not in "fiu":
             continue
-        if np.isfinite(values).all():
+        if _counts(values):
+            warnings.warn(f"column {name} left out: it numbers the rows", MissingChannel, stacklevel=4)
+        elif np.isfinite(values).all():
             channels[name] = values
         else:
             gaps = int(np.count_nonzero(~np.isfinite(values)))
@@ -71,7 +87,16 @@ def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_
                 f"channel {name} left out: {gaps} of {len(values)} values missing", MissingChannel, stacklevel=4
             )
     u = np.stack([_numbers(column(table, by_ours[name]), by_ours[name]) for name in OUTPUTS], axis=1)
-    return samples_of(column(table, by_ours[TIME_COLUMN]), u, channels, time_unit, by_ours[TIME_COLUMN])
+    name = by_ours[TIME_COLUMN]
+    index = np.asarray(table.index) if name not in names_of(table) and hasattr(table, "index") else np.empty(0)
+    if name == TIME_COLUMN and index.dtype.kind in "Mm":  # of rows that are labelled by their times
+        return samples_of(index, u, channels, time_unit, "the index")
+    return samples_of(column(table, name), u, channels, time_unit, name)
+
+
+def _counts(values: Any) -> bool:
+    """Whether each value is one more than that before: as a channel it would be the time again."""
+    return len(values) > 2 and bool((np.diff(values) == 1).all())
 
 
 def samples_of(
@@ -96,7 +121,9 @@ def samples_of(
 
 
 def readings_of(u: Any) -> Floats:
-    """(3,) or (n,3) as floats. Raises InvalidData."""
+    """(3,) or (n,3) as floats; of a table by the names ux, uy, uz, where it has these. Raises InvalidData."""
+    if is_table(u) and set(OUTPUTS) <= set(names_of(u)):
+        u = np.stack([np.asarray(column(u, name)) for name in OUTPUTS], axis=1)
     readings = _numbers(u, "u")
     if readings.ndim not in (1, 2) or readings.shape[-1] != 3:
         hint = "; transpose it" if readings.ndim == 2 and readings.shape[0] == 3 else ""
@@ -150,6 +177,9 @@ def _time_ns(t: Any, time_unit: str | None, name: str) -> Ints:
     found = _numbers(times, name)
     if not np.isfinite(found).all():
         raise InvalidData(f"{name}: sample {int(np.flatnonzero(~np.isfinite(found))[0])} has no finite time")
+    if time_unit is None and (stated := _UNIT_IN_NAME.search(name)):
+        unit = next(unit for unit in ("ms", "us", "ns") if stated[1].lower().replace("µ", "u")[0] == unit[0])
+        raise InvalidData(f"{name}: floats count as seconds; if they are in {unit}: time_unit='{unit}'")
     scaled = found * (UNITS_NS[time_unit or "s"] / UNITS_NS["s"])
     if np.abs(scaled).max(initial=0.0) > SECONDS_MOST:
         raise InvalidData(f"{name} goes to {found.max():.6g}, too much for seconds: say its unit by time_unit")
@@ -168,6 +198,8 @@ def _datetimes(times: Any, name: str) -> Any:
 
 
 def _numbers(values: Any, name: str) -> Floats:
+    if np.ma.is_masked(values):
+        raise InvalidData(f"{name}: some values are masked; leave them out first")
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):

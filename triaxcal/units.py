@@ -88,6 +88,17 @@ def grouped(unit: str) -> str:
     return f"({unit})" if set(unit) & set(" /") else unit
 
 
+def same_unit(one: str, other: str) -> bool:
+    """However they are spelled: m/s², m/s^2 and M/S2 are one."""
+    return _spelled(one) == _spelled(other)
+
+
+def _spelled(unit: str) -> str:
+    folded = unit.casefold().replace("²", "2").replace("μ", "µ")
+    bare = re.sub(r"[\s^*·\[\]()]", "", folded)
+    return {"m/s/s": "m/s2", "ms-2": "m/s2", "gn": "g", "g0": "g", "count": "counts"}.get(bare, bare)
+
+
 def reference_unit_of(reference: float) -> str:
     """g where the magnitude can be gravity in units of g, else what the caller did not name."""
     return "g" if 0.9 <= reference <= 1.1 else UNNAMED

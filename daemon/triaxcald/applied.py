@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +14,9 @@ from triaxcal.documents import OUT, UNCERTAINTY, Calibration
 from triaxcal.errors import MissingChannel
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.profile import READINGS
-from triaxcald.errors import InputError
-from triaxcald.inputs import CALIBRATION, bundle_of
+from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
 from triaxcald.pipeline import Pipeline
+from triaxcald.recording.export import Rows
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import Phase
 from triaxcald.tables.samples import Reading, read_table
@@ -26,11 +27,11 @@ BLOCK = 65536
 
 @dataclass
 class Applied:
-    """``blocks`` have the calibrated readings among their channels, behind those of the input; ``start_ns`` is where
-    their seconds begin, None for the first sample. ``missing`` has, once they are through, what the calibration needs
+    """``blocks`` have the columns of the input, and behind them the calibrated readings; ``start_ns`` is where their
+    seconds begin, None for the first sample. ``missing`` has, once they are through, what the calibration needs
     and the recording lacks; ``remarks`` say how a table was read."""
 
-    blocks: Iterator[SampleBlock]
+    blocks: Iterator[Rows]
     start_ns: int | None
     missing: list[str] = field(default_factory=list)
     remarks: tuple[str, ...] = ()
@@ -44,18 +45,25 @@ def applied(
     own_recording: bool = False,
     phase: Phase = CALIBRATION,
     reading: Reading | None = None,
+    output_unit: str = "",
 ) -> Applied:
-    """Of the recording ``name``; ``reading`` says how a table is read.
+    """Of the recording ``name``; ``reading`` says how a table is read, and ``output_unit`` what its outputs are in.
 
     Raises InputError, RecordingError; where its blocks are read, also Refused.
     """
     found = Applied(iter(()), None)
+    beside: Mapping[str, Any] = {}
     if name.endswith(".mcap"):
         blocks = _of_recording(Path(name), phase)
     else:
-        table = read_table(name, reading)
-        samples = table.samples
+        table = read_table(name, reading, beside=True)
+        require_same_outputs(calibration, name, output_unit or table.output_unit)
+        samples, beside = table.samples, table.beside
+        if own_recording and len(samples.time_ns):
+            calibration.require_whole((samples.time_ns - samples.time_ns[0]) * 1e-9)
         found.start_ns, found.remarks = 0, table.remarks
+        if samples.duplicates:
+            found.remarks += (f"{samples.duplicates} rows left out that repeat the one before them",)
         blocks = (
             SampleBlock(
                 samples.time_ns[at : at + BLOCK],
@@ -67,11 +75,10 @@ def applied(
         )
     columns = OUT + UNCERTAINTY * uncertainty
 
-    def calibrated() -> Iterator[SampleBlock]:
+    def calibrated() -> Iterator[Rows]:
         begin_ns: int | None = None
+        at = 0
         for block in blocks:
-            if taken := [n for n in columns if n in block.channels]:
-                raise InputError(f"{name}: it has a column {taken[0]} already")
             if begin_ns is None and len(block):
                 begin_ns = int(block.time_ns[0])
             t_s = (block.time_ns - (begin_ns or 0)) * 1e-9
@@ -86,7 +93,10 @@ def applied(
                 )
             found.missing += [m for w in told if (m := str(w.message)) not in found.missing]
             values = np.concatenate(a, axis=1) if uncertainty else a
-            yield replace(block, channels={**block.channels, **dict(zip(columns, values.T, strict=True))})
+            cells = {n: v[at : at + len(block)] for n, v in beside.items()}
+            at += len(block)
+            held = {f"{n} (input)" if n in columns else n: v for n, v in {**Rows.of(block).columns, **cells}.items()}
+            yield Rows(block.time_ns, held | dict(zip(columns, values.T, strict=True)))
 
     found.blocks = calibrated()
     return found

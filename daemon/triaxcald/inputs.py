@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from triaxcal.documents import Calibration
 from triaxcal.errors import InvalidData
 from triaxcal.means import poses_of_means
 from triaxcal.moment import Moment
@@ -19,6 +20,7 @@ from triaxcal.quality import QualityDetector, untrusted_poses
 from triaxcal.stillness.detector import StillnessDetector, Windows
 from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
+from triaxcal.units import same_unit
 from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
@@ -101,6 +103,16 @@ def measure(
     quality = together(counted, seen)
     creep = [] if moments is not None else creeping(poses)
     return Measured(name, poses, windows, quality + creep, output_unit=table.output_unit, remarks=table.remarks)
+
+
+def require_same_outputs(calibration: Calibration, name: str, unit: str) -> None:
+    """Raises InputError where the outputs of the recording ``name`` are in another ``unit`` than those that were
+    calibrated, as far as both say."""
+    if unit and calibration.output_unit and not same_unit(unit, calibration.output_unit):
+        raise InputError(
+            f"{name}: outputs in {unit}, and the calibration is of outputs in {calibration.output_unit}; "
+            "--output-unit says otherwise"
+        )
 
 
 def _of_means(name: str, table: Table) -> Measured:

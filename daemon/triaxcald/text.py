@@ -91,7 +91,7 @@ NO_LIMIT = "the station has no limit for what was measured"
 
 def passed(verification: Mapping[str, Any] | None) -> str:
     if verification is None:
-        return "the fit is within the limits"
+        return "the fit is within the limits; the device's own output was not checked"
     limit = verification["limit_rms_g"]
     told = "" if limit is None else f", limit {micro_g(limit)}"
     return f"within the limits; the device's own output in {_poses(verification)} is {_checked(verification)}{told}"

@@ -8,7 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, cast
 
 from triaxcal_drivers.errors import DriverMissing
-from triaxcal_drivers.extras import lacking
+from triaxcal_drivers.extras import absent, lacking
 from triaxcal_drivers.nearest import clipped
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def listed() -> list[Listed]:
     for name, point in sorted(_points().items()):
         fault = None
         try:
-            driver_named(name)
+            fault = absent(getattr(driver_named(name), "packages", ()))
         except DriverMissing as e:
             fault = str(e)
         found.append(Listed(name, point.value, point.dist.name if point.dist else "?", fault))

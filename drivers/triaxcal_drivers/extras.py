@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Iterable
+
 EXTRAS = {
     "can": "can",
     "canopen": "can",
@@ -13,6 +16,14 @@ EXTRAS = {
 """By the name that is imported."""
 CALLED = {"can": "python-can", "serial": "pyserial"}
 """Where the package has another name than what is imported."""
+
+
+def absent(modules: Iterable[str]) -> str | None:
+    """What to install, of modules by the names that are imported; None where all are there."""
+    missing = next((m for m in modules if importlib.util.find_spec(m) is None), None)
+    if missing is None:
+        return None
+    return lacking(ModuleNotFoundError(name=missing)) or f"the package {missing} is not installed"
 
 
 def lacking(e: ModuleNotFoundError) -> str | None:

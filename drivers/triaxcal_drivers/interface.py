@@ -129,7 +129,8 @@ class Driver(Protocol):
     """What an entry point of group ``triaxcal.drivers`` names: a class with these.
 
     A ``bus_model`` says by a method ``claim`` what one process has for itself while it works with a unit (see
-    `triaxcal_drivers.claim`); without it all settings together name the device.
+    `triaxcal_drivers.claim`); without it all settings together name the device. A driver may name the ``packages`` that
+    it imports only when a device is opened, so that `triaxcal devices` can say which are not there.
     """
 
     profile_model: type[Profile]

@@ -105,6 +105,21 @@ def test_a_driver_that_does_not_load_is_listed_with_the_reason(elsewhere, module
     assert found["modbus"] is None
 
 
+def test_a_driver_whose_packages_are_not_there_is_listed_with_what_brings_them(elsewhere):
+    lacking = DRIVER.replace("class SerialDriver:", 'class SerialDriver:\n    packages = ("json", "no_such_module")')
+    assert lacking != DRIVER
+    elsewhere("their_drivers", lacking, "their-serial = their_drivers:SerialDriver")
+    said = elsewhere.python(
+        "from triaxcal_drivers.catalogue import listed; from triaxcal_drivers.extras import EXTRAS, absent\n"
+        "print({d.name: d.fault for d in listed()}['their-serial']); EXTRAS['no_such_module'] = 'can'\n"
+        "print(absent(['no_such_module']))"
+    )
+    assert said.splitlines() == [
+        "the package no_such_module is not installed",
+        "the package no_such_module is not installed; pip install 'triaxcal[can]' brings it",
+    ]
+
+
 def test_asking_for_one_driver_imports_no_other(elsewhere):
     elsewhere("their_drivers", "raise RuntimeError", "their-serial = their_drivers:SerialDriver")
     said = elsewhere.python(

@@ -57,6 +57,43 @@ def diagnosed(poses: Any) -> tc.Diagnosis:
 # Poses
 
 
+def test_poses_say_themselves_in_a_few_lines(poses: Any) -> None:
+    assert repr(poses).startswith(f"{len(poses)} still poses from {poses[0].start_s:.1f} to {poses[-1].end_s:.1f} s")
+    assert len(repr(poses)) < 500
+
+
+def test_a_unit_that_was_said_of_the_poses_is_the_calibrations(recorded: Recorded) -> None:
+    found = tc.find_poses(recorded.frame(), output_unit="V")
+    assert tc.calibrate(found, signs=MINUS).output_unit == "V"
+    assert tc.diagnose(found, signs=MINUS).calibration.output_unit == "V"
+    assert tc.calibrate(found, signs=MINUS, output_unit="mV").output_unit == "mV"
+
+
+def test_rows_may_be_labelled_by_their_times(recorded: Recorded, poses: Any) -> None:
+    frame = recorded.frame()
+    stamps = pd.to_datetime("2026-03-09") + pd.to_timedelta(frame.pop("t_s"), unit="s")
+    for index, columns in ((pd.DatetimeIndex(stamps), None), (pd.DatetimeIndex(stamps, name="at"), {"t": "at"})):
+        found = tc.find_poses(frame.set_index(index), columns=columns)
+        assert [p.samples for p in found] == [p.samples for p in poses]
+
+
+def test_numbers_whose_name_states_another_unit_are_not_seconds(recorded: Recorded) -> None:
+    frame = recorded.frame()
+    for name, unit, scale in (("millis", "ms", 1e3), ("time (us)", "us", 1e6), ("t_ns", "ns", 1e9)):
+        frame[name] = frame["t_s"] * scale
+        with pytest.raises(tc.InvalidData, match=f"floats count as seconds; if they are in {unit}: time_unit='{unit}'"):
+            tc.find_poses(frame.drop(columns="t_s"), columns={"t": name})
+        assert len(tc.find_poses(frame.drop(columns="t_s"), columns={"t": name}, time_unit=unit)) > 20
+        frame = frame.drop(columns=name)
+    frame["seconds"] = frame.pop("t_s")
+    assert len(tc.find_poses(frame, columns={"t": "seconds"})) > 20
+
+
+def test_what_is_meant_as_an_output_is_no_channel(recorded: Recorded) -> None:
+    with pytest.raises(tc.InvalidData, match="columns: u_x is no role; expected t, ux, uy, uz, or the name a channel"):
+        tc.find_poses(recorded.frame(), columns={"u_x": "ux"})
+
+
 def test_times_may_be_seconds_datetimes_or_integers_of_a_unit(recorded: Recorded, poses: Any) -> None:
     ns = np.round(recorded.t * 1e9).astype(np.int64)
     begun = np.datetime64("2026-03-01T08:00:00", "ns")
@@ -163,7 +200,9 @@ def test_a_calibration_is_verified_on_poses_that_no_fit_saw(recorded: Recorded, 
     u, temp_c = recorded.unit.sample(t)
     found = tc.verify(diagnosed.calibration, t, u, channels={"temp_c": temp_c})
     assert len(found.poses) == len(found.error) >= 25
-    assert found.rms < 4 * found.noise_floor
+    assert found.noise_floor < found.expected
+    assert found.rms < 2 * found.expected
+    assert "expected of noise and the calibration's uncertainty" in repr(found)
     assert tc.verify(diagnosed.before, t, u).rms > 5 * found.rms
     with pytest.raises(tc.Refused, match="no still pose"):
         tc.verify(diagnosed.calibration, [])
@@ -272,3 +311,25 @@ def test_an_arrow_table_is_taken_and_a_lazy_one_is_to_be_collected(recorded: Rec
     assert [p.samples for p in found] == [p.samples for p in tc.find_poses(frame)]
     with pytest.raises(tc.InvalidData, match="a lazy table: collect it first"):
         tc.find_poses(pl.LazyFrame({"t_s": [0.0]}))
+
+
+def test_a_column_that_numbers_the_rows_is_no_channel(recorded: Recorded) -> None:
+    frame = recorded.frame()
+    frame["n"] = np.arange(len(frame)) + 7
+    with pytest.warns(tc.MissingChannel, match="column n left out: it numbers the rows"):
+        found = tc.find_poses(frame)
+    assert set(found[0].channels) == {"temp_c"}
+
+
+def test_outputs_of_a_table_are_taken_by_their_names(recorded: Recorded, poses: Any) -> None:
+    frame = recorded.frame()
+    found = tc.find_poses(frame["t_s"], frame[["uz", "uy", "ux"]])
+    assert [list(p.mean) for p in found] == [list(p.mean) for p in poses]
+
+
+def test_a_gap_in_a_channel_is_a_gap_in_what_is_calibrated(recorded: Recorded, diagnosed: tc.Diagnosis) -> None:
+    temp_c = recorded.temp_c.copy()
+    temp_c[3] = np.nan
+    a = diagnosed.calibration.apply(recorded.u, channels={"temp_c": temp_c})
+    assert np.isnan(a[3]).any()
+    assert np.isfinite(np.delete(a, 3, axis=0)).all()

@@ -162,9 +162,24 @@ def test_times_that_are_not_of_the_recording_are_refused_and_those_of_a_table_co
     for times in (t + 1.7e9, np.datetime64("2026-01-01", "ns") + np.arange(26), t - 100.0):
         with pytest.raises(tc.InvalidData, match="count from its first sample"):
             c.apply(u, t=times, own_recording=True)
-    table = pd.DataFrame(dict(zip(("ux", "uy", "uz"), u.T, strict=True)) | {"t_s": t + 1.7e9})
-    found = c.apply(table, own_recording=True)[["ax", "ay", "az"]].to_numpy()
-    assert found == pytest.approx(c.apply(u, t=t, own_recording=True), abs=1e-12)
+    whole = 10 * t
+    table = pd.DataFrame(dict(zip(("ux", "uy", "uz"), u.T, strict=True)) | {"t_s": whole + 1.7e9})
+    found = c.apply(table, t=whole, own_recording=True)[["ax", "ay", "az"]].to_numpy()
+    assert found == pytest.approx(c.apply(u, t=whole, own_recording=True), abs=1e-12)
+    table["t_s"] += np.linspace(0, 12, 26)  # to the end of the last pose
+    assert c.apply(table, own_recording=True)["ax"].notna().all()
+
+
+def test_a_part_of_the_recording_needs_its_times(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
+    """The first row of a part is not the first sample of the recording."""
+    poses = noisy_poses(paper_unit, twenty_six, 1e-5, np.random.default_rng(1))
+    c = tc.calibrate(poses, signs=(-1, -1, -1), effects=["bias_drift"])
+    u, t = paper_unit.output(twenty_six, {}), np.linspace(0, 262, 26)
+    table = pd.DataFrame(dict(zip(("ux", "uy", "uz"), u.T, strict=True)) | {"t_s": t})
+    with pytest.raises(tc.InvalidData, match=r"the table spans .* s, and the recording that was fitted 260 s: give t,"):
+        c.apply(table[10:], own_recording=True)
+    part = c.apply(table[10:], t=t[10:], own_recording=True).to_numpy()
+    assert part == pytest.approx(c.apply(table, own_recording=True).to_numpy()[10:], abs=1e-12)
 
 
 def test_readings_far_beyond_what_an_effect_holds_for_are_refused(paper_unit: Sensor) -> None:
@@ -291,3 +306,20 @@ def test_a_document_whose_poses_cannot_be_plotted_is_said(paper_unit: Sensor, sp
     document |= {"poses": [{"used": True, "residual_g": 0.0, "standard_error_g": 1e-5, "direction": [0, 0, 1]}]}
     with pytest.raises(tc.InvalidData, match="cannot be plotted"):
         residuals_figure({**document, **spoiled})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"terms": ["linear", "temperature_bias"]}, "effects: no coefficients of temperature_bias, which terms has"),
+        ({"scale_factor": [True, True, True]}, "not numbers where numbers belong"),
+        ({"bias": ["0.1", "0.2", "0.3"]}, "not numbers where numbers belong"),
+    ],
+)
+def test_a_document_that_contradicts_itself_is_refused(
+    paper_unit: Sensor, twenty_six: np.ndarray, change: dict[str, object], words: str
+) -> None:
+    poses = noisy_poses(paper_unit, twenty_six, 1e-5, np.random.default_rng(1))
+    document = tc.calibrate(poses, signs=(-1, -1, -1)).to_dict()
+    with pytest.raises(tc.InvalidData, match=words):
+        tc.Calibration.from_dict(document | change, where="cal.json")

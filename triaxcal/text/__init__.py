@@ -8,9 +8,9 @@ from triaxcal.text.budget import basis, not_evaluated, remedy
 from triaxcal.text.cautions import caution
 from triaxcal.text.holds import holds, use
 from triaxcal.text.quality import quality, quality_line
-from triaxcal.text.summary import html, loop, short, summary
+from triaxcal.text.summary import html, loop, poses, short, summary, verification
 
 __all__ = [
-    "basis", "caution", "holds", "html", "loop", "not_evaluated", "quality", "quality_line", "remedy", "short",
-    "summary", "use",
+    "basis", "caution", "holds", "html", "loop", "not_evaluated", "poses", "quality", "quality_line", "remedy",
+    "short", "summary", "use", "verification",
 ]  # fmt: skip

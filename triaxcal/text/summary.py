@@ -10,6 +10,7 @@ import numpy as np
 
 from triaxcal.calibration import Calibration, Residual
 from triaxcal.effects.contract import SINCE_START, TIME
+from triaxcal.poses.pose import Pose
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 
@@ -52,6 +53,24 @@ def loop(
         lines.append(f"unexplained: {small.in_full(unexplained_rms)}")
     lines += [f"advice: {line}" for line in advice]
     return "\n".join(["Diagnosis", *(f"  {line}" for line in lines)])
+
+
+def poses(found: Sequence[Pose], data_quality: Iterable[str]) -> str:
+    """How many, when, and what spoils the raw stream."""
+    faulty = sum(bool(p.fault) for p in found)
+    count = f"{len(found)} still {'pose' if len(found) == 1 else 'poses'}"
+    when = f" from {found[0].start_s:.1f} to {found[-1].end_s:.1f} s" if found else ""
+    lines = [f"{count}{when}" + (f", {faulty} of them excluded" if faulty else "")]
+    return "\n".join([*lines, *(f"  {line}" for line in data_quality)])
+
+
+def verification(poses: str, rms: float, noise_floor: float, expected: float, reference: tuple[str, float]) -> str:
+    """The error in poses of another recording, beside what noise and the calibration's uncertainty make there."""
+    small = ErrorUnit.of(*reference)
+    line = f"{poses}: rms {small.in_full(rms)}, noise floor {small.in_full(noise_floor)}"
+    if math.isnan(expected):
+        return line
+    return f"{line}, {small.in_full(expected)} expected of noise and the calibration's uncertainty"
 
 
 def html(c: Calibration, output_unit: str, reference_unit: str, warnings: Iterable[str]) -> str:

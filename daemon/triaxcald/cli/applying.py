@@ -34,7 +34,8 @@ def apply_command(a: argparse.Namespace) -> int:
         uncertainty=a.uncertainty,
         own_recording=a.own_recording,
         phase=a.phase,
-        reading=reading_of(a, a.recording),
+        reading=reading_of(a, a.recording, calibration),
+        output_unit=a.output_unit or "",
     )
     for remark in found.remarks:
         say(f"{a.recording}: {remark}")

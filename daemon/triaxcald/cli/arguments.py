@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from triaxcal.gravity import HEIGHTS_M
 from triaxcal.moment import Moment
@@ -18,7 +18,19 @@ RECORDING = ".mcap, a table (.csv, .csv.gz, .txt, .parquet) or - for text on sta
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong in one line and ends with 2."""
+    """Says what is wrong in one line and ends with 2. Options may stand anywhere between files."""
+
+    _mixing = False
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """A command's own arguments, which its parent hands on by this method."""
+        if self._mixing or self._subparsers is not None:
+            return super().parse_known_args(args, namespace)
+        self._mixing = True
+        try:
+            return self.parse_known_intermixed_args(args, namespace)
+        finally:
+            self._mixing = False
 
     def error(self, message: str) -> NoReturn:
         for option, example in (("--sign", "-,-,-"), ("--faces", "-X,-X"), ("--datum", "-Z,-X")):
@@ -29,12 +41,9 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def parsed(parser: OneLineParser, arguments: Sequence[str]) -> argparse.Namespace:
-    """As `parse_args`, and options may stand between recordings, where there may be several."""
-    chosen, left = parser.parse_known_args(arguments)
-    several = next((v for n in ("recording", "recordings") if isinstance(v := getattr(chosen, n, None), list)), None)
-    if several is not None and not any(word.startswith("-") and word != "-" for word in left):
-        several += map(type(several[0]), left)
-    elif left:
+    chosen = argparse.Namespace()
+    _, left = parser.parse_known_args(arguments, chosen)
+    if left:
         parser.error(f"unrecognized arguments: {' '.join(left)}")
     return chosen
 

@@ -128,6 +128,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     print(f"  verdict: {o.document['verdict']}: {o.document['reason']}")
     for line in o.certified.document["outside"]:
         print(f"  outside limits: {line}")
+    for line in o.certified.document["result"]["data_quality"]:
+        print(f"  warning: {line}")
     for caution in loop.after.cautions:
         print(f"  warning: {of_metrology.caution(caution)}")
     papers = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}

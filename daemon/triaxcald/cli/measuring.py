@@ -7,10 +7,12 @@ import math
 
 import numpy as np
 
+from triaxcal import text
 from triaxcal.calibration import Calibration
 from triaxcal.calibration_document import poses_document
-from triaxcal.calibration_reading import calibration_of, calibration_part, reference_unit_in
+from triaxcal.calibration_reading import calibration_part, reference_unit_in
 from triaxcal.creep import with_creep_left
+from triaxcal.documents import Calibration as Document
 from triaxcal.effects.contract import RUN, SINCE_START, TIME
 from triaxcal.errors import Refused
 from triaxcal.held_out import magnitude_errors
@@ -55,17 +57,22 @@ def poses(a: argparse.Namespace) -> int:
 
 def verify_command(a: argparse.Namespace) -> int:
     document = read_document(a.calibration)
-    model = calibration_of(document, where=a.calibration)
+    calibration = Document.from_dict(document, where=a.calibration)
+    model = calibration.fitted
     sensor, reference = model.sensor, model.reference
     if a.sign and any(k * s < 0 for k, s in zip(sensor.scale_factor, a.sign, strict=True)):
         raise InputError(f"--sign: the scale factors in {a.calibration} have other signs")
     if a.reference and not math.isclose(a.reference, reference, rel_tol=1e-9):
         raise InputError(f"--reference {a.reference:g}: {a.calibration} was made for {reference:g}")
-    measured = read_recording(a, a.recording)
+    measured = read_recording(a, a.recording, of=calibration)
     with telling_data_quality(measured):
         _require_trusted(measured)
     found = _verified(measured, model, where=a.calibration)
     assert found.rms_g is not None
+    assert found.noise_floor_g is not None
+    trusted = [p for p in measured.poses if not p.fault]
+    of_calibration = calibration.uncertainty_in(trusted)
+    expected = float(np.sqrt(found.noise_floor_g**2 + np.mean(of_calibration**2)))
     warnings = unlike(measured.name, found.rms_g, reference)
     if not warnings:
         held = shape_in(calibration_part(document, where=a.calibration))
@@ -76,6 +83,7 @@ def verify_command(a: argparse.Namespace) -> int:
         "rms_g": error(found.rms_g, reference),
         "max_abs_g": error(found.max_abs_g, reference),
         "noise_floor_g": error(found.noise_floor_g, reference),
+        "expected_rms_g": error(expected, reference) if np.isfinite(expected) else None,
         "poses": pose_rows(found, reference),
         "data_quality": measured.data_quality,
         "warnings": warnings,
@@ -85,6 +93,8 @@ def verify_command(a: argparse.Namespace) -> int:
         emit(result)
     else:
         _show_verified(found, f"|a| − {reference:g} {unit} under {a.calibration}", ErrorUnit.of(unit, reference))
+        poses = counted(len(found.poses), len(found.untrusted))
+        print(text.verification(poses, found.rms_g, found.noise_floor_g, expected, (unit, reference)))
         warn([*warnings, *measured.data_quality])
     return judge(a.limit, found.rms_g)
 
@@ -138,5 +148,3 @@ def _show_verified(found: Verification, title: str, small: ErrorUnit) -> None:
         ],
         found.poses,
     )
-    poses = counted(len(found.poses), len(found.untrusted))
-    print(f"{poses}: rms {small.in_full(found.rms_g)}, noise floor {small.in_full(found.noise_floor_g)}")

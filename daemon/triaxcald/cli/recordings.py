@@ -13,7 +13,7 @@ from triaxcald.errors import InputError
 from triaxcald.files import new_file
 from triaxcald.inputs import bundle_of
 from triaxcald.pipeline import Pipeline
-from triaxcald.recording.export import write_csv
+from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
@@ -76,7 +76,7 @@ def export_command(a: argparse.Namespace) -> int:
         if a.stream not in bundle.profile.streams:
             raise InputError(f"--stream {a.stream}: the recording has {', '.join(bundle.profile.streams)}")
         pipeline = Pipeline(bundle, a.stream)
-        blocks = (pipeline.feed(batch) for batch in recording.raw(a.phase))
+        blocks = (Rows.of(pipeline.feed(batch)) for batch in recording.raw(a.phase))
         if a.output is None:
             rows = write_csv(sys.stdout, blocks)
         else:

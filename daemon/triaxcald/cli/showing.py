@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+from triaxcal.documents import Calibration
+from triaxcal.effects.contract import channel_of
 from triaxcal.errors import Refused
 from triaxcal.gravity import local_gravity_g
 from triaxcal.poses.pose import Pose
@@ -16,7 +18,7 @@ from triaxcal.uncertainty import Stated
 from triaxcal.units import ErrorUnit, reference_unit_of
 from triaxcald.cli.console import say, table
 from triaxcald.errors import InputError
-from triaxcald.inputs import Measured, measure
+from triaxcald.inputs import Measured, measure, require_same_outputs
 from triaxcald.tables.samples import Reading
 
 
@@ -35,9 +37,14 @@ class Choice:
         return ErrorUnit.of(self.reference_unit, self.reference)
 
 
-def read_recording(a: argparse.Namespace, name: str, moments: Moments | None = None) -> Measured:
-    """The still poses of the recording ``name``, read as the arguments say; how a table was read is told."""
-    found = measure(name, moments=moments, reading=reading_of(a, name))
+def read_recording(
+    a: argparse.Namespace, name: str, moments: Moments | None = None, of: Calibration | None = None
+) -> Measured:
+    """The still poses of the recording ``name``, read as the arguments say; how a table was read is told. ``of`` is the
+    calibration that is to be applied to them. Raises InputError where that is of other units."""
+    found = measure(name, moments=moments, reading=reading_of(a, name, of))
+    if of is not None:
+        require_same_outputs(of, name, a.output_unit or found.output_unit)
     for remark in found.remarks:
         say(f"{found.name}: {remark}")
     if not found.poses and moments is None:
@@ -45,12 +52,13 @@ def read_recording(a: argparse.Namespace, name: str, moments: Moments | None = N
     return found
 
 
-def reading_of(a: argparse.Namespace, name: str) -> Reading:
-    """How a table is to be read. Raises InputError where the recording is none."""
+def reading_of(a: argparse.Namespace, name: str, of: Calibration | None = None) -> Reading:
+    """How a table is to be read, where ``of`` is the calibration that needs its channels. Raises InputError where the
+    recording is none."""
     said = Reading(a.columns or {}, a.time_unit, a.rate, a.skip_bad, dict(a.where or ()), a.pose_means)
     if name.endswith(".mcap") and said != Reading():
         raise InputError(f"{name}: --columns, --time-unit, --rate, --skip-bad, --where and --pose-means are for tables")
-    return said
+    return said if of is None else replace(said, wanted=frozenset(map(channel_of, of.fitted.channel_reference)))
 
 
 def chosen(a: argparse.Namespace, measured: Measured) -> Choice:

@@ -128,6 +128,7 @@ def _on_recordings(commands: Any) -> None:
         help="REC is the recording that was calibrated: effects of time at each of its times",
     )  # fmt: skip
     p.add_argument("--phase", default=PHASES[0], choices=PHASES, help="of an .mcap")
+    p.add_argument("--output-unit", metavar="UNIT", help="unit of REC's outputs, whatever its header says")
     add_table(p)
     p = _command(
         commands, "verify", "measuring:verify_command", "error of the magnitude in every pose under a calibration",

@@ -94,7 +94,7 @@ def guide(
     elif due:
         hint = f"next: {_nearest(targets, distinct[0])}once more, as at first"
     elif missing:
-        hint = f"next: {missing[0]} up"
+        hint = f"next: {_said(missing[0], targets)}"
     else:
         hint = "turn the unit to a pose not taken yet"
     middles = tuple((p.start_s + p.end_s) / 2 for p, is_enough in zip(poses, enough, strict=True) if is_enough)
@@ -119,7 +119,15 @@ def _nearest(targets: Sequence[Direction], v: Floats) -> str:
     if not targets:
         return ""
     label, _ = max(targets, key=lambda target: float(target[1] @ v))
-    return f"{label} up "
+    return f"{_said(label, targets)} "
+
+
+def _said(label: str, targets: Sequence[Direction]) -> str:
+    """The axes that point up; for a direction that only a number names, its components."""
+    if label.startswith(("+", "-")):
+        return f"{label} up"
+    x, y, z = next(v for name, v in targets if name == label)
+    return f"{label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
 
 
 def ups(poses: Sequence[Held], nominal: Sequence[float] | None) -> Floats:

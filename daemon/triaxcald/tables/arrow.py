@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,17 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.files import open_file
-from triaxcal_drivers.interface import SampleBlock
 from triaxcald.errors import InputError
-from triaxcald.recording.export import columns_of, require_alike
+from triaxcald.recording.export import Rows, require_alike
 from triaxcald.tables.layout import DATED, DAY_TIME, MISSING, MOMENT
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 _NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
-CELLS_MOST = 2**28
+CELLS_MOST = 2**25
 """A number that never changes takes no room in a Parquet file, and 8 bytes here."""
+DAY_NS = 86_400 * 10**9
+BYTES_MOST = 2**30
+"""Of a Parquet file's values as they are stored, before compression; in memory they take a few times as much."""
 _NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 
@@ -33,7 +35,8 @@ class Column:
 
     ``numbers`` (n,), NaN where a cell holds none; ``moments_ns`` (n,) where the cells are moments, from 1970 or from
     midnight. ``gaps`` (n,) are cells that hold nothing, and ``strange`` (n,) those with something else than a number or
-    a moment. ``whole`` are all numbers without a fraction, exactly, as far as they fit 64 bits.
+    a moment. ``whole`` are all numbers without a fraction, exactly, as far as they fit 64 bits. ``cells`` are what
+    stood there.
     """
 
     numbers: NDArray[np.float64]
@@ -42,6 +45,7 @@ class Column:
     moments_ns: NDArray[np.int64] | None = None
     whole: NDArray[np.int64] | None = None
     texts: Any = None
+    cells: Any = None
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -49,14 +53,28 @@ class Column:
 
     def equals(self, value: str) -> NDArray[np.bool_]:
         """(n,) whether a cell has this text, or in a file of typed columns this number."""
+        import pyarrow as pa
         import pyarrow.compute as pc
 
         if self.texts is not None:
             return np.asarray(pc.equal(self.texts, value))
+        if self.cells is not None and not (
+            pa.types.is_floating(self.cells.type) or pa.types.is_nested(self.cells.type)
+        ):
+            return np.asarray(pc.fill_null(pc.equal(pc.cast(self.cells, pa.string()), value), False))
         try:
             return np.asarray(self.numbers == float(value))
         except ValueError:
             return np.zeros(len(self.numbers), bool)
+
+    def over_several_lines(self) -> list[str]:
+        """The cells of a text that hold a line end."""
+        import pyarrow.compute as pc
+
+        if self.texts is None:
+            return []
+        found = self.texts.filter(pc.match_substring(self.texts, "\n"))
+        return [str(cell) for cell in found[:100].to_pylist()]
 
     def text(self, row: int) -> str:
         """On one line, though a stray quote may have drawn several into the cell."""
@@ -99,7 +117,7 @@ def read_text(text: str, separator: str, decimal: str, fields: int) -> tuple[lis
         )
     except pa.ArrowInvalid as e:
         raise ValueError(str(e).splitlines()[0]) from e
-    return [_of_text(column.combine_chunks(), decimal) for column in table.columns], ragged
+    return [replace(_of_text(c, decimal), cells=c) for c in (c.combine_chunks() for c in table.columns)], ragged
 
 
 def read_parquet(path: Path) -> tuple[list[str], list[Column]]:
@@ -112,14 +130,37 @@ def read_parquet(path: Path) -> tuple[list[str], list[Column]]:
             file = pq.ParquetFile(opened)
             if file.metadata.num_rows * file.metadata.num_columns > CELLS_MOST:
                 raise InputError(f"{path}: more than {CELLS_MOST} cells")
+            if _text_bytes(file) > BYTES_MOST:
+                raise InputError(f"{path}: more than {BYTES_MOST} bytes of text")
             table = file.read().flatten()
         while any(pa.types.is_struct(t) for t in table.schema.types):
             table = table.flatten()
-        return list(table.column_names), [_of_array(column.combine_chunks()) for column in table.columns]
+        columns = [column.combine_chunks() for column in table.columns]
+        return list(table.column_names), [replace(_of_array(column), cells=column) for column in columns]
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror or str(e).splitlines()[0]}") from e
     except (pa.ArrowException, ValueError) as e:
         raise InputError(f"{path}: not readable as Parquet: {str(e).splitlines()[0]}") from e
+
+
+def _text_bytes(file: Any) -> int:
+    """At most, of the columns of text, by the longest value that the file's statistics tell of each."""
+    total = 0
+    for group in range(file.metadata.num_row_groups):
+        for i in range(file.metadata.num_columns):
+            column = file.metadata.row_group(group).column(i)
+            if column.physical_type == "BYTE_ARRAY":
+                told = column.statistics
+                longest = len(told.max) if told is not None and told.has_min_max else 0
+                total += max(column.total_uncompressed_size, longest * column.num_values)
+    return total
+
+
+def chosen(cells: Any, rows: NDArray[np.intp]) -> Any:
+    """Those of these rows, as slices of them may be written."""
+    import pyarrow as pa
+
+    return cells.take(pa.array(rows))
 
 
 def _of_array(array: pa.Array) -> Column:
@@ -150,7 +191,7 @@ def _of_array(array: pa.Array) -> Column:
         counts = np.asarray(pc.fill_null(array.cast(pa.int32() if array.type.bit_width == 32 else pa.int64()), 0))
         moments = counts.astype(np.int64) * _NANOSECONDS[kind.unit]
         return Column(np.full(n, np.nan), gaps, np.zeros(n, bool), moments)
-    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind):
         return _of_text(pc.fill_null(array, "").cast(pa.string()), ".")
     return Column(np.full(n, np.nan), gaps, ~gaps)
 
@@ -228,15 +269,32 @@ def _moments(texts: pa.StringArray, gaps: NDArray[np.bool_]) -> tuple[NDArray[np
         return None
     texts = pc.replace_substring(texts, ",", ".")
     strange = ~np.asarray(fine) & ~gaps
+    held = pc.if_else(fine, texts, "1970-01-01T00:00:00" + ("Z" if zoned else ""))
+    found = _as_moments(held, pa.timestamp("ns", "UTC" if zoned else None))
+    strange |= np.asarray(found.is_null())
+    moments = np.asarray(pc.fill_null(found.cast(pa.int64()), 0)).copy()
+    if not MOMENT.fullmatch(first):  # the time of day begins again at midnight
+        usable = ~(gaps | strange)
+        days = np.cumsum(np.diff(moments[usable], prepend=moments[usable][:1]) < -DAY_NS // 2)
+        moments[usable] += days * DAY_NS
+    return moments, strange
+
+
+def _as_moments(texts: pa.Array, kind: pa.DataType) -> pa.Array:
+    """Null where a text has the form of a moment and is none, as the thirteenth month."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
     try:
-        held = pc.if_else(fine, texts, "1970-01-01T00:00:00" + ("Z" if zoned else ""))
-        found = pc.cast(held, pa.timestamp("ns", "UTC" if zoned else None))
+        return pc.cast(texts, kind)
     except pa.ArrowInvalid:
-        return np.zeros(len(texts), np.int64), ~gaps
-    return np.asarray(found.cast(pa.int64())), strange
+        half = len(texts) // 2
+        if not half:
+            return pa.nulls(len(texts), kind)
+        return pa.concat_arrays([_as_moments(texts[:half], kind), _as_moments(texts[half:], kind)])
 
 
-def write_parquet(path: Path, blocks: Iterable[SampleBlock], start_ns: int | None = None) -> int:
+def write_parquet(path: Path, blocks: Iterable[Rows], start_ns: int | None = None) -> int:
     """As `triaxcald.recording.export.write_csv`, times in seconds as floats; the number of samples. ``path`` is
     overwritten. Raises RecordingError, OSError."""
     import pyarrow as pa  # 50 MB that nothing else needs
@@ -249,15 +307,21 @@ def write_parquet(path: Path, blocks: Iterable[SampleBlock], start_ns: int | Non
             if not len(block):
                 continue
             start_ns = int(block.time_ns[0]) if start_ns is None else start_ns
-            columns = {"t_s": (block.time_ns - start_ns) * 1e-9, **columns_of(block)}
-            table = pa.table({name: pa.array(np.ascontiguousarray(v)) for name, v in columns.items()})
+            columns = {"t_s": (block.time_ns - start_ns) * 1e-9, **block.columns}
+            table = pa.table({name: _array(values) for name, values in columns.items()})
             writer = writer or pq.ParquetWriter(path, table.schema)
             writer.write_table(table)
             samples += len(block)
         if writer is None:
-            empty = {name: pa.array([], pa.float64()) for name in ("t_s", "ux", "uy", "uz", *(names or ()))}
+            empty = {name: pa.array([], pa.float64()) for name in ("t_s", *(names or ("ux", "uy", "uz")))}
             writer = pq.ParquetWriter(path, pa.table(empty).schema)
     finally:
         if writer is not None:
             writer.close()
     return samples
+
+
+def _array(values: Any) -> pa.Array:
+    import pyarrow as pa
+
+    return pa.array(np.ascontiguousarray(values)) if isinstance(values, np.ndarray) else values

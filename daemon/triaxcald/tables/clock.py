@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +14,26 @@ from triaxcald.tables.arrow import Column
 from triaxcald.tables.naming import ISO, Name, Unclear
 from triaxcald.tables.naming import NANOSECONDS as UNITS
 
-STEP_MOST_S, STEP_LEAST_S = 1.0, 1e-5
-"""Numbers with a fraction in steps between these are seconds: a logger takes more than a sample a second, and none
-takes one in 10 µs; steps as short are a spreadsheet's days."""
+STEP_MOST_S, STEP_LEAST_S = 0.2, 2e-4
+"""Numbers with a fraction in steps between these are seconds: a logger takes from five to five thousand samples a
+second. Shorter steps may be minutes, hours or a spreadsheet's days, longer ones milliseconds."""
+OWN_MOST_S, OWN_LEAST_S = 1.0, 1e-5
+"""The same of our own layout, whose times are seconds."""
 _RATE = re.compile(
     r"(?:sampl\w*[ _-]*(?:rate|freq\w*)|(?:update|data|output|acquisition|measurement)[ _-]*(?:rate|freq\w*)|\brate\b|"
-    r"\bfreq(?:uency)?\b|\bfs\b|\bf_s\b|\bodr\b|abtast\w*|messrate)[^\d\n]{0,25}?(\d+(?:[.,]\d+)?)\s*(k?)(?:hz|sps|1/s)?|"
-    r"\bat (\d+(?:[.,]\d+)?) ?(k?)hz\b",
+    r"\bfreq(?:uency)?\b|\bodr\b|abtast(?:rate|frequenz)\w*|messrate)[^\d\n]{0,25}?(?P<plain>\d+(?:[.,]\d+)?)"
+    r"(?P<unit>\s*[^\s\d,;)\]]*)|"
+    r"(?:\bfs\b|\bf_s\b)\D{0,5}(?P<fs>\d+(?:[.,]\d+)?)\s*(?P<fs_unit>k?hz|sps|1/s)|"
+    r"\bat (?P<at>\d+(?:[.,]\d+)?) ?(?P<at_unit>k?hz)\b",
     re.IGNORECASE,
 )
+_GROUPS = (("plain", "unit"), ("fs", "fs_unit"), ("at", "at_unit"))
+"""Of the figure and of its unit, by the ways to state a rate."""
+_HERTZ = re.compile(r"\s*(k?)(?:hz|sps|1/s|samples/s(?:ec)?)\W*", re.IGNORECASE)
+_OTHER_RATE = re.compile(r"baud|bit ?rate|filter|cut-?off|bandwidth|range|refresh|heart", re.IGNORECASE)
+_PERIOD = re.compile(r"\b[mµu]?s\b", re.IGNORECASE)
+"""In front of a number that is no sample rate in hertz."""
+_THOUSANDS = re.compile(r"\d{1,3},\d{3}")
 
 
 def stated_rate(remarks: Sequence[str]) -> tuple[float, str] | None:
@@ -29,8 +41,13 @@ def stated_rate(remarks: Sequence[str]) -> tuple[float, str] | None:
     found: dict[float, str] = {}
     for line in remarks:
         for m in _RATE.finditer(line):
-            figure, kilo = (m[1], m[2]) if m[1] else (m[3], m[4])
-            value = float(figure.replace(",", ".")) * (1000 if kilo else 1)
+            if _OTHER_RATE.search(line[: m.end()]) or _PERIOD.search(m[0]):
+                continue
+            figure, unit = next((m[n], m[u]) for n, u in _GROUPS if m[n])
+            hertz = _HERTZ.fullmatch(unit or "")
+            if _THOUSANDS.fullmatch(figure) or (hertz is None and re.search(r"\w", unit or "")):
+                continue
+            value = float(figure.replace(",", ".")) * (1000 if hertz and hertz[1] else 1)
             if value > 0:
                 found.setdefault(value, line.strip().strip("#%/").strip())
     return next(iter(found.items())) if len(found) == 1 else None
@@ -68,7 +85,8 @@ def of_index(column: Column | None, n: int, rate: float) -> tuple[NDArray[np.int
 
 def require_seconds(time_ns: NDArray[np.int64], column: str) -> None:
     """Raises Unclear where times that were taken for seconds could be in another unit."""
-    _evident(np.asarray(time_ns * 1e-9), bool((time_ns % UNITS["s"] == 0).all()), Name.of(column))
+    whole = bool((time_ns % UNITS["s"] == 0).all())
+    _evident(np.asarray(time_ns * 1e-9), whole, Name.of(column), OWN_LEAST_S, OWN_MOST_S)
 
 
 def _evenly(counted: NDArray[np.int64], rate: float) -> NDArray[np.int64]:
@@ -77,7 +95,13 @@ def _evenly(counted: NDArray[np.int64], rate: float) -> NDArray[np.int64]:
     return np.asarray(np.rint(counted * (UNITS["s"] / rate)).astype(np.int64))
 
 
-def _evident(times: NDArray[np.float64] | NDArray[np.int64], whole: bool, name: Name) -> str:
+def _evident(
+    times: NDArray[np.float64] | NDArray[np.int64],
+    whole: bool,
+    name: Name,
+    least_s: float = STEP_LEAST_S,
+    most_s: float = STEP_MOST_S,
+) -> str:
     if name.other_time_unit:
         raise Unclear(f"{_called(name)} is in {name.other_time_unit}; convert it to seconds, or give --rate HZ")
     steps = np.diff(times)
@@ -85,7 +109,7 @@ def _evident(times: NDArray[np.float64] | NDArray[np.int64], whole: bool, name: 
     if not len(rising):
         return "s"
     step = float(np.median(rising))
-    if not whole and STEP_LEAST_S <= step < STEP_MOST_S:
+    if not whole and least_s <= step < most_s and not name.unknown_unit and not _are_clock_figures(times, steps):
         return "s"
     kind = "integers" if whole else "numbers"
     options = ", ".join(f"{u} would be {_rate(step * UNITS[u] / UNITS['s'])}" for u in UNITS)
@@ -93,6 +117,14 @@ def _evident(times: NDArray[np.float64] | NDArray[np.int64], whole: bool, name: 
         f"{_called(name)}: {kind} in steps of {plain(step)} in a unit that nothing states; say which: "
         f"--time-unit s, ms, us or ns ({options}), or --time-unit index --rate HZ"
     )
+
+
+def _are_clock_figures(times: NDArray[np.float64] | NDArray[np.int64], steps: NDArray[Any]) -> bool:
+    """Whether they are times of day as HHMMSS.ss: of hundreds and ten thousands no more than 59 are there, and the
+    hundreds jump on from 60."""
+    seconds, minutes = times % 100, times // 100 % 100
+    jumps = np.abs(steps - 40) < 1
+    return bool((seconds < 60).all() and (minutes < 60).all() and jumps.any() and times.max(initial=0) >= 100)
 
 
 def _rate(step_s: float) -> str:

@@ -11,7 +11,7 @@ import codecs
 import csv
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 LINES_LOOKED_AT = 500
 """Loggers write up to a hundred lines about themselves before the first sample."""
@@ -22,6 +22,10 @@ SEPARATORS = ("\t", ";", ",", "|", " ")
 MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "inf", "+inf", "-inf", "infinity", "-infinity", "-nan"))
 """Texts in lower case that stand for no number; so do all that begin with # (#N/A, #NV, #DIV/0!)."""
 NUMBER = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+", re.ASCII)
+"""What may be a number with its thousands parted by commas."""
+TABLE_LEAST = 10
+"""Lines of numbers above the header that are no remarks any more."""
 DAY_TIME = re.compile(r"\d{1,2}:\d\d:\d\d(?:[.,]\d{1,9}|:\d{3})?", re.ASCII)
 DATED = re.compile(r"(\S+(?: \S+)?)[ T]+(\d{1,2}:\d\d:\d\d(?:[.,]\d{1,9}|:\d{3})?)( ?[AaPp][Mm])?", re.ASCII)
 """A date as nobody else writes it, and the time of day."""
@@ -54,6 +58,8 @@ class Layout:
     fields: int
     remarks: tuple[str, ...]
     unlike: tuple[int, int] | None = None
+    fault: str = ""
+    """Why the numbers may be read in two ways."""
 
 
 def decoded(data: bytes) -> str:
@@ -97,9 +103,34 @@ def layout_of(lines: Sequence[str]) -> Layout | None:
     if printed and 2 * max(run.lines for run in printed) > max(run.lines for run in found):
         found = printed
     best = max(found, key=lambda run: (run.lines, run.numeric))
-    rows = [split(line, best.separator) for line in lines[best.first :] if _is_sample(line, best.separator)]
-    decimal = "," if any("," in f and NUMBER.fullmatch(f) for row in rows for f in row) else "."
-    return _above(lines, best, decimal)
+    rows = [split(line, best.separator) for line in lines[best.first :] if is_sample(line, best.separator)]
+    numbers = [f for row in rows for f in row if NUMBER.fullmatch(f) or THOUSANDS.fullmatch(f)]
+    decimal = "," if any("," in f for f in numbers) else "."
+    found_layout = _above(lines, best, decimal, _labelled(rows))
+    fault = _marks(numbers) or _above_the_header(lines, best, found_layout)
+    return replace(found_layout, fault=fault)
+
+
+def _marks(numbers: Sequence[str]) -> str:
+    """What is wrong with the decimal marks, if anything: a comma may part thousands."""
+    commas = [f for f in numbers if "," in f]
+    pointed = next((f for f in numbers if "." in f), None)
+    if commas and pointed is not None:
+        return (
+            f"numbers with a comma and with a point ({commas[0]}, {pointed}); write them without thousands separators"
+        )
+    if commas and all(THOUSANDS.fullmatch(f) for f in commas):
+        return f"{commas[0]} may have a decimal comma or part thousands; write numbers without thousands separators"
+    return ""
+
+
+def _above_the_header(lines: Sequence[str], run: _Run, layout: Layout) -> str:
+    """Whether another table stands above."""
+    above = [i for i in range(len(layout.remarks)) if is_sample(lines[i], run.separator)]
+    if len(above) < TABLE_LEAST:
+        return ""
+    fields = len(split(lines[above[0]], run.separator))
+    return f"line {above[0] + 1}: another table, of {fields} fields, above that of {run.fields}; part them in two files"
 
 
 def split(line: str, separator: str) -> list[str]:
@@ -131,7 +162,7 @@ class _Run:
     trailing: bool
 
 
-def _is_sample(line: str, separator: str) -> bool:
+def is_sample(line: str, separator: str) -> bool:
     return (
         bool(line.strip())
         and not is_remark(line.strip(), separator)
@@ -151,7 +182,7 @@ def _run(lines: Sequence[str], separator: str) -> _Run | None:
     """The samples: lines with the most common number of fields among those that hold numbers."""
     counted: dict[int, list[tuple[int, list[str]]]] = {}
     for i, line in enumerate(lines):
-        if _is_sample(line, separator):
+        if is_sample(line, separator):
             row = split(line, separator)
             counted.setdefault(len(row), []).append((i, row))
     if not counted:
@@ -161,7 +192,7 @@ def _run(lines: Sequence[str], separator: str) -> _Run | None:
     return _Run(separator, rows[0][0], len(rows), fields, numeric, all(row[-1] == "" for _, row in rows))
 
 
-def _above(lines: Sequence[str], run: _Run, decimal: str) -> Layout:
+def _above(lines: Sequence[str], run: _Run, decimal: str, labelled: bool) -> Layout:
     """The layout, with header and row of units looked for from the first sample upwards."""
     header = units = None
     at = run.first
@@ -171,7 +202,7 @@ def _above(lines: Sequence[str], run: _Run, decimal: str) -> Layout:
         return Layout(run.separator, decimal, tuple(row), None, 1, run.fields, ())
     behind_mark: int | None = None
     for i in range(run.first - 1, -1, -1):
-        names = _names(lines[i], run)
+        names = _names(lines[i], run, labelled)
         if names is None:
             continue
         if is_remark(lines[i].strip(), run.separator):
@@ -183,7 +214,7 @@ def _above(lines: Sequence[str], run: _Run, decimal: str) -> Layout:
         header, at = tuple(names), i
         break
     if header is None and behind_mark is not None:
-        header, at = tuple(_names(lines[behind_mark], run) or ()), behind_mark
+        header, at = tuple(_names(lines[behind_mark], run, labelled) or ()), behind_mark
     if header is None and units is not None:
         header, units = units, None
     first = _first_after(lines, run, at, header is not None)
@@ -203,9 +234,11 @@ def _unlike(lines: Sequence[str], run: _Run) -> tuple[int, int] | None:
 def _first_after(lines: Sequence[str], run: _Run, at: int, header: bool) -> int:
     """The first line behind the header that is neither a remark nor a row of units: also one that lacks numbers."""
     if not header:
-        return run.first
+        return next((i for i in range(run.first) if is_sample(lines[i], run.separator)), run.first)
     for i in range(at + 1, run.first):
         row = split(lines[i], run.separator)
+        if is_sample(lines[i], run.separator):
+            return i
         if (
             lines[i].strip()
             and not is_remark(lines[i].strip(), run.separator)
@@ -215,8 +248,17 @@ def _first_after(lines: Sequence[str], run: _Run, at: int, header: bool) -> int:
     return run.first
 
 
-def _names(line: str, run: _Run) -> list[str] | None:
-    """Names for all fields of a line that could be the header; None where it is not."""
+def _labelled(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether the rows begin with a name of their own, or with their number."""
+    first = [row[0] for row in rows[:20]]
+    counted = [f for f in first if f.isdecimal()]
+    if len(counted) < len(first):
+        return not any(NUMBER.fullmatch(f) for f in first)
+    return [int(f) for f in counted] == list(range(int(counted[0]), int(counted[0]) + len(counted)))
+
+
+def _names(line: str, run: _Run, labelled: bool) -> list[str] | None:
+    """Names for all fields of a line that could be the header; None where it is not. ``labelled``: see `_labelled`."""
     bare = line.strip(" ").lstrip("#%/;").strip(" ") if is_remark(line.strip(), run.separator) else line
     if not bare.strip():
         return None
@@ -227,6 +269,8 @@ def _names(line: str, run: _Run) -> list[str] | None:
     ):  # LabVIEW's stands behind the first line alone
         row = row[:-1]
     if len(row) == run.fields - 1 and not is_remark(line.strip(), run.separator):
+        if not (run.trailing or labelled):
+            return None
         row = [*row, ""] if run.trailing else ["", *row]  # R names its rows, and not their column
     if len(row) != run.fields or not any(row) or any(NUMBER.fullmatch(f) or f.lower() == "nan" for f in row):
         return None

@@ -7,10 +7,11 @@ the question. No number of the table is looked at here.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
+from triaxcal_drivers.nearest import clipped
 from triaxcald.tables import words as known
 
 OUTPUTS = ("ux", "uy", "uz")
@@ -43,6 +44,7 @@ class Name:
     text: str
     words: tuple[str, ...]
     unit: str
+    in_brackets: str = ""
 
     @classmethod
     def of(cls, text: str, unit: str = "") -> Name:
@@ -55,7 +57,7 @@ class Name:
         unit = next((s.strip() for s in reversed(stated) if _is_unit(s.strip())), "") or _in_brackets(unit)
         if not unit and len(words) > 1 and words[-1] in {*known.UNITS_OF_TIME, *known.OTHER_UNITS_OF_TIME}:
             unit = words.pop()
-        return cls(bare, tuple(words), unit)
+        return cls(bare, tuple(words), unit, next((s.strip() for s in reversed(stated) if s.strip()), ""))
 
     @property
     def is_time(self) -> bool:
@@ -76,7 +78,12 @@ class Name:
         stated = known.UNITS_OF_TIME.get(self.unit.lower())
         if stated or len(self.words) == 1:
             return stated or known.UNITS_OF_TIME.get(self.words[0])
-        return next((known.UNITS_OF_TIME[w] for w in self.words if len(w) > 4 and w in known.UNITS_OF_TIME), None)
+        return next((known.UNITS_OF_TIME[w] for w in self.words if len(w) > 1 and w in known.UNITS_OF_TIME), None)
+
+    @property
+    def unknown_unit(self) -> bool:
+        """Whether brackets behind the name hold what is no unit that anybody uses: ticks, or 10 ms."""
+        return bool(self.in_brackets) and not self.unit
 
     @property
     def other_time_unit(self) -> str | None:
@@ -90,23 +97,25 @@ class Name:
     @property
     def is_computed(self) -> bool:
         return "angular" not in self.words and bool(
-            set(self.words) & (known.COMPUTED | known.WITHOUT_GRAVITY | known.ERRORS)
+            set(self.words) & (known.COMPUTED | known.WITHOUT_GRAVITY | known.TURNED | known.ERRORS)
         )
 
     @property
     def is_celsius(self) -> bool:
         """A temperature whose unit is no other than the degree Celsius."""
-        called = set(self.words) & known.TEMPERATURE
+        called = set(self.words) & known.TEMPERATURE and not set(self.words) & known.NOT_CELSIUS
         return bool(called) and self.unit.lower().lstrip("°º").removeprefix("deg").strip() in ("", "c", "celsius")
 
 
 @dataclass(frozen=True)
 class Triple:
-    """Three columns, 0-based, that differ by x, y, z alone, or by a number."""
+    """Three columns, 0-based, that differ by x, y, z alone, or by a number. ``letter`` is all that they are called by
+    beside that, where that is one letter and no unit: a quantity's, or a label."""
 
     columns: tuple[int, int, int]
     kind: Kind
     plain: bool
+    letter: str = ""
 
 
 @dataclass(frozen=True)
@@ -179,13 +188,13 @@ def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str]
     return Roles(outputs, time, indices, channels, frozenset(said), rivals)
 
 
-def are_seconds_and_rest(one: str, other: str) -> bool:
-    """Whether the names are those of whole seconds and of the nanoseconds behind them, as header.stamp.secs, .nsecs."""
-    m, n = (
-        re.fullmatch(r"(.*)(?:sec|secs)", bare_name(one)),
-        re.fullmatch(r"(.*)(?:nsecs?|nanosecs?)", bare_name(other)),
-    )
-    return m is not None and n is not None and m[1] == n[1]
+def seconds_and_rest(names: Sequence[str]) -> Iterator[tuple[int, int]]:
+    """The columns of whole seconds and of the nanoseconds behind them, as header.stamp.secs and header.stamp.nsecs."""
+    bare = [bare_name(n) for n in names]
+    rests = {m[1]: j for j, n in enumerate(bare) if (m := re.fullmatch(r"(.*?)(?:nsecs?|nanosecs?)", n))}
+    for i, name in enumerate(bare):
+        if (m := re.fullmatch(r"(.*?)secs?", name)) and m[1] in rests:
+            yield i, rests[m[1]]
 
 
 def _column(names: Sequence[str], wanted: str, *, named: bool) -> int:
@@ -214,11 +223,15 @@ def _outputs(names: Sequence[Name], triples: Sequence[Triple], *, named: bool) -
             f"--columns {'t=1,ux=2,uy=3,uz=4' if len(names) > 3 else 'ux=1,uy=2,uz=3 --rate HZ'}"
         )
     own = [next((i for i, n in enumerate(names) if n.text == axis), None) for axis in OUTPUTS]
-    if None not in own and len({n.text for n in names if n.text in OUTPUTS}) == len(OUTPUTS):
+    if None not in own and len([n.text for n in names if n.text in OUTPUTS]) == len(OUTPUTS):
         return own[0], own[1], own[2]  # type: ignore[return-value]
     accelerations = [t for t in triples if t.kind is Kind.ACCELERATION]
     others = [t for t in triples if t.kind is Kind.NOT_KNOWN]
     without = [t for t in triples if t.kind is Kind.WITHOUT_GRAVITY]
+    labelled = [t for t in triples if t.letter in ("a", "b")]
+    if {t.letter for t in labelled} == {"a", "b"}:  # sensors A and B, or an acceleration and a magnetic field
+        others += [t for t in labelled if t not in (*accelerations, *others)]
+        raise Unclear(_several(names, [*accelerations, *others, *without], without))
     if len(accelerations) == 1 and not without and not any(t.plain for t in others):
         return accelerations[0].columns
     if not accelerations and len(others) == 1 and not without:
@@ -227,10 +240,7 @@ def _outputs(names: Sequence[Name], triples: Sequence[Triple], *, named: bool) -
         return without[0].columns
     several = [*accelerations, *others, *without]
     if len(several) > 1:
-        raise Unclear(
-            f"{len(several)} triples of outputs ({'; '.join(_called(names, t) for t in several)}); choose by "
-            f"{_option(names, several[0])}" + ("; gravity has to be in them" if without else "")
-        )
+        raise Unclear(_several(names, several, without))
     if without:
         raise Unclear(
             f"{_called(names, without[0])} seem to be without gravity, which the fit needs; if they have it: "
@@ -242,8 +252,15 @@ def _outputs(names: Sequence[Name], triples: Sequence[Triple], *, named: bool) -
             f"no column that is called as an accelerometer's output; if {_called(names, sensors[0])} are meant: "
             f"{_option(names, sensors[0])}"
         )
-    seen = ", ".join(n.text for n in names if n.text)
+    seen = clipped(", ".join(n.text for n in names if n.text))
     raise Unclear(f"no three outputs among the columns {seen}; name them: --columns ux=NAME,uy=NAME,uz=NAME")
+
+
+def _several(names: Sequence[Name], several: Sequence[Triple], without: Sequence[Triple]) -> str:
+    return (
+        f"{len(several)} triples of outputs ({'; '.join(_called(names, t) for t in several)}); choose by "
+        f"{_option(names, several[0])}" + ("; gravity has to be in them" if without else "")
+    )
 
 
 def _called(names: Sequence[Name], triple: Triple) -> str:
@@ -275,7 +292,7 @@ def _triples(names: Sequence[Name], free: Sequence[int]) -> list[Triple]:
         if set(by_axis) == set(AXES):
             for columns in zip(*(by_axis[axis] for axis in AXES), strict=False):
                 triples.append(_triple(names, columns, at))
-    return triples or _numbered(names, free)
+    return [*triples, *_numbered(names, [i for i in free if all(i not in t.columns for t in triples)])]
 
 
 def _triple(names: Sequence[Name], columns: tuple[int, ...], at: int) -> Triple:
@@ -283,7 +300,8 @@ def _triple(names: Sequence[Name], columns: tuple[int, ...], at: int) -> Triple:
     first = names[columns[0]]
     words = set(Name.of(first.text[:at] + " " + first.text[at + 1 :]).words) - known.BESIDE_AN_AXIS
     kind = _kind(words, first.unit.lower().replace(" ", ""))
-    return Triple((columns[0], columns[1], columns[2]), kind, not words)
+    alone = next(iter(words)) if len(words) == 1 and not first.unit else ""
+    return Triple((columns[0], columns[1], columns[2]), kind, not words, alone if len(alone) == 1 else "")
 
 
 def _kind(words: set[str], unit: str) -> Kind:
@@ -291,7 +309,11 @@ def _kind(words: set[str], unit: str) -> Kind:
         return Kind.COMPUTED
     if words & known.WITHOUT_GRAVITY:
         return Kind.WITHOUT_GRAVITY
-    if words & (known.COMPUTED - {"velocity"}) or ("velocity" in words and "angular" not in words):
+    if (
+        words & known.TURNED
+        or (words & (known.COMPUTED - {"velocity", "total"}))
+        or ("velocity" in words and "angular" not in words)
+    ):
         return Kind.COMPUTED
     if words & known.ACCELERATION or {"g", "force"} <= words or {"g", "f"} <= words:
         return Kind.ACCELERATION

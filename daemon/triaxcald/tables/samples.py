@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, product
+from itertools import chain, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,8 @@ from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow, clock
 from triaxcald.tables.arrow import Column
-from triaxcald.tables.layout import Layout, decoded, layout_of
-from triaxcald.tables.naming import INDEX, ISO, OUTPUTS, TIME, Name, Roles, Unclear, are_seconds_and_rest, roles_of
+from triaxcald.tables.layout import Layout, decoded, is_sample, layout_of
+from triaxcald.tables.naming import INDEX, ISO, OUTPUTS, TIME, Name, Roles, Unclear, roles_of, seconds_and_rest
 from triaxcald.tables.own_text import FIELDS_MOST, CsvSamples, is_own, samples_of_blocks
 from triaxcald.tables.source import blocks, label_of
 
@@ -27,6 +28,11 @@ ROWS_LOOKED_AT = 10_000
 """For the words in a column: those that come in turn come early."""
 VALUE_LIMIT = 1e100
 """Squares of values, and sums of them, have to be numbers too."""
+SENSORS = frozenset(("sensor", "sensors", "type", "id", "device", "source", "node", "side", "imu", "name"))
+"""Words by which a column of numbers names the sensor that a row is of."""
+VALUES_MOST, IN_TURN = 50, 0.2
+"""Sensors are few, and their rows come in turn; a label of what was done changes rarely."""
+SECONDS_MOST = 2**63 // 10**9
 FAR = 1e4
 """Times what nine in ten samples reach: more is no reading, as a knock reaches the end of the range."""
 COMPUTED_LEAST = 0.999
@@ -43,7 +49,7 @@ class Reading:
     """How a table is to be read, where the user says so. ``columns`` are names or numbers (from 1) of the table's by
     role (t, ux, uy, uz, or a channel's name); ``time_unit`` one of `naming.TIME_UNITS`; ``rate`` in Hz; ``where`` are
     values that the rows to be read have in a column; with ``pose_means`` each row is the mean of a pose, and needs no
-    time."""
+    time. Columns called as one of ``wanted`` are channels under that name, whatever else they may be."""
 
     columns: Mapping[str, str] = field(default_factory=dict)
     time_unit: str | None = None
@@ -51,15 +57,18 @@ class Reading:
     skip_bad: bool = False
     where: Mapping[str, str] = field(default_factory=dict)
     pose_means: bool = False
+    wanted: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
 class Table:
-    """``remarks`` say what was guessed and what was left out, a line each; ``output_unit`` is what the header says."""
+    """``remarks`` say what was guessed and what was left out, a line each; ``output_unit`` is what the header says.
+    ``beside`` are the cells (n,) of the columns that are neither outputs nor channels, by name, and of the time."""
 
     samples: CsvSamples
     remarks: tuple[str, ...] = ()
     output_unit: str = ""
+    beside: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -78,22 +87,23 @@ class _Grid:
         return f"column {clipped(self.names[column])}" if self.named else f"column {column + 1}"
 
 
-def read_table(name: str, reading: Reading | None = None) -> Table:
-    """Of a path, or of text on standard input (``-``). Raises InputError: file, line, field, what was expected."""
+def read_table(name: str, reading: Reading | None = None, *, beside: bool = False) -> Table:
+    """Of a path, or of text on standard input (``-``); with ``beside`` the cells of all its columns are kept. Raises
+    InputError: file, line, field, what was expected."""
     reading = reading or Reading()
     label = label_of(name)
     try:
         if name.endswith((".parquet", ".pq")):
             names, columns = arrow.read_parquet(Path(name))
             grid = _Grid(tuple(names), ("",) * len(names), True, tuple(columns), lambda row: f"row {row + 1}")
-            return _assembled(grid, reading)
+            return _assembled(grid, reading, beside)
         data = blocks(name, label)
         first = next(data, b"")
-        if (reading == Reading() and is_own(first)) or not first:
+        if (replace(reading, wanted=frozenset()) == Reading() and is_own(first)) or not first:
             samples = samples_of_blocks(chain((first,), data) if first else (), label)
             clock.require_seconds(samples.time_ns, "t_s")
             return Table(samples)
-        return _assembled(_grid(first, data), reading)
+        return _assembled(_grid(first, data), reading, beside)
     except Unclear as e:
         raise InputError(f"{label}: {e}") from None
 
@@ -117,6 +127,8 @@ def _grid(first: bytes, rest: Iterator[bytes]) -> _Grid:
     if layout.unlike is not None:
         line, count = layout.unlike
         raise Unclear(f"line {line + 1}: {count} names, and {layout.fields} fields in the lines of numbers below")
+    if layout.fault:
+        raise Unclear(layout.fault)
     if layout.fields > FIELDS_MOST:
         raise Unclear(f"{layout.fields} fields, expected at most {FIELDS_MOST}")
     at = _offset(text, layout.first)
@@ -125,6 +137,7 @@ def _grid(first: bytes, rest: Iterator[bytes]) -> _Grid:
     if layout.separator == " ":
         body = re.sub(r"^ +| +$", "", re.sub(r"[ \t]+", " ", body), flags=re.MULTILINE)
     columns, ragged = _read(body, layout)
+    _require_no_lines_in_cells(columns, layout)
     columns, names, units = _without_empty(columns, layout)
     left_out = {r.row for r in ragged}
     line_of = _lines(text, layout.first, left, left_out)
@@ -133,6 +146,16 @@ def _grid(first: bytes, rest: Iterator[bytes]) -> _Grid:
         names, units, layout.header is not None, tuple(columns), line_of, layout.remarks,
         tuple((every(r.row), r.fields) for r in ragged),
     )  # fmt: skip
+
+
+def _require_no_lines_in_cells(columns: Sequence[Column], layout: Layout) -> None:
+    """A stray quote takes the lines up to the next one for a text."""
+    for column in columns:
+        for cell in column.over_several_lines():
+            swallowed = [line for line in cell.split("\n")[1:] if is_sample(line, layout.separator)]
+            if swallowed:
+                quoted = clipped(swallowed[0].strip())
+                raise Unclear(f"a stray quotation mark: samples stand between it and the next one ({quoted}…)")
 
 
 def _kind(data: bytes) -> str:
@@ -184,7 +207,7 @@ def _lines(text: str, first: int, left: re.Pattern[str], left_out: set[int]) -> 
     return line_of
 
 
-def _assembled(grid: _Grid, reading: Reading) -> Table:
+def _assembled(grid: _Grid, reading: Reading, beside: bool) -> Table:
     chosen = _rows_where(grid, reading.where)
     if grid.named and TIME not in reading.columns:
         grid = _with_joined_times(grid)
@@ -204,22 +227,46 @@ def _assembled(grid: _Grid, reading: Reading) -> Table:
         if (np.abs(readings[:, axis]) >= VALUE_LIMIT).any():
             row = int(rows[int(np.argmax(np.abs(readings[:, axis])))])
             raise Unclear(f"{grid.line_of(row)}: {grid.called(i)}: a value of {VALUE_LIMIT:g} or more")
-    time_ns = timing.time_ns[rows] if timing.time_ns is not None else _counted(grid, timing, rows)
-    channels, left_out = _channels(grid, roles, parsed, timing, rows, readings)
+    if timing.time_ns is not None:
+        time_ns = timing.time_ns[rows]
+    else:
+        time_ns, by_index = _counted(grid, timing, rows, chosen)
+        timing = timing if by_index else replace(timing, index=None)
+    channels, left_out = _channels(grid, roles, parsed, timing, rows, readings, reading.wanted)
     once = _rising(grid, timing, rows, time_ns, readings, channels)
     samples = CsvSamples(
         time_ns[once], readings[once], {n: v[once] for n, v in channels.items()}, int(len(once) - once.sum())
     )
     remarks = [_read_as(grid, roles, timing, reading)]
     remarks += [f"left out: {'; '.join(left_out)}"] if left_out else []
-    return Table(samples, (*remarks, *skipped), _unit_of(roles, parsed))
+    if len({*(units := [parsed[i].unit for i in roles.outputs])}) > 1:
+        raise Unclear(f"outputs in {', '.join(unit or 'no unit' for unit in units)}; expected one unit for all three")
+    kept = _beside(grid, roles, samples.channels, rows[once]) if beside else {}
+    return Table(samples, (*remarks, *skipped), _unit_of(roles, parsed), kept)
+
+
+def _beside(grid: _Grid, roles: Roles, channels: Mapping[str, object], rows: NDArray[np.intp]) -> dict[str, Any]:
+    """What was not read, or under another name than its own, unless that is one of ours."""
+    read = {"t_s", *OUTPUTS, *channels}
+    found: dict[str, Any] = {}
+    for i, column in enumerate(grid.columns):
+        name = Name.of(grid.names[i]).text if grid.named else f"column {i + 1}"
+        if i in roles.outputs or not name or column.cells is None:
+            continue
+        if name in read and name not in OUTPUTS:  # the first of that name is the channel
+            read.remove(name)
+            continue
+        found[f"{name} ({i + 1})" if name in {*found, *channels, *OUTPUTS} else name] = arrow.chosen(column.cells, rows)
+    return found
 
 
 def _with_joined_times(grid: _Grid) -> _Grid:
     """Seconds and nanoseconds in two columns, as ROS has them, as one of nanoseconds."""
-    for i, j in product(range(len(grid.names)), repeat=2):
+    for i, j in seconds_and_rest(grid.names):
         seconds, rest = grid.columns[i], grid.columns[j]
-        if seconds.whole is None or rest.whole is None or not are_seconds_and_rest(grid.names[i], grid.names[j]):
+        if seconds.whole is None or rest.whole is None:
+            continue
+        if np.abs(seconds.whole).max(initial=0) >= SECONDS_MOST:
             continue
         whole = seconds.whole * 10**9 + rest.whole
         joined = Column(whole.astype(float), seconds.gaps | rest.gaps, seconds.strange | rest.strange, whole=whole)
@@ -239,7 +286,8 @@ def _rows_where(grid: _Grid, where: Mapping[str, str]) -> NDArray[np.bool_]:
     for name, value in where.items():
         found = [i for i, held in enumerate(grid.names) if name in (held, Name.of(held).text)]
         if len(found) != 1:
-            raise Unclear(f"--where {name}={value}: the table has {len(found)} columns of that name")
+            has = ", ".join(Name.of(held).text for held in grid.names) if grid.named else "no header"
+            raise Unclear(f"--where {name}={value}: {len(found)} columns of that name; the table has {clipped(has)}")
         column = grid.columns[found[0]]
         chosen &= column.equals(value)
         if not chosen.any():
@@ -254,6 +302,12 @@ def _distinct(column: Column, most: int = 20) -> list[str]:
 def _require_one_sensor(grid: _Grid, chosen: NDArray[np.bool_]) -> None:
     """Rows of several sensors below each other, as some phones write them, would be read as one that jumps."""
     for i, column in enumerate(grid.columns):
+        values = _in_turn(column, chosen, by_number=bool(set(Name.of(grid.names[i]).words) & SENSORS) and grid.named)
+        if values:
+            raise Unclear(
+                f"rows of several sensors in turn ({grid.called(i)}: {clipped(', '.join(values))}); choose those of "
+                f"one: --where {Name.of(grid.names[i]).text}={values[0]}"
+            )
         if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > 0.5:
             continue
         texts = {column.text(int(row)) for row in np.flatnonzero(chosen)[:ROWS_LOOKED_AT]}
@@ -265,10 +319,27 @@ def _require_one_sensor(grid: _Grid, chosen: NDArray[np.bool_]) -> None:
             )
 
 
+def _in_turn(column: Column, chosen: NDArray[np.bool_], by_number: bool) -> list[str]:
+    """The few values that a column of texts, or of numbers that name something, has in turn from row to row."""
+    rows = np.flatnonzero(chosen)[:ROWS_LOOKED_AT]
+    numbered = by_number and column.whole is not None and column.usable[rows].mean() > 0.5
+    if column.moments_ns is not None or len(rows) < 4 or not (numbered or column.strange[rows].mean() > 0.5):
+        return []
+    names = column.whole if numbered else None
+    held = [column.text(int(r)) if names is None else str(names[r]) for r in rows]
+    values = sorted(set(held), key=lambda v: ("acc" not in v.lower(), v))
+    turns = sum(a != b for a, b in pairwise(held)) / len(held)
+    few = 1 < len(values) <= min(VALUES_MOST, len(held) // 4)
+    return values if few and turns > IN_TURN else []
+
+
 def _require_numbers(grid: _Grid, i: int, chosen: NDArray[np.bool_]) -> None:
     column = grid.columns[i]
     if column.moments_ns is not None or (chosen & column.usable).sum() * 2 <= (chosen & column.strange).sum():
-        row = int(np.flatnonzero(chosen & (column.strange | (column.moments_ns is not None)))[0])
+        rows = np.flatnonzero(chosen & (column.strange | (column.moments_ns is not None)))
+        if not len(rows):
+            raise Unclear(f"{grid.called(i)} holds no number" if len(column.numbers) else "no samples, expected some")
+        row = int(rows[0])
         raise Unclear(f"{grid.line_of(row)}: {grid.called(i)}: '{column.text(row)[:40]}', expected a finite number")
 
 
@@ -318,6 +389,10 @@ def _no_time(grid: _Grid, roles: Roles, by_index: bool) -> str:
             row = int(np.flatnonzero(grid.columns[i].strange)[0])
             held = grid.columns[i].text(row)[:40]
             return f"{grid.called(i)}: '{held}' is no time (dates as 2026-01-31 12:00:00.25); convert it, or --rate HZ"
+        falls = np.flatnonzero(np.diff(grid.columns[i].numbers) < 0)
+        if len(falls):
+            where = f"{grid.line_of(int(falls[0]) + 1)}: {grid.called(i)}"
+            return f"{where}: the time falls back, as a counter does that starts again; --rate HZ counts the samples"
     which = "t=NAME" if grid.named else "t=NUMBER"
     return (
         f"no column of time; name it (--columns {which},…), or say how many samples a second there are: --rate HZ; "
@@ -360,7 +435,7 @@ def _timed(
     rising = [f for f in found if f[0]] or found
     lasted = {i: _lasted_s(t, chosen & grid.columns[i].usable) for _, i, t, _ in rising}
     longest, shortest = max(lasted.values()), min(lasted.values())
-    if longest - shortest > 2 + 0.01 * longest:
+    if longest - shortest > 2 + 0.01 * abs(longest):
         both = ", ".join(f"{grid.called(i)} {plain(s)} s" for i, s in lasted.items())
         raise Unclear(f"columns of time that do not agree how long it took ({both}); choose one: --columns t=NAME")
     _, i, time_ns, known = rising[0]
@@ -382,17 +457,20 @@ def _lasted_s(time_ns: NDArray[np.int64], rows: NDArray[np.bool_]) -> float:
     return float(held[-1] - held[0]) * 1e-9 if len(held) else 0.0
 
 
-def _counted(grid: _Grid, timing: _Timing, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+def _counted(
+    grid: _Grid, timing: _Timing, rows: NDArray[np.intp], chosen: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], bool]:
+    """(n,), and whether it is the index that counted them."""
     index = None if timing.index is None else grid.columns[timing.index]
     every = np.zeros(len(grid.columns[0].numbers), bool)
     every[rows] = True
     if index is not None:
         time_ns, counted = clock.of_index(_of_rows(index, every), len(rows), timing.rate)
         if counted:
-            return time_ns
-    n = int(rows[-1]) - int(rows[0]) + 1
-    span = n if not grid.ragged else len(rows)
-    return clock.of_index(None, span, timing.rate)[0][rows - rows[0] if span == n else slice(None)]
+            return time_ns, True
+    among = np.cumsum(chosen)[rows]  # rows of other sensors do not count
+    place = among - among[0] if not grid.ragged else np.arange(len(rows))
+    return clock.of_index(None, int(place[-1]) + 1, timing.rate)[0][place], False
 
 
 def _kept(
@@ -404,15 +482,16 @@ def _kept(
     for i in needed:
         usable &= grid.columns[i].usable
     far = usable & _far(grid, needed[: len(OUTPUTS)], usable)
-    usable &= ~far
+    usable &= ~far.any(axis=0)
     bad = chosen & ~usable
     faults = []
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
-        i = next((i for i in needed if not grid.columns[i].usable[row]), needed[0])
+        too_far = [i for i, of_column in zip(needed, far, strict=False) if of_column[row]]
+        i = next((i for i in needed if not grid.columns[i].usable[row]), *too_far[:1])
         held = grid.columns[i].text(row)
         what = f"'{held[:40]}'" if held else "empty"
-        expected = f"a number within {FAR:g} times most others" if far[row] else "a finite number"
+        expected = f"a number within {FAR:g} times most others" if i in too_far else "a finite number"
         faults.append(f"{grid.line_of(row)}: {grid.called(i)}: {what}, expected {expected}")
     for line, fields in grid.ragged[:1]:
         faults.append(f"{line}: {fields} fields, expected {len(grid.columns)}")
@@ -425,11 +504,12 @@ def _kept(
 
 
 def _far(grid: _Grid, outputs: Sequence[int], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Rows that hold something else than outputs: a line garbled on its way, a moment in the place of a header."""
-    sizes = np.max([np.abs(np.nan_to_num(grid.columns[i].numbers)) for i in outputs], axis=0)
+    """(3,n) cells that hold something else than outputs: a line garbled on its way, a moment in the place of a
+    header."""
+    sizes = np.abs(np.nan_to_num([grid.columns[i].numbers for i in outputs]))
     if not usable.any():
-        return np.zeros(len(sizes), bool)
-    return np.asarray(sizes > FAR * np.quantile(sizes[usable], 0.9))
+        return np.zeros(sizes.shape, bool)
+    return np.asarray(sizes > FAR * np.quantile(sizes.max(axis=0)[usable], 0.9))
 
 
 def _channels(
@@ -439,6 +519,7 @@ def _channels(
     timing: _Timing,
     rows: NDArray[np.intp],
     readings: NDArray[np.float64],
+    wanted: frozenset[str],
 ) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
     """All other columns of numbers without gaps, and why the others are not among them."""
     channels = {role: grid.columns[i].numbers[rows] for role, i in roles.channels.items()}
@@ -452,6 +533,9 @@ def _channels(
         name = re.sub(r'[,\s"]+', " ", names[i].text if grid.named else f"column {i + 1}").strip()
         values = column.numbers[rows]
         reason = _unfit(column, rows, magnitude)
+        if name in wanted and name not in channels and not (column.strange | column.gaps)[rows].any():
+            channels[name] = values
+            continue
         if i in roles.time or column.moments_ns is not None:
             reason = "another time"
         elif i in roles.indices or _counts(column, rows):

@@ -43,6 +43,9 @@ COMPUTED = frozenset((
     "vm", "enmo", "vel", "velocity", "pos", "position", "displacement", "jerk", "delta", "dt",
 ))  # fmt: skip
 """Of columns that are computed from the outputs, or from the motion of the whole."""
+TURNED = frozenset(("earth", "world", "global", "ned", "enu", "nav", "geo"))
+"""Of readings that were turned into another frame than the sensor's."""
+NOT_CELSIUS = frozenset(("f", "fahrenheit", "k", "kelvin", "raw", "mv", "v", "adc", "counts", "lsb", "code"))
 ERRORS = frozenset(("se", "sem", "std", "sd", "stderr", "stdev", "sigma", "error", "err", "unc", "uncertainty", "var"))
 WITHOUT_GRAVITY = frozenset(
     ("linear", "lin", "linacc", "linaccel", "user", "useracceleration", "free", "freeacc", "dynamic")

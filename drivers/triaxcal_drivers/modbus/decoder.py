@@ -135,7 +135,8 @@ class ModbusDecoder:
             np.stack([values.pop(name) for name in READING_CHANNELS], axis=1),
             values,
             missing=placed.missing,
-            duplicates=len(records) - len(kept),
+            # A block of the newest sample is read oftener than that changes; a record comes out of a FIFO once.
+            duplicates=len(records) - len(kept) if isinstance(stream, FifoStream) else 0,
             errors=errors,
         )
 

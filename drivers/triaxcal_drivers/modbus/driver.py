@@ -17,6 +17,7 @@ class ModbusDriver:
 
     profile_model = ModbusProfile
     bus_model = ModbusBus
+    packages = ("pymodbus",)
 
     def device(self, bundle: Bundle, bus: Any) -> Device:
         if not isinstance(bus, ModbusBus):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -196,10 +197,21 @@ class ModbusProfile(Profile):
         for name, register in self.registers.items():
             if words_of(register.type) > min(self.max_read_words, self.max_write_words):
                 raise ValueError(f"registers.{name}: {register.type} is longer than one request may be")
+        self._require_apart()
         sources = [(s.function, s.address) for s in self.streams.values()]
         if len(set(sources)) < len(sources):
             raise ValueError("streams: two of them start at the same address")
         return self
+
+    def _require_apart(self) -> None:
+        """Words may have several names; two roles in one place are a mistake."""
+        placed = sorted((r.table, r.address, name) for name, r in self.registers.items() if r.role)
+        for (table, at, one), (other_table, start, other) in itertools.pairwise(placed):
+            words = words_of(self.registers[one].type)
+            if table == other_table and start < at + words:
+                raise ValueError(
+                    f"registers.{other}: address {start} lies in {one}, which takes {words} words from {at} on"
+                )
 
 
 class ModbusBus(Strict):

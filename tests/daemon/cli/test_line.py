@@ -30,7 +30,8 @@ def loop() -> Loop:
 
 
 def shown(loop: Loop, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    document = {"unit": {"serial": "7"}, "not_written": "no registers", "outside": []}
+    result = {"data_quality": ["missing_samples: 3 of 900"]}
+    document = {"unit": {"serial": "7"}, "not_written": "no registers", "outside": [], "result": result}
     show_outcome(
         Outcome("left", 0, {"verdict": "pass", "reason": ""}, Held(), certified=Certified(document, loop, None, True))
     )

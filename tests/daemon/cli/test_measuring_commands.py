@@ -203,7 +203,9 @@ def test_verify_judges_a_recording_by_a_calibration(finished_run: Any, calibrati
     fitted = json.loads(linear.read_text())
     done = triaxcal("verify", linear, finished_run.can, "--json")
     assert (done.code, done.err) == (0, "")
-    assert set(done.json) == {"format", "rms_g", "max_abs_g", "noise_floor_g", "poses", "data_quality", "warnings"}
+    keys = {"format", "rms_g", "max_abs_g", "noise_floor_g", "expected_rms_g", "poses", "data_quality", "warnings"}
+    assert set(done.json) == keys
+    assert done.json["noise_floor_g"] < done.json["expected_rms_g"]
     _all_finite(done.json)
     assert done.json["rms_g"] == pytest.approx(fitted["residual"]["rms_g"], rel=0.05)
     assert len(done.json["poses"]) == len(fitted["poses"])

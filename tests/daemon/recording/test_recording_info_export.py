@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.errors import RecordingError
-from triaxcald.recording.export import write_csv
+from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
 from triaxcald.recording.recover import recover
 from triaxcald.recording.writer import RecordingWriter
@@ -69,7 +69,7 @@ def test_samples_are_written_as_text() -> None:
         {"temp_c": np.array([21.5, 22.0])},
     )
     out = io.StringIO()
-    assert write_csv(out, [block]) == 2
+    assert write_csv(out, [Rows.of(block)]) == 2
     expected = "t_s,ux,uy,uz,temp_c\n0.000000000,0.1,-2.0,3e-07,21.5\n1.500000001,1.0,2.0,3.0,22.0\n"
     assert out.getvalue() == expected
 
@@ -92,7 +92,7 @@ def test_what_is_exported_reads_back_to_the_last_bit(rows: list[tuple[int, float
         for i in range(0, len(rows), 7)
     ]
     out = io.StringIO()
-    write_csv(out, blocks)
+    write_csv(out, map(Rows.of, blocks))
     found = read_csv(io.BytesIO(out.getvalue().encode()))
     np.testing.assert_array_equal(found.readings, table[:, :3])
     np.testing.assert_array_equal(found.channels["a"], table[:, 3])
@@ -103,4 +103,4 @@ def test_blocks_of_different_channels_do_not_mix() -> None:
     one = SampleBlock(np.array([1]), np.array([0]), np.zeros((1, 3)), {"a": np.zeros(1)})
     other = SampleBlock(np.array([2]), np.array([1]), np.zeros((1, 3)), {})
     with pytest.raises(RecordingError, match=r"channels \[\] after sample 1, expected \['a'\]"):
-        write_csv(io.StringIO(), [one, other])
+        write_csv(io.StringIO(), map(Rows.of, [one, other]))

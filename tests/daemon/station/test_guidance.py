@@ -33,6 +33,12 @@ def test_at_first_the_first_pose_of_the_plan_is_next() -> None:
     assert list(state.missing) == LABELS
 
 
+def test_a_direction_that_only_a_number_names_is_told_by_its_components() -> None:
+    label, (x, y, z) = directions(20)[0]
+    assert label.startswith("N")
+    assert _guide([], wanted=20).hint == f"next: {label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
+
+
 def test_a_pose_that_is_there_is_not_asked_for_again() -> None:
     state = _guide([_pose(UP[0])])
     assert state.found == 1

@@ -95,7 +95,8 @@ def test_verification_outside_the_limit_brings_the_old_calibration_back(
 def _whitewashed(path: Path) -> None:
     """A failed unit said to have passed, by one who knows of the inventory and the digests, is found."""
     forged = Forgery.of(path)
-    with_pass = {"verdict": "pass", "exit_code": 0, "reason": "the fit is within the limits"}
+    reason = "the fit is within the limits; the device's own output was not checked"
+    with_pass = {"verdict": "pass", "exit_code": 0, "reason": reason}
     forged.edit("outcome.json", lambda o: o.update(with_pass))
     forged.seal()
     lines = [text.difference(d) for d in audit(forged.write(path.with_name("forged.mcap"))).differences]

@@ -83,6 +83,13 @@ def test_lines_that_lack_a_number_are_named_and_left_out_where_the_user_says(
     assert table.remarks[-1] == f"1 of {left + 1} lines left out (--skip-bad); {fault}"
 
 
+def test_of_a_garbled_line_the_column_is_named_that_is_garbled(tmp_path: Path) -> None:
+    lines = [f"{i / 100:.2f},1,2,3" for i in range(30)]
+    lines[20] = "0.20,1,2e9,3"
+    fault = asked(tmp_path, "time,ax,ay,az\n" + "\n".join(lines) + "\n")
+    assert fault.startswith("line 22: column ay: '2e9', expected a number within 10000 times most others; 1 such")
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -99,7 +106,13 @@ def test_lines_that_lack_a_number_are_named_and_left_out_where_the_user_says(
         (b"PAR1\x00\x00", "binary data (Parquet; name it .parquet)"),
         (b"\x00\x01\x02\x03" * 50, "binary data, expected a text table"),
         ("time,ax,ay,az\n0,01,0,98,0,03,-0,11\n0,02,0,97,0,03,-0,10\n", "line 1: 4 names, and 8 fields in the lines"),
-        ("t,ax,ay,az,bx,by,bz\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n", None),
+        ("t,ax,ay,az,bx [µT],by [µT],bz [µT]\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n", None),
+        ("t,ax,ay,az,bx,by,bz\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n",
+         "2 triples of outputs (ax, ay, az; bx, by, bz); choose by --columns ux=ax,"),
+        ("t,Sensor A x,Sensor A y,Sensor A z,Sensor B x,Sensor B y,Sensor B z\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n",
+         "2 triples of outputs (Sensor A x, Sensor A y, Sensor A z; Sensor B x"),
+        ("ms,ax,ay,az\n4294967280,1,2,3\n4294967290,1,2,3\n4,1,2,3\n14,1,2,3\n",
+         "line 4: column ms: the time falls back, as a counter does that starts again; --rate HZ"),
         ("t,left_x,left_y,left_z,right_x,right_y,right_z\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n",
          "2 triples of outputs (left_x, left_y, left_z; right_x, right_y, right_z); choose by --columns ux=left_x,"),
         ("t,x,y,z,x,y,z\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n", "choose by --columns ux=2,uy=3,uz=4"),
@@ -107,7 +120,7 @@ def test_lines_that_lack_a_number_are_named_and_left_out_where_the_user_says(
         ("t,linear_x,linear_y,linear_z\n0.0,1,2,3\n0.1,1,2,3\n", "linear_z seem to be without gravity"),
         ("t,ch3,ch2,ch1\n0.0,1,2,3\n0.1,1,2,3\n", "no three outputs among the columns t, ch3, ch2, ch1"),
         ("ax,ay,az\n1,2,3\n1,2,3\n", "no column of time; name it (--columns t=NAME,…), or say how many samples"),
-        ("time,clock,ax,ay,az\n0.0,0.0,1,2,3\n0.1,0.7,1,2,3\n0.2,1.4,1,2,3\n10.3,22.1,1,2,3\n",
+        ("time,clock,ax,ay,az\n0.0,0.0,1,2,3\n0.1,0.15,1,2,3\n0.2,0.3,1,2,3\n10.3,22.1,1,2,3\n",
          "columns of time that do not agree how long it took (column time 10.3 s, column clock 22.1 s)"),
     ],
 )  # fmt: skip
@@ -127,7 +140,7 @@ def test_what_cannot_be_read_in_one_way_alone_is_said(tmp_path: Path, content: s
         (Reading(rate=100.0, time_unit="ms"), "--rate, --time-unit ms: give one or the other"),
         (Reading(time_unit="iso"), "--time-unit iso: column time holds numbers, no dates"),
         (Reading(time_unit="index"), "--time-unit index: say how many samples a second it counts: --rate HZ"),
-        (Reading(where={"unit": "A"}), "--where unit=A: the table has 0 columns of that name"),
+        (Reading(where={"unit": "A"}), "--where unit=A: 0 columns of that name"),
         (Reading(where={"ax": "7"}), "--where ax=7: no row has that; it has 1"),
     ],
 )
@@ -219,3 +232,97 @@ def test_a_parquet_file_of_more_cells_than_memory_holds_is_refused(
 def test_forty_exports_and_more_are_tried_each_of_another_program() -> None:
     assert len(EXPORTS) >= 40
     assert len({e.program for e in EXPORTS}) == len(EXPORTS)
+
+
+def lines(rows: list[str], header: str = "time,ax,ay,az") -> str:
+    return "\n".join([header, *rows]) + "\n"
+
+
+EVERY = [f"{i / 100:.2f},{0.1 + i % 3:.3f},0.2,0.9" for i in range(40)]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("0.01;1,024;985;8,069\n0.02;1,020;984;8,071\n0.03;1,021;980;8,070\n", "numbers with a comma and with a point"),
+        ('10,"1,024",985,"8,069"\n20,"1,020",984,"8,071"\n', "1,024 may have a decimal comma or part thousands"),
+        (lines([row.replace(",0.9", "") for row in EVERY[:5]] + EVERY), "line 2: 3 fields, expected 4; 5 such lines"),
+        (lines([r.rpartition(",")[0] for r in EVERY[:12]], "t,a,b") + lines(EVERY + EVERY),
+         "line 2: another table, of 3 fields, above that of 4; part them in two files"),
+        (lines(["0.11,0.2,0.9,24.1", "0.12,0.2,0.9,24.1", "0.11,0.2,0.9,24.2"], "ax,ay,az"),
+         "line 1: 3 names, and 4 fields in the lines of numbers below"),
+        (lines([*EVERY[:5], '0.05,0.1,0.2,"5 in', *EVERY[6:20], '0.2,0.1,0.2,"', *EVERY[21:]]),
+         "a stray quotation mark: samples stand between it and the next one (0.06,"),
+        (lines([f"{i // 2 / 100:.2f},{i % 2 + 1},{row[5:]}" for i, row in enumerate(EVERY)], "time,sensor_id,ax,ay,az"),
+         "rows of several sensors in turn (column sensor_id: 1, 2); choose those of one: --where sensor_id=1"),
+        (lines([f"{row},{('left', 'right')[i % 2]}" for i, row in enumerate(EVERY)], "time,ax,ay,az,where"),
+         "rows of several sensors in turn (column where: left, right); choose those of one: --where where=left"),
+        (lines([f"{i * 0.625},1,2,3" for i in range(20)]), "numbers in steps of 0.625 in a unit that nothing states"),
+        (lines([f"{i / 6000:.6f},1,2,3" for i in range(20)]), "in a unit that nothing states"),
+        (lines([f"{140559 + i / 10 + 40 * (i >= 10):.1f},1,2,3" for i in range(30)]), "in a unit that nothing states"),
+        (lines([f"{i / 100},1,2,3" for i in range(20)], "Time [ticks],ax,ay,az"), "in a unit that nothing states"),
+        (lines([f"{row},0.1,0.2,0.9" for row in EVERY],
+               "time,body_acc_x,body_acc_y,body_acc_z,total_acc_x,total_acc_y,total_acc_z"), "2 triples of outputs"),
+        (lines(EVERY, "time,acc_earth_x,acc_earth_y,acc_earth_z"), "no three outputs among the columns"),
+        (lines([f"{row},0.1,0.2,0.9" for row in EVERY], "t_s,ux,uy,uz,ux,uy,uz").replace(",", ";"),
+         "2 triples of outputs"),
+        (lines(["s,g,mg,g", *EVERY]), "outputs in g, mg, g; expected one unit for all three"),
+        (lines([f"{i / 100},1,2," for i in range(20)]), "column az holds no number"),
+    ],
+)  # fmt: skip
+def test_what_a_second_reader_found_read_wrongly_is_asked_about(tmp_path: Path, content: str, words: str) -> None:
+    assert words in asked(tmp_path, content)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "# baud rate: 115200", "# Abtastzeit: 0,01 s", "# sample rate: 10 ms", "# Sampling rate [ms]: 10",
+        "# Sample frequency (Hz): 1,000", "# FS: +-8 g", "# low-pass filter at 42 Hz",
+    ],
+)  # fmt: skip
+def test_a_number_that_is_no_rate_in_hertz_is_none(tmp_path: Path, line: str) -> None:
+    content = f"{line}\n" + lines([f"{i},1,2,3" for i in range(20)], "sample,ax,ay,az")
+    assert "column sample is an index, and nothing states a rate: --rate HZ" in asked(tmp_path, content)
+
+
+def test_numbered_accelerations_are_taken_rather_than_letters_of_something_else(tmp_path: Path) -> None:
+    table = read(tmp_path, lines([f"{row},0.1,0.2,0.9" for row in EVERY], "time,a1,a2,a3,ex,ey,ez"))
+    assert "ux = a1, uy = a2, uz = a3" in table.remarks[0]
+
+
+@pytest.mark.parametrize("name", ["ms_elapsed", "time ms since boot", "Time (ms)"])
+def test_a_unit_of_time_counts_wherever_it_stands_in_the_name(tmp_path: Path, name: str) -> None:
+    table = read(tmp_path, lines([f"{i * 10.5},1,2,3" for i in range(20)], f"{name},ax,ay,az"))
+    assert table.samples.time_ns[-1] == round(19 * 10.5e6)
+
+
+def test_rows_of_another_sensor_take_no_time_where_the_rate_is_told(tmp_path: Path) -> None:
+    content = lines([f"{('ACC', 'GYR')[i % 2]},1,2,{i}" for i in range(40)], "sensor,x,y,z")
+    table = read(tmp_path, content, Reading(where={"sensor": "ACC"}, rate=100.0))
+    assert set(np.diff(table.samples.time_ns)) == {10_000_000}
+
+
+def test_an_index_that_counts_no_samples_is_not_said_to(tmp_path: Path) -> None:
+    content = lines([f"{2 * i},1,2,{i % 3}" for i in range(40)], "packet,ax,ay,az")
+    assert read(tmp_path, content, Reading(rate=100.0)).remarks[0].startswith("read as t = rows, 100 Hz")
+
+
+@pytest.mark.parametrize("name", ["temp_f", "Temp [°F]", "temp_raw", "temp_mv"])
+def test_a_temperature_in_another_unit_keeps_its_name(tmp_path: Path, name: str) -> None:
+    channels = read(tmp_path, lines([f"{row},{70 + i % 7}" for i, row in enumerate(EVERY)], f"time,ax,ay,az,{name}"))
+    assert "temp_c" not in channels.samples.channels
+
+
+def test_one_wrong_date_is_one_wrong_line(tmp_path: Path) -> None:
+    rows = [f"2024-12-01 10:00:00.{i:02d},1,2,{i % 3}" for i in range(40)]
+    rows[7] = rows[7].replace("2024-12", "2024-13")
+    assert asked(tmp_path, lines(rows)).startswith("line 9: column time: '2024-13-01 10:00:00.07', expected")
+    assert len(read(tmp_path, lines(rows), Reading(skip_bad=True)).samples.time_ns) == 39
+
+
+def test_times_of_day_go_on_after_midnight(tmp_path: Path) -> None:
+    rows = [f"23:59:59.{i:02d},1,2,{i % 3}" for i in range(50, 100)] + [
+        f"00:00:00.{i:02d},1,2,{i % 3}" for i in range(50)
+    ]
+    assert set(np.diff(read(tmp_path, lines(rows)).samples.time_ns)) == {10_000_000}

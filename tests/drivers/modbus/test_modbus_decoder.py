@@ -63,6 +63,16 @@ def test_a_fifo_window_is_decoded(bundle):
     assert (block.missing, block.duplicates, block.errors) == (0, 0, 0)
 
 
+def test_the_newest_sample_read_twice_is_one_sample_and_no_fault(bundle):
+    """Read oftener than it changes, as a block with a counter should be."""
+    readings = 'layout = "poll"\n'
+    counted = (readings, readings + 'counter = { word = 3, type = "uint16" }\n')
+    replies = [(10**7 * i, POLL_SOURCE, 0, bytes.fromhex(f"AE41 5652 4340 {7 + i // 2:04X}")) for i in range(6)]
+    block = ModbusDriver().decoder(bundle(counted), "readings").feed(RawBatch.of(replies))
+    assert len(block) == 3
+    assert (block.missing, block.duplicates) == (0, 0)
+
+
 def test_a_polled_block_is_a_sample(bundle):
     replies = [(100 * i, POLL_SOURCE, 0, bytes.fromhex("AE41 5652 4340")) for i in range(3)]
     block = decoder(bundle, "readings").feed(RawBatch.of(replies))

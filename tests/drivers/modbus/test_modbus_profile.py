@@ -27,6 +27,9 @@ from triaxcal_drivers.profile import validate
          "registers.pair: type int24 is none of Modbus: use int32"),
         ('pair = { address = 1,', "pair = { address = 65535,", "address 65535 leaves no room for uint32"),
         ('table = "input", access = "ro"', 'table = "input"', "an input register is read-only"),
+        ('pair = {', 'one = { address = 9, type = "float32", role = "bias.x" }\n'
+         'two = { address = 10, type = "float32", role = "bias.y" }\npair = {',
+         "registers.two: address 10 lies in one, which takes 2 words from 9 on"),
         ('name = "by-hand"', 'name = "by-hand"\nmax_write_words = 1', "is longer than one request may be"),
         ('name = "by-hand"', 'name = "by-hand"\nmax_read_words = 126', "max_read_words: input should be less than"),
     ],

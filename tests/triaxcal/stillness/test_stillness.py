@@ -333,7 +333,7 @@ def test_one_reading_that_is_no_number_is_refused() -> None:
     readings = np.zeros((100, 3))
     readings[41, 1] = np.nan
     time_ns = np.arange(100) * 10_000_000
-    with pytest.raises(InvalidData, match="reading 41 is not a finite number"):
+    with pytest.raises(InvalidData, match="reading 41: y is not a finite number; leave such rows out first"):
         Samples(time_ns, readings)
     with pytest.raises(InvalidData, match="at 410000000 ns is not a finite number"):
         StillnessDetector().feed(time_ns, readings)
