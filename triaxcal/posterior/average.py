@@ -29,6 +29,8 @@ NEGLIGIBLE = 1e-6
 """The probability of a set that moves no average."""
 LISTED = 0.01
 """The probability of a name that a document lists."""
+BIAS = slice(3, 6)
+"""Of the nine parameters as the fit has them: to one of these a bias adds as it is."""
 CELLS = 400
 """Sets, with one part and one choice of sizes each, whose covariances are mixed: the likeliest. The others are as these
 are."""
@@ -88,7 +90,7 @@ def average(seen: Posterior, at: HoldsAt) -> Average:
     wander = _wander(seen, left, at.t_s)
     return Average(
         Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + wander, sensor.effects),
-        G @ _covariance(seen, mean, carried) @ G.T,
+        G @ _covariance(seen, mean, carried, wander, at.t_s) @ G.T,
         {effect.name: seen.of_names[effect.name] for effect in carried.effects},
         wander,
     )
@@ -155,10 +157,9 @@ def _carry(linear: Floats, to: Floats, of: Floats) -> Floats:
 def _both(seen: Posterior, effect: Effect, elsewhere: _Elsewhere) -> Floats:
     """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of |a| in the next recording."""
     rows = seen.evidence.rows
-    _, J, _ = everything(rows.problem, rows.state.extended([effect]))
     _, along, by_v, held = elsewhere
     there = -np.einsum("ni,nip->np", by_v, effect.basis(along, held)) / rows.of_a_pose
-    return np.concatenate([J[:, 9:] / rows.error[:, None], there])
+    return np.concatenate([rows.by_coefficients(effect), there])
 
 
 def _elsewhere(seen: Posterior, at: HoldsAt) -> _Elsewhere:
@@ -199,8 +200,9 @@ def _mean(seen: Posterior, carried: _Carried) -> tuple[Floats, dict[int, Floats]
     return deviation, left
 
 
-def _covariance(seen: Posterior, mean: Floats, carried: _Carried) -> Floats:
-    """(9+p,9+p): within each set, part and choice of sizes, and between them."""
+def _covariance(seen: Posterior, mean: Floats, carried: _Carried, wander: Floats, t_s: float) -> Floats:
+    """(9+p,9+p): within each set, part and choice of sizes, and between them. The biases are those of the moment, with
+    what a process in time adds."""
     evidence = seen.evidence
     rows = evidence.rows
     inverse: dict[int, Floats] = {}
@@ -220,9 +222,19 @@ def _covariance(seen: Posterior, mean: Floats, carried: _Carried) -> Floats:
         to = np.concatenate([np.zeros((len(mean), 9)), carried.by_term[:, places]], axis=1)
         to[:9, :9] += np.diag(1 / rows.lengths)
         off = to @ here - mean
+        off[BIAS] -= wander
+        variance = np.zeros((3, 3))
+        assumed = evidence.parts[part]
+        if assumed.kind is not None and assumed.kind.what is What.TIME:
+            crossed = assumed.tau**2 * assumed.kind.bias_at(rows, t_s) @ inverse[part]
+            off[BIAS] += crossed @ (rows.y - design @ here)
+            variance = assumed.tau**2 * (assumed.kind.scale * np.eye(3) - crossed @ assumed.kind.bias_at(rows, t_s).T)
+            to[BIAS] -= crossed @ design
+        spread = to @ within @ to.T
+        spread[BIAS, BIAS] += variance
         share = float(np.exp(log_share))
         total += share
-        out += share * (to @ within @ to.T * rows.noise_given(chi2) + np.outer(off, off))
+        out += share * (spread * rows.noise_given(chi2) + np.outer(off, off))
     return out / total
 
 

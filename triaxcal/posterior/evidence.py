@@ -62,14 +62,17 @@ class SetEvidence:
 
 class Evidence:
     """The rows, the ``terms`` a set may have with the ``columns`` (N,C) of them all, the ``parts`` (the first is none),
-    and the grid of ``sizes`` (R,) in g."""
+    and the grid of ``sizes`` (R,) of effects in g."""
 
     def __init__(self, rows: Rows, terms: Sequence[Term], odds: Odds, smallest_g: float | None = None) -> None:
         """Sizes begin at ``smallest_g``, by default at that share of the noise of a pose which the odds have."""
         self.rows, self.terms, self.odds = rows, terms, odds
         self.parts = _parts(rows, odds)
         least = odds.smallest * rows.of_a_pose if smallest_g is None else smallest_g
-        self.sizes = np.geomspace(least, odds.largest_g * rows.problem.reference, odds.sizes)
+        reference = rows.problem.reference
+        self.sizes = np.geomspace(least, odds.largest_g * reference, odds.sizes)
+        gross = np.geomspace(least, odds.largest_outlier * reference, odds.sizes)
+        self._sizes_of = np.array([gross if term.effect is None else self.sizes for term in terms])
         self.log_prior = np.array([term.log_prior for term in terms])
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
         self.columns = np.concatenate([np.empty((len(rows.y), 0)), *(term.columns for term in terms)], axis=1)
@@ -105,8 +108,9 @@ class Evidence:
         out = np.empty((len(self.terms), len(self.sizes)))
         for index, places in self._by_rank:
             information, along = self._in_own_axes(turned, weight, shared, places, score)
-            spread = 1 + self.sizes[None, :, None] ** 2 * information[:, None, :]
-            gain = np.sum(self.sizes[None, :, None] ** 2 / spread * along[:, None, :], axis=2)
+            squared = self._sizes_of[index][:, :, None] ** 2
+            spread = 1 + squared * information[:, None, :]
+            gain = np.sum(squared / spread * along[:, None, :], axis=2)
             out[index] = self.rows.log_likelihood(chi2 - gain) - 0.5 * np.log(spread).sum(axis=2)
         alone = float(self.rows.log_likelihood(np.array(chi2))) + base
         return out + base - np.log(len(self.sizes)), alone
@@ -163,11 +167,12 @@ class Evidence:
 
     def of_set(self, members: tuple[int, ...], parts: Sequence[int]) -> SetEvidence:
         """Sizes of three and more terms go by every second step of the grid."""
-        coarse = self.sizes if len(members) < 3 else self.sizes[1::2]
-        sizes = np.array(list(itertools.product(coarse, repeat=len(members)))).reshape(len(coarse) ** len(members), -1)
+        first, step = (0, 1) if len(members) < 3 else (1, 2)
+        grids = [self._sizes_of[i][first::step] for i in members]
+        sizes = np.array(list(itertools.product(*grids)), dtype=float)
         index = self.places(members)
         scale = np.repeat(sizes, [self.terms[i].rank for i in members], axis=1)
-        prior = float(self.log_prior[list(members)].sum()) - len(members) * np.log(len(coarse))
+        prior = float(self.log_prior[list(members)].sum()) - sum(np.log(len(grid)) for grid in grids)
         information = np.empty((len(parts), len(index), len(index)))
         score = np.empty((len(parts), len(index)))
         chi2, base = np.empty((2, len(parts), 1))

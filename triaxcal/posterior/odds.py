@@ -23,10 +23,12 @@ class Odds:
     """That one calibration does not hold in all poses: a unit exchanged, or its channels, in one of two hundred."""
     largest_g: float = 30e-3
     """A sensor that departs by more from the linear model is broken."""
+    largest_outlier: float = 1.0
+    """Of the reference, as of another unit or mounting: a pose that was moved, or turned over, is off by as much."""
     smallest: float = 0.1
     """Of the noise of a pose: what is less shows in no data."""
     sizes: int = 9
-    """Steps between the two, even in the logarithm: a factor of about 4, within which the evidence hardly changes."""
+    """Steps between the two, even in the logarithm: a factor of 3 to 5, within which the evidence hardly changes."""
     unmodelled_smallest: float = 0.4
     unmodelled_largest: float = 200.0
     unmodelled_sizes: int = 7
@@ -42,6 +44,9 @@ class Odds:
     """Where an unmodelled part is likelier than not, no effect is corrected."""
     together: int = 3
     """Effects and outliers at once, at most."""
+    curved: float = 1.0
+    """Where the likeliest effects make more of chi-square by their curvature, all is linearised anew about them: so
+    much changes no evidence by more than a factor of 1.6."""
     window: float = 1e4
     """Sets of less probability than the best by this factor are left out (Occam's window; Madigan and Raftery 1994,
     J. Am. Stat. Assoc. 89:1535)."""

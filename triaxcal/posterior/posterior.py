@@ -16,6 +16,7 @@ from triaxcal.calibration import Calibration
 from triaxcal.conditions import channels_of
 from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
+from triaxcal.errors import Refused
 from triaxcal.poses.pose import Pose
 from triaxcal.posterior.evidence import Evidence, SetEvidence
 from triaxcal.posterior.odds import Odds
@@ -23,9 +24,14 @@ from triaxcal.posterior.rows import Rows
 from triaxcal.posterior.sets import likely_sets
 from triaxcal.posterior.terms import terms_of
 from triaxcal.posterior.unmodelled import What
+from triaxcal.problem import State, everything
 from triaxcal.runs import by_run
 from triaxcal.search.candidates import still_conditions
 
+ROUNDS = 3
+"""Of linearising anew: each is a step of Gauss and Newton."""
+PARTS = 3
+"""Unmodelled parts beside which a name is asked about without a pose, the likeliest beside the name."""
 ALTERNATIVES = 8
 """Names at most among which alternatives are looked for, the likeliest."""
 
@@ -143,17 +149,27 @@ class Posterior:
         return ()
 
     def without_any_pose(self, name: str) -> float:
-        """The probability of a name if that pose were an outlier which it takes most to explain."""
-        worst = self.of_names.get(name, 0.0)
-        for pose in range(self.evidence.rows.n):
-            names = [
-                (w, self.names_of(found))
-                for w, found in zip(self.weight, self.sets, strict=True)
-                if pose in self.poses_of(found)
-            ]
-            out = sum(w for w, _ in names)
-            if out > 0:
-                worst = min(worst, float(sum(w for w, held in names if name in held) / out))
+        """The probability of a name if that pose were an outlier which it takes most to explain: beside the likeliest
+        set with the name, less the name."""
+        best = next((found for found in self.sets if name in self.names_of(found)), None)
+        if best is None:
+            return 0.0
+        evidence = self.evidence
+        rest = tuple(i for i in best.members if evidence.terms[i].name != name)
+        mine = np.array([term.name == name for term in evidence.terms])
+        rows = np.argsort(-best.by_part)[:PARTS]
+        parts = sorted({0, *(best.parts[row] for row in rows)})
+        worst = self.of_names[name]
+        for i, term in enumerate(evidence.terms):
+            if term.pose < 0 or i in rest:
+                continue
+            members = tuple(sorted((*rest, i)))
+            beside = evidence.of_set(members, parts)
+            others = [other.kind not in {evidence.terms[k].kind for k in members} for other in evidence.terms]
+            each = logsumexp([evidence.with_further(beside, row, cells=1) for row in range(len(parts))], axis=(0, 2))
+            each = np.where(others, each + evidence.log_prior, -np.inf)
+            acts, none = logsumexp(each[mine]), logsumexp([beside.total, *each[~mine]])
+            worst = min(worst, float(np.exp(acts - np.logaddexp(acts, none))))
         return worst
 
     @cached_property
@@ -176,5 +192,39 @@ def posterior(
     rows = Rows.of(poses, linear, signs)
     moving = set(channels_of(rows.poses)) - still_conditions(rows.poses)
     effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, rows.poses)
-    evidence = Evidence(rows, terms_of(rows, effects, odds), odds, smallest_g)
-    return Posterior(evidence, likely_sets(evidence))
+    for _ in range(ROUNDS):
+        evidence = Evidence(rows, terms_of(rows, effects, odds), odds, smallest_g)
+        seen = Posterior(evidence, likely_sets(evidence))
+        point = _point_of(seen)
+        if point is None:
+            break
+        rows = rows.about(point)
+    return seen
+
+
+def _point_of(seen: Posterior) -> State | None:
+    """Where the likeliest set says that the unit is; None where the linearisation holds there, or nothing does."""
+    evidence, best = seen.evidence, seen.sets[0]
+    rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
+    if any(term.another >= 0 for term in terms) or not seen.names_of(best):
+        return None
+    scaled = np.einsum("ps,psq->q", np.exp(best.log - best.total), best.mean)
+    inverse = np.linalg.inv(evidence.covariance(best.parts[int(np.argmax(best.by_part))]))
+    left = inverse @ (rows.y - evidence.columns[:, evidence.places(best.members)] @ scaled)
+    linear = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ left)
+    effects, coefficients, foretold = [], [], rows.linear @ linear - rows.y
+    ends = np.cumsum([0, *(term.rank for term in terms)])
+    for term, mine in zip(terms, np.split(scaled, ends[1:-1]), strict=True):
+        if term.effect is not None:
+            own = np.zeros(len(term.effect.coefficients))
+            own[list(term.kept)] = term.mix * mine
+            effects.append(term.effect)
+            coefficients.append(own)
+            foretold = foretold + term.columns @ mine
+    point = State(np.concatenate([rows.state.theta + linear / rows.lengths, *coefficients]), tuple(effects))
+    try:
+        found, _, _ = everything(rows.problem, point, jacobian=False)
+    except Refused:
+        return None
+    curved = rows.beside.T @ (found / rows.error - foretold)
+    return point if curved @ curved > evidence.odds.curved else None

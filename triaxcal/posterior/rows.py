@@ -10,6 +10,7 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration
 from triaxcal.creep import without_creep
+from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.pose import Pose
@@ -18,6 +19,7 @@ from triaxcal.pure_error import noise_levels
 from triaxcal.start import begun
 from triaxcal.trends import Trends
 
+LINEAR = 9
 QUIETEST = 0.1
 """Of the median: a pose without scatter (a logger's dead band) would weigh without end."""
 CHI2_LOG = np.linspace(-8.0, 70.0, 12000)
@@ -31,13 +33,15 @@ class Rows:
     ``places`` (n,) are those of the poses among all that were given. ``y`` (N,) misfits, ``linear`` (N,9)
     derivatives by the nine parameters with columns of length one, ``lengths`` (9,) what they were divided by,
     ``error`` (N,) standard errors in units of the reference. ``beside`` (N,m) is an orthonormal basis of what the
-    nine leave, m = N − 9, and ``z`` (m,) the misfits in it. ``state`` is where all was linearised.
+    nine leave, m = N − 9, and ``z`` (m,) the misfits in it. ``run`` (n,) is the recording that each pose is of.
+    ``point`` is where all was linearised, with effects where these are large, and ``state`` its nine parameters.
     """
 
     poses: Sequence[Pose]
     places: Ints
+    run: Ints
     problem: Problem
-    state: State
+    point: State
     y: Floats
     linear: Floats
     lengths: Floats
@@ -50,17 +54,24 @@ class Rows:
     @classmethod
     def of(cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float]) -> Rows:
         """About the ``linear`` fit of these poses, which leaves outliers out. Poses with a fault are left out. Raises
-        as `triaxcal.start.begun` does."""
+        as `triaxcal.start.begun` does; Refused where no degree of freedom is left."""
         places = np.array([i for i, p in enumerate(poses) if not p.fault], dtype=int)
         sound = [poses[i] for i in places]
         poses = without_creep(sound) if np.isfinite([p.trend_error for p in sound]).all() else sound
         problem, _ = begun(poses, signs=signs, reference=linear.reference)
-        state = State.of(problem, replace(linear.sensor, effects=()))
         trends = Trends.of(problem, poses)
         problem = problem if trends is None else replace(problem, further=trends)
-        r, J, error = everything(problem, state)
-        n = len(poses)
-        if len(r) <= J.shape[1]:
+        return cls._about(State.of(problem, replace(linear.sensor, effects=())), poses, places, problem)
+
+    def about(self, point: State) -> Rows:
+        """The same rows, linearised elsewhere: coefficients count from zero there too."""
+        return self._about(point, self.poses, self.places, self.problem)
+
+    @classmethod
+    def _about(cls, point: State, poses: Sequence[Pose], places: Ints, problem: Problem) -> Rows:
+        r, J, error = everything(problem, point)
+        r, J, n = r - J[:, LINEAR:] @ point.theta[LINEAR:], J[:, :LINEAR], len(poses)
+        if len(r) <= LINEAR:
             raise Refused(f"{n} poses leave nothing over the nine parameters to judge effects by")
         error = np.concatenate([_not_too_quiet(error[:n]), _not_too_quiet(error[n:])])
         columns = J / error[:, None]
@@ -69,7 +80,17 @@ class Rows:
         beside = np.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
         y, noise = -r / error, noise_levels(poses)
         likelihood = noise.log_likelihood(np.exp(CHI2_LOG), beside.shape[1])
-        return cls(poses, places, problem, state, y, columns, lengths, error, beside, beside.T @ y, noise, likelihood)
+        run, z = np.array([p.run.index for p in poses]), beside.T @ y
+        return cls(poses, places, run, problem, point, y, columns, lengths, error, beside, z, noise, likelihood)
+
+    def by_coefficients(self, effect: Effect) -> Floats:
+        """(N,p) derivatives of the rows by the coefficients of an effect."""
+        _, J, _ = everything(self.problem, self.point.extended([effect]))
+        return np.asarray(J[:, len(self.point.theta) :] / self.error[:, None])
+
+    @property
+    def state(self) -> State:
+        return State(self.point.theta[:LINEAR], ())
 
     @property
     def n(self) -> int:

@@ -16,7 +16,6 @@ from triaxcal.errors import Refused
 from triaxcal.planning.directions import directions
 from triaxcal.posterior.odds import Odds
 from triaxcal.posterior.rows import Rows
-from triaxcal.problem import everything
 from triaxcal.search.candidates import still_conditions
 
 FEWEST = 4
@@ -110,14 +109,13 @@ def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
     """Derivatives of the rows by the coefficients (N,p), and the size of each (p,): the rms of what a coefficient of
     one adds over the sphere and over the poses' conditions, about its mean over these. None where it cannot be told."""
     try:
-        _, J, _ = everything(rows.problem, rows.state.extended([effect]))
+        columns = rows.by_coefficients(effect)
         held = rows.problem.conditions
         up = np.array([v for _, v in directions(SPHERE)]) * rows.problem.reference
         every: Mapping[str, Floats] = {name: np.repeat(values, len(up)) for name, values in held.items()}
         basis = effect.basis(np.tile(up, (rows.n, 1)), every).reshape(rows.n, len(up), AXES, -1)
     except (EffectFault, Refused):
         return None
-    columns = J[:, 9:] / rows.error[:, None]
     if not (np.isfinite(columns).all() and np.isfinite(basis).all()):
         return None
     if effect.needs:
@@ -137,7 +135,7 @@ def _outlier(rows: Rows, pose: int, odds: Odds) -> Term:
 
 def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
     """From a pose on all nine parameters are others: another unit, channels that were exchanged."""
-    order = np.argsort(rows.t_s, kind="stable")
+    order = np.lexsort((rows.t_s, rows.run))
     cuts = range(FEWEST, rows.n - FEWEST + 1)
     size = np.sqrt(np.mean((rows.linear[: rows.n] * rows.error[: rows.n, None]) ** 2, axis=0))
     mix = 1 / (np.maximum(size, NOTHING_G) * np.sqrt(len(size)))

@@ -57,18 +57,19 @@ class Kind:
     scale: float
 
     def bias_at(self, rows: Rows, t_s: float) -> Floats:
-        """(3,N) covariance of the bias at a moment of the recording with the rows over their errors, of what goes with
-        time; a length is a share of the recording's duration."""
+        """(3,N) covariance of the bias at a moment of the last recording with the rows over their errors, of what goes
+        with time; a length is a share of the recording's duration. The bias itself has the variance ``scale``."""
         length = self.length * duration_of(rows)
         apart = t_s - rows.t_s
-        near = np.exp(-(apart**2) / 2 / length**2)
+        near = np.exp(-(apart**2) / 2 / length**2) * (rows.run == rows.run.max())
         both = [near] if not rows.slopes else [near, near * apart / length**2 * rows.held_s]
         by_v = place(rows, rows.problem.u).by_v
         return np.asarray(self.scale * np.concatenate([each[:, None] * by_v for each in both]).T / rows.error)
 
 
 def duration_of(rows: Rows) -> float:
-    return max(float(np.ptp(rows.t_s)), 1e-9)
+    """Of the longest recording."""
+    return max(1e-9, *(float(np.ptp(rows.t_s[rows.run == run])) for run in np.unique(rows.run)))
 
 
 def kinds_of(rows: Rows) -> list[Kind]:
@@ -114,12 +115,13 @@ def _covariances(rows: Rows) -> Iterator[tuple[What, float, Floats]]:
 
 
 def _in_time(rows: Rows, share: float, together: Floats) -> Floats:
-    """A bias of each axis that wanders smoothly: one process for means and slopes, or slow drift is paid twice."""
+    """A bias of each axis that wanders smoothly, in each recording anew: one process for means and slopes, or slow
+    drift is paid twice."""
     n, length = rows.n, share * duration_of(rows)
     apart = rows.t_s[:, None] - rows.t_s[None]
-    near = np.exp(-(apart**2) / 2 / length**2) * together
+    near = np.exp(-(apart**2) / 2 / length**2) * together * (rows.run[:, None] == rows.run)
     if not rows.slopes:
-        return near
+        return np.asarray(near)
     held = rows.held_s
     mixed = near * apart / length**2 * held[None]
     inside = near * (1 / length**2 - apart**2 / length**4) * held[:, None] * held[None]

@@ -124,3 +124,21 @@ def test_a_process_in_time_says_where_the_bias_is_at_the_moment_asked_for(
     # What is constant all along is the sensor's bias.
     told, truth = (b - b.mean(axis=0) for b in (told, np.array([bias_g(t) for t in moments])))
     assert np.sqrt(np.mean((told - truth) ** 2)) < 0.2 * np.sqrt(np.mean(truth**2))
+
+
+def test_the_bias_at_a_moment_is_as_sure_as_a_process_in_time_leaves_it(
+    poses_with: Callable[..., list[Pose]], paper_unit: Sensor
+) -> None:
+    """Biases that wander smoothly, drawn anew for each seed."""
+    off = []
+    for seed in range(8):
+        poses = poses_with(seed + 40)
+        t_s = np.array([*(p.t_s for p in poses), poses[-1].end_s])
+        near = np.exp(-((t_s[:, None] - t_s) ** 2) / 2 / (0.25 * t_s[-1]) ** 2)
+        rng = np.random.default_rng(seed)
+        bias_g = np.linalg.cholesky(near + 1e-9 * np.eye(len(near))) @ rng.normal(0, 4e-4, (len(t_s), 3))
+        moved = [replace(p, mean=p.mean + paper_unit.scale_factor * b) for p, b in zip(poses, bias_g, strict=False)]
+        made = average(posterior(moved, fit(moved, signs=MINUS), signs=MINUS, catalogue=()), at(float(t_s[-1])))
+        truth = paper_unit.bias + bias_g[-1]
+        off.append((made.sensor.bias - truth) / np.sqrt(np.diag(made.covariance)[6:9]))
+    assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.5

@@ -120,3 +120,29 @@ def test_the_unit_of_the_reference_changes_no_probability(poses_with: Poses) -> 
     assert {n: p for n, p in in_si.items() if p > 1e-3} == pytest.approx(
         {n: p for n, p in in_g.items() if p > 1e-3}, rel=1e-3, abs=1e-6
     )
+
+
+@pytest.mark.parametrize("mg", [1.0, 5.0, 15.0])
+@pytest.mark.parametrize("name", ["second_order_nonlinearity", "third_order_nonlinearity", "temperature_bias"])
+def test_a_strong_effect_is_as_certain_as_a_weak_one(poses_with: Poses, name: str, mg: float) -> None:
+    """At several mg the linear fit is too far off for one linearisation about it."""
+    seen = found(poses_with(12, **{name: [mg * 1e-3, -0.7e-3 * mg, 0.5e-3 * mg]}))
+    assert seen.certain == ((name,),)
+    assert refusal(seen) is None
+
+
+@pytest.mark.parametrize("by_g", [0.01, 0.4, 0.9])
+def test_a_pose_is_an_outlier_however_far_it_is_off(
+    poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]], by_g: float
+) -> None:
+    seen = found(knocked(poses_with(2), 7, by_g))
+    assert seen.of_outliers[7] > 0.99
+    assert seen.of_unmodelled < 0.3
+
+
+def test_a_unit_turned_in_its_socket_is_seen_with_the_pose(poses_with: Poses) -> None:
+    """As a connector plugged in the other way round: two channels change their signs."""
+    poses = poses_with(7)
+    seen = found([*poses[:17], *(replace(p, mean=p.mean * [-1, -1, 1]) for p in poses[17:])])
+    assert seen.of_another[17] > 0.9
+    assert refusal(seen) is Refusal.ANOTHER
