@@ -101,6 +101,8 @@ class PoseResult:
     raised_g: float | None = None
     carries: float = 0.0
     """0…1: how much of some combination of its mean and its trend the pose determines by itself."""
+    outlier_probability: float | None = None
+    """None where nobody asked."""
 
     @property
     def error_g(self) -> float:
@@ -124,6 +126,9 @@ class Calibration:
     "effect.name"; ``shared`` are coefficients, named so, that only a combination of them is known of. ``trends``: how
     |a| goes inside the poses was fitted along with their means. ``rivals`` are models that explain the same poses as
     well, by what they have in the place of an effect; standard errors are those of this model, were it the right one.
+    ``weights`` is the probability of each effect where the coefficients are means over all that may act. Then
+    ``spread`` (p,) are the standard deviations of the coefficients before the poses were seen, and ``thermal``
+    (9+p,9+p) is the part of the covariance that thermal effects make which the model has not.
     ``holds_at`` None: effects of time count as long after the start, as in documents of 0.1. ``linear_only`` is the
     linear model fitted by itself, where there are effects and somebody asked for it.
     """
@@ -145,6 +150,9 @@ class Calibration:
     blind_to: tuple[str, ...] = ()
     cautions: tuple[Caution, ...] = ()
     rivals: Mapping[str, Calibration] = field(default_factory=dict, repr=False)
+    weights: Mapping[str, float] = field(default_factory=dict)
+    spread: Floats | None = field(default=None, repr=False)
+    thermal: Floats | None = field(default=None, repr=False)
     holds_at: HoldsAt | None = None
     linear_only: Calibration | None = field(default=None, repr=False)
 
@@ -185,7 +193,12 @@ class Calibration:
             for c in e.whole.coefficients
         }
         return replace(
-            self, sensor=self.sensor.whole, covariance=mix @ self.covariance @ mix.T, shared=frozenset(shared)
+            self,
+            sensor=self.sensor.whole,
+            covariance=mix @ self.covariance @ mix.T,
+            thermal=None if self.thermal is None else mix @ self.thermal @ mix.T,
+            spread=None if self.spread is None else np.abs(mix[9:, 9:]) @ self.spread,
+            shared=frozenset(shared),
         )
 
     def coefficients_of(self, name: str) -> dict[str, tuple[float, float | None, str]]:

@@ -58,7 +58,7 @@ def noise_levels(poses: Sequence[Pose]) -> NoiseLevels:
     return common.blurred(max(1 / dof - 1 / first.shared_dof, 0.0))
 
 
-def lack_of_fit_p(chi2: float, left: int, pure_dof: float) -> float | None:
+def lack_of_fit_p(chi2: float, left: float, pure_dof: float) -> float | None:
     """Probability of a sum of squares this large in ``left`` degrees of freedom, from the poses' own noise.
 
     None where nothing is left, or where the noise is not known.

@@ -7,7 +7,7 @@ the coefficients are those that come nearest, in the poses and in the next recor
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -17,23 +17,26 @@ from scipy.special import logsumexp
 from triaxcal.arrays import Floats
 from triaxcal.calibration import HoldsAt
 from triaxcal.conditions import at_reference, of_moment
+from triaxcal.effects import CATALOGUE, TEMPERATURE
 from triaxcal.effects.contract import Effect
 from triaxcal.planning.directions import directions
 from triaxcal.posterior.evidence import SetEvidence
 from triaxcal.posterior.posterior import Posterior
+from triaxcal.posterior.rows import LINEAR
 from triaxcal.posterior.unmodelled import What, place
 from triaxcal.problem import State, everything, parameters_by_theta
 from triaxcal.sensor import Sensor
 
 NEGLIGIBLE = 1e-6
 """The probability of a set that moves no average."""
-LISTED = 0.01
-"""The probability of a name that a document lists."""
+NOTICEABLE = 0.1
+"""Of the standard error of a pose: a name that is unlikely and corrects less is not listed."""
 BIAS = slice(3, 6)
 """Of the nine parameters as the fit has them: to one of these a bias adds as it is."""
 CELLS = 400
 """Sets, with one part and one choice of sizes each, whose covariances are mixed: the likeliest. The others are as these
 are."""
+THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
 STEPS = 3
 """Of Newton's method, for nine parameters a few parts in a thousand from where they go."""
 SPHERE = 26
@@ -52,18 +55,22 @@ class Refusal(StrEnum):
     ANOTHER = "another"
     """One calibration does not hold in all poses: a unit was exchanged on the way, or its channels."""
     ONE_POSE = "one_pose"
-    """A name is certain, and hangs on a single pose."""
+    """A name is certain, and without some single pose unlikelier than not."""
 
 
 @dataclass(frozen=True, eq=False)
 class Average:
     """``sensor`` has one entry for each likely name, by the mean of its coefficients: sets without the effect count,
     with zero. ``covariance`` (9+p,9+p) is that of its scale factors, misalignments, biases and coefficients, within
-    the sets and between them; ``weights`` the probability of each name. ``wander`` (3,) g, which the biases hold, is
-    what a process in time adds to them at the moment for which all this holds."""
+    the sets and between them, of which ``thermal`` is the part of sets with a thermal effect that is not listed;
+    ``spread`` (p,) are the coefficients' standard deviations before the poses were seen, as the probabilities and sizes
+    after have them. ``weights`` has the probability of each name. ``wander`` (3,) g, which the biases hold, is what a
+    process in time adds to them at the moment for which all this holds."""
 
     sensor: Sensor
     covariance: Floats
+    thermal: Floats
+    spread: Floats
     weights: Mapping[str, float]
     wander: Floats
 
@@ -75,25 +82,37 @@ def refusal(seen: Posterior) -> Refusal | None:
     if seen.of_unmodelled >= odds.refused:
         return Refusal.UNMODELLED
     certain = [name for name, p in seen.of_names.items() if p >= odds.certain]
-    if any(seen.without_any_pose(name) < odds.certain for name in certain):
+    if any(seen.without_any_pose(name) < odds.refused for name in certain):
         return Refusal.ONE_POSE
     return None
 
 
 def average(seen: Posterior, at: HoldsAt) -> Average:
     """Over all sets, sizes and parts; it holds for another recording as at a moment of this one."""
-    carried = _Carried.of(seen, at)
+    carried = _Carried.of(seen, at, _likeliest(seen))
     mean, left = _mean(seen, carried)
     state = _settled(seen, mean, carried)
-    G = parameters_by_theta(seen.evidence.rows.problem, state)
     sensor = state.sensor(seen.evidence.rows.problem)
     wander = _wander(seen, left, at.t_s)
-    return Average(
-        Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + wander, sensor.effects),
-        G @ _covariance(seen, mean, carried, wander, at.t_s) @ G.T,
-        {effect.name: seen.of_names[effect.name] for effect in carried.effects},
-        wander,
-    )
+    moved = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + wander, sensor.effects)
+    return _with_errors(seen, at, carried, moved, state, mean, wander)
+
+
+def linear_alone(seen: Posterior, at: HoldsAt, linear: Sensor) -> Average:
+    """The ``linear`` sensor with the errors that all likely sets make of it: what is handed on where no effect is
+    corrected."""
+    rows = seen.evidence.rows
+    state = State.of(rows.problem, linear)
+    return _with_errors(seen, at, _Carried.of(seen, at, []), linear, state, state.theta - rows.state.theta, np.zeros(3))
+
+
+def _with_errors(
+    seen: Posterior, at: HoldsAt, carried: _Carried, sensor: Sensor, state: State, mean: Floats, wander: Floats
+) -> Average:
+    G = parameters_by_theta(seen.evidence.rows.problem, state)
+    spread = _Spread.of(seen, mean, carried, wander, at.t_s)
+    weights = {effect.name: seen.of_names[effect.name] for effect in carried.effects}
+    return Average(sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, wander)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +125,9 @@ class _Carried:
     by_term: Floats
 
     @classmethod
-    def of(cls, seen: Posterior, at: HoldsAt) -> _Carried:
+    def of(cls, seen: Posterior, at: HoldsAt, likeliest: Sequence[Effect]) -> _Carried:
         evidence = seen.evidence
         rows = evidence.rows
-        likeliest = _likeliest(seen)
         there = _elsewhere(seen, at)
         each = [_both(seen, effect, there) for effect in likeliest]
         ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
@@ -134,16 +152,21 @@ def _likeliest(seen: Posterior) -> list[Effect]:
     """Of each name that is listed the form and the shape of the greatest weight, the likeliest name first."""
     weight: dict[int, float] = defaultdict(float)
     effects: dict[int, Effect] = {}
+    corrects: dict[str, float] = defaultdict(float)
     for w, found in zip(seen.weight, seen.sets, strict=True):
-        for i in found.members:
-            effect = seen.evidence.terms[i].effect
-            if effect is not None:
-                weight[id(effect)] += float(w)
-                effects[id(effect)] = effect
+        scaled = np.einsum("ps,psq->q", np.exp(found.log - found.total), found.mean)
+        ends = np.cumsum([0, *(seen.evidence.terms[i].rank for i in found.members)])
+        for i, first, last in zip(found.members, ends, ends[1:], strict=False):
+            term = seen.evidence.terms[i]
+            if term.effect is not None:
+                weight[id(term.effect)] += float(w)
+                effects[id(term.effect)] = term.effect
+                corrects[term.name] += float(w) * float(np.sqrt(np.mean(scaled[first:last] ** 2)))
+    least = NOTICEABLE * seen.evidence.rows.of_a_pose
     out: dict[str, Effect] = {}
     for key in sorted(weight, key=lambda key: -weight[key]):
         out.setdefault(effects[key].name, effects[key])
-    return [out[name] for name, p in seen.of_names.items() if p > LISTED]
+    return [out[n] for n, p in seen.of_names.items() if p >= seen.evidence.odds.reported or corrects[n] > least]
 
 
 def _carry(linear: Floats, to: Floats, of: Floats) -> Floats:
@@ -200,13 +223,39 @@ def _mean(seen: Posterior, carried: _Carried) -> tuple[Floats, dict[int, Floats]
     return deviation, left
 
 
-def _covariance(seen: Posterior, mean: Floats, carried: _Carried, wander: Floats, t_s: float) -> Floats:
-    """(9+p,9+p): within each set, part and choice of sizes, and between them. The biases are those of the moment, with
-    what a process in time adds."""
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """As `Average` has it, of the parameters as deviations: ``whole`` and ``thermal`` (9+p,9+p), ``prior`` (p,)
+    variances."""
+
+    whole: Floats
+    thermal: Floats
+    prior: Floats
+
+    @classmethod
+    def of(cls, seen: Posterior, mean: Floats, carried: _Carried, wander: Floats, t_s: float) -> _Spread:
+        """Within each set, part and choice of sizes, and between them. The biases are those of the moment, with what a
+        process in time adds."""
+        listed = {effect.name for effect in carried.effects}
+        whole, thermal = np.zeros((2, len(mean), len(mean)))
+        prior, total = np.zeros(len(mean) - LINEAR), 0.0
+        for share, names, size, here in _cells(seen, mean, carried, wander, t_s):
+            total += share
+            whole += share * here
+            prior += share * size
+            if names & (THERMAL - listed):
+                thermal += share * here
+        return cls(whole / total, thermal / total, prior / total)
+
+
+def _cells(
+    seen: Posterior, mean: Floats, carried: _Carried, wander: Floats, t_s: float
+) -> Iterator[tuple[float, frozenset[str], Floats, Floats]]:
+    """Of each likely set, part and choice of sizes: its probability, its names, the variances (p,) that its sizes give
+    the coefficients, and the second moments (9+p,9+p) about the mean."""
     evidence = seen.evidence
     rows = evidence.rows
     inverse: dict[int, Floats] = {}
-    total, out = 0.0, np.zeros((len(mean), len(mean)))
     for log_share, found, row, cell in _likely_cells(seen):
         part = found.parts[row]
         if part not in inverse:
@@ -215,27 +264,26 @@ def _covariance(seen: Posterior, mean: Floats, carried: _Carried, wander: Floats
         design = np.concatenate([rows.linear, evidence.columns[:, places]], axis=1)
         precision = design.T @ inverse[part] @ design
         sizes = np.repeat(found.sizes[cell], [evidence.terms[i].rank for i in found.members])
-        precision[9:, 9:] += np.diag(sizes**-2.0)
+        precision[LINEAR:, LINEAR:] += np.diag(sizes**-2.0)
         within = np.linalg.inv(precision)
         here = within @ (design.T @ (inverse[part] @ rows.y))
-        chi2 = float(rows.y @ inverse[part] @ (rows.y - design @ here))
-        to = np.concatenate([np.zeros((len(mean), 9)), carried.by_term[:, places]], axis=1)
-        to[:9, :9] += np.diag(1 / rows.lengths)
+        left = rows.y - design @ here
+        to = np.concatenate([np.zeros((len(mean), LINEAR)), carried.by_term[:, places]], axis=1)
+        size = np.sum((to[LINEAR:, LINEAR:] * sizes) ** 2, axis=1)
+        to[:LINEAR, :LINEAR] += np.diag(1 / rows.lengths)
         off = to @ here - mean
         off[BIAS] -= wander
-        variance = np.zeros((3, 3))
+        wandering = np.zeros((3, 3))
         assumed = evidence.parts[part]
         if assumed.kind is not None and assumed.kind.what is What.TIME:
-            crossed = assumed.tau**2 * assumed.kind.bias_at(rows, t_s) @ inverse[part]
-            off[BIAS] += crossed @ (rows.y - design @ here)
-            variance = assumed.tau**2 * (assumed.kind.scale * np.eye(3) - crossed @ assumed.kind.bias_at(rows, t_s).T)
-            to[BIAS] -= crossed @ design
+            there = assumed.tau**2 * assumed.kind.bias_at(rows, t_s)
+            off[BIAS] += there @ inverse[part] @ left
+            wandering = assumed.tau**2 * assumed.kind.scale * np.eye(3) - there @ inverse[part] @ there.T
+            to[BIAS] -= there @ inverse[part] @ design
         spread = to @ within @ to.T
-        spread[BIAS, BIAS] += variance
-        share = float(np.exp(log_share))
-        total += share
-        out += share * (spread * rows.noise_given(chi2) + np.outer(off, off))
-    return out / total
+        spread[BIAS, BIAS] += wandering
+        noise = rows.noise_given(float(rows.y @ inverse[part] @ left))
+        yield float(np.exp(log_share)), seen.names_of(found), size, spread * noise + np.outer(off, off)
 
 
 def _likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:

@@ -41,7 +41,8 @@ class Odds:
     reported: float = 0.5
     """Outliers, and names that are not certain, are told from this probability on."""
     refused: float = 0.5
-    """Where an unmodelled part is likelier than not, no effect is corrected."""
+    """Where an unmodelled part is likelier than not, or a name would be unlikelier than not without some one pose, no
+    effect is corrected."""
     together: int = 3
     """Effects and outliers at once, at most."""
     curved: float = 1.0

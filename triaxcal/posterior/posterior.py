@@ -59,6 +59,10 @@ class Posterior:
         poses = (self.evidence.terms[i].pose for i in found.members)
         return frozenset(pose for pose in poses if pose >= 0)
 
+    def given(self, name: str) -> Posterior:
+        """If this effect acts."""
+        return Posterior(self.evidence, [found for found in self.sets if name in self.names_of(found)])
+
     @cached_property
     def of_names(self) -> Mapping[str, float]:
         """The probability that each effect acts, whatever acts beside it, the likeliest first."""

@@ -53,7 +53,7 @@ def _(b: of.RegisterSteps) -> str:
 
 @basis.register
 def _(b: of.CompetingModels) -> str:
-    return f"{' or '.join(b.names)} would do as well on these poses"
+    return f"{' or '.join(b.names) or 'something else'} would do as well on these poses"
 
 
 @basis.register

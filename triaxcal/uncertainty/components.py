@@ -14,12 +14,14 @@ from triaxcal.pure_error import pure_error_dof
 from triaxcal.uncertainty.basis import (
     Basis,
     BirgeFactor,
+    CompetingModels,
     CompleteModel,
     Creep,
     CreepHalved,
     Excess,
     FinerRegisters,
     LongerOrMorePoses,
+    ModelsToldApart,
     ReferenceKnown,
     RegisterSteps,
     Remedy,
@@ -28,6 +30,8 @@ from triaxcal.uncertainty.basis import (
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
 
+CERTAIN = 0.99
+"""Effects of this probability do not compete."""
 NOTHING = 1e-12
 """Share of a variance that is none."""
 
@@ -90,6 +94,8 @@ def statistical(calibration: Calibration, linearised: Linearised, beyond: float)
     if creep.any():
         basis = Creep(int(np.count_nonzero(creep)))
         out.append(Component.of(linearised, "creep", "B", np.inf, (S * creep) @ S.T, basis, CreepHalved()))
+    if calibration.spread is not None:
+        return out + _between(calibration, linearised, (S * linearised.noise**2) @ S.T)
     excess = beyond * (calibration.covariance - (S * linearised.noise**2) @ S.T)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
         raised: Basis = BirgeFactor(calibration.inflation)
@@ -97,6 +103,22 @@ def statistical(calibration: Calibration, linearised: Linearised, beyond: float)
             raised = Excess(calibration.excess_g / calibration.reference)
         out.append(Component.of(linearised, "lack_of_fit", "A", calibration.dof, excess, raised, CompleteModel()))
     return out
+
+
+def _between(calibration: Calibration, linearised: Linearised, noise: Floats) -> list[Component]:
+    """What the ``noise`` (p,p) of the poses leaves of a covariance that is one over all that may act; thermal effects
+    have a line of their own."""
+    thermal = 0.0 if calibration.thermal is None else calibration.thermal
+    rest = positive(calibration.covariance - noise - thermal)
+    names = tuple(name for name, p in calibration.weights.items() if p < CERTAIN)
+    basis, by = CompetingModels(names), ModelsToldApart()
+    return [Component.of(linearised, "choice_of_effect", "B", np.inf, rest, basis, by)]
+
+
+def positive(covariance: Floats) -> Floats:
+    """The nearest that is one: a difference of two may have lost that."""
+    size, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
 
 
 def half_the_noise(poses: Sequence[Pose]) -> Remedy:

@@ -41,7 +41,7 @@ class Linearised:
         _, J, self.error = everything(self.problem, self.state)
         # What the shapes of effects were chosen by blurs the parameters too.
         self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
-        self.gain = _pinv(self.weighted)
+        self.gain = _gain(self.weighted, calibration.spread)
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
         """(p,n): shift of the parameters for an error of each residual (`triaxcal.problem.everything`)."""
@@ -75,7 +75,12 @@ class Linearised:
         return np.concatenate([-np.linalg.lstsq(nine, r, rcond=None)[0], np.zeros(len(self.G) - 9)])
 
 
-def _pinv(matrix: Floats) -> Floats:
-    """Columns are scaled first: those of a temperature and of a cube are decades apart."""
-    norms = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    return np.asarray(np.linalg.pinv(matrix / norms, rcond=1e-13) / norms[:, None])
+def _gain(weighted: Floats, spread: Floats | None) -> Floats:
+    """(p,n) of parameters by weighted residuals, where coefficients are held by their ``spread``. Columns are scaled
+    first: those of a temperature and of a cube are decades apart."""
+    norms = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
+    rows = weighted / norms
+    if spread is not None and len(spread):
+        held = np.eye(len(norms))[9 : 9 + len(spread)] / np.maximum(spread, 1e-300)[:, None]
+        rows = np.concatenate([rows, held / norms])
+    return np.asarray(np.linalg.pinv(rows, rcond=1e-13)[:, : len(weighted)] / norms[:, None])

@@ -18,7 +18,7 @@ from triaxcal.uncertainty.basis import (
     ThermometerAt,
     UnmodelledTemperature,
 )
-from triaxcal.uncertainty.components import Component, half_the_noise
+from triaxcal.uncertainty.components import Component, half_the_noise, positive
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
 
@@ -34,6 +34,8 @@ def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[
     A coefficient that did not show is not zero: it is what the data leave of `SENSITIVITY_PER_K`, a mean and a spread
     by Bayes' rule, and the parameters of a fit without it are off by what it does to them.
     """
+    if calibration.spread is not None:
+        return _as_probable(calibration, linearised), 1.0
     missing = _thermal_but(linearised.effects)
     if TEMPERATURE not in linearised.problem.channel_reference or not missing:
         return [], 1.0
@@ -66,6 +68,16 @@ def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[
     by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
     basis = UnmodelledTemperature(names, moved, identifiable=not isinstance(by, PosesAtOtherTemperatures))
     return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)], beyond
+
+
+def _as_probable(calibration: Calibration, linearised: Linearised) -> list[Component]:
+    """By the probability of each thermal effect and of its sizes, as the poses and what happens inside them tell."""
+    if calibration.thermal is None or not calibration.thermal.any():
+        return []
+    names = tuple(e.name for e in CATALOGUE if TEMPERATURE in e.needs and e not in linearised.effects)
+    moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
+    basis, by = UnmodelledTemperature(names, moved, identifiable=False), PosesAtOtherTemperatures(names)
+    return [Component.of(linearised, "temperature", "B", np.inf, positive(calibration.thermal), basis, by)]
 
 
 def _posterior(Z: Floats) -> Floats:

@@ -1,0 +1,180 @@
+"""Close the loop: what acts beyond the linear model, with which probability, and what the error becomes with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from triaxcal.calibration import Calibration, Exclusion, HoldsAt
+from triaxcal.conditions import channels_of
+from triaxcal.effects import catalogue_for
+from triaxcal.effects.contract import Effect
+from triaxcal.effects.plugins import plugins
+from triaxcal.errors import Refused
+from triaxcal.held_out import HeldOut, held_out
+from triaxcal.moment import Moment
+from triaxcal.pose_fit import fit
+from triaxcal.poses.pose import Pose
+from triaxcal.posterior.average import Refusal, average, refusal
+from triaxcal.posterior.blind import Blind, blind_to
+from triaxcal.posterior.corrected import corrected
+from triaxcal.posterior.findings import Findings, findings
+from triaxcal.posterior.odds import Odds
+from triaxcal.posterior.posterior import Posterior, posterior
+from triaxcal.runs import by_run
+from triaxcal.search.candidates import still_conditions
+
+Coefficients = Mapping[str, tuple[float, float | None, str]]
+"""Name → value, standard error, unit."""
+
+
+class Verdict(StrEnum):
+    ADOPTED = "adopted"
+    """Known, and corrected."""
+    CONFOUNDED = "confounded"
+    """One of several acts; or it is known, and no effect is corrected (`Loop.refusal`)."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that acts for certain, alone or as the likeliest of ``alternatives``, each with its probability. The
+    ``coefficients`` are those that are corrected, or else those if it is this effect that acts; ``remedy`` is how to be
+    rid of it."""
+
+    effect: str
+    verdict: Verdict
+    probability: float
+    alternatives: Mapping[str, float]
+    coefficients: Coefficients
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that acts more likely than not, and not for certain: with the ``coefficients`` if it acts."""
+
+    effect: str
+    probability: float
+    coefficients: Coefficients
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The closed loop. ``before`` is the linear calibration, ``after`` the one that is handed on; ``found`` all that is
+    read off the posterior. ``blind`` are effects that these poses cannot show in full, ``faulty`` those of other
+    packages that cannot be used, each with the reason."""
+
+    before: Calibration
+    after: Calibration
+    found: Findings
+    findings: tuple[Finding, ...]
+    candidates: tuple[Candidate, ...]
+    refusal: Refusal | None
+    held_out: HeldOut | None
+    blind: Mapping[str, Blind]
+    faulty: Mapping[str, str]
+    seen: Posterior = field(repr=False, compare=False)
+
+    @property
+    def probabilities(self) -> Mapping[str, float]:
+        """That each effect acts, whatever else does, the likeliest first."""
+        return self.seen.of_names
+
+
+def diagnose(
+    poses: Sequence[Pose],
+    *,
+    signs: Sequence[float] = (1, 1, 1),
+    reference: float = 1.0,
+    check: Sequence[Pose] | None = None,
+    catalogue: Sequence[Effect] | None = None,
+    at: Moment | float = Moment.END,
+    odds: Odds | None = None,
+) -> Loop:
+    """Find and correct the effects that still poses show beyond the linear model.
+
+    ``catalogue`` are the effects to look for: all that are known for these poses' channels where it is None. ``check``
+    are poses of another recording, for the held-out error. ``at`` is the moment of the recording for which the
+    calibration holds elsewhere: a number in seconds from the first sample. Raises as `triaxcal.pose_fit.fit` does.
+    """
+    linear = fit(poses, signs=signs, reference=reference)
+    sound = [p for p in poses if not p.fault]
+    moment = HoldsAt.of(sound, at)
+    if moment is None:
+        raise Refused("no pose without a fault")
+    moving = set(channels_of(sound)) - still_conditions(sound)
+    effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, sound)
+    seen = posterior(poses, linear, signs=signs, catalogue=effects, odds=odds)
+    before = replace(_without_outliers(poses, linear, signs, seen), holds_at=moment)
+    blind = blind_to(seen.evidence, effects)
+    before, after = (c.with_blind_to(tuple(blind)) for c in (before, corrected(before, seen, moment)))
+    found, refused = findings(seen), refusal(seen)
+    told = _Told(seen, moment, after)
+    sound_check = None if check is None else [p for p in check if not p.fault]
+    return Loop(
+        before=before,
+        after=after,
+        found=found,
+        findings=tuple(told.finding(named.probabilities, refused) for named in found.named),
+        candidates=tuple(Candidate(name, p, told.given(name)[0]) for name, p in found.candidates.items()),
+        refusal=refused,
+        held_out=None if sound_check is None else held_out(before, after, sound_check, {}),
+        blind=blind,
+        faulty=dict(plugins()[1]) if catalogue is None else {},
+        seen=seen,
+    )
+
+
+def _without_outliers(
+    poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], seen: Posterior
+) -> Calibration:
+    """The linear calibration without the poses that are outliers whatever else acts, and with all others."""
+    likely = {int(i): float(p) for i, p in zip(seen.evidence.rows.places, seen.of_outliers, strict=True)}
+    outliers = [i for i, p in likely.items() if p >= seen.evidence.odds.reported]
+    if outliers != [i for i, p in enumerate(linear.poses) if p.excluded == Exclusion.OUTLIER]:
+        with suppress(Refused):  # the others may not carry a fit
+            linear = fit(poses, signs=signs, reference=linear.reference, aside=outliers, why=Exclusion.OUTLIER)
+    return replace(
+        linear, poses=tuple(replace(p, outlier_probability=likely.get(i)) for i, p in enumerate(linear.poses))
+    )
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What is told of an effect of this name: as it is in ``after``, or as it would be if it acted."""
+
+    seen: Posterior
+    moment: HoldsAt
+    after: Calibration
+
+    def finding(self, probabilities: Mapping[str, float], refused: Refusal | None) -> Finding:
+        name, *others = probabilities
+        adopted = not others and refused is None
+        coefficients, remedy = self._corrected(name) if adopted else self.given(name)
+        return Finding(
+            effect=name,
+            verdict=Verdict.ADOPTED if adopted else Verdict.CONFOUNDED,
+            probability=probabilities[name],
+            alternatives={other: probabilities[other] for other in others},
+            coefficients=coefficients,
+            remedy=remedy,
+        )
+
+    def given(self, name: str) -> tuple[Coefficients, str]:
+        """If it acts."""
+        made = average(self.seen.given(name), self.moment)
+        reference = self.seen.evidence.rows.problem.channel_reference
+        c = replace(self.after, sensor=made.sensor, covariance=made.covariance, channel_reference=reference)
+        return self._of(c, name)
+
+    def _corrected(self, name: str) -> tuple[Coefficients, str]:
+        return self._of(self.after, name)
+
+    def _of(self, c: Calibration, name: str) -> tuple[Coefficients, str]:
+        effect, q = next((e, q) for e, q in c.sensor.effects if e.name == name)
+        floor = self.after.residual.noise_floor_g
+        if not effect.coefficients[0].unit.startswith("g"):
+            floor /= c.reference  # the effect is a share of the magnitude
+        return c.coefficients_of(name), effect.advice(float(abs(q).max()), floor)
