@@ -253,7 +253,8 @@ class Calibration:
 
     def conditions_of(self, poses: Sequence[Pose]) -> dict[str, Floats]:
         """Of poses of the recording that it was fitted to."""
-        channels = with_scale(channels_of(poses), poses, self.sensor.scale_factor, self.sensor.bias)
+        known = channels_of(poses, self.channel_reference)
+        channels = with_scale(known, poses, self.sensor.scale_factor, self.sensor.bias)
         return conditions(channels, self.channel_reference)
 
     def with_blind_to(self, effects: tuple[str, ...]) -> Calibration:

@@ -16,6 +16,7 @@ from triaxcal.effects.contract import (
     BEFORE,
     CHANGE,
     HELD,
+    LAGS_S,
     RUN,
     SCATTER,
     SINCE_START,
@@ -24,6 +25,8 @@ from triaxcal.effects.contract import (
     channel_of,
     condition_of,
     is_derived,
+    lag_in,
+    lag_of,
     rate_of,
 )
 from triaxcal.errors import InvalidData
@@ -35,8 +38,9 @@ def conditions(channels: Mapping[str, Floats], reference: Mapping[str, float]) -
     return {name: np.asarray(channels[name]) - value for name, value in reference.items() if name in channels}
 
 
-def channels_of(poses: Sequence[Pose]) -> dict[str, Floats]:
-    """The channels' means by pose, (n,) each, their rates, and the time of each pose and for how long it was held."""
+def channels_of(poses: Sequence[Pose], wanted: Iterable[str] = ()) -> dict[str, Floats]:
+    """The channels' means by pose, (n,) each, their rates, and the time of each pose and for how long it was held; of
+    the channels' lags (`lag_of`) those that are among the conditions ``wanted``."""
     out: dict[str, Floats] = {}
     for channel in sorted(set.intersection(*(set(p.channels) for p in poses)) if poses else set()):
         name = condition_of(channel)
@@ -48,7 +52,50 @@ def channels_of(poses: Sequence[Pose]) -> dict[str, Floats]:
     out[HELD] = np.array([p.end_s - p.start_s for p in poses])
     if any(p.run.of > 1 for p in poses):
         out[RUN] = np.array([float(p.run.index) for p in poses])
+    out |= _lags(out, poses, wanted)
     return out
+
+
+def _lags(channels: Mapping[str, Floats], poses: Sequence[Pose], wanted: Iterable[str]) -> dict[str, Floats]:
+    """Each recording's by itself; the channel is taken to have stood still before its first pose."""
+    out: dict[str, Floats] = {}
+    runs = np.array([p.run.index for p in poses])
+    t_s = np.array([p.t_s for p in poses])
+    for name in wanted:
+        lag = lag_in(name)
+        if lag is None or lag[0] not in channels:
+            continue
+        out[name] = np.zeros(len(poses))
+        for run in np.unique(runs):
+            rows = np.flatnonzero(runs == run)
+            rows = rows[np.argsort(t_s[rows], kind="stable")]
+            first, values = poses[rows[0]], channels[lag[0]][rows]
+            begun = values[0] - (first.t_s - first.start_s) * first.rates.get(channel_of(lag[0]), 0.0)
+            since = behind(np.insert(t_s[rows], 0, first.start_s), np.insert(values, 0, begun), lag[1])
+            out[name][rows] = since[1:]
+    return out
+
+
+def behind(t_s: Floats, values: Floats, constant_s: float) -> Floats:
+    """(n,) how far a first-order lag, τ y′ = c − y, is from the channel c that it follows: y − c at ascending times
+    (n,), where c has the values (n,). In between c goes straight, and before the first it had long stood still."""
+    out = np.zeros(len(values))
+    for i, (step_s, change) in enumerate(zip(np.diff(t_s), np.diff(values), strict=True)):
+        x = step_s / constant_s
+        caught = -math.expm1(-x)
+        out[i + 1] = out[i] * (1 - caught) - change * (caught / x if x > 0 else 1.0)
+    return out
+
+
+def rate_of_lag(behind_by: Floats, rate: Floats, constant_s: float) -> Floats:
+    """(n,) the rate of what `behind` gives, per second, where its channel has the ``rate``."""
+    return -behind_by / constant_s - rate
+
+
+def lags_for(effects: Iterable[Effect]) -> tuple[str, ...]:
+    """Every lag of the channels of whose lags the effects need any: their shapes may be moved."""
+    found = {lag[0] for e in effects for n in e.needs if (lag := lag_in(n))}
+    return tuple(lag_of(channel, constant_s) for channel in sorted(found) for constant_s in LAGS_S)
 
 
 def with_scale(
@@ -99,7 +146,7 @@ def conditions_elsewhere(
     """`conditions` of poses of another recording than that which ``reference`` is of, whose clock is its own: effects
     of time count as at one ``moment`` (`of_moment`). Raises InvalidData where a channel is missing.
     """
-    channels = with_scale(channels_of(poses), poses, scale_factor, bias)
+    channels = with_scale(channels_of(poses, reference), poses, scale_factor, bias)
     channels[RUN] = np.full(len(poses), np.inf)
     missing = [n for n in reference if n not in channels]
     if missing:

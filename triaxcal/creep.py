@@ -13,8 +13,8 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
-from triaxcal.conditions import conditions_elsewhere
-from triaxcal.effects.contract import HELD, SINCE_START, TIME, channel_of, is_derived
+from triaxcal.conditions import conditions_elsewhere, rate_of_lag
+from triaxcal.effects.contract import HELD, SINCE_START, TIME, channel_of, is_derived, lag_in
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.poses.pose import Pose
 
@@ -78,8 +78,13 @@ def _change(poses: Sequence[Pose], model: Calibration, held: Mapping[str, Floats
         for name in held:
             if name in (TIME, SINCE_START):
                 at[name] = held[name] if elsewhere else held[name] + half
-            elif not is_derived(name) and all(channel_of(name) in p.rates for p in poses):
-                at[name] = held[name] + half * np.array([p.rates[channel_of(name)] for p in poses])
+                continue
+            lag = lag_in(name)
+            channel = channel_of(lag[0] if lag else name)
+            if (lag is None and is_derived(name)) or any(channel not in p.rates for p in poses):
+                continue
+            rate = np.array([p.rates[channel] for p in poses])
+            at[name] = held[name] + half * (rate if lag is None else rate_of_lag(held[name], rate, lag[1]))
         ends.append(at)
     s = sensor.along_axes(np.array([p.mean for p in poses]), held)
     first, last = (sensor.departure(s, at) for at in ends)

@@ -137,7 +137,7 @@ def _searched(
 ) -> Explanation:
     before = fit(poses, signs=signs, reference=reference, aside=aside, why=Exclusion.OUTLIER)
     kept = [p for i, p in enumerate(poses) if i not in aside]
-    problem = problem_of(kept, signs=signs, reference=reference)
+    problem = problem_of(kept, signs=signs, reference=reference, effects=catalogue)
     linear = solve(problem, start(problem, kept, signs), ())
     problem = with_history(problem, kept, linear.sensor(problem))
     left_out = LeftOut(poses, aside, signs, reference)

@@ -22,7 +22,7 @@ from triaxcal.caution import (
 )
 from triaxcal.conditions import of_unknown_history
 from triaxcal.cross_validation import cross_validated
-from triaxcal.effects.contract import Effect
+from triaxcal.effects.contract import Effect, lag_in
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, NotStill, Refused
 from triaxcal.outliers import Spoiled
@@ -78,8 +78,8 @@ def fit(
         kept = [poses[i] for i in sound]
         found_of = fit(kept, signs=signs, reference=reference, effects=effects, aside=among, why=why)
         return replace(with_faulty(found_of, poses), holds_at=HoldsAt.of(poses))
-    whole, begin = begun(poses, signs=signs, reference=reference)
-    missing = {n for e in effects for n in e.needs if n not in whole.channel_reference}
+    whole, begin = begun(poses, signs=signs, reference=reference, effects=effects)
+    missing = {n for e in effects for n in e.needs if n not in whole.channel_reference and lag_in(n) is None}
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
     verdict = Spoiled(tuple(sorted(aside))) if aside is not None else Spoiled()
@@ -95,7 +95,7 @@ def fit(
     kept, problem = list(poses), whole
     if found:
         kept = [p for i, p in enumerate(poses) if i not in found]
-        problem, begin = begun(kept, signs=signs, reference=reference)
+        problem, begin = begun(kept, signs=signs, reference=reference, effects=effects)
         by_means = None
     # What may be no worse than the others shows by how much all come back less well than their noise.
     judged = whole.only(np.setdiff1d(np.arange(len(poses)), unknown)) if verdict.doubtful else None

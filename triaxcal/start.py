@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.conditions import channels_of, references, with_scale
+from triaxcal.conditions import channels_of, lags_for, references, with_scale
 from triaxcal.distributions import chi2_ppf
+from triaxcal.effects.contract import Effect
 from triaxcal.ellipsoid import closed_form, coefficients
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.planning.directions import dilution, distinct, linear_design, most_wanted
@@ -33,8 +34,15 @@ class Uncarried(Refused):
         super().__init__(f"{why}; {len(a)} poses in {distinct(a)} distinct directions", wanted=wanted)
 
 
-def problem_of(poses: Sequence[Pose], *, signs: Sequence[float] = (1, 1, 1), reference: float = 1.0) -> Problem:
-    """Raises InvalidData, Refused where there are fewer than nine poses."""
+def problem_of(
+    poses: Sequence[Pose],
+    *,
+    signs: Sequence[float] = (1, 1, 1),
+    reference: float = 1.0,
+    effects: Sequence[Effect] = (),
+) -> Problem:
+    """With the lags of channels that the ``effects`` need. Raises InvalidData, Refused where there are fewer than nine
+    poses."""
     if len(poses) < POSES_LEAST:
         raise Refused(
             f"{len(poses)} still pose{'s' * (len(poses) != 1)}; nine parameters need at least {POSES_LEAST}, "
@@ -50,7 +58,7 @@ def problem_of(poses: Sequence[Pose], *, signs: Sequence[float] = (1, 1, 1), ref
         raise InvalidData(f"signs must be +1 or −1, not {signs}")
     if not (np.isfinite(reference) and reference > 0):
         raise InvalidData(f"the reference must be a positive number, not {reference}")
-    channels = channels_of(poses)
+    channels = channels_of(poses, lags_for(effects))
     return Problem(
         u=u,
         covariance=np.array([p.covariance for p in poses]),
@@ -102,9 +110,12 @@ def with_history(problem: Problem, poses: Sequence[Pose], sensor: Sensor) -> Pro
     return problem.with_channels(with_scale(problem.channels, poses, sensor.scale_factor, sensor.bias))
 
 
-def begun(poses: Sequence[Pose], *, signs: Sequence[float], reference: float) -> tuple[Problem, State]:
-    """The problem with the history of its poses, and where the fit begins. Raises as `problem_of` and `start` do."""
-    problem = problem_of(poses, signs=signs, reference=reference)
+def begun(
+    poses: Sequence[Pose], *, signs: Sequence[float], reference: float, effects: Sequence[Effect] = ()
+) -> tuple[Problem, State]:
+    """The problem with the history of its poses and what the ``effects`` need, and where the fit begins. Raises as
+    `problem_of` and `start` do."""
+    problem = problem_of(poses, signs=signs, reference=reference, effects=effects)
     state = start(problem, poses, signs)
     return with_history(problem, poses, state.sensor(problem)), state
 

@@ -8,13 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.conditions import behind
 from triaxcal.effects import TEMPERATURE
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SINCE_START, TIME, rate_of
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, LAGS_S, SINCE_START, TIME, lag_in, lag_of, rate_of
 from triaxcal.gravity import STANDARD_GRAVITY
 from triaxcal.poses.pose import Pose
 from triaxcal.sensor import Sensor
 
-CONDITIONS = frozenset({TEMPERATURE, rate_of(TEMPERATURE), TIME, SINCE_START, HELD, *BEFORE, *CHANGE})
+LAGS = {lag_of(TEMPERATURE, constant_s): constant_s for constant_s in LAGS_S}
+CONDITIONS = frozenset({TEMPERATURE, rate_of(TEMPERATURE), *LAGS, TIME, SINCE_START, HELD, *BEFORE, *CHANGE})
 """What an effect of a synthetic unit may go with."""
 
 
@@ -94,6 +96,13 @@ class Environment:
         turn = 2 * np.pi / self.swing_period_s
         return np.asarray(self.ramp_c_per_s + self.swing_c * turn * np.cos(turn * t_s))
 
+    def temperature_lag(self, t_s: Floats, constant_s: float) -> Floats:
+        """By how much a first-order lag is off the temperature, which stood still before the start."""
+        turn = 2 * np.pi / self.swing_period_s
+        x, gone = turn * constant_s, np.exp(-np.asarray(t_s) / constant_s)
+        swing = self.swing_c * x / (1 + x**2) * (gone - np.cos(turn * t_s) - x * np.sin(turn * t_s))
+        return np.asarray(self.ramp_c_per_s * constant_s * (gone - 1) + swing)
+
 
 @dataclass
 class SyntheticUnit:
@@ -119,7 +128,9 @@ class SyntheticUnit:
         conditions = {n: v - self.channel_reference[n] for n, v in held.items() if n in self.channel_reference}
         conditions |= {SINCE_START: t_s, HELD: np.zeros(len(t_s))}
         conditions[rate_of(TEMPERATURE)] = self.environment.temperature_rate(t_s)
-        if any(set(effect.needs) & {*BEFORE, *CHANGE} for effect, _ in self.sensor.effects):
+        needs = {name for effect, _ in self.sensor.effects for name in effect.needs}
+        conditions |= {n: self.environment.temperature_lag(t_s, LAGS[n]) for n in needs & LAGS.keys()}
+        if needs & {*BEFORE, *CHANGE}:
             before = self.path.before(t_s) @ self.sensor.axes.T
             change = a @ self.sensor.axes.T - before
             conditions |= dict(zip((*BEFORE, *CHANGE), (*before.T, *change.T), strict=True))
@@ -154,6 +165,9 @@ def noisy_poses(
     own |= {name: before[:, i] for i, name in enumerate(BEFORE)} | {
         name: (s - before)[:, i] for i, name in enumerate(CHANGE)
     }
+    needs = {name for effect, _ in sensor.effects for name in effect.needs} - held.keys()
+    lags = {name: lag for name in needs if (lag := lag_in(name)) and lag[0] in held}
+    own |= {name: behind(t_s, held[channel], constant_s) for name, (channel, constant_s) in lags.items()}
     conditions = {name: v - reference.get(name, 0.0) for name, v in {**held, **own}.items()}
     u = sensor.output(directions, conditions) + rng.standard_normal((n, 3)) * error
     return [

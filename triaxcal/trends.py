@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.conditions import rate_of_lag
 from triaxcal.distributions import f_sf
-from triaxcal.effects.contract import HELD, SINCE_START, TIME, Effect, channel_of, is_derived, rate_of
+from triaxcal.effects.contract import HELD, SINCE_START, TIME, Effect, channel_of, is_derived, lag_in, rate_of
 from triaxcal.poses.pose import Pose
 from triaxcal.problem import Linearised, Problem, State, everything, linearise
 
@@ -170,4 +171,12 @@ def _changes(problem: Problem, poses: Sequence[Pose], length: Floats) -> tuple[d
         errors[name] = length * np.array([p.rate_errors[channel] for p in poses])
         change[rate_of(name)] = length * np.array([p.bends[channel] for p in poses])
         errors[rate_of(name)] = length * np.array([p.bend_errors[channel] for p in poses])
+    for name in problem.channels:
+        lag = lag_in(name)
+        if lag is not None and lag[0] in change:
+            channel = channel_of(lag[0])
+            rate = np.array([p.rates[channel] for p in poses])
+            change[name] = length * rate_of_lag(problem.channels[name], rate, lag[1])
+            # That of the rate counts with the channel itself.
+            errors[name] = length / lag[1] * np.array([p.channel_errors.get(channel, 0.0) for p in poses])
     return {n: c for n, c in change.items() if n in problem.channels}, errors

@@ -222,7 +222,7 @@ def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) ->
         tuple((effect, of_effect(effect, values)) for effect, values in sensor.effects),
     )
     u = np.array([p.mean for p in poses])
-    channels = with_scale(channels_of(poses), poses, sensor.scale_factor, sensor.bias)
+    channels = with_scale(channels_of(poses, held.channel_reference), poses, sensor.scale_factor, sensor.bias)
     reference = dict(held.channel_reference)
     conditions = {n: channels[n] - v for n, v in reference.items()}
     if TEMPERATURE in reference and REFERENCE_TEMPERATURE in rounded:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 import triaxcal as tc
 from triaxcal.calibration import Calibration as Fitted
 from triaxcal.calibration import HoldsAt, Residual
-from triaxcal.effects import CATALOGUE, Effect
+from triaxcal.effects import CATALOGUE, TO_COME, Effect
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import HELD, SINCE_START, TIME, is_derived
@@ -25,7 +26,7 @@ from triaxcal.pose_fit import fit
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
-KNOWN: list[Effect] = [*CATALOGUE, ChannelBias("supply_v"), ChannelScaleFactor("supply_v")]
+KNOWN: list[Effect] = [*CATALOGUE, *TO_COME, ChannelBias("supply_v"), ChannelScaleFactor("supply_v")]
 FORMS = [BiasStep(83.5) if form.name == "bias_step" else form for e in KNOWN for form in e.forms]
 T_S, SINCE_MIDDLE_S = 260.0, 130.0
 
@@ -223,6 +224,34 @@ def test_a_document_is_saved_and_loaded_without_loss(calibration: tc.Calibration
     assert list(found.standard_errors.values()) == pytest.approx(list(calibration.standard_errors.values()), rel=1e-4)
     assert found.warnings == calibration.warnings
     assert np.isnan(found.fitted.dof)
+
+
+TRUTHS = {
+    "fifth_order_nonlinearity": 1e-3, "compression": 3e-3, "scale_factor_drift": 3e-6, "temperature_lag": 3e-4,
+    "remanence": 1e-3,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", [form for e in TO_COME for form in e.forms], ids=lambda e: f"{e.name}-{len(e.name)}")
+def test_a_fit_with_an_effect_to_come_is_saved_and_loaded_without_loss(
+    effect: Effect, paper_unit: Sensor, twenty_six: np.ndarray, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(10)
+    sensor = replace(paper_unit, effects=((effect, TRUTHS[effect.name] * np.array([1.0, -1.0, 1.0])),))
+    temp_c = {"temp_c": 25 + 3 * np.sin(np.arange(26) / 2)}
+    poses = noisy_poses(sensor, twenty_six[rng.permutation(26)], 1e-5, rng, channels=temp_c)
+    fitted = tc.Calibration(fit(poses, signs=(-1, -1, -1), effects=[effect], aside=()), output_unit="V")
+    fitted.save(tmp_path / "cal.json")
+    found = tc.Calibration.load(tmp_path / "cal.json")
+    assert found.to_dict() == fitted.to_dict()
+    assert found.fitted.sensor.effects[0][0] == effect
+    u = np.array([p.mean for p in poses])
+    held = found.fitted.conditions_of(poses)
+    assert found.fitted.sensor.specific_force(u, held) == pytest.approx(
+        fitted.fitted.sensor.specific_force(u, held), abs=1e-8
+    )
+    length = np.linalg.norm(found.fitted.sensor.specific_force(u, held), axis=1)
+    assert np.sqrt(np.mean((length - 1) ** 2)) < 2e-5
 
 
 def test_a_document_can_be_changed_without_changing_the_calibration(calibration: tc.Calibration) -> None:

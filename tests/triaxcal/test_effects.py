@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator
@@ -14,25 +15,30 @@ import numpy as np
 import pytest
 
 import triaxcal.effects
-from triaxcal.effects import CATALOGUE, TIME, Effect, catalogue_for, effect_named, effect_of
+from triaxcal.effects import CATALOGUE, TIME, TO_COME, Effect, catalogue_for, effect_named, effect_of
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
+from triaxcal.effects.compression import Compression
 from triaxcal.effects.contract import (
     BEFORE,
     CHANGE,
     DERIVED,
     HELD,
+    LAGS_S,
     RUN,
     SCATTER,
     SINCE_START,
     channel_of,
     condition_of,
     is_derived,
+    lag_in,
+    lag_of,
     rate_of,
 )
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.plugins import plugins
+from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.loop import diagnose
@@ -47,7 +53,12 @@ AGREED = {
     "temperature_bias", "temperature_bias_quadratic", "temperature_scale_factor", "thermal_gradient",
     "bias_drift", "warm_up", "bias_step", "hysteresis", "vibration_rectification",
 }  # fmt: skip
-FORMS = [form for effect in CATALOGUE for form in effect.forms]
+# Known to documents, and not looked for.
+AGREED_TO_COME = {
+    "fifth_order_nonlinearity", "compression", "scale_factor_drift", "temperature_lag", "remanence",
+}  # fmt: skip
+KNOWN = (*CATALOGUE, *TO_COME)
+FORMS = [form for effect in KNOWN for form in effect.forms]
 CHANNEL_EFFECTS: list[Effect] = [ChannelBias("supply_v"), ChannelScaleFactor("supply_v")]
 EVERY = [*FORMS, *CHANNEL_EFFECTS]
 
@@ -57,8 +68,15 @@ HERE: dict[str, float] = {
     "temp_c": 7.0, rate_of("temp_c"): 0.25, "supply_v": -0.5, TIME: 11.0, SINCE_START: 40.0, HELD: 10.0,
     "before_x": 0.5, "before_y": -0.25, "before_z": 0.75, "change_x": 1.5, "change_y": -2.75, "change_z": 0.0,
     "scatter_x": 1e-4, "scatter_y": 4e-4, "scatter_z": 9e-4,
+    **{lag_of("temp_c", constant_s): -1e-3 * constant_s for constant_s in LAGS_S},
 }  # fmt: skip
 I3 = np.eye(3)
+
+
+def bent(s: float) -> float:
+    return 0.07 * math.log1p(math.exp((s - 0.7) / 0.07))
+
+
 # What a unit of each coefficient adds to axis x, y, z, written by hand for that pose; by name and number of form.
 BY_HAND = {
     ("second_order_nonlinearity", 0): np.diag([4.0, 9.0, 25.0]),
@@ -80,6 +98,14 @@ BY_HAND = {
     ("hysteresis", 0): np.diag([0.5, -0.25, 0.75]),
     ("hysteresis", 1): np.diag([1.0, -1.0, 0.0]),
     ("vibration_rectification", 0): np.diag([1e-4, 4e-4, 9e-4]),
+    ("fifth_order_nonlinearity", 0): np.diag([32.0, -243.0, 3125.0]),
+    # The knee at 0.7: 1.3, 2.3 and 4.3 beyond it, and what its bend, 0.07 wide, leaves so far off.
+    ("compression", 0): np.diag([bent(-2) - bent(2), bent(3) - bent(-3), bent(-5) - bent(5)]),
+    ("compression", 1): np.diag([2 * bent(0) - bent(v) - bent(-v) for v in (2, 3, 5)]),
+    ("scale_factor_drift", 0): np.diag([22.0, -33.0, 55.0]),
+    ("temperature_lag", 0): 6.67 * I3,  # 7 K less 330 s at 1 mK/s
+    # Along y the pose before had half of what leaves the whole, in a force of the order of 10.
+    ("remanence", 0): np.diag([1.0, -0.5, 1.0]),
     ("channel_bias:supply_v", 0): -0.5 * I3,
     ("channel_scale_factor:supply_v", 0): np.diag([-1.0, 1.5, -2.5]),
 }
@@ -98,15 +124,20 @@ def held(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     return out | {SINCE_START: rng.uniform(0, 600, n), HELD: rng.uniform(1, 20, n)}
 
 
-@pytest.mark.parametrize("effect", CATALOGUE, ids=each)
+@pytest.mark.parametrize("effect", KNOWN, ids=each)
 def test_the_name_is_one_agreed_on_and_units_and_remedy_are_stated(effect: Effect) -> None:
-    assert effect.name in AGREED
+    assert effect.name in AGREED | AGREED_TO_COME
     assert effect_named(effect.name) is effect
     assert effect.remedy.endswith(".")
 
 
 def test_the_catalogue_has_every_name_that_is_agreed_on_once() -> None:
     assert sorted(e.name for e in CATALOGUE) == sorted(AGREED)
+
+
+def test_what_is_to_come_is_known_by_its_name_and_looked_for_by_nobody() -> None:
+    assert sorted(e.name for e in TO_COME) == sorted(AGREED_TO_COME)
+    assert not {e.name for e in catalogue_for(HERE)} & AGREED_TO_COME
 
 
 @pytest.mark.parametrize("effect", EVERY, ids=each)
@@ -207,15 +238,17 @@ def test_the_search_tries_time_constants_from_a_few_poses_to_the_whole_recording
     assert np.corrcoef(x.T)[0, 1] > 0.98
 
 
-@pytest.mark.parametrize(("effect", "shape"), [(WarmUp(), "time_constant"), (BiasStep(), "at")])
+@pytest.mark.parametrize(
+    ("effect", "shape"), [(WarmUp(), "time_constant"), (BiasStep(), "at"), (Compression(), "knee")]
+)
 def test_shaped_changes_the_shape_and_nothing_else(effect: Effect, shape: str) -> None:
     other = effect.shaped({shape: 123.0})
-    assert dict(other.shape) == {shape: (123.0, "s")}
+    assert dict(other.shape) == {shape: (123.0, effect.shape[shape][1])}
     assert (other.name, other.coefficients, other.needs) == (effect.name, effect.coefficients, effect.needs)
 
 
 def test_effects_without_a_shape_come_back_as_they_are() -> None:
-    for effect in CATALOGUE:
+    for effect in KNOWN:
         if not effect.shape:
             assert effect.shaped({}) is effect
             assert list(effect.variants(one())) == list(effect.forms)
@@ -263,6 +296,7 @@ def test_coefficients_that_are_not_given_are_zero() -> None:
     effect, q = effect_of("bias_drift", {"x": 1e-6, "z2": 1e-9})
     assert effect == BiasDrift(2)
     assert q.tolist() == [1e-6, 0, 0, 0, 0, 1e-9]
+    assert effect_of("temperature_lag", {"x": 1e-4, "time_constant": 90.0})[0] == TemperatureLag(90.0)
     effect, q = effect_of("hysteresis", {"sign_z": 1e-4})
     assert effect == Hysteresis("reversal")
 
@@ -312,7 +346,9 @@ def test_every_logged_channel_gets_a_bias_and_a_scale_factor_effect_of_its_own()
     assert catalogue_for(DERIVED) == (*CATALOGUE, *plugins()[0])
 
 
-@pytest.mark.parametrize("channel", ["flow.rate", "temp_c.rate", TIME, HELD, "before_x", f"{HELD}.logged", "x.logged"])
+@pytest.mark.parametrize(
+    "channel", ["flow.rate", "temp_c.rate", "temp_c.lag:33", TIME, HELD, "before_x", f"{HELD}.logged", "x.logged"]
+)
 def test_a_logged_channel_may_have_any_name(channel: str) -> None:
     condition = condition_of(channel)
     assert not is_derived(condition)
@@ -345,8 +381,8 @@ def test_every_effect_is_one_file_of_its_own_name() -> None:
     files -= {"contract", "catalogue", "part", "wrapped", "plugins"}
     # The two effects of a channel are one file, as they are one thought and have the channel in their names. Those of
     # several recordings, and the empirical term, are not searched for in a recording by itself.
-    assert files == {e.name for e in CATALOGUE} | {"channel", "in_run", "run_bias", "empirical"}
-    for effect in CATALOGUE:
+    assert files == {e.name for e in KNOWN} | {"channel", "in_run", "run_bias", "empirical"}
+    for effect in KNOWN:
         module = importlib.import_module(f"triaxcal.effects.{effect.name}")
         assert type(effect).__module__ == module.__name__
     assert {type(e).__module__ for e in CHANNEL_EFFECTS} == {"triaxcal.effects.channel"}
@@ -356,6 +392,8 @@ def test_the_conditions_that_need_no_channel_are_those_of_the_contract() -> None
     assert set(DERIVED) == {TIME, SINCE_START, HELD, *BEFORE, *CHANGE, *SCATTER, RUN}
     for effect in CATALOGUE:
         assert set(effect.needs) <= {*DERIVED, "temp_c", "temp_c.rate"}
+    for effect in TO_COME:
+        assert all(n in DERIVED or n == "temp_c" or lag_in(n) for n in effect.needs)
 
 
 # Effects of other packages.
@@ -484,6 +522,7 @@ def test_a_broken_effect_gives_its_reason_and_leaves_the_others_alone() -> None:
         ("name='temperature_bias'", "the name temperature_bias is taken by triaxcal"),
         ("name='run_bias'", "the name run_bias is taken by triaxcal"),
         ("name='run_scale_factor'", "the name run_scale_factor is taken by triaxcal"),
+        ("name='compression'", "the name compression is taken by triaxcal"),
         ("name='empirical'", "the name empirical is taken by triaxcal"),
         ("name='linear'", "the name linear is taken by triaxcal"),
         ("name='channel_bias:dose_gy'", "the name channel_bias:dose_gy is that of an effect of a channel"),

@@ -11,6 +11,9 @@ from scipy import stats
 from triaxcal.effects import TIME, Effect
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.hysteresis import Hysteresis
+from triaxcal.effects.remanence import Remanence
+from triaxcal.effects.scale_factor_drift import ScaleFactorDrift
+from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.effects.thermal_gradient import ThermalGradient
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.sensor import Sensor
@@ -122,6 +125,10 @@ OF_TIME: list[tuple[Effect, float, float, list[float]]] = [
     # From the second pose (1, 0, 0), which began at 5 s, one looks back at the first (0, 0, 1).
     (Hysteresis(), 6.0, 1e-3, [0.0, 0.0, 1e-3]),
     (Hysteresis("reversal"), 6.0, 1e-3, [1e-3, 0.0, -1e-3]),
+    (Remanence(), 6.0, 1e-3, [0.0, 0.0, 1e-3]),
+    (ScaleFactorDrift(), 6.0, 1e-3, [6e-3, 0.0, 0.0]),
+    # A ramp of 2 K/s for 6 s, followed with 10 s.
+    (TemperatureLag(10.0), 6.0, 1e-3, [2e-3 * (6 - 10 * (1 - np.exp(-0.6)))] * 3),
     (Hysteresis(), 3.0, 1e-3, [0.0, 0.0, 1e-3]),
     (Hysteresis("reversal"), 3.0, 1e-3, [0.0, 0.0, 0.0]),
     (Hysteresis("reversal"), 16.0, 1e-3, [0.0, 1e-3, 1e-3]),

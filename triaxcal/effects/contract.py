@@ -7,6 +7,7 @@ linear (a time constant, the moment of a step) is the effect's shape: the search
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, Self
@@ -35,6 +36,9 @@ CLOCKS = (TIME, SINCE_START, HELD)
 DERIVED = (*CLOCKS, *BEFORE, *CHANGE, *SCATTER, RUN)
 """Conditions that no channel has to be logged for, beside the rates of those that are."""
 LOGGED = ".logged"
+LAGS_S = (10, 15, 22, 33, 47, 68, 100, 150, 220, 330, 470, 680, 1000, 1500, 2200, 3300, 4700, 6800, 10000)
+"""Time constants for which it is known how far a channel's lag is behind it: preferred numbers (IEC 60063, E6)."""
+_LAG = re.compile(r"(.+)\.lag:([1-9]\d{0,5})")
 
 
 def rate_of(channel: str) -> str:
@@ -42,9 +46,21 @@ def rate_of(channel: str) -> str:
     return f"{channel}.rate"
 
 
+def lag_of(channel: str, constant_s: int) -> str:
+    """The name of the condition that is a channel after a first-order lag of this time constant, less the channel
+    itself: zero while the channel stands still, −τ times its rate where that has long been the same."""
+    return f"{channel}.lag:{constant_s}"
+
+
+def lag_in(condition: str) -> tuple[str, int] | None:
+    """The channel and the time constant of `lag_of`; None of any other condition."""
+    found = _LAG.fullmatch(condition)
+    return (found[1], int(found[2])) if found else None
+
+
 def is_derived(condition: str) -> bool:
     """Whether a condition follows from the poses, whatever is logged."""
-    return condition in DERIVED or condition.endswith(rate_of(""))
+    return condition in DERIVED or condition.endswith(rate_of("")) or lag_in(condition) is not None
 
 
 def condition_of(channel: str) -> str:
@@ -148,6 +164,14 @@ def on_each_axis(condition: Floats) -> Floats:
     return per_axis(np.repeat(condition[:, None], 3, axis=1))
 
 
+def signs(values: Floats, s: Floats, certain: float) -> Floats:
+    """(n,3) of values (n,3) beside the specific force s (n,3): ±1, and in a straight line through zero up to where
+    they are ``certain``, in parts of the specific force's order of magnitude."""
+    # In powers of ten, so that it is the same in every pose: the reference may be 1 g, 50 µT or 5e-5 T.
+    length = np.maximum(np.linalg.norm(s, axis=1, keepdims=True), 1e-100)
+    return np.asarray(np.clip(values / (certain * 10.0 ** np.rint(np.log10(length))), -1.0, 1.0))
+
+
 def no_slope(s: Floats, coefficients: int = 3) -> Floats:
     """(n,3,3,p) of an effect that does not depend on the specific force."""
     return np.zeros((len(s), 3, 3, coefficients))
@@ -155,6 +179,13 @@ def no_slope(s: Floats, coefficients: int = 3) -> Floats:
 
 def xyz(unit: str, name: str = "{}") -> tuple[Coefficient, ...]:
     return tuple(Coefficient(name.format(axis), unit, axis) for axis in "xyz")
+
+
+def span_of(t_s: Floats) -> tuple[float, float]:
+    """Of poses at times (n,), in seconds: the shortest time constant that a few of them show, and how long they
+    take."""
+    whole = float(np.ptp(t_s))
+    return 1.5 * whole / max(len(t_s) - 1, 1), whole
 
 
 def held_within(remedy: str, largest: float, floor: float, unit: str) -> str:

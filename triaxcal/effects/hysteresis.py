@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import BEFORE, CHANGE, Coefficient, Effect, no_slope, per_axis, xyz
+from triaxcal.effects.contract import BEFORE, CHANGE, Coefficient, Effect, no_slope, per_axis, signs, xyz
 
 KINDS = {"memory": "", "reversal": "sign_"}
 REVERSAL = 1e-3
@@ -44,9 +44,7 @@ class Hysteresis(Effect):
         values = np.stack([conditions[n] for n in self.needs], axis=1)
         if self.kind == "memory":
             return per_axis(values)
-        # In powers of ten, so that it is the same in every pose: the reference may be 1 g, 50 µT or 5e-5 T.
-        length = np.maximum(np.linalg.norm(s, axis=1, keepdims=True), 1e-100)
-        return per_axis(np.clip(values / (REVERSAL * 10.0 ** np.rint(np.log10(length))), -1.0, 1.0))
+        return per_axis(signs(values, s, REVERSAL))
 
     def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
         return no_slope(s)

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import SINCE_START, Coefficient, Effect, no_slope, on_each_axis, xyz
+from triaxcal.effects.contract import SINCE_START, Coefficient, Effect, no_slope, on_each_axis, span_of, xyz
 
 CONSTANTS = 8
 SLOWEST = 4.0
@@ -47,9 +47,7 @@ class WarmUp(Effect):
 
     def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
         """From what three poses show to what is straight over the recording but for a few per cent."""
-        t = conditions[SINCE_START]
-        whole = float(np.ptp(t))
-        shortest = 1.5 * whole / max(len(t) - 1, 1)
+        shortest, whole = span_of(conditions[SINCE_START])
         return tuple(
             self.shaped({"time_constant": float(c)}) for c in np.geomspace(shortest, SLOWEST * whole, CONSTANTS)
         )

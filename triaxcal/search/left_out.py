@@ -38,7 +38,7 @@ class LeftOut:
         """What effects leave of all poses ``but`` some; zero where these cannot carry them."""
         poses = [p for i, p in enumerate(self.poses) if i not in but]
         try:
-            problem, begin = begun(poses, signs=self.signs, reference=self.reference)
+            problem, begin = begun(poses, signs=self.signs, reference=self.reference, effects=effects)
             chi2 = left_by_means(problem, solve(problem, begin, tuple(effects)))
         except (Refused, EffectFault):
             return 0.0

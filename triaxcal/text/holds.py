@@ -14,6 +14,7 @@ from triaxcal.effects.contract import (
     Effect,
     channel_of,
     is_derived,
+    lag_in,
     rate_of,
 )
 from triaxcal.figures import plain
@@ -46,5 +47,6 @@ def _at(name: str, value: float, several: bool) -> str:
         unit = {TIME: " s", HELD: " s"}.get(name, "")
         return f"at {name} = {plain(value, 6)}{unit}"
     if is_derived(name):
-        return f"while {channel_of(name.removesuffix(rate_of('')))} does not change"
+        lag = lag_in(name)
+        return f"while {channel_of(lag[0] if lag else name.removesuffix(rate_of('')))} does not change"
     return f"at {channel_of(name)} = {plain(value, 6)}{' °C' if name == TEMPERATURE else ''}"

@@ -26,7 +26,9 @@ class Linearised:
         sensor = calibration.sensor
         poses = [p.pose for p in calibration.poses if p.used]
         signs = tuple(np.sign(sensor.scale_factor))
-        problem = with_history(problem_of(poses, signs=signs, reference=calibration.reference), poses, sensor)
+        effects = [effect for effect, _ in sensor.effects]
+        problem = problem_of(poses, signs=signs, reference=calibration.reference, effects=effects)
+        problem = with_history(problem, poses, sensor)
         # A model without a channel holds at its mean; the reference of one that has it is rounded to read well. To a
         # millionth, since processors differ in the last digits, and a steady channel should not seem to move.
         means = {n: round(float(np.mean(problem.channels[n])), 6) for n in problem.channel_reference}

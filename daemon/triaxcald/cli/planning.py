@@ -11,7 +11,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.calibration_document import Document
 from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
-from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER
+from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER, lag_in
 from triaxcal.errors import InvalidData
 from triaxcal.planning.addition import Addition
 from triaxcal.planning.clock import in_plan
@@ -40,6 +40,11 @@ def plan_command(a: argparse.Namespace) -> int:
             raise InputError(
                 f"--for {effect.name}: expected an effect of direction, time or a channel; this one goes with the pose "
                 "before or with shaking, for which any plan does, taken twice in different orders"
+            )
+        if any(lag_in(n) for n in effect.needs):
+            raise InputError(
+                f"--for {effect.name}: expected an effect of direction, time or a channel; this one goes with what a "
+                "channel was before, for which any plan does, taken while that rises, falls and stands still"
             )
     if a.poses and a.poses > POSES_MOST:
         raise InputError(f"--poses {a.poses}: at most {POSES_MOST}")

@@ -60,6 +60,19 @@ _MEANINGS = {
         "The sensing element or its amplifier flattens towards both ends of its range; the unit keeps it.",
         "e = q s³", {"*": "s³"},
     ),
+    "fifth_order_nonlinearity": Meaning(
+        "the output bends with the fifth power of the input",
+        "The sensing element or its amplifier flattens towards both ends of its range, more steeply than a cube; the "
+        "unit keeps it.",
+        "e = q s⁵", {"*": "s⁵"},
+    ),
+    "compression": Meaning(
+        "the output gives way towards the ends of the range",
+        "An amplifier nears its supply, or a torquer the end of its current; the unit keeps it.",
+        "e = −q (h(s) − h(−s))  or  e = −q (h(s) + h(−s))",
+        {"*": "h(−s) − h(s)", "even_*": "−h(s) − h(−s)", "knee": "κ"},
+        "h(s): s − κ beyond the knee κ and zero below it, with a bend as wide as κ/10 between",
+    ),
     "scale_factor_asymmetry": Meaning(
         "the scale factor differs between positive and negative inputs",
         "The two halves of a push-pull stage or of a differential element are unlike; the unit keeps it.",
@@ -95,6 +108,12 @@ _MEANINGS = {
         "While the unit warms or cools, one side of it is warmer than the other.",
         "e = q dT/dt", {"*": "dT/dt"}, "T: temp_c, by the second",
     ),
+    "temperature_lag": Meaning(
+        "the bias follows the temperature late",
+        "What makes it warms and cools later than the thermometer.",
+        "e = q (θ − T₀), τ dθ/dt = T − θ", {"*": "θ − T₀", "time_constant": "τ"},
+        "T: temp_c; θ: the same after a first-order lag of the time constant τ", _T,
+    ),
     "channel_bias": Meaning(
         "the bias goes with {c}",
         "What {c} measures acts on the zero of the unit, or moves together with something that does.",
@@ -112,6 +131,12 @@ _MEANINGS = {
         "e = q (t − t₀) + q₂ (t − t₀)² + q₃ (t − t₀)³",
         {"*": "t − t₀", "*2": "(t − t₀)²", "*3": "(t − t₀)³"}, "t: time in s; powers without a coefficient are zero",
         ("t₀", "t_s"),
+    ),
+    "scale_factor_drift": Meaning(
+        "the scale factor drifts with time",
+        "The unit had not settled: a reference voltage or a magnet still warmed. It belongs to this recording, not to "
+        "the unit.",
+        "e = q (t − t₀) s", {"*": "(t − t₀) s"}, "t: time in s", ("t₀", "t_s"),
     ),
     "warm_up": Meaning(
         "the bias settles after the start, as while a unit warms up",
@@ -141,6 +166,11 @@ _MEANINGS = {
         "The element, its mounting or the fixture does not come all the way back.",
         "e = q s′  or  e = q sign(s − s′)", {"*": "s′", "sign_*": "sign(s − s′)"},
         "s′: the specific force along the axis in the pose before",
+    ),
+    "remanence": Meaning(
+        "the bias keeps the sign of the load in the pose before",
+        "Iron that was magnetised, a charge that was left, a joint that slipped.",
+        "e = q sign(s′)", {"*": "sign(s′)"}, "s′: the specific force along the axis in the pose before",
     ),
     "vibration_rectification": Meaning(
         "vibration shifts the bias",

@@ -251,6 +251,11 @@ def test_a_full_disk_for_the_result(finished_run: Any, tmp_path: Path, triaxcal:
         (["plan", "--poses", "0"], "expected a whole number of at least 1, not '0'"),
         (["plan", "--poses", "1e3"], "expected a whole number of at least 1, not '1e3'"),
         (["plan", "--for", "flat_earth"], "--for flat_earth: no effect of that name; known: "),
+        (
+            ["plan", "--for", "remanence"],
+            "--for remanence: expected an effect of direction, time or a channel; this one goes with the pose before",
+        ),
+        (["plan", "--for", "temperature_lag"], "this one goes with what a channel was before, for which any plan does"),
         (["record", "station.toml"], "the following arguments are required: -o"),
         (["log"], "the following arguments are required: info|recover|export"),
         (["sim", "none.toml"], "none.toml: No such file or directory"),

@@ -8,16 +8,16 @@ import re
 import numpy as np
 import pytest
 
-from triaxcal.effects import CATALOGUE, effect_named
+from triaxcal.effects import CATALOGUE, TO_COME, effect_named
 from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, Effect
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, LAGS_S, RUN, SCATTER, SINCE_START, Effect, lag_of
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.in_run import InRuns
 from triaxcal.effects.run_bias import RunBias, RunScaleFactor
 from triaxcald.report.meanings import factor, in_plain, told
 
-FORMS = [form for effect in (*CATALOGUE, effect_named("channel_bias:fan rpm")) for form in effect.forms]
+FORMS = [form for effect in (*CATALOGUE, *TO_COME, effect_named("channel_bias:fan rpm")) for form in effect.forms]
 FORMS += [effect_named("channel_scale_factor:supply_v"), *(BiasDrift(d) for d in (1, 2, 3))]
 FORMS += [Hysteresis("memory"), Hysteresis("reversal")]
 RNG = np.random.default_rng(11)
@@ -26,8 +26,15 @@ CONDITIONS = {
     name: RNG.uniform(0.5, 2.0, 5)
     for name in {*(n for e in FORMS for n in e.needs), *BEFORE, *CHANGE, *SCATTER, SINCE_START, HELD}
 }
+CONDITIONS |= {lag_of("temp_c", constant_s): RNG.uniform(-1, 1, 5) for constant_s in LAGS_S}
 CONDITIONS[HELD] = np.zeros(5)
 CONDITIONS[SINCE_START] = np.arange(5.0)
+
+
+def hinge(s: np.ndarray, effect: Effect) -> np.ndarray:
+    """s − κ beyond the knee, with a bend as wide as κ/10."""
+    knee = effect.shape.get("knee", (1.0, ""))[0]
+    return np.asarray(knee / 10 * (np.log1p(np.exp(10 * (s / knee - 1))) - np.log1p(np.exp(-10))))
 
 
 def by_hand(text: str, effect: Effect, axis: int) -> np.ndarray:
@@ -38,6 +45,12 @@ def by_hand(text: str, effect: Effect, axis: int) -> np.ndarray:
         return np.asarray(S[:, "xyz".index(product[1])] * S[:, "xyz".index(product[2])])
     tau, at = (effect.shape.get(n, (1.0, ""))[0] for n in ("time_constant", "at"))
     known = {
+        "s⁵": s**5,
+        "h(−s) − h(s)": hinge(-s, effect) - hinge(s, effect),
+        "−h(s) − h(−s)": -hinge(-s, effect) - hinge(s, effect),
+        "θ − T₀": need + (c[effect.needs[1]] if effect.name == "temperature_lag" else 0.0),
+        "(t − t₀) s": need * s,
+        "sign(s′)": np.sign(c[BEFORE[axis]]),
         "s²": s**2,
         "s³": s**3,
         "|s|": np.abs(s),
@@ -73,7 +86,7 @@ def test_what_the_page_says_a_coefficient_is_multiplied_by_is_what_the_effect_do
     assert told(effect.name, {}).formula
 
 
-@pytest.mark.parametrize("effect", [Empirical(), *CATALOGUE], ids=lambda e: e.name)
+@pytest.mark.parametrize("effect", [Empirical(), *CATALOGUE, *TO_COME], ids=lambda e: e.name)
 def test_every_effect_of_the_catalogue_is_told_in_words(effect: Effect) -> None:
     known = told(effect.name, {})
     assert known.because

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from triaxcal.effects import CATALOGUE
+from triaxcal.effects import CATALOGUE, TO_COME
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias
@@ -16,6 +16,7 @@ from triaxcal.effects.in_run import InRuns
 from triaxcal.effects.part import Part
 from triaxcal.effects.run_bias import RunBias
 from triaxcal.effects.temperature_bias import TemperatureBias
+from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.effects.temperature_scale_factor import TemperatureScaleFactor
 from triaxcal.effects.thermal_gradient import ThermalGradient
 from triaxcal.effects.vibration_rectification import VibrationRectification
@@ -74,8 +75,13 @@ def test_each_condition_is_told_once_and_effects_of_directions_have_none() -> No
 
 
 def test_no_effect_of_the_catalogue_is_said_to_hold_at_a_derived_conditions_zero() -> None:
-    said = " ".join(holds(CATALOGUE, REFERENCE))
-    assert not [name for name in (SINCE_START, HELD, RUN, "before_", "change_", "scatter_", ".rate") if name in said]
+    said = " ".join(holds([*CATALOGUE, *TO_COME], REFERENCE))
+    derived = (SINCE_START, HELD, RUN, "before_", "change_", "scatter_", ".rate", ".lag")
+    assert not [name for name in derived if name in said]
+
+
+def test_a_lagging_temperature_has_caught_up_where_the_temperature_does_not_change() -> None:
+    assert holds([TemperatureLag(200.0)], REFERENCE) == ("at temp_c = 24.5 °C", "while temp_c does not change")
 
 
 def test_with_effects_the_matrix_alone_is_said_not_to_be_the_calibration() -> None:

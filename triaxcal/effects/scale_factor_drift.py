@@ -1,0 +1,28 @@
+"""Scale factor that moves steadily with time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import TIME, Coefficient, Effect, per_axis, per_axis_slope, xyz
+
+
+@dataclass(frozen=True)
+class ScaleFactorDrift(Effect):
+    """``e_i = q_i (t − t_ref) s_i``: the scale factor grows by the share q_i a second, as a reference voltage or a
+    magnet that warms or ages makes it."""
+
+    name: str = "scale_factor_drift"
+    coefficients: tuple[Coefficient, ...] = xyz("1/s")
+    needs: tuple[str, ...] = (TIME,)
+    remedy: str = "Let the unit settle before the first pose, and repeat the first poses at the end."
+
+    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return per_axis(s * conditions[TIME][:, None])
+
+    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+        return per_axis_slope(np.repeat(conditions[TIME][:, None], 3, axis=1))
