@@ -171,7 +171,6 @@ class Evidence:
         grids = [self._sizes_of[i][first::step] for i in members]
         sizes = np.array(list(itertools.product(*grids)), dtype=float)
         index = self.places(members)
-        scale = np.repeat(sizes, [self.terms[i].rank for i in members], axis=1)
         prior = float(self.log_prior[list(members)].sum()) - sum(np.log(len(grid)) for grid in grids)
         information = np.empty((len(parts), len(index), len(index)))
         score = np.empty((len(parts), len(index)))
@@ -183,12 +182,43 @@ class Evidence:
             information[row], score[row] = weighted @ own, weighted @ turned.z
             chi2[row] = turned.z @ (weight * turned.z)
             base[row] = self.parts[part].log_prior + 0.5 * np.log(weight).sum() + prior
-        precision = np.eye(len(index)) + scale[:, :, None] * information[:, None] * scale[:, None, :]
-        scores = scale * score[:, None]
-        found = np.linalg.solve(precision, scores[..., None])[..., 0]
-        chi2 = chi2 - np.sum(found * scores, axis=2)
-        log = self.rows.log_likelihood(chi2) - 0.5 * np.linalg.slogdet(precision)[1] + base
-        return SetEvidence(members, tuple(parts), sizes, log, scale * found)
+        gain, log_det, mean = _absorbed(information, score, [self.terms[i].rank for i in members], grids)
+        log = self.rows.log_likelihood(chi2 - gain) - 0.5 * log_det + base
+        return SetEvidence(members, tuple(parts), sizes, log, mean)
+
+
+def _absorbed(
+    information: Floats, score: Floats, ranks: Sequence[int], grids: Sequence[Floats]
+) -> tuple[Floats, Floats, Floats]:
+    """Of coefficients in blocks of these ``ranks``, with ``information`` (P,q,q) and ``score`` (P,q), for every choice
+    S of one size for each block from its grid: by how much they lower the sum of squares (P,S), the logarithm of the
+    determinant of their precision over that of the prior (P,S), and their mean (P,S,q).
+
+    Block by block: in the axes of its own information every size is a division, and the rest is what it leaves.
+    """
+    if not ranks:
+        nothing = np.zeros((len(score), 1))
+        return nothing, nothing, np.zeros((len(score), 1, 0))
+    r, squared = ranks[0], grids[0][:, None] ** 2
+    value, axes = np.linalg.eigh(information[:, :r, :r])
+    spread = 1 + squared * np.maximum(value, 0.0)[:, None]
+    shrunk = squared / spread
+    along = np.einsum("pqr,pq->pr", axes, score[:, :r])
+    gain, log_det = np.sum(shrunk * along[:, None] ** 2, axis=2), np.log(spread).sum(axis=2)
+    if len(ranks) == 1:
+        return gain, log_det, (shrunk * along[:, None]) @ axes.transpose(0, 2, 1)
+    crossed = axes.transpose(0, 2, 1) @ information[:, :r, r:]
+    taken = shrunk[..., None] * crossed[:, None]
+    rest = information[:, None, r:, r:] - crossed.transpose(0, 2, 1)[:, None] @ taken
+    left = score[:, None, r:] - np.einsum("psrq,pr->psq", taken, along)
+    P, R, q = left.shape
+    more, more_det, others = _absorbed(rest.reshape(P * R, q, q), left.reshape(P * R, q), ranks[1:], grids[1:])
+    others = others.reshape(P, R, -1, q)
+    own = shrunk[:, :, None] * (along[:, None, None] - np.einsum("prq,pstq->pstr", crossed, others))
+    mean = np.concatenate([np.einsum("pqr,pstr->pstq", axes, own), others], axis=3)
+    gain = gain[..., None] + more.reshape(P, R, -1)
+    log_det = log_det[..., None] + more_det.reshape(P, R, -1)
+    return gain.reshape(P, -1), log_det.reshape(P, -1), mean.reshape(P, -1, r + q)
 
 
 def _parts(rows: Rows, odds: Odds) -> list[Part]:

@@ -193,9 +193,10 @@ def posterior(
     """Of what acts beside the ``linear`` fit of these poses. ``smallest_g`` is the least size of an effect that is
     asked about; several units that are compared have one."""
     odds = odds or Odds()
-    rows = Rows.of(poses, linear, signs)
-    moving = set(channels_of(rows.poses)) - still_conditions(rows.poses)
-    effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, rows.poses)
+    sound = [p for p in poses if not p.fault]
+    moving = set(channels_of(sound)) - still_conditions(sound)
+    effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, sound)
+    rows = Rows.of(poses, linear, signs, effects)
     for _ in range(ROUNDS):
         evidence = Evidence(rows, terms_of(rows, effects, odds), odds, smallest_g)
         seen = Posterior(evidence, likely_sets(evidence))

@@ -52,13 +52,16 @@ class Rows:
     likelihood: Floats
 
     @classmethod
-    def of(cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float]) -> Rows:
-        """About the ``linear`` fit of these poses, which leaves outliers out. Poses with a fault are left out. Raises
+    def of(
+        cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], effects: Sequence[Effect] = ()
+    ) -> Rows:
+        """About the ``linear`` fit of these poses, which leaves outliers out, with the conditions that these
+        ``effects`` need. Poses with a fault are left out. Raises
         as `triaxcal.start.begun` does; Refused where no degree of freedom is left."""
         places = np.array([i for i, p in enumerate(poses) if not p.fault], dtype=int)
         sound = [poses[i] for i in places]
         poses = without_creep(sound) if np.isfinite([p.trend_error for p in sound]).all() else sound
-        problem, _ = begun(poses, signs=signs, reference=linear.reference)
+        problem, _ = begun(poses, signs=signs, reference=linear.reference, effects=effects)
         trends = Trends.of(problem, poses)
         problem = problem if trends is None else replace(problem, further=trends)
         return cls._about(State.of(problem, replace(linear.sensor, effects=())), poses, places, problem)
