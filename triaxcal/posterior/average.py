@@ -142,7 +142,8 @@ class _Carried:
             if id(term.effect) not in known:
                 known[id(term.effect)] = _carry(linear, each[k], _both(seen, term.effect, there))
             found = known[id(term.effect)][:, list(term.kept)] * term.mix
-            by_term[np.ix_([*range(9), *range(9 + ends[k], 9 + ends[k + 1])], evidence.places([i]))] = found
+            places = evidence.places([i])[: len(term.kept)]
+            by_term[np.ix_([*range(9), *range(9 + ends[k], 9 + ends[k + 1])], places)] = found
         by_term[:9] /= rows.lengths[:, None]
         columns = np.concatenate([np.empty((len(rows.y), 0)), *(c[: len(rows.y)] for c in each)], axis=1)
         return cls(tuple(likeliest), columns, by_term)
@@ -161,7 +162,8 @@ def _likeliest(seen: Posterior) -> list[Effect]:
             if term.effect is not None:
                 weight[id(term.effect)] += float(w)
                 effects[id(term.effect)] = term.effect
-                corrects[term.name] += float(w) * float(np.sqrt(np.mean(scaled[first:last] ** 2)))
+                own = scaled[first:last][: len(term.kept)]
+                corrects[term.name] += float(w) * float(np.sqrt(np.mean(own**2)))
     least = NOTICEABLE * seen.evidence.rows.of_a_pose
     out: dict[str, Effect] = {}
     for key in sorted(weight, key=lambda key: -weight[key]):
@@ -293,9 +295,9 @@ def _likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
     for found in seen.sets:
         if found.total - total < np.log(NEGLIGIBLE):
             break
-        for flat in np.argsort(-found.log, axis=None)[: CELLS // 4]:
-            row, cell = divmod(int(flat), found.log.shape[1])
-            cells.append((float(found.log[row, cell]) - total, found, row, cell))
+        flat = found.log.ravel()
+        few = np.argpartition(-flat, CELLS // 4)[: CELLS // 4] if len(flat) > CELLS // 4 else range(len(flat))
+        cells += [(float(flat[i]) - total, found, *divmod(int(i), found.log.shape[1])) for i in few]
     return sorted(cells, key=lambda cell: -cell[0])[:CELLS]
 
 

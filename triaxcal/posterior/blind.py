@@ -48,7 +48,7 @@ def _in_full(evidence: Evidence, name: str) -> bool:
     """Whether no combination of all the coefficients of some shape looks like the nine parameters."""
     beside = evidence.rows.beside.T
     for term in evidence.terms:
-        if term.name == name and term.effect is not None and term.rank == len(term.effect.coefficients):
+        if term.name == name and term.effect is not None and len(term.kept) == len(term.effect.coefficients):
             columns = term.columns / np.maximum(np.linalg.norm(term.columns, axis=0), 1e-300)
             if np.linalg.svd(beside @ columns, compute_uv=False)[-1] > VISIBLE:
                 return True

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
@@ -50,11 +51,11 @@ class SetEvidence:
     log: Floats
     mean: Floats
 
-    @property
+    @cached_property
     def total(self) -> float:
         return float(logsumexp(self.log))
 
-    @property
+    @cached_property
     def by_part(self) -> Floats:
         """(P,) logarithms."""
         return np.asarray(logsumexp(self.log, axis=1))

@@ -34,6 +34,8 @@ class Unmodelled:
     probability: float
     what: What | None
     rms: float
+    likely: bool
+    """Whether it is to be told."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ def _unmodelled(seen: Posterior) -> Unmodelled:
             squares = np.diag(part.kind.covariance)[: rows.n] * rows.error[: rows.n] ** 2
             variance += float(p) * part.tau**2 * float(np.mean(squares))
     likeliest = next((what for what in seen.of_kinds if what is not What.INSIDE), None)
-    return Unmodelled(total, likeliest, float(np.sqrt(variance / total)) if total > 0 else 0.0)
+    rms = float(np.sqrt(variance / total)) if total > 0 else 0.0
+    return Unmodelled(total, likeliest, rms, total >= seen.evidence.odds.reported)
 
 
 def _nothing(seen: Posterior) -> float:

@@ -9,7 +9,7 @@ from enum import StrEnum
 
 from triaxcal.calibration import Calibration, Exclusion, HoldsAt
 from triaxcal.conditions import channels_of
-from triaxcal.effects import catalogue_for
+from triaxcal.effects import TO_COME, catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
@@ -35,6 +35,17 @@ class Verdict(StrEnum):
     """Known, and corrected."""
     CONFOUNDED = "confounded"
     """One of several acts; or it is known, and no effect is corrected (`Loop.refusal`)."""
+
+
+class Call(StrEnum):
+    """What to do with the calibration."""
+
+    USABLE = "usable"
+    """What acts is known and corrected, or nothing does."""
+    RECORD_MORE = "record_more"
+    """What acts is not known for certain, and poses could tell."""
+    INVESTIGATE = "investigate"
+    """Something acts that no effect describes, or this is not one unit in one mounting."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +93,13 @@ class Loop:
         """That each effect acts, whatever else does, the likeliest first."""
         return self.seen.of_names
 
+    @property
+    def call(self) -> Call:
+        if self.refusal in (Refusal.UNMODELLED, Refusal.ANOTHER):
+            return Call.INVESTIGATE
+        certain = all(f.verdict is Verdict.ADOPTED for f in self.findings)
+        return Call.USABLE if certain and not self.candidates and not self.found.outliers else Call.RECORD_MORE
+
 
 def diagnose(
     poses: Sequence[Pose],
@@ -105,7 +123,7 @@ def diagnose(
     if moment is None:
         raise Refused("no pose without a fault")
     moving = set(channels_of(sound)) - still_conditions(sound)
-    effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, sound)
+    effects = by_run((*catalogue_for(moving), *TO_COME) if catalogue is None else catalogue, sound)
     seen = posterior(poses, linear, signs=signs, catalogue=effects, odds=odds)
     before = replace(_without_outliers(poses, linear, signs, seen), holds_at=moment)
     blind = blind_to(seen.evidence, effects)

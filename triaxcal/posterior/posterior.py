@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import channels_of
-from triaxcal.effects import catalogue_for
+from triaxcal.effects import TO_COME, catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.poses.pose import Pose
@@ -195,7 +195,7 @@ def posterior(
     odds = odds or Odds()
     sound = [p for p in poses if not p.fault]
     moving = set(channels_of(sound)) - still_conditions(sound)
-    effects = by_run(catalogue_for(moving) if catalogue is None else catalogue, sound)
+    effects = by_run((*catalogue_for(moving), *TO_COME) if catalogue is None else catalogue, sound)
     rows = Rows.of(poses, linear, signs, effects)
     for _ in range(ROUNDS):
         evidence = Evidence(rows, terms_of(rows, effects, odds), odds, smallest_g)
@@ -222,10 +222,10 @@ def _point_of(seen: Posterior) -> State | None:
     for term, mine in zip(terms, np.split(scaled, ends[1:-1]), strict=True):
         if term.effect is not None:
             own = np.zeros(len(term.effect.coefficients))
-            own[list(term.kept)] = term.mix * mine
+            own[list(term.kept)] = term.mix * mine[: len(term.kept)]
             effects.append(term.effect)
             coefficients.append(own)
-            foretold = foretold + term.columns @ mine
+            foretold = foretold + rows.by_coefficients(term.effect) @ own
     point = State(np.concatenate([rows.state.theta + linear / rows.lengths, *coefficients]), tuple(effects))
     try:
         found, _, _ = everything(rows.problem, point, jacobian=False)

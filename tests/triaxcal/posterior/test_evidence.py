@@ -38,7 +38,7 @@ def density(evidence: Evidence, part: int, members: tuple[int, ...], sizes: np.n
 
 
 def of(evidence: Evidence, name: str, rank: int) -> int:
-    return next(i for i, term in enumerate(evidence.terms) if term.name == name and term.rank == rank)
+    return next(i for i, term in enumerate(evidence.terms) if term.name == name and len(term.kept) == rank)
 
 
 @pytest.mark.parametrize("part", [0, 10, 25, 40])

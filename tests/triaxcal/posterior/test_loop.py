@@ -14,7 +14,7 @@ from triaxcal.moment import Moment
 from triaxcal.poses.pose import Pose
 from triaxcal.posterior import Refusal
 from triaxcal.posterior.blind import Why
-from triaxcal.posterior.loop import Loop, Verdict, diagnose
+from triaxcal.posterior.loop import Call, Loop, Verdict, diagnose
 
 Poses = Callable[..., list[Pose]]
 Knocked = Callable[[list[Pose], int, float], list[Pose]]
@@ -52,8 +52,10 @@ def test_one_of_several_is_told_with_the_probability_of_each(poses_with: Poses) 
 
 def test_a_likely_name_is_a_candidate_with_what_it_would_be(poses_with: Poses) -> None:
     for seed in range(2):
-        (candidate,) = closed(poses_with(seed, second_order_nonlinearity=[3e-4, -3e-4, 2.4e-4])).candidates
+        loop = closed(poses_with(seed, second_order_nonlinearity=[3e-4, -3e-4, 2.4e-4]))
+        (candidate,) = loop.candidates
         assert candidate.effect == "second_order_nonlinearity"
+        assert loop.call is Call.RECORD_MORE
         assert 0.5 <= candidate.probability < 0.99
         value, error, _ = candidate.coefficients["x"]
         assert error is not None
@@ -66,12 +68,14 @@ def test_where_nothing_acts_nothing_is_told(poses_with: Poses) -> None:
         assert loop.findings == loop.candidates == ()
         assert loop.after.terms == ("linear",)
         assert loop.refusal is None
+        assert loop.call is Call.USABLE
 
 
 def test_where_something_has_no_name_nothing_is_corrected() -> None:
     recording = Case("dead_zone", 1, (100.0, 200.0), 26, "white").make()
     loop = diagnose(still_poses(recording.samples()), signs=recording.signs)
     assert loop.refusal is Refusal.UNMODELLED
+    assert loop.call is Call.INVESTIGATE
     assert loop.found.unmodelled.probability > 0.5
     assert loop.after.terms == ("linear",)
     assert all(f.verdict is Verdict.CONFOUNDED for f in loop.findings)

@@ -1,0 +1,92 @@
+"""What a closed loop says in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from triaxcal.next_recording import NextRecording, Source
+from triaxcal.poses.pose import Began
+from triaxcal.posterior.average import Refusal
+from triaxcal.posterior.blind import Blind, Why
+from triaxcal.posterior.findings import Another, Findings, Unmodelled
+from triaxcal.posterior.loop import Call, Candidate, Finding, Verdict
+from triaxcal.posterior.unmodelled import What
+from triaxcal.text import diagnosis
+from triaxcal.units import ErrorUnit
+
+SMALL = ErrorUnit.of("g", 1.0)
+NOTHING = Findings((), {}, {}, Unmodelled(0.04, What.TIME, 1e-5, False), None, 0.91)
+KNOWN = Finding("hysteresis", Verdict.ADOPTED, 0.99995, {}, {}, "Let it rest.")
+GROUP = Finding("warm_up", Verdict.CONFOUNDED, 0.72, {"bias_drift": 0.275}, {}, "Let it warm up.")
+BEGAN = {4: Began(132.0, None), 9: Began(301.5, None)}
+
+
+def cause(found: Findings, findings: tuple[Finding, ...] = (), candidates: tuple[Candidate, ...] = ()) -> str:
+    return diagnosis.cause(found, findings, candidates, BEGAN, SMALL)
+
+
+@pytest.mark.parametrize(
+    ("p", "said"),
+    [(0.9999, "more than 0.999"), (0.9961, "0.996"), (0.8449, "0.84"), (0.0512, "0.051"), (1e-7, "less than 0.001")],
+)
+def test_a_probability_is_told_as_exactly_as_it_is_known(p: float, said: str) -> None:
+    assert diagnosis.chance(p) == said
+
+
+def test_the_cause_is_told_with_its_probability() -> None:
+    assert cause(NOTHING) == "no effect shows (nothing acts with probability 0.91)"
+    assert cause(NOTHING, (KNOWN,)) == "hysteresis (more than 0.999) acts"
+    assert cause(NOTHING, (GROUP,)) == "one of warm_up (0.72), bias_drift (0.28) acts"
+    likely = Candidate("third_order_nonlinearity", 0.63, {})
+    assert cause(NOTHING, (KNOWN,), (likely,)).endswith("third_order_nonlinearity probably acts (0.63)")
+
+
+def test_what_has_no_name_is_told_with_its_size_and_what_it_goes_with() -> None:
+    found = replace(NOTHING, unmodelled=Unmodelled(0.97, What.BEFORE, 240e-6, True))
+    said = "something acts that no effect describes (probability 0.97), 240.0 µg rms; it goes with the pose before"
+    assert cause(found) == said
+
+
+def test_another_unit_is_told_with_the_pose_it_begins_at() -> None:
+    said = cause(replace(NOTHING, another=Another(4, 0.998)))
+    assert said.startswith("from the pose at 132.0 s on one calibration does not hold")
+    assert "probability 0.998" in said
+
+
+def test_outliers_are_told_each_with_its_moment() -> None:
+    assert cause(replace(NOTHING, outliers={9: 0.98})) == "outliers, which are left out: the pose at 301.5 s (0.98)"
+
+
+def test_a_reason_says_why_a_known_effect_is_not_corrected() -> None:
+    assert diagnosis.reason(KNOWN, None) == "it acts with probability more than 0.999"
+    refused = replace(KNOWN, verdict=Verdict.CONFOUNDED)
+    assert diagnosis.reason(refused, Refusal.ONE_POSE).endswith(
+        "not corrected, because what was found hangs on a single pose"
+    )
+    assert "or else bias_drift 0.28: one of them with 0.995" in diagnosis.reason(GROUP, None)
+
+
+def test_errors_say_what_is_assumed_of_the_next_recording() -> None:
+    assumed = NextRecording(4.1e-3, 2e-3, Source.ASSUMED)
+    said = diagnosis.errors(601e-6, 18e-6, assumed, SMALL)
+    assert said == (
+        "residual rms 601.0 µg before, 18.0 µg after; in the next recording within 4100.0 µg (expanded, with 2000.0 µg "
+        "from start to start, assumed)"
+    )
+
+
+@pytest.mark.parametrize("refused", Refusal)
+def test_every_refusal_has_words(refused: Refusal) -> None:
+    assert diagnosis.reason(replace(KNOWN, verdict=Verdict.CONFOUNDED), refused).count(";") == 1
+
+
+@pytest.mark.parametrize("why", Why)
+def test_every_reason_to_be_blind_has_words(why: Why) -> None:
+    assert diagnosis.blind(Blind(why, "temp_c"))
+
+
+@pytest.mark.parametrize("found", Call)
+def test_every_call_has_words(found: Call) -> None:
+    assert diagnosis.call(found)
