@@ -91,8 +91,8 @@ def _(c: of_fit.BirgeRatio) -> str:
 @caution.register
 def _(_: of_fit.ResidualsTooSmall) -> str:
     return (
-        "residuals are smaller than the noise and the creep of the poses explain: what moves the outputs inside a pose "
-        "(a temperature, a stand that settles) moves the means less, so the standard errors are on the safe side"
+        "residuals are smaller than noise and creep inside the poses would make them: what moves the outputs inside a "
+        "pose (a temperature, a stand that settles) moves the means less, so the standard errors are on the safe side"
     )
 
 

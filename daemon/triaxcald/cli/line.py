@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import shutil
 import signal
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -170,8 +172,10 @@ def _show_next(folder: Path, units: Sequence[DemoUnit]) -> None:
     print("next:")
     if reports:
         print(f"  open {reports[0]} in a browser: what was found, with pictures")
-    print(f"  triaxcal audit {folder}: both results recomputed from the recordings alone")
-    print("  triaxcal diagnose and triaxcal apply: the same with a recording of your own (docs/tutorial)")
+    command = "triaxcal" if shutil.which("triaxcal") else sys.argv[0]
+    print(f"  {command} audit {folder}: both results recomputed from the recordings alone")
+    tutorial = "docs/tutorial/first-calibration.md"
+    print(f"  {command} diagnose and {command} apply: the same with a recording of your own ({tutorial})")
 
 
 def _show_demo(u: DemoUnit) -> None:

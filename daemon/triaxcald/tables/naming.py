@@ -95,10 +95,12 @@ class Name:
         return bool(set(self.words) & (known.OTHER_SENSORS | known.COMPUTED | known.ELSEWHERE))
 
     @property
+    def is_without_gravity(self) -> bool:
+        return bool(set(self.words) & known.WITHOUT_GRAVITY)
+
+    @property
     def is_computed(self) -> bool:
-        return "angular" not in self.words and bool(
-            set(self.words) & (known.COMPUTED | known.WITHOUT_GRAVITY | known.TURNED | known.ERRORS)
-        )
+        return "angular" not in self.words and bool(set(self.words) & (known.COMPUTED | known.TURNED | known.ERRORS))
 
     @property
     def is_celsius(self) -> bool:

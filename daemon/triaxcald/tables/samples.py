@@ -542,6 +542,8 @@ def _channels(
             reason = "an index"
         elif i in roles.rivals:
             reason = "other outputs"
+        elif grid.named and names[i].is_without_gravity:
+            reason = "without gravity"
         elif grid.named and names[i].is_computed:
             reason = "computed from the outputs"
         elif reason is None and (not name or name in (*OUTPUTS, "t_s") or name in channels):

@@ -40,6 +40,12 @@ writer.event("begun")
 """
 
 
+def _heeding() -> None:
+    """Signals that a shell ignores for what it runs in the background, or under nohup."""
+    for number in (INT, HUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def _python(code: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", START + code, *arguments],
@@ -47,7 +53,7 @@ def _python(code: str, *arguments: str | Path) -> subprocess.CompletedProcess[st
         text=True,
         check=False,
         timeout=120,
-        preexec_fn=lambda: signal.signal(INT, signal.SIG_DFL),  # also in the background of a shell
+        preexec_fn=_heeding,
     )
 
 
