@@ -35,6 +35,17 @@ class Together:
     common: Mapping[str, float]
     nothing: float
 
+    def certain(self, level: float) -> tuple[str, ...]:
+        """The fewest names of which one acts in all with this probability, the likeliest first; none where nothing is
+        as certain. Names that hold each other's columns, as temperature and its square, stand together."""
+        total, names = 0.0, []
+        for name, p in self.probability.items():
+            names.append(name)
+            total += p
+            if total >= level:
+                return tuple(names)
+        return ()
+
 
 def together(units: Sequence[Posterior]) -> Together:
     """Of units whose posteriors are of one catalogue and one grid of sizes (`triaxcal.posterior.posterior`). Names that

@@ -32,6 +32,7 @@ def test_an_effect_with_common_values_is_certain_in_all_and_in_none_alone(
     assert found.probability["temperature_bias"] > 0.9  # that it is a little bent cannot be excluded
     assert found.nothing < 0.01
     assert found.common["temperature_bias"] > 0.5
+    assert "temperature_bias" in found.certain(0.99)
 
 
 def test_values_of_their_own_are_not_called_common(poses_with: Callable[..., list[Pose]]) -> None:
@@ -46,6 +47,7 @@ def test_where_nothing_acts_nothing_is_found_together(poses_with: Callable[..., 
     found = together(of_units([poses_with(seed + 50) for seed in range(UNITS)]))
     assert max(found.probability.values()) < 0.5
     assert found.nothing > 0.3
+    assert found.certain(0.99) == ()
 
 
 def test_what_one_unit_has_alone_is_no_effect_of_all(poses_with: Callable[..., list[Pose]]) -> None:
