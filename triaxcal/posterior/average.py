@@ -207,7 +207,7 @@ def _covariance(seen: Posterior, mean: Floats, carried: _Carried, wander: Floats
     rows = evidence.rows
     inverse: dict[int, Floats] = {}
     total, out = 0.0, np.zeros((len(mean), len(mean)))
-    for log_share, found, row, cell in _likely_cells(seen):
+    for log_share, found, row, cell in likely_cells(seen):
         part = found.parts[row]
         if part not in inverse:
             inverse[part] = np.linalg.inv(evidence.covariance(part))
@@ -238,7 +238,7 @@ def _covariance(seen: Posterior, mean: Floats, carried: _Carried, wander: Floats
     return out / total
 
 
-def _likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
+def likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
     """The logarithm of its probability, the set, and the places of part and sizes."""
     total = float(logsumexp([found.total for found in seen.sets]))
     cells = []
