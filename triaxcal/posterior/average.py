@@ -258,7 +258,7 @@ def _cells(
     evidence = seen.evidence
     rows = evidence.rows
     inverse: dict[int, Floats] = {}
-    for log_share, found, row, cell in _likely_cells(seen):
+    for log_share, found, row, cell in likely_cells(seen):
         part = found.parts[row]
         if part not in inverse:
             inverse[part] = np.linalg.inv(evidence.covariance(part))
@@ -288,7 +288,7 @@ def _cells(
         yield float(np.exp(log_share)), seen.names_of(found), size, spread * noise + np.outer(off, off)
 
 
-def _likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
+def likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
     """The logarithm of its probability, the set, and the places of part and sizes."""
     total = float(logsumexp([found.total for found in seen.sets]))
     cells = []

@@ -153,17 +153,21 @@ class Posterior:
         return ()
 
     def without_any_pose(self, name: str) -> float:
-        """The probability of a name if that pose were an outlier which it takes most to explain: beside the likeliest
-        set with the name, less the name."""
+        """The probability of a name if that pose were an outlier which it takes most to explain."""
+        return float(self.without_each_pose(name).min())
+
+    def without_each_pose(self, name: str) -> Floats:
+        """(n,) the probability of a name if that pose were an outlier: beside the likeliest set with the name, less the
+        name. As it is, where the pose is one of that set's outliers."""
+        evidence = self.evidence
+        out = np.full(evidence.rows.n, self.of_names.get(name, 0.0))
         best = next((found for found in self.sets if name in self.names_of(found)), None)
         if best is None:
-            return 0.0
-        evidence = self.evidence
+            return out
         rest = tuple(i for i in best.members if evidence.terms[i].name != name)
         mine = np.array([term.name == name for term in evidence.terms])
         rows = np.argsort(-best.by_part)[:PARTS]
         parts = sorted({0, *(best.parts[row] for row in rows)})
-        worst = self.of_names[name]
         for i, term in enumerate(evidence.terms):
             if term.pose < 0 or i in rest:
                 continue
@@ -173,8 +177,8 @@ class Posterior:
             each = logsumexp([evidence.with_further(beside, row, cells=1) for row in range(len(parts))], axis=(0, 2))
             each = np.where(others, each + evidence.log_prior, -np.inf)
             acts, none = logsumexp(each[mine]), logsumexp([beside.total, *each[~mine]])
-            worst = min(worst, float(np.exp(acts - np.logaddexp(acts, none))))
-        return worst
+            out[term.pose] = np.exp(acts - np.logaddexp(acts, none))
+        return out
 
     @cached_property
     def _total(self) -> float:

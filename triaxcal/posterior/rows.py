@@ -9,6 +9,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.calibration import Calibration
+from triaxcal.conditions import channels_of, with_scale
 from triaxcal.creep import without_creep
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
@@ -85,6 +86,35 @@ class Rows:
         likelihood = noise.log_likelihood(np.exp(CHI2_LOG), beside.shape[1])
         run, z = np.array([p.run.index for p in poses]), beside.T @ y
         return cls(poses, places, run, problem, point, y, columns, lengths, error, beside, z, noise, likelihood)
+
+    def to_come(self, poses: Sequence[Pose]) -> Rows:
+        """Of poses that nobody has taken, about the same point and in the same units: misfits are not known, and
+        nothing is ``beside``."""
+        sensor = self.state.sensor(self.problem)
+        every = channels_of([*self.poses, *poses], self.problem.channel_reference)
+        channels = {name: values[self.n :] for name, values in every.items()}
+        problem = replace(
+            self.problem,
+            u=np.array([p.mean for p in poses]),
+            covariance=np.array([p.covariance for p in poses]),
+            channels=with_scale(channels, poses, sensor.scale_factor, sensor.bias),
+            further=None,
+        )
+        problem = replace(problem, further=Trends.of(problem, poses) if self.slopes else None)
+        _, J, error = everything(problem, self.point)
+        nothing = np.empty((len(error), 0))
+        return replace(
+            self,
+            poses=poses,
+            places=np.full(len(poses), -1),
+            run=np.array([p.run.index for p in poses]),
+            problem=problem,
+            y=np.full(len(error), np.nan),
+            linear=J[:, :LINEAR] / error[:, None] / self.lengths,
+            error=error,
+            beside=nothing,
+            z=np.empty(0),
+        )
 
     def by_coefficients(self, effect: Effect) -> Floats:
         """(N,p) derivatives of the rows by the coefficients of an effect."""

@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, Ints
+from triaxcal.effects.contract import BEFORE
 from triaxcal.planning.directions import directions
 from triaxcal.posterior.rows import Rows
 
@@ -27,6 +29,8 @@ MEMORY = 0.8
 """Of the reference vector, by the pose before."""
 IN_TIME = (0.1, 0.3)
 """Of the recording's duration."""
+ABSORBED = 1e-9
+"""A covariance of which the nine parameters leave no more is theirs: of time, where nobody knows when poses were."""
 
 
 class What(StrEnum):
@@ -43,11 +47,53 @@ class What(StrEnum):
 
 
 @dataclass(frozen=True, eq=False)
+class Place:
+    """k readings: ``up`` (k,3) unit vectors, ``by_v`` (k,3) how |a| goes with the bias of each axis, ``along`` (k,3)
+    the readings along the sensitive axes in g, ``linear`` (k,9) derivatives by the nine parameters."""
+
+    up: Floats
+    by_v: Floats
+    along: Floats
+    linear: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """k poses as a covariance sees them, taken or to come: ``place``, the specific force in the pose ``before`` (k,3)
+    over the reference, ``t_s``, ``held_s`` and ``run`` (k,); the standard ``error`` of their rows (K,), K = 2 k where
+    these have ``slopes``."""
+
+    place: Place
+    before: Floats
+    t_s: Floats
+    held_s: Floats
+    run: Ints
+    error: Floats
+    slopes: bool
+
+    @classmethod
+    def of(cls, rows: Rows) -> Held:
+        held = rows.problem.conditions
+        before = np.stack([held[name] for name in BEFORE], axis=1) / rows.problem.reference
+        return cls(place(rows, rows.problem.u), before, rows.t_s, rows.held_s, rows.run, rows.error, rows.slopes)
+
+    @property
+    def k(self) -> int:
+        return len(self.t_s)
+
+
+class _Between(Protocol):
+    """(K,L) covariance of the rows of k poses and of l poses, in units of the reference squared, but for a factor."""
+
+    def __call__(self, p: Held, q: Held) -> Floats: ...
+
+
+@dataclass(frozen=True, eq=False)
 class Kind:
     """A covariance of the rows beside the nine parameters, in its own axes: ``variance`` (m,) along ``axes`` (m,m),
     with mean 1, so that τ² is the mean variance in units of the noise. ``covariance`` (N,N) of the rows over their
-    errors; it and every other covariance of this kind are to be multiplied by ``scale``. ``length`` is that of its
-    correlation."""
+    errors, and ``between`` what makes it and that of any other poses; every covariance of this kind is to be multiplied
+    by ``scale``. ``length`` is that of its correlation."""
 
     what: What
     length: float
@@ -55,6 +101,11 @@ class Kind:
     axes: Floats
     covariance: Floats
     scale: float
+    between: _Between
+
+    def covariance_of(self, p: Held, q: Held) -> Floats:
+        """(K,L) of the rows of poses, over their errors."""
+        return np.asarray(self.scale * self.between(p, q) / p.error[:, None] / q.error)
 
     def bias_at(self, rows: Rows, t_s: float) -> Floats:
         """(3,N) covariance of the bias at a moment of the last recording with the rows over their errors, of what goes
@@ -74,71 +125,68 @@ def duration_of(rows: Rows) -> float:
 
 def kinds_of(rows: Rows) -> list[Kind]:
     found = []
-    for what, length, covariance in _covariances(rows):
-        weighted = covariance / rows.error[:, None] / rows.error[None]
+    here = Held.of(rows)
+    for what, length, between in _covariances(rows):
+        weighted = between(here, here) / rows.error[:, None] / rows.error
         inner = rows.beside.T @ weighted @ rows.beside
         total = float(np.trace(inner))
-        if total <= 0:
+        if total <= ABSORBED * np.trace(weighted):
             continue
         scale = len(inner) / total
         variance, axes = np.linalg.eigh(inner * scale)
-        found.append(Kind(what, length, np.maximum(variance, 0.0), axes, weighted * scale, scale))
+        found.append(Kind(what, length, np.maximum(variance, 0.0), axes, weighted * scale, scale, between))
     return found
 
 
-def _covariances(rows: Rows) -> Iterator[tuple[What, float, Floats]]:
-    """(N,N) each, in units of the reference squared, but for a factor."""
-    n = rows.n
-
-    def of_means(covariance: Floats) -> Floats:
-        whole = np.zeros((len(rows.y), len(rows.y)))
-        whole[:n, :n] = covariance
-        return whole
-
-    yield What.NOTHING, 0.0, of_means(np.eye(n))
+def _covariances(rows: Rows) -> Iterator[tuple[What, float, _Between]]:
+    yield What.NOTHING, 0.0, lambda p, q: _of_means(p, q, _same(p, q))
     sphere = _Sphere.of(rows)
     for length in SMOOTH:
-        yield What.DIRECTION, length, of_means(sphere.covariance(lambda p, q, s=length: _smooth(p, q, s)))
+        yield What.DIRECTION, length, sphere.covariance(partial(_smooth, length=length))
     for what, sign in ((What.ODD, -1), (What.EVEN, 1)):
         length = BY_AXIS * rows.problem.reference
-        yield what, length, of_means(sphere.covariance(lambda p, q, s=sign, at=length: _by_axis(p, q, s, at)))
-    before = np.stack([rows.problem.conditions[f"before_{axis}"] for axis in "xyz"], axis=1) / rows.problem.reference
-    near = np.exp(-np.sum((before[:, None] - before[None]) ** 2, axis=2) / 2 / MEMORY**2)
-    together = sphere.here.by_v @ sphere.here.by_v.T
-    yield What.BEFORE, MEMORY, of_means(near * together)
+        yield what, length, sphere.covariance(partial(_by_axis, sign=sign, length=length))
+    yield What.BEFORE, MEMORY, _by_the_pose_before
     for share in IN_TIME:
-        yield What.TIME, share, _in_time(rows, share, together)
+        yield What.TIME, share, partial(_in_time, length=share * duration_of(rows))
     if rows.slopes:
-        slopes = np.zeros((len(rows.y), len(rows.y)))
-        slopes[n:, n:] = np.eye(n)
-        yield What.INSIDE, 0.0, slopes
+        yield What.INSIDE, 0.0, lambda p, q: _of_slopes(p, q, _same(p, q))
 
 
-def _in_time(rows: Rows, share: float, together: Floats) -> Floats:
-    """A bias of each axis that wanders smoothly, in each recording anew: one process for means and slopes, or slow
-    drift is paid twice."""
-    n, length = rows.n, share * duration_of(rows)
-    apart = rows.t_s[:, None] - rows.t_s[None]
-    near = np.exp(-(apart**2) / 2 / length**2) * together * (rows.run[:, None] == rows.run)
-    if not rows.slopes:
-        return np.asarray(near)
-    held = rows.held_s
-    mixed = near * apart / length**2 * held[None]
-    inside = near * (1 / length**2 - apart**2 / length**4) * held[:, None] * held[None]
-    whole = np.zeros((2 * n, 2 * n))
-    whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:] = near, mixed, mixed.T, inside
+def _same(p: Held, q: Held) -> Floats:
+    """(k,l): what is each pose's own is shared with no other pose."""
+    return np.eye(p.k) if p is q else np.zeros((p.k, q.k))
+
+
+def _of_means(p: Held, q: Held, covariance: Floats) -> Floats:
+    whole = np.zeros((len(p.error), len(q.error)))
+    whole[: p.k, : q.k] = covariance
     return whole
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """k readings: ``up`` (k,3) unit vectors, ``by_v`` (k,3) how |a| goes with the bias of each axis, ``along`` (k,3)
-    the readings along the sensitive axes in g, ``linear`` (k,9) derivatives by the nine parameters."""
+def _of_slopes(p: Held, q: Held, covariance: Floats) -> Floats:
+    whole = np.zeros((len(p.error), len(q.error)))
+    whole[p.k :, q.k :] = covariance
+    return whole
 
-    up: Floats
-    by_v: Floats
-    along: Floats
-    linear: Floats
+
+def _by_the_pose_before(p: Held, q: Held) -> Floats:
+    near = np.exp(-np.sum((p.before[:, None] - q.before[None]) ** 2, axis=2) / 2 / MEMORY**2)
+    return _of_means(p, q, near * (p.place.by_v @ q.place.by_v.T))
+
+
+def _in_time(p: Held, q: Held, length: float) -> Floats:
+    """A bias of each axis that wanders smoothly, in each recording anew: one process for means and slopes, or slow
+    drift is paid twice."""
+    apart = p.t_s[:, None] - q.t_s[None]
+    together = (p.place.by_v @ q.place.by_v.T) * (p.run[:, None] == q.run)
+    near = np.exp(-(apart**2) / 2 / length**2) * together
+    if not p.slopes:
+        return np.asarray(near)
+    mean_slope = near * apart / length**2 * q.held_s[None]
+    slope_mean = -near * apart / length**2 * p.held_s[:, None]
+    inside = near * (1 / length**2 - apart**2 / length**4) * p.held_s[:, None] * q.held_s[None]
+    return np.block([[near, mean_slope], [slope_mean, inside]])
 
 
 class _Covariance(Protocol):
@@ -147,9 +195,8 @@ class _Covariance(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Sphere:
-    """The poses, and directions all over the sphere with what takes the nine parameters' part off a function there."""
+    """Directions all over the sphere, with what takes the nine parameters' part off a function there."""
 
-    here: Place
     everywhere: Place
     fit: Floats
 
@@ -158,14 +205,19 @@ class _Sphere:
         sensor = rows.state.sensor(rows.problem)
         up = np.array([v for _, v in directions(SPHERE)]) * rows.problem.reference
         everywhere = place(rows, sensor.output(up, {}))
-        return cls(place(rows, rows.problem.u), everywhere, np.linalg.pinv(everywhere.linear))
+        return cls(everywhere, np.linalg.pinv(everywhere.linear))
 
-    def covariance(self, of: _Covariance) -> Floats:
-        """(n,n) of a function of direction in the poses, less its linear part over the sphere."""
-        absorbed = self.here.linear @ self.fit
-        crossed = of(self.here, self.everywhere)
-        both = absorbed @ crossed.T
-        return of(self.here, self.here) - both - both.T + absorbed @ of(self.everywhere, self.everywhere) @ absorbed.T
+    def covariance(self, of: _Covariance) -> _Between:
+        """Of a function of direction, less its linear part over the sphere."""
+        inner = of(self.everywhere, self.everywhere)
+
+        def between(p: Held, q: Held) -> Floats:
+            here, there = p.place.linear @ self.fit, q.place.linear @ self.fit
+            crossed = of(p.place, self.everywhere) @ there.T
+            mirrored = here @ of(self.everywhere, q.place)
+            return _of_means(p, q, of(p.place, q.place) - crossed - mirrored + here @ inner @ there.T)
+
+        return between
 
 
 def place(rows: Rows, u: Floats) -> Place:

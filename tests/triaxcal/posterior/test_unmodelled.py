@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,3 +36,8 @@ def test_every_kind_has_a_mean_variance_of_one_in_its_own_axes(rows: Rows) -> No
 
 def test_only_slopes_know_what_acts_inside_the_poses_alone(rows: Rows) -> None:
     assert (What.INSIDE in {kind.what for kind in kinds_of(rows)}) == rows.slopes
+
+
+def test_nothing_goes_with_time_where_nobody_knows_when_poses_were_taken(poses_with: Callable[..., list[Pose]]) -> None:
+    rows = rows_of([replace(p, start_s=0.0, end_s=0.0) for p in poses_with(1)], MINUS)
+    assert What.TIME not in {kind.what for kind in kinds_of(rows)}

@@ -1,0 +1,197 @@
+"""Which poses next: those with the largest expected information on what acts (Lindley 1956, Ann. Math. Stat. 27:986).
+
+The information of a pose is by how much it lowers the entropy of the hypotheses on average, over what the likely sets
+say that it will show. That average is taken over draws, as are the probabilities to expect. Poses are chosen one after
+the other, each beside those before it; the best is that with the most information for its price.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.effects import TEMPERATURE
+from triaxcal.poses.pose import Pose
+from triaxcal.posterior.actions import LONGER, OPEN, Action, Do, Options
+from triaxcal.posterior.posterior import Posterior
+from triaxcal.posterior.predictive import Cells, Hypothesis, probabilities
+from triaxcal.posterior.rows import Rows
+from triaxcal.posterior.unmodelled import What
+
+SHARE = 0.99
+"""Of the probability that the sets hold which are asked, if so few do (`triaxcal.posterior.average.CELLS`)."""
+DRAWS = 256
+"""Of what the poses may show: an expected entropy is then known to a few hundredths."""
+LEAST = 0.05
+"""Nats for the price of a pose: what takes two hypotheses from even odds to two to one. Less is not worth a pose."""
+MOST = 6
+"""Poses at a time: what they show then tells so much that the draws are too few for one more."""
+ALIKE = 0.02
+"""Actions that bring as much but for this share are alike, and the first of them is chosen: so much is the chance of
+the draws, and no processor's rounding decides."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The probability of a name ``now``, and the mean of what it will be after the actions ``if_it_acts``."""
+
+    now: float
+    if_it_acts: float
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """``actions`` in the order to take them. ``entropy`` is that of the hypotheses, in nats, and ``entropy_after`` its
+    mean after the actions; ``expected`` has the names that are open, the likeliest first."""
+
+    actions: tuple[Action, ...]
+    entropy: float
+    entropy_after: float
+    expected: Mapping[str, Expected]
+
+
+def advice(seen: Posterior, most: int = 3) -> Advice:
+    """Up to so many poses, at best `MOST`, beside what to log and how long to hold them. Raises Refused where the
+    model does not hold in poses to come."""
+    if decided(seen):
+        return Advice((), 0.0, 0.0, {})
+    most = min(most, MOST)
+    future = _Future(Cells.likeliest(seen, SHARE))
+    wanted = _decisive(seen)[:most]
+    options = Options(seen, wanted)
+    for pose in wanted:
+        future.take(options, int(seen.evidence.rows.places[pose]))
+    while len(future.actions) < most and future.take(options):
+        pass
+    names = {name: p for name, p in seen.of_names.items() if OPEN < p < 1 - OPEN}
+    expected = {name: Expected(p, future.if_it_acts(name, p)) for name, p in names.items()}
+    return Advice((*_beside_poses(seen), *future.actions), future.entropy, future.entropy_after, expected)
+
+
+def decided(seen: Posterior) -> bool:
+    """Whether it is likelier than not that nothing acts but what is certain."""
+    certain = seen.evidence.odds.certain
+    names = frozenset(name for group in seen.certain if len(group) == 1 for name in group)
+    outliers = frozenset(np.flatnonzero(seen.of_outliers >= certain).tolist())
+    settled = probabilities(seen).get(Hypothesis(names, outliers, -1, None), 0.0)
+    return settled >= seen.evidence.odds.reported
+
+
+def _decisive(seen: Posterior) -> list[int]:
+    """Poses without which a name that is certain would not be: to be taken again, whatever the posterior expects."""
+    certain = seen.evidence.odds.certain
+    out = []
+    for name, p in seen.of_names.items():
+        without = seen.without_each_pose(name) if p >= certain else np.array([p])
+        if p >= certain > without.min():
+            out.append(int(np.argmin(without)))
+    return list(dict.fromkeys(out))
+
+
+def _beside_poses(seen: Posterior) -> Iterator[Action]:
+    """What no pose tells: a channel that nobody logs, and an error that every pose has of its own."""
+    if seen.of_unmodelled < seen.evidence.odds.reported:
+        return
+    what = next(what for what in seen.of_kinds if what is not What.INSIDE)
+    rows = seen.evidence.rows
+    if what is What.TIME:
+        logged = any(TEMPERATURE in p.channels for p in rows.poses)
+        yield Action(Do.LOG, channel="" if logged else TEMPERATURE)
+    elif what is What.NOTHING:
+        yield Action(Do.HOLD, hold_s=LONGER * float(np.median(rows.held_s)))
+
+
+class _Future:
+    """Draws of what the actions taken so far will show: of draw s the rows ``shown`` (S,K), under the cell ``truth``
+    (S,). ``log_weight`` (C,S) is that of each cell after them."""
+
+    def __init__(self, cells: Cells) -> None:
+        self.cells = cells
+        order = np.argsort(cells.of, kind="stable")
+        ends = np.cumsum(cells.weight[order])
+        self.truth: Ints = order[np.minimum(np.searchsorted(ends, (np.arange(DRAWS) + 0.5) / DRAWS), len(ends) - 1)]
+        self.log_weight = np.tile(np.log(cells.weight)[:, None], DRAWS)
+        self.of = np.eye(len(cells.hypotheses))[:, cells.of]
+        self.actions: list[Action] = []
+        self.poses: list[Pose] = []
+        self.shown: Floats = np.empty((DRAWS, 0))
+        self.rng = np.random.default_rng(0)
+        self.entropy = self.entropy_after = float(_entropy(self.of @ cells.weight))
+
+    def take(self, options: Options, again: int | None = None) -> bool:
+        """The best action of all, if it is worth its price; or the best that takes a pose ``again``, whatever that is
+        worth."""
+        found = options.after(self.poses)
+        rows = options.rows.to_come([*self.poses, *(pose for _, pose in found)])
+        chances = _Chances(self, rows, self.rng.standard_normal((DRAWS, len(rows.y) // rows.n)))
+        weights = [chances.log_weight(len(self.poses) + i)[0] for i in range(len(found))]
+        gain = np.array([self.entropy_after - self._entropy_of(w) for w in weights])
+        rate = gain / [action.price for action, _ in found]
+        if again is not None:
+            rate[[action.do is not Do.REPEAT or action.again != again for action, _ in found]] = -np.inf
+        best = int(np.argmax(rate >= rate.max() - ALIKE * abs(rate.max())))
+        if again is None and rate[best] < LEAST:
+            return False
+        self.log_weight, shown = chances.log_weight(len(self.poses) + best)
+        self.shown = chances.with_shown(shown)
+        action, pose = found[best]
+        self.actions.append(replace(action, information=float(gain[best])))
+        self.poses.append(pose)
+        self.entropy_after -= float(gain[best])
+        return True
+
+    def if_it_acts(self, name: str, p: float) -> float:
+        """The mean of p′² over that of p′, where p′ is the probability after the actions: draws in which the name acts
+        are as frequent as p′ says."""
+        after = self.cells.with_name(name) @ np.exp(self.log_weight)
+        return float(np.mean(after**2) / np.mean(after)) if after.any() else p
+
+    def _entropy_of(self, log_weight: Floats) -> float:
+        return float(np.mean(_entropy(self.of @ np.exp(log_weight))))
+
+
+class _Chances:
+    """Of the poses of ``rows``, those taken first, what every cell says beside what was shown; ``normal`` (S,r) are the
+    draws, the same for all."""
+
+    def __init__(self, future: _Future, rows: Rows, normal: Floats) -> None:
+        self.future, self.rows, self.normal = future, rows, normal
+        self.mean, self.covariance = future.cells.predicted(rows)
+        k = len(future.poses)
+        self.slopes = rows.n if rows.slopes else 0
+        self.taken = self._places(range(k))
+        inner = self.covariance[:, self.taken[:, None], self.taken]
+        self.gain = np.linalg.solve(inner, self.covariance[:, self.taken])
+        self.off = future.shown - self.mean[:, None, self.taken]
+
+    def _places(self, poses: Sequence[int]) -> Ints:
+        """Of the rows of poses, the means first."""
+        index = np.array(poses, dtype=int)
+        return np.concatenate([index, index + self.slopes]) if self.slopes else index
+
+    def log_weight(self, pose: int) -> tuple[Floats, Floats]:
+        """(C,S) of the cells after this pose too, and what it shows (S,r)."""
+        at, truth = self._places([pose]), self.future.truth
+        gain = self.gain[:, :, at]
+        mean = self.mean[:, None, at] + self.off @ gain
+        crossed = self.covariance[:, at[:, None], self.taken]
+        lower = np.linalg.cholesky(self.covariance[:, at[:, None], at] - crossed @ gain)
+        shown = mean[truth, np.arange(len(truth))] + np.einsum("srq,sq->sr", lower[truth], self.normal)
+        off = (shown - mean) @ np.linalg.inv(lower).transpose(0, 2, 1)
+        log = -0.5 * np.sum(off**2, axis=2) - np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)[:, None]
+        weight = self.future.log_weight + log
+        return weight - logsumexp(weight, axis=0), shown
+
+    def with_shown(self, shown: Floats) -> Floats:
+        """(S,K) with one pose more, the means first."""
+        k, before = len(self.future.poses), self.future.shown
+        return np.concatenate([before[:, :k], shown[:, :1], before[:, k:], shown[:, 1:]], axis=1)
+
+
+def _entropy(p: Floats) -> Floats:
+    """(…) of probabilities (H,…), in nats."""
+    return np.asarray(-np.sum(p * np.log(np.maximum(p, 1e-300)), axis=0))
