@@ -1,8 +1,8 @@
 """Recordings with an effect inside that nobody declares, and what is true of them.
 
 A recording is a random triad in random poses with random noise; the effect is one of `physics.KINDS`, one of
-`uncatalogued.KINDS`, two of the former ("two") or nothing ("none"). Its size is s, see `visible`: what is drawn is
-scaled until s is what was asked for.
+`uncatalogued.KINDS` or of `invented.KINDS`, two of the first ("two") or nothing ("none"). Its size is s, see `visible`:
+what is drawn is scaled until s is what was asked for.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.undeclared import physics, uncatalogued
+from tests.undeclared import invented, physics, uncatalogued
 from tests.undeclared.noise import Noise
 from tests.undeclared.physics import Effect
 from tests.undeclared.scene import (
@@ -31,7 +31,7 @@ from tests.undeclared.scene import (
 from tests.undeclared.visible import Linear, magnitude, nine_of, standard_errors
 from triaxcal.samples import Samples
 
-KINDS = (*physics.KINDS, *uncatalogued.KINDS)
+KINDS = (*physics.KINDS, *uncatalogued.KINDS, *invented.KINDS)
 LARGEST_G = 0.05
 """An effect that adds more than this in any pose is no longer a small error of a sensor."""
 OF_TEMPERATURE = ("temperature_bias", "temperature_bias_quadratic", "temperature_scale_factor", "thermal_gradient")
@@ -127,6 +127,12 @@ def recording(
     raise CannotShow(f"{kind}, s = {size}, {poses} poses: not in {DRAWS} draws")
 
 
+def _effect(rng: np.random.Generator, name: str, here: Scene, channel: str, triad: Triad) -> Effect:
+    if name in physics.KINDS:
+        return physics.drawn(rng, name, here, channel)
+    return (invented if name in invented.KINDS else uncatalogued).drawn(rng, name, here, triad)
+
+
 def _kinds_of(rng: np.random.Generator, kind: str) -> list[str]:
     if kind == "none":
         return []
@@ -149,10 +155,7 @@ def _drawn(
     if rng.random() < 0.4 or any(n.startswith("channel_") for n in names):
         histories[channel] = wandering(rng, *OTHER_CHANNELS[channel], typical_s)
     here = scene(rng, triad, up, rate_hz, histories, shaken="vibration_rectification" in names)
-    effects = [
-        physics.drawn(rng, n, here, channel) if n in physics.KINDS else uncatalogued.drawn(rng, n, here, triad)
-        for n in names
-    ]
+    effects = [_effect(rng, n, here, channel, triad) for n in names]
     errors = true_errors(triad, here, noise)
     linear = Linear.of(triad, triad.outputs(here.pose_force), errors)
     effects = [scaled(e, here, triad, linear, s) for e, s in zip(effects, wanted, strict=True)]
