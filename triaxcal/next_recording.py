@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
+from triaxcal.conditions import at_reference, of_moment
 from triaxcal.distributions import DOF_MOST, t_ppf
-from triaxcal.effects.run_bias import BETWEEN_RUNS
+from triaxcal.effects.contract import RUN
 from triaxcal.uncertainty import Budget
 
 START_TO_START = 2e-3
 """In references, of |a| over the sphere, where one recording is all that is known: eight sensors of a mass-market board
 (MIMU4444, runs 1 to 4) came back by 1.5, 0.5 and 3.4 mg on their three axes. A unit of another class says otherwise by
 several recordings."""
+
+FEWEST = 3
+"""Poses of a run that tell its bias."""
 
 
 class Source(StrEnum):
@@ -53,29 +57,33 @@ def next_recording(c: Calibration, budget: Budget, start_to_start: float | None 
 
 
 def _between_runs(c: Calibration) -> tuple[float, float] | None:
-    """The standard deviation of |a| over the sphere that biases from run to run make, and its degrees of freedom; None
-    of one recording."""
+    """The standard deviation of |a| over the sphere that biases from run to run make, at the moment for which the
+    calibration holds, and its degrees of freedom; None of one recording."""
     poses = [p for p in c.poses if p.used]
     runs = sorted({p.pose.run.index for p in poses})
     if len(runs) < 2:
         return None
-    names = {effect.name for effect in BETWEEN_RUNS}
-    sensor = replace(c.sensor, effects=tuple((e, q) for e, q in c.sensor.effects if e.name not in names))
-    held = c.conditions_of([p.pose for p in poses])
-    found = sensor.radius(np.array([p.pose.mean for p in poses]), held)
+    found = c.sensor.radius(np.array([p.pose.mean for p in poses]), c.conditions_of([p.pose for p in poses]))
     off, error = found.length - c.reference, np.array([p.error_g for p in poses])
-    shifts, variances = [], []
+    biases, variances = [], []
     for run in runs:
         own = np.array([p.pose.run.index == run for p in poses])
-        if own.sum() < 3:
-            continue
-        shift, variance = _shift(found.by_v[own], off[own], error[own])
-        shifts.append(shift)
-        variances.append(variance)
-    if len(shifts) < 2:
+        if own.sum() >= FEWEST:
+            left, variance = _shift(found.by_v[own], off[own], error[own])
+            biases.append(left + _in_run(c, run))
+            variances.append(variance)
+    if len(biases) < 2:
         return None
-    spread = np.var(shifts, axis=0, ddof=1) - np.mean(variances, axis=0)
-    return float(np.sqrt(max(spread.sum(), 0.0) / 3)), 3.0 * (len(shifts) - 1)
+    spread = np.var(biases, axis=0, ddof=1) - np.mean(variances, axis=0)
+    return float(np.sqrt(max(spread.sum(), 0.0) / 3)), 3.0 * (len(biases) - 1)
+
+
+def _in_run(c: Calibration, run: int) -> Floats:
+    """(3,) what effects of the clocks, and of single runs, add to the bias in a run at the moment of its clock."""
+    held = at_reference(c.channel_reference, 1)
+    clocks = of_moment(c.channel_reference, c.moment) | {RUN: float(run)}
+    held |= {n: np.array([v - c.channel_reference[n]]) for n, v in clocks.items() if n in c.channel_reference}
+    return np.asarray(c.sensor.departure(np.zeros((1, 3)), held)[0])
 
 
 def _shift(by_v: Floats, off: Floats, error: Floats) -> tuple[Floats, Floats]:

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from triaxcal.conditions import channels_of, conditions, references
+from triaxcal.effects import Effect, effect_named
 from triaxcal.next_recording import START_TO_START, Source, next_recording
 from triaxcal.planning.directions import directions
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
-from triaxcal.runs import together
+from triaxcal.runs import by_run, together
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import budget
@@ -73,3 +75,30 @@ def test_errors_in_the_next_recording_stay_within_what_is_stated(paper_unit: Sen
         off = np.linalg.norm((u - c.sensor.centre) @ c.sensor.matrix.T, axis=1) - 1
         within.append(np.sqrt(np.mean(off**2)) <= stated)
     assert np.mean(within) >= 0.9
+
+
+def test_what_differs_from_run_to_run_counts_though_an_effect_explains_it(paper_unit: Sensor) -> None:
+    """A board that warms up anew, less each time: explained in all runs, and unknown of the next."""
+    decays = np.array([4e-3, 2.5e-3, 1.5e-3, 1e-3])
+    runs = []
+    for k, size in enumerate(decays):
+        poses = run_of(paper_unit, 70 + k)
+        warm = [size * np.exp(-p.t_s / 300) for p in poses]
+        scale = paper_unit.scale_factor
+        runs.append([replace(p, mean=p.mean + scale * w) for p, w in zip(poses, warm, strict=True)])
+    poses = together(runs)
+    (effect,) = (e for e in by_run([effect_named("warm_up")], poses) if e.name == "warm_up")
+    shown = next(e for e in effect.variants(_conditions(poses)) if len(e.coefficients) == 12 and 200 < _tau(e) < 450)
+    c = fit(poses, signs=MINUS, effects=[shown])
+    end_s = max(p.end_s for p in runs[-1])
+    biases = decays * np.exp(-end_s / _tau(shown))
+    assert next_recording(c, budget(c)).start_to_start == pytest.approx(np.std(biases, ddof=1), rel=0.3)
+
+
+def _tau(effect: Effect) -> float:
+    return next(value for value, _ in effect.shape.values())
+
+
+def _conditions(poses: list[Pose]) -> dict[str, np.ndarray]:
+    channels = channels_of(poses)
+    return conditions(channels, references(channels))
