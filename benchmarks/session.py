@@ -1,0 +1,112 @@
+"""Several recordings of one session taken as one unit: what acts, and how well the next recording is foretold.
+
+    python -m benchmarks.session [--jobs 2] [--agree]
+
+Runs 1 to 5 of eight sensors on one board, one after the other, in ../shared/datasets/mimu4444. Runs 1 to k of a sensor
+are diagnosed together, and the error of |a| in run k + 1 is set beside what was stated of it. ``--agree``: whether an
+effect acts in all eight sensors, by all five runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.next_recording import FOLDER, SENSORS, error_g, poses_of
+from benchmarks.processes import one_thread
+from benchmarks.table import Table
+from triaxcal.next_recording import next_recording
+from triaxcal.posterior.loop import diagnose
+from triaxcal.posterior.together import together as of_units
+from triaxcal.runs import together
+from triaxcal.uncertainty import budget
+
+
+@dataclass(frozen=True)
+class Told:
+    """Of runs 1 to ``runs`` of a sensor, in g; ``next_g`` in the run after them, NaN where there is none."""
+
+    sensor: int
+    runs: int
+    found: str
+    before_g: float
+    after_g: float
+    next_before_g: float
+    next_after_g: float
+    stated_g: float
+
+
+def told(asked: tuple[int, int]) -> Told:
+    sensor, runs = asked
+    loop = diagnose(together([poses_of(run, sensor) for run in range(1, runs + 1)]))
+    nan = float("nan")
+    following = poses_of(runs + 1, sensor) if runs < 5 else None
+    shape = {e.name: dict(e.shape) for e, _ in loop.after.sensor.effects if e.shape}
+    found = [f"{f.effect} {f.verdict.value} {_shape(shape.get(f.effect, {}))}".strip() for f in loop.findings]
+    found += [f"{c.effect} {c.probability:.2f}" for c in loop.candidates]
+    found += [f"not corrected: {loop.refusal.value}"] if loop.refusal else []
+    return Told(
+        sensor,
+        runs,
+        ", ".join(found) or "nothing",
+        loop.before.residual.rms_g,
+        loop.after.residual.rms_g,
+        nan if following is None else error_g(loop.before, following),
+        nan if following is None else error_g(loop.after, following),
+        next_recording(loop.after, budget(loop.after)).expanded_uncertainty,
+    )
+
+
+def _shape(shape: dict[str, tuple[float, str]]) -> str:
+    return " ".join(f"{value:.0f} {unit}" for value, unit in shape.values())
+
+
+def agree() -> Table:
+    seen = [diagnose(together([poses_of(run, s) for run in range(1, 6)])).seen for s in SENSORS]
+    found = of_units(seen)
+    rows = [[n, f"{p:.4f}", f"{found.common[n]:.3f}"] for n, p in found.probability.items() if p > 1e-3]
+    title = "In all eight sensors together, by five runs"
+    return Table(
+        title, ["effect", "probability", "its values are common"], [*rows, ["none", f"{found.nothing:.2g}", ""]]
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--agree", action="store_true", help="whether an effect acts in all sensors")
+    options = parser.parse_args(arguments)
+    if not FOLDER.is_dir():
+        sys.stderr.write(f"{FOLDER}: no recordings there\n")
+        return 2
+    if options.agree:
+        print(agree())
+        return 0
+    with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
+        found = list(pool.map(told, [(sensor, runs) for runs in (2, 3, 4, 5) for sensor in SENSORS]))
+    rows = []
+    for one in found:
+        figures = [one.before_g, one.after_g, one.next_before_g, one.next_after_g, one.stated_g]
+        rows.append([f"1 to {one.runs}", str(one.sensor), one.found, *(_micro(v) for v in figures)])
+    head = ["runs", "sensor", "what acts", "residual before", "after", "next run before", "after", "stated (95 %)"]
+    print(Table("Of a session, µg rms", head, rows))
+    ratios = np.array([one.next_after_g / one.next_before_g for one in found if np.isfinite(one.next_before_g)])
+    within = np.mean([one.next_after_g <= one.stated_g for one in found if np.isfinite(one.next_before_g)])
+    print(
+        f"\nnext run, after / before: geometric mean {np.exp(np.mean(np.log(ratios))):.3f}, worst {ratios.max():.2f}, "
+        f"worse by 5 % {np.mean(ratios > 1.05):.0%}; within what was stated {within:.0%}"
+    )
+    return 0
+
+
+def _micro(value: float) -> str:
+    return f"{value * 1e6:.0f}" if np.isfinite(value) else "—"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
