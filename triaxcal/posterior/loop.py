@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 
 from triaxcal.calibration import Calibration, Exclusion, HoldsAt
 from triaxcal.conditions import channels_of
@@ -17,6 +18,7 @@ from triaxcal.held_out import HeldOut, held_out
 from triaxcal.moment import Moment
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
+from triaxcal.posterior.advice import Advice, advice
 from triaxcal.posterior.average import Refusal, average, refusal
 from triaxcal.posterior.blind import Blind, blind_to
 from triaxcal.posterior.corrected import corrected
@@ -92,6 +94,14 @@ class Loop:
     def probabilities(self) -> Mapping[str, float]:
         """That each effect acts, whatever else does, the likeliest first."""
         return self.seen.of_names
+
+    @cached_property
+    def advice(self) -> Advice:
+        """What to record next; nothing where that cannot be told."""
+        try:
+            return advice(self.seen)
+        except Refused:  # the model has no inverse in poses to come
+            return Advice((), 0.0, 0.0, {})
 
     @property
     def call(self) -> Call:

@@ -159,6 +159,16 @@ class Posterior:
     def without_each_pose(self, name: str) -> Floats:
         """(n,) the probability of a name if that pose were an outlier: beside the likeliest set with the name, less the
         name. As it is, where the pose is one of that set's outliers."""
+        if name not in self._without:
+            self._without[name] = self._asked_without(name)
+        return self._without[name]
+
+    @cached_property
+    def _without(self) -> dict[str, Floats]:
+        """What was asked before."""
+        return {}
+
+    def _asked_without(self, name: str) -> Floats:
         evidence = self.evidence
         out = np.full(evidence.rows.n, self.of_names.get(name, 0.0))
         best = next((found for found in self.sets if name in self.names_of(found)), None)

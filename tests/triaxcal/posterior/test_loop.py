@@ -56,6 +56,7 @@ def test_a_likely_name_is_a_candidate_with_what_it_would_be(poses_with: Poses) -
         (candidate,) = loop.candidates
         assert candidate.effect == "second_order_nonlinearity"
         assert loop.call is Call.RECORD_MORE
+        assert loop.advice.expected["second_order_nonlinearity"].if_it_acts > candidate.probability
         assert 0.5 <= candidate.probability < 0.99
         value, error, _ = candidate.coefficients["x"]
         assert error is not None
@@ -69,6 +70,7 @@ def test_where_nothing_acts_nothing_is_told(poses_with: Poses) -> None:
         assert loop.after.terms == ("linear",)
         assert loop.refusal is None
         assert loop.call is Call.USABLE
+        assert loop.advice.actions == ()
 
 
 def test_where_something_has_no_name_nothing_is_corrected() -> None:
