@@ -302,6 +302,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--method", choices=METHODS, default="loop")
     parser.add_argument("--range", choices=RANGES, default="development", help="of seeds")
     parser.add_argument("--share", type=float, default=1.0, help="of the recordings; default all")
+    parser.add_argument("--section", help="only this one, in the place of what FILE has of it")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     options = parser.parse_args(arguments)
     if options.show:
@@ -309,8 +310,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(reliability(read(options.show)))
     if options.write:
         with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
-            asked = list(cases(RANGES[options.range], options.share))
+            asked = [c for c in cases(RANGES[options.range], options.share) if options.section in (None, c[0])]
             lines = list(pool.map(partial(line, METHODS[options.method]), asked, chunksize=2))
+        if options.section and options.write.exists():
+            lines = [*(one for one in read(options.write) if one.section != options.section), *lines]
         write(options.write, lines)
         print(table(lines))
         print(reliability(lines))
