@@ -8,11 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.triaxcal.posterior.conftest import MINUS
+from tests.triaxcal.posterior.conftest import MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
+from triaxcal.planning.directions import directions
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.posterior import Posterior, Refusal, posterior, refusal
+from triaxcal.posterior.unmodelled import What
+from triaxcal.sensor import Sensor
+from triaxcal.synthetic import noisy_poses
 
 Poses = Callable[..., list[Pose]]
 
@@ -147,3 +151,24 @@ def test_a_unit_turned_in_its_socket_is_seen_with_the_pose(poses_with: Poses) ->
     seen = found([*poses[:17], *(replace(p, mean=p.mean * [-1, -1, 1]) for p in poses[17:])])
     assert seen.of_another[17] > 0.9
     assert refusal(seen) is Refusal.ANOTHER
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("bent_g", [0.0, 2e-4])
+def test_a_repeat_that_contradicts_is_time_or_memory_and_no_outlier(
+    with_effects: Callable[..., Sensor], bent_g: float, seed: int
+) -> None:
+    """The same direction within half a degree, 450 µg off, with a drift that no channel logs."""
+    rng = np.random.default_rng(seed)
+    ups = rng.permutation(np.array([up for _, up in directions(26)]))
+    again = ups[3] + np.radians(0.5) * np.cross(ups[3], rng.standard_normal(3))
+    unit = with_effects(**({"second_order_nonlinearity": [bent_g, -bent_g, bent_g]} if bent_g else {}))
+    poses = noisy_poses(unit, np.concatenate([ups, [again / np.linalg.norm(again)]]), SIGMA_G, rng)
+    along = rng.standard_normal(3)
+    share = np.linspace(0, 1, len(poses))
+    drift_g = 450e-6 * along / abs(along @ ups[3]) / (share[-1] - share[3])
+    seen = found([replace(p, mean=p.mean + unit.scale_factor * drift_g * x) for p, x in zip(poses, share, strict=True)])
+    moves = {"bias_drift", "warm_up", "bias_step", "scale_factor_drift", "hysteresis", "remanence"}
+    assert seen.any_of(moves) + seen.of_kinds[What.TIME] + seen.of_kinds[What.BEFORE] > 0.99
+    assert max(seen.of_outliers[3], seen.of_outliers[-1]) < 0.5
+    assert all(seen.without_any_pose(name) >= 0.99 for (name, *others) in seen.certain if not others)
