@@ -303,5 +303,5 @@ def _mended(covariance: Floats, out: Floats, along: Floats) -> Floats:
 
 def _rounding(w: Windows, spans: Sequence[Span]) -> Floats:
     """(3,) variance of what rounding of the outputs leaves in a mean."""
-    scatter = np.mean([w.variance[s.used].mean(axis=0) for s in spans], axis=0)
-    return left_in_means(w, scatter)
+    scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans])
+    return left_in_means(w, scatter, np.array([len(s.used) for s in spans]))

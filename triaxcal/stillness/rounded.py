@@ -9,18 +9,22 @@ it; below a third the mean is off by what no scatter shows, and the scatter is o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy.special import ndtr
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, Ints
 from triaxcal.stillness.windows import Windows
 
 COARSEST = 50
 """Steps that the range of the outputs has at least."""
 TWO_READINGS_LEAST = 8
 """Windows with two readings from which a step is learned."""
-ALIKE, MOSTLY = 0.25, 0.9
-"""The steps in so many of these windows differ by no more than this share: a number of printed decimals moves them."""
+ALIKE = 0.25
+"""Share of a step by which printed decimals move it, at most."""
+MOSTLY, SINGLE = 0.9, 0.6
+"""So many of these windows differ by a step, or by two or three where the unit moves; so many by one."""
 OTHERWISE = 1.5
 """A step so many times the smallest difference is no matter of which readings happened to be seen."""
 FINE = 1.0
@@ -28,6 +32,8 @@ FINE = 1.0
 HARMONICS = np.arange(1, 50)[:, None]
 SIGMAS = np.linspace(0.0, FINE, 201)
 """Noise in steps, where its inverse is looked up."""
+BLUR = 0.01
+"""Steps squared: from one place to the next of those that are tried, variances differ by no more on average."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +94,10 @@ def shown_step(w: Windows) -> Floats:
         if len(hops) < TWO_READINGS_LEAST:
             continue
         step = float(np.median(hops))
-        alike = np.mean(np.abs(hops - step) <= ALIKE * step) >= MOSTLY
-        if alike and step * COARSEST < np.ptp(w.mean[:, i]):
+        times = np.clip(np.rint(hops / step), 1, 3)
+        alike = np.abs(hops / step - times) <= ALIKE
+        agree = np.mean(alike) >= MOSTLY and np.mean(alike & (times == 1)) >= SINGLE
+        if agree and step * COARSEST < np.ptp(w.mean[:, i]):
             out[i] = step
     return out
 
@@ -101,15 +109,48 @@ def rounding_variance(step: Floats, scatter: Floats) -> Floats:
     return np.asarray(step**2 * left_in_mean(noise_of(scatter / step**2)))
 
 
-def left_in_means(w: Windows, scatter: Floats) -> Floats:
-    """(3,) the same for the steps that these windows show, where readings have ``scatter`` (3,) in the poses; and with
-    it what printing leaves: the same reading is printed with the same error, so that is averaged over readings alone.
+def left_in_means(w: Windows, scatter: Floats, count: Ints) -> Floats:
+    """(3,) variance of what rounding to the steps that these windows show leaves in means of poses, of which readings
+    have ``scatter`` (k,3) over ``count`` (k,) windows; and with it what printing leaves: the same reading is printed
+    with the same error, so that is averaged over readings alone.
     """
     step, printed = _steps(w)
-    sigma = noise_of(scatter / step**2)
+    level = scatter.mean(axis=0) / step**2
+    sigma = noise_of(level)
+    left = left_in_mean(sigma)
+    for i in np.flatnonzero(sigma < FINE):
+        left[i] = _left_by_poses(scatter[:, i] / step[i] ** 2, count)
     # The sum of the squared shares of the readings: of a density of σ steps, 1/(2√π σ).
     again = np.minimum(1 / (2 * np.sqrt(np.pi) * np.maximum(sigma, 1e-3)), 1.0)
-    return np.asarray(rounding_variance(step, scatter) + printed**2 / 12 * again)
+    return np.asarray(step**2 * left + printed**2 / 12 * again)
+
+
+def _left_by_poses(variance: Floats, count: Ints) -> float:
+    """`left_in_mean` over all noise that poses of such ``variance`` (k,), in steps squared, may have, told from
+    ``count`` (k,) windows: where the poses lie between two steps is chance, so that the mean of few of their variances
+    says little, and what is left goes with the square of the noise in an exponent.
+    """
+    sigma, seen, spread = _by_place()
+    off = variance[:, None, None] - seen
+    width = BLUR**2 + spread / count[:, None, None]
+    chance = (np.exp(-(off**2) / (2 * width)) / np.sqrt(width)).mean(axis=2)
+    likelihood = np.log(np.maximum(chance, 1e-300)).sum(axis=0)
+    weight = np.exp(likelihood - likelihood.max())
+    return float(weight @ left_in_mean(sigma) / weight.sum())
+
+
+@cache
+def _by_place() -> tuple[Floats, Floats, Floats]:
+    """Noise (s,) in steps; by it and by the place between two steps, (s,p) each, the variance of a reading, and that of
+    the squared deviations, by the exact sums.
+    """
+    sigma, place = SIGMAS[4::2], (np.arange(50) + 0.5) / 100
+    codes = np.arange(-6, 8)
+    edges = (np.append(codes, codes[-1] + 1) - 0.5 - place[:, None]) / sigma[:, None, None]
+    share = np.diff(ndtr(edges), axis=2)
+    off = codes - (share @ codes)[:, :, None]
+    variance = (share * off**2).sum(axis=2)
+    return sigma, variance, (share * off**4).sum(axis=2) - variance**2
 
 
 def left_in_mean(sigma: Floats) -> Floats:

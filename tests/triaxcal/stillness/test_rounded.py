@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,15 @@ def test_steps_are_seen_behind_decimals_that_do_not_fit_them(fourteen: np.ndarra
     w = detect(t_s, u)[0]
     assert len(np.unique(np.round(np.diff(np.unique(u[:, 0])), 6))) > 1
     assert resolution(w) == pytest.approx(np.full(3, STEP_G), rel=0.05)
+
+
+def test_windows_that_move_by_two_steps_hide_no_step(fourteen: np.ndarray, detect: Detect) -> None:
+    t_s, u, _, _ = coarse(0.2, 0, fourteen, decimals=4)
+    w = detect(t_s, u)[0]
+    at = np.flatnonzero((w.hop > 0).all(axis=1))[:11]
+    few = np.zeros_like(w.hop)
+    few[at] = w.hop[at] * np.where(np.arange(11) < 2, 2, 1)[:, None]
+    assert resolution(replace(w, hop=few)) == pytest.approx(np.full(3, STEP_G), rel=0.05)
 
 
 def test_steps_that_the_readings_keep_are_taken_as_they_are(fourteen: np.ndarray, detect: Detect) -> None:
