@@ -14,7 +14,8 @@ from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose_noise import PoseNoise, pose_noise
 from triaxcal.stillness.detector import Span
-from triaxcal.stillness.windows import Windows, resolution, rounding_variance
+from triaxcal.stillness.rounded import left_in_means, resolution
+from triaxcal.stillness.windows import Windows
 
 SHAKEN, QUIET = 2.0, 0.1
 """Poses are shaken in which the outputs scatter with so many times the variance of the quietest tenth of them."""
@@ -302,5 +303,5 @@ def _mended(covariance: Floats, out: Floats, along: Floats) -> Floats:
 
 def _rounding(w: Windows, spans: Sequence[Span]) -> Floats:
     """(3,) variance of what rounding of the outputs leaves in a mean."""
-    scatter = np.mean([w.variance[s.used].mean(axis=0) for s in spans], axis=0)
-    return rounding_variance(resolution(w), scatter)
+    scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans])
+    return left_in_means(w, scatter, np.array([len(s.used) for s in spans]))

@@ -118,11 +118,10 @@ class Steps:
             out[axis] = np.sqrt(np.median(self._rough[axis])) if self._rough[axis] else 0.0
         return out
 
-    def scatters(self) -> Bools:
-        """(3,) whether the noise is wider than half a step, so that readings rest on no value for long: as a rule, and
-        not much less in any part of the stream, as where a machine that shakes the stand is switched off.
+    def scatters(self, step: Floats) -> Bools:
+        """(3,) whether the noise is wider than half a ``step`` (3,), so that readings rest on no value for long: as a
+        rule, and not much less in any part of the stream, as where a machine that shakes the stand is switched off.
         """
-        step = self.step()
         return np.asarray((self.roughness() > COARSE * step) & (np.sqrt(self._least_rough) > HUSHED * step))
 
 

@@ -19,6 +19,7 @@ from triaxcal.quality.finding import Finding, Holds, MissingSamples
 from triaxcal.quality.repeats import RunLengths
 from triaxcal.quality.timing import Gaps
 from triaxcal.stillness.detector import Span
+from triaxcal.stillness.rounded import OTHERWISE, shown_step
 from triaxcal.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, Windows
 
 CELL_S = 0.1
@@ -106,7 +107,11 @@ class QualityDetector:
             return []
         holds = Holds.of(self._begin_ns, w, spans)
         step, roughness = self._steps.step(), self._steps.roughness()
-        noisy = self._steps.scatters()
+        if w is not None:
+            # Printed decimals that are no multiples of the step hide it from single differences.
+            shown = shown_step(w)
+            step = np.where(shown > OTHERWISE * step, shown, step)
+        noisy = self._steps.scatters(step)
         rate_hz = 1e9 / self._period_ns
         cells = self._cells.cells()
         rails, spoiled = faults.saturation(cells, self._runs, holds, step, roughness, noisy)

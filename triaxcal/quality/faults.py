@@ -22,7 +22,7 @@ from triaxcal.quality.finding import (
     StuckOutput,
 )
 from triaxcal.quality.repeats import ROWS, Run, RunLengths
-from triaxcal.stillness.windows import rounding_variance
+from triaxcal.stillness.rounded import noise_of
 
 RAIL_LEAST = 10
 RAIL_TIMES = 3
@@ -201,9 +201,7 @@ def _rounding_error(variance: float) -> float:
     readings have ``variance`` on average over the places (Widrow and Kollár 2008, Quantization Noise: the harmonics of
     the rounding error under Gaussian noise).
     """
-    sigma = np.linspace(0, 1, 201)
-    seen = sigma**2 + 1 / 12 - rounding_variance(np.ones(len(sigma)), sigma**2 + 1 / 12)
-    noise = float(np.interp(variance, seen, sigma))
+    noise = float(noise_of(np.array([variance]))[0])
     k, place = np.arange(1, 50)[:, None], np.linspace(0, 0.5, 101)
     waves = (-1.0) ** k / (np.pi * k) * np.sin(2 * np.pi * k * place) * np.exp(-2 * np.pi**2 * k**2 * noise**2)
     return min(float(np.abs(waves.sum(axis=0)).max()), 0.5)

@@ -18,8 +18,9 @@ from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
 from triaxcal.stillness.edges import SPAN_LEAST_WINDOWS, trimmed
 from triaxcal.stillness.noise_scales import SCALES, NoiseScales, contrasts
+from triaxcal.stillness.rounded import Rounding, resolution
 from triaxcal.stillness.shaken import ALONE_S, runs, shaken_noise, shaken_runs
-from triaxcal.stillness.windows import WindowCutter, Windows, resolution, rounding_variance
+from triaxcal.stillness.windows import WindowCutter, Windows
 
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
 
@@ -74,15 +75,13 @@ def find_spans(w: Windows) -> list[Span]:
     calm = np.asarray((w.variance <= quiet_limit(w.variance[live], w.size - 1)).all(axis=1)) & ~stuck
     if _only_moves(w, calm):
         return []
-    known = calm & live
-    residue = rounding_variance(step, np.median(raw[known], axis=0)) if known.any() else np.zeros(3)
-    found, noise = _still_runs(w, calm, live, residue)
+    found, noise = _still_runs(w, calm, live, _rounding(step, raw[calm & live]))
     for _ in range(2):
         inside = _inside(w, found) & live
         if inside.sum() < 2 * SPAN_LEAST_WINDOWS:
             break
         calm = np.asarray((w.variance <= _limit_within(w.variance[inside], w.size - 1)).all(axis=1)) & ~stuck
-        found, noise = _still_runs(w, calm, live, residue)
+        found, noise = _still_runs(w, calm, live, _rounding(step, raw[inside & calm]))
     taken, pieces = _quiet_pieces(w, found, noise)
     shaken = shaken_runs(w, [*taken, *runs(stuck, w.joined)], noise)
     disturbed = ~_steady(w, calm, noise)
@@ -90,6 +89,12 @@ def find_spans(w: Windows) -> list[Span]:
     quiet = np.zeros(len(w), dtype=bool)
     quiet[np.concatenate([*pieces, np.zeros(0, dtype=np.int64)])] = True
     return [s for s in spans if _long_enough(w, s.used, SPAN_LEAST_S if quiet[s.used].any() else ALONE_S)]
+
+
+def _rounding(step: Floats, quiet: Floats) -> Rounding:
+    """What the step adds, by the variances (k,3) of quiet windows: of their mean, since a median of windows with one
+    reading or two says little."""
+    return Rounding.of(step, quiet.mean(axis=0) if len(quiet) else np.zeros(3))
 
 
 def _quiet_pieces(w: Windows, found: list[Ints], noise: NoiseScales) -> tuple[list[Ints], list[Ints]]:
@@ -127,11 +132,11 @@ def _frozen(w: Windows, step: Floats) -> Bools:
     return frozen
 
 
-def _still_runs(w: Windows, calm: Bools, live: Bools, residue: Floats) -> tuple[list[Ints], NoiseScales]:
+def _still_runs(w: Windows, calm: Bools, live: Bools, rounding: Rounding) -> tuple[list[Ints], NoiseScales]:
     """Runs of windows that are calm and do not move, and the noise they were judged by, learned from the ``live``."""
-    noise = NoiseScales.learned(w, calm & live, residue, first=True)
+    noise = NoiseScales.learned(w, calm & live, rounding, first=True)
     for _ in range(2):
-        noise = NoiseScales.learned(w, _steady(w, calm, noise) & live, residue)
+        noise = NoiseScales.learned(w, _steady(w, calm, noise) & live, rounding)
     still = _steady(w, calm, noise)
     return [run for run in runs(still, w.joined) if len(run) >= SPAN_LEAST_WINDOWS], noise
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.stillness.rounded import Rounding
 from triaxcal.stillness.windows import Windows
 
 SCALES = (1, 2, 4, 8)
@@ -31,20 +32,25 @@ class NoiseScales:
     scatter: Floats
 
     @classmethod
-    def learned(cls, w: Windows, still: Bools, residue: Floats, *, first: bool = False) -> NoiseScales:
-        """``residue`` (3,) is the variance that rounding leaves in a mean. ``first``: most windows may move as yet."""
+    def learned(cls, w: Windows, still: Bools, rounding: Rounding, *, first: bool = False) -> NoiseScales:
+        """``rounding`` is what the step of the output adds. ``first``: most windows may move as yet.
+
+        Where steps are wide, most differences are zero, and a median says nothing of places half-way between two steps.
+        """
         base = w.variance[still] if still.any() else w.variance
         scatter = np.sqrt(np.median(base, axis=0))
         quantile = 0.25 if first else 0.5
         step: dict[int, Floats] = {}
         edge: dict[int, Floats] = {}
         for s in SCALES:
-            white = scatter**2 * 2 / (w.size * s)
-            step[s] = _scale(contrasts(w.mean, still, w.joined, s, s)[1], quantile, residue, white, step.get(s // 2))
-            white = scatter**2 * 1.25 / (w.size * s)
-            edge[s] = _scale(
-                contrasts(w.mean, still, w.joined, 4 * s, s)[1], quantile, residue, white, edge.get(s // 2)
-            )
+            share = 2 / (w.size * s)
+            found = contrasts(w.mean, still, w.joined, s, s)[1]
+            least = np.maximum(2 * rounding.residue, rounding.widest * share)
+            step[s] = _scale(found, quantile, least, scatter**2 * share, step.get(s // 2))
+            share = 1.25 / (w.size * s)
+            found = contrasts(w.mean, still, w.joined, 4 * s, s)[1]
+            least = np.maximum(2 * rounding.residue, rounding.widest * share)
+            edge[s] = _scale(found, quantile, least, scatter**2 * share, edge.get(s // 2))
         return cls(step, edge, scatter)
 
     def of_edge(self, scale: int, before: int) -> Floats:
@@ -59,8 +65,9 @@ class NoiseScales:
         )
 
 
-def _scale(differences: Floats, quantile: float, residue: Floats, white: Floats, half: Floats | None) -> Floats:
-    """From a quantile of the absolute differences; without enough of them, as white noise falls from half the scale."""
+def _scale(differences: Floats, quantile: float, least: Floats, white: Floats, half: Floats | None) -> Floats:
+    """From a quantile of the absolute differences; without enough of them, as white noise falls from half the scale. At
+    least the variance ``least`` (3,)."""
     if len(differences) >= ENOUGH:
         # A normal variable is within 0.3186 and 0.6745 standard deviations in a quarter and in half of all cases.
         sigma = np.quantile(np.abs(differences), quantile, axis=0) / {0.25: 0.31864, 0.5: 0.67449}[quantile]
@@ -68,7 +75,7 @@ def _scale(differences: Floats, quantile: float, residue: Floats, white: Floats,
         sigma = half / np.sqrt(2)
     else:
         sigma = np.sqrt(white)
-    sigma = np.maximum(sigma, np.sqrt(2 * residue))
+    sigma = np.maximum(sigma, np.sqrt(least))
     # An axis that hardly ever changes from window to window may still scatter inside them.
     return np.asarray(np.where(sigma > 0, sigma, np.sqrt(white)))
 

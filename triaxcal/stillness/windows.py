@@ -22,10 +22,6 @@ RATE_SAMPLES = 64
 RATE_S = 1.0
 """The sample period is learned from at least so many samples over at least so long."""
 RATE_LEAST = 12
-
-
-COARSEST = 50
-"""Steps that the range of the outputs has at least."""
 READING_MOST = 1e100
 """Squares of readings, and sums of them, have to be numbers too."""
 
@@ -35,7 +31,8 @@ class Windows:
     """Summaries of consecutive windows of ``size`` samples, (m,) or (m,3) each.
 
     ``start_ns`` and ``end_ns`` are the times of a window's first and last sample; ``variance`` of a sample by axis,
-    ``cross`` covariance of axes xy, yz, zx; ``joined`` says that no gap lies between it and the one before.
+    ``cross`` covariance of axes xy, yz, zx; ``hop`` is the difference of its readings where there are two only, else
+    zero; ``joined`` says that no gap lies between it and the one before.
     """
 
     size: int
@@ -44,6 +41,7 @@ class Windows:
     mean: Floats
     variance: Floats
     cross: Floats
+    hop: Floats
     channels: Mapping[str, Floats]
     joined: Bools
 
@@ -64,7 +62,9 @@ class WindowCutter:
     _held: int = 0
     _size: int = 0
     _period_ns: float = 0.0
-    _done: list[tuple[Ints, Ints, Floats, Floats, Floats, dict[str, Floats], Bools]] = field(default_factory=list)
+    _done: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats, dict[str, Floats], Bools]] = field(
+        default_factory=list
+    )
     _last_ns: int | None = None
     _broken: bool = False
 
@@ -137,46 +137,29 @@ class WindowCutter:
         joined[0] = not self._broken and bool(self._done)
         self._broken = False
         means = {n: v.reshape(count, self._size).mean(axis=1) for n, v in channels.items()}
-        self._done.append((times[:, 0].copy(), times[:, -1].copy(), mean, variance, cross, means, joined))
+        self._done.append(
+            (times[:, 0].copy(), times[:, -1].copy(), mean, variance, cross, _hop(columns), means, joined)
+        )
 
     def windows(self) -> Windows:
         """Raises InvalidData where there is not one whole window yet."""
         if not self._done:
             raise InvalidData(f"too few samples for one window (at least {RATE_SAMPLES})")
         if len(self._done) > 1:
-            names = self._done[0][5]
+            names = self._done[0][6]
             self._done = [
                 (
-                    *(np.concatenate([d[i] for d in self._done]) for i in range(5)),
-                    {n: np.concatenate([d[5][n] for d in self._done]) for n in names},
-                    np.concatenate([d[6] for d in self._done]),
+                    *(np.concatenate([d[i] for d in self._done]) for i in range(6)),
+                    {n: np.concatenate([d[6][n] for d in self._done]) for n in names},
+                    np.concatenate([d[7] for d in self._done]),
                 )  # type: ignore[list-item]
             ]
-        start, end, mean, variance, cross, channels, joined = self._done[0]
-        return Windows(self._size, start, end, mean, variance, cross, channels, joined)
+        start, end, mean, variance, cross, hop, channels, joined = self._done[0]
+        return Windows(self._size, start, end, mean, variance, cross, hop, channels, joined)
 
 
-def resolution(w: Windows) -> Floats:
-    """(3,) the smallest difference that any two readings show, judged by the sums of windows; never quite zero.
-
-    A step that is a good part of the range is no resolution: outputs without any noise differ by their poses alone.
-    """
-    sums = w.mean * w.size
-    least: Floats = 1e-12 * np.max(np.abs(sums), axis=0, initial=1e-100)
-    out = least.copy()
-    for i in range(3):
-        gaps = np.diff(np.unique(sums[:, i]))
-        gaps = gaps[gaps > least[i]]
-        fine = len(gaps) > 0 and gaps.min() * COARSEST < np.ptp(w.mean[:, i])
-        out[i] = gaps.min() if fine else least[i]
-    return out
-
-
-def rounding_variance(step: Floats, scatter: Floats) -> Floats:
-    """(3,) variance of what rounding of the outputs to ``step`` leaves in a mean, however long; ``scatter`` is the
-    variance of a reading. Noise averages it out, if there is enough of it (Widrow and Kollár 2008, Quantization Noise:
-    the harmonics of the rounding error under Gaussian noise).
-    """
-    noise = np.maximum(scatter / step**2 - 1 / 12, 0.0)
-    k = np.arange(1, 50)[:, None]
-    return np.asarray(step**2 * (np.exp(-4 * np.pi**2 * k**2 * noise) / (2 * np.pi**2 * k**2)).sum(axis=0))
+def _hop(columns: Floats) -> Floats:
+    """(m,3) how far the two readings of a window lie apart, of ``columns`` (m,3,size); zero where there are others."""
+    high, low = columns.max(axis=2), columns.min(axis=2)
+    two = ((columns == high[:, :, None]) | (columns == low[:, :, None])).all(axis=2)
+    return np.asarray(np.where(two, high - low, 0.0))
