@@ -37,6 +37,9 @@ CELLS = 400
 """Sets, with one part and one choice of sizes each, whose covariances are mixed: the likeliest. The others are as these
 are."""
 THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
+EARNED = 0.03
+"""Of the mean square of what an unlikely name may do: a name that corrects less only adds coefficients that nobody
+knows."""
 STEPS = 3
 """Of Newton's method, for nine parameters a few parts in a thousand from where they go."""
 SPHERE = 26
@@ -89,13 +92,34 @@ def refusal(seen: Posterior) -> Refusal | None:
 
 def average(seen: Posterior, at: HoldsAt) -> Average:
     """Over all sets, sizes and parts; it holds for another recording as at a moment of this one."""
-    carried = _Carried.of(seen, at, _likeliest(seen))
+    listed = _likeliest(seen)
+    made = _of_listed(seen, at, listed)
+    kept = [effect for effect in listed if _earns(seen, made, effect)]
+    return made if len(kept) == len(listed) else _of_listed(seen, at, kept)
+
+
+def _of_listed(seen: Posterior, at: HoldsAt, listed: Sequence[Effect]) -> Average:
+    carried = _Carried.of(seen, at, listed)
     mean, left = _mean(seen, carried)
     state = _settled(seen, mean, carried)
     sensor = state.sensor(seen.evidence.rows.problem)
     wander = _wander(seen, left, at.t_s)
     moved = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + wander, sensor.effects)
     return _with_errors(seen, at, carried, moved, state, mean, wander)
+
+
+def _earns(seen: Posterior, made: Average, effect: Effect) -> bool:
+    """Whether a name is likely, or corrects a good part of what it may do."""
+    if seen.of_names[effect.name] >= seen.evidence.odds.reported:
+        return True
+    ends = np.cumsum([LINEAR, *(len(q) for _, q in made.sensor.effects)])
+    k = next(k for k, (other, _) in enumerate(made.sensor.effects) if other is effect)
+    own, q = slice(ends[k], ends[k + 1]), made.sensor.effects[k][1]
+    size = made.spread[ends[k] - LINEAR : ends[k + 1] - LINEAR]
+    if not size.all():  # only in sets that are hardly likely
+        return False
+    corrects = float(np.sum((q / size) ** 2))
+    return corrects >= EARNED * (corrects + float(np.sum(np.diag(made.covariance)[own] / size**2)))
 
 
 def linear_alone(seen: Posterior, at: HoldsAt, linear: Sensor) -> Average:
@@ -118,7 +142,8 @@ def _with_errors(
 @dataclass(frozen=True, eq=False)
 class _Carried:
     """``effects`` in the form and the shape that stands for each name, ``columns`` (N,p) theirs. ``by_term`` (9+p,C)
-    are the parameters, as deviations, by the scaled coefficients of all terms; zero for outliers."""
+    are the parameters, as deviations, by the scaled coefficients of all terms; zero for outliers. What a name that is
+    not listed does goes into the nine parameters, as far as these can take it."""
 
     effects: tuple[Effect, ...]
     columns: Floats
@@ -134,16 +159,19 @@ class _Carried:
         linear = np.concatenate([rows.linear, there[0]])
         by_term = np.zeros((9 + ends[-1], evidence.columns.shape[1]))
         of_name = {effect.name: k for k, effect in enumerate(likeliest)}
+        nothing = np.empty((len(linear), 0))
         known: dict[int, Floats] = {}
-        for i, term in enumerate(evidence.terms):
-            k = of_name.get(term.name)
-            if k is None or term.effect is None:
+        for i in sorted({i for found in seen.sets for i in found.members}):
+            term = evidence.terms[i]
+            if term.effect is None:
                 continue
+            k = of_name.get(term.name)
+            to = nothing if k is None else each[k]
             if id(term.effect) not in known:
-                known[id(term.effect)] = _carry(linear, each[k], _both(seen, term.effect, there))
+                known[id(term.effect)] = _carry(linear, to, _both(seen, term.effect, there))
             found = known[id(term.effect)][:, list(term.kept)] * term.mix
-            places = evidence.places([i])[: len(term.kept)]
-            by_term[np.ix_([*range(9), *range(9 + ends[k], 9 + ends[k + 1])], places)] = found
+            own = [] if k is None else [*range(9 + ends[k], 9 + ends[k + 1])]
+            by_term[np.ix_([*range(9), *own], evidence.places([i]))] = found
         by_term[:9] /= rows.lengths[:, None]
         columns = np.concatenate([np.empty((len(rows.y), 0)), *(c[: len(rows.y)] for c in each)], axis=1)
         return cls(tuple(likeliest), columns, by_term)
@@ -162,8 +190,7 @@ def _likeliest(seen: Posterior) -> list[Effect]:
             if term.effect is not None:
                 weight[id(term.effect)] += float(w)
                 effects[id(term.effect)] = term.effect
-                own = scaled[first:last][: len(term.kept)]
-                corrects[term.name] += float(w) * float(np.sqrt(np.mean(own**2)))
+                corrects[term.name] += float(w) * float(np.sqrt(np.mean(scaled[first:last] ** 2)))
     least = NOTICEABLE * seen.evidence.rows.of_a_pose
     out: dict[str, Effect] = {}
     for key in sorted(weight, key=lambda key: -weight[key]):

@@ -236,7 +236,7 @@ def _point_of(seen: Posterior) -> State | None:
     for term, mine in zip(terms, np.split(scaled, ends[1:-1]), strict=True):
         if term.effect is not None:
             own = np.zeros(len(term.effect.coefficients))
-            own[list(term.kept)] = term.mix * mine[: len(term.kept)]
+            own[list(term.kept)] = term.mix * mine
             effects.append(term.effect)
             coefficients.append(own)
             foretold = foretold + rows.by_coefficients(term.effect) @ own

@@ -122,8 +122,7 @@ def _of_term(term: Term, rows: Rows, known: dict[int, Floats]) -> Floats:
         except EffectFault:
             columns = np.full((len(rows.y), len(term.effect.coefficients)), np.nan)
         known[id(term.effect)] = np.where(np.isfinite(columns), columns, 0.0)
-    free = known[id(term.effect)][:, list(term.kept)] * term.mix
-    return np.concatenate([free, np.zeros((len(rows.y), term.rank - len(term.kept)))], axis=1)
+    return np.asarray(known[id(term.effect)][:, list(term.kept)] * term.mix)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.conditions import of_unknown_history
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
@@ -29,11 +28,10 @@ AXES = 3
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """``columns`` (N,r) are those of coefficients of size one, so that ρ times them has the rms ρ. The first q are of
-    those coefficients of the ``effect`` that are free, ``kept``, and ``mix`` (q,) is what they were multiplied by; any
-    others are of poses in which nobody knows what acts: the effect goes with the pose before the first. ``kind`` is the
-    same for terms that exclude each other; ``pose`` is the outlier's, or −1; ``another`` is the pose from which on
-    there is another unit or mounting, or −1."""
+    """``columns`` (N,q) are those of coefficients of size one, so that ρ times them has the rms ρ; ``mix`` (q,) what
+    they were multiplied by. ``kind`` is the same for terms that exclude each other; ``pose`` is the outlier's, or −1;
+    ``another`` is the pose from which on there is another unit or mounting, or −1; ``kept`` are those coefficients of
+    the ``effect`` that are free."""
 
     name: str
     kind: str
@@ -71,7 +69,6 @@ def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds) -> Iterator
     forms: dict[tuple[str, ...], list[Effect]] = defaultdict(list)
     for variant in variants:
         forms[tuple(c.name for c in variant.coefficients)].append(variant)
-    unknown = _unknown(rows, effect)
     for shapes in forms.values():
         chosen = list(_axes([c.part for c in shapes[0].coefficients], odds))
         for shape in shapes:
@@ -79,24 +76,13 @@ def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds) -> Iterator
             if made is None:
                 continue
             columns, size = made
-            columns[unknown.any(axis=1)] = 0.0
             for kept, of_axes in chosen:
                 index = list(kept)
                 if (size[index] < NOTHING_G).any():
                     continue
                 mix = 1 / (size[index] * np.sqrt(len(index)))
                 prior = share + np.log(of_axes / len(forms) / len(shapes))
-                free = np.concatenate([columns[:, index] * mix, unknown], axis=1)
-                yield Term(effect.name, effect.name, free, mix, prior, shape, kept)
-
-
-def _unknown(rows: Rows, effect: Effect) -> Floats:
-    """(N,k) a column for the mean, and the slope, of each pose before which nobody knows what was, if that matters."""
-    poses = of_unknown_history(rows.poses, [effect])
-    places = [i + rows.n * of_slope for i in poses for of_slope in range(1 + rows.slopes)]
-    columns = np.zeros((len(rows.y), len(places)))
-    columns[places, range(len(places))] = 1 / rows.error[places]
-    return columns
+                yield Term(effect.name, effect.name, columns[:, index] * mix, mix, prior, shape, kept)
 
 
 def _axes(parts: Sequence[str], odds: Odds) -> Iterator[tuple[tuple[int, ...], float]]:

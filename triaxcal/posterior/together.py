@@ -162,15 +162,14 @@ def _explained(evidence: Evidence, information: Floats, score: Floats, term: int
 def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations], index: Sequence[int]) -> Floats:
     """(R,) the same gain, where all have the coefficients of the first, for a noise that is known."""
     first = units[0].evidence.terms[index[0]]
-    q = len(first.kept)
-    information, score = np.zeros((q, q)), np.zeros(q)
+    information, score = np.zeros((first.rank, first.rank)), np.zeros(first.rank)
     for unit, of_unit, i in zip(units, equations, index, strict=True):
         scale = first.mix / unit.evidence.terms[i].mix
-        places = unit.evidence.places([i])[:q]
+        places = unit.evidence.places([i])
         information += scale[:, None] * of_unit.information[np.ix_(places, places)] * scale
         score += scale * of_unit.score[places]
     size = units[0].evidence.sizes[:, None, None]
-    precision = np.eye(q) + size**2 * information
-    found = np.linalg.solve(precision, np.broadcast_to(score[:, None], (len(size), q, 1)))[:, :, 0]
+    precision = np.eye(first.rank) + size**2 * information
+    found = np.linalg.solve(precision, np.broadcast_to(score[:, None], (len(size), first.rank, 1)))[:, :, 0]
     gain = 0.5 * size[:, 0, 0] ** 2 * (found @ score) - 0.5 * np.linalg.slogdet(precision)[1]
     return np.asarray(gain + sum(of_unit.log_share for of_unit in equations))

@@ -134,3 +134,10 @@ def test_what_poses_cannot_show_is_told_with_the_reason(poses_with: Poses) -> No
     assert bare.blind["temperature_bias"].why is Why.NOT_LOGGED
     assert "second_order_nonlinearity" not in bare.blind
     assert loop.after.blind_to == tuple(loop.blind)
+
+
+@pytest.mark.parametrize("count", [10, 12])
+def test_poses_with_hardly_anything_to_spare_correct_nothing_that_nobody_knows(poses_with: Poses, count: int) -> None:
+    loop = closed(poses_with(6)[:count])
+    assert loop.after.terms == ("linear",)
+    assert loop.findings == ()

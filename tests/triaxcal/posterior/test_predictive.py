@@ -79,11 +79,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
         for i, size in zip(members, found.sizes[cell], strict=True):
             term = evidence.terms[i]
             assert term.effect is not None
-            free = of_rows.by_coefficients(term.effect)[:, list(term.kept)] * term.mix
-            unknown = np.zeros((len(free), term.rank - free.shape[1]))
-            if of_rows is rows and unknown.size:  # the history of the first pose
-                free[0], unknown[0] = 0.0, 1 / rows.error[0]
-            columns.append(size * np.concatenate([free, unknown], axis=1))
+            columns.append(size * of_rows.by_coefficients(term.effect)[:, list(term.kept)] * term.mix)
         return np.concatenate([FLAT * of_rows.linear, *columns], axis=1)
 
     both = np.concatenate([design(rows), design(ahead)])
