@@ -15,6 +15,7 @@ import numpy as np
 
 from tests.undeclared.physics import Effect, axes_drawn, on_axes, sizes
 from tests.undeclared.scene import Scene, Triad
+from tests.undeclared.uncatalogued import outside
 
 
 def backlash(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -58,7 +59,7 @@ def telegraph(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
     def columns(s: Scene) -> np.ndarray:
         return np.asarray((level[np.minimum(s.pose, len(level) - 1)][:, None] * force)[:, :, None])
 
-    return _outside("telegraph", "bias that hops between two levels", columns, np.ones(1))
+    return outside("telegraph", "bias that hops between two levels", columns, np.ones(1))
 
 
 def flickering_gain(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -68,7 +69,7 @@ def flickering_gain(rng: np.random.Generator, scene: Scene, triad: Triad) -> Eff
     def columns(s: Scene) -> np.ndarray:
         return np.asarray((ripple[np.minimum(s.pose, len(ripple) - 1)][:, None] * s.force)[:, :, None])
 
-    return _outside("flickering_gain", "scale factor at random in each pose", columns, np.ones(1))
+    return outside("flickering_gain", "scale factor at random in each pose", columns, np.ones(1))
 
 
 def transverse(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -90,7 +91,7 @@ def sagging_fixture(rng: np.random.Generator, scene: Scene, triad: Triad) -> Eff
         bent = np.hypot(s.up[:, 0], s.up[:, 1]) ** 3 * np.cos(3 * around + phase)
         return np.asarray((bent[:, None] * force)[s.pose][:, :, None])
 
-    return _outside("sagging_fixture", "three bumps a turn about the unit's z", columns, np.ones(1))
+    return outside("sagging_fixture", "three bumps a turn about the unit's z", columns, np.ones(1))
 
 
 def two_operators(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -101,7 +102,7 @@ def two_operators(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effec
         hand = (s.pose + first) % 2 - 0.5
         return np.asarray((hand[:, None] * force)[:, :, None])
 
-    return _outside("two_operators", "bias in every other pose", columns, np.ones(1))
+    return outside("two_operators", "bias in every other pose", columns, np.ones(1))
 
 
 def heater(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -128,11 +129,7 @@ def square_root_of_time(rng: np.random.Generator, scene: Scene, triad: Triad) ->
 
 def _by_axes(rng: np.random.Generator, kind: str, text: str, shape: Callable[[Scene], np.ndarray]) -> Effect:
     axes = axes_drawn(rng)
-    return _outside(kind, text, on_axes(axes, shape), sizes(rng, len(axes)))
-
-
-def _outside(kind: str, text: str, columns: Callable[[Scene], np.ndarray], coefficients: np.ndarray) -> Effect:
-    return Effect(kind, None, text, columns, coefficients, of_recording=True)
+    return outside(kind, text, on_axes(axes, shape), sizes(rng, len(axes)))
 
 
 _DRAWN = (

@@ -15,7 +15,7 @@ def adc_wave(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
     period, phase = 10 ** rng.uniform(np.log10(0.05), np.log10(0.7)), rng.uniform(0, 2 * np.pi, 3)
     axes = axes_drawn(rng)
     columns = on_axes(axes, lambda s: np.sin(2 * np.pi * (s.force + triad.bias) / period + phase))
-    return _outside("adc_wave", f"converter's wave of {period:.3f} g", columns, sizes(rng, len(axes)))
+    return outside("adc_wave", f"converter's wave of {period:.3f} g", columns, sizes(rng, len(axes)))
 
 
 def magnetic_field(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -28,7 +28,7 @@ def magnetic_field(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effe
         body = s.attitude @ field
         return np.asarray((body @ matrix.T)[s.pose][:, :, None])
 
-    return _outside("magnetic_field", f"magnetic field of dip {np.degrees(dip):.0f}°", columns, np.ones(1))
+    return outside("magnetic_field", f"magnetic field of dip {np.degrees(dip):.0f}°", columns, np.ones(1))
 
 
 def stand_twist(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -40,14 +40,14 @@ def stand_twist(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
         waves = np.stack([np.cos(az), np.sin(az), np.cos(2 * az), np.sin(2 * az)], axis=1)
         return np.asarray((waves @ weight.T)[s.pose][:, :, None])
 
-    return _outside("stand_twist", "twist by azimuth", columns, np.ones(1))
+    return outside("stand_twist", "twist by azimuth", columns, np.ones(1))
 
 
 def pose_duration(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
     """The mean of what builds up for as long as a pose is held."""
     axes = axes_drawn(rng)
     columns = on_axes(axes, lambda s: s.held_s[s.pose])
-    return _outside("pose_duration", "bias by the length of the pose", columns, sizes(rng, len(axes)))
+    return outside("pose_duration", "bias by the length of the pose", columns, sizes(rng, len(axes)))
 
 
 def random_walk(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -56,7 +56,7 @@ def random_walk(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
     def columns(s: Scene) -> np.ndarray:
         return np.asarray(path[np.minimum(s.pose, len(path) - 1)][:, :, None])
 
-    return _outside("random_walk", "bias that walks at random from pose to pose", columns, np.ones(1))
+    return outside("random_walk", "bias that walks at random from pose to pose", columns, np.ones(1))
 
 
 def cable(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -68,7 +68,7 @@ def cable(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
         here = pulls[np.minimum(s.pose, len(pulls) - 1)]
         return np.asarray((here[:, None] * force)[:, :, None])
 
-    return _outside("cable", f"cable that pulls in {int((pulls > 0).sum())} poses", columns, np.ones(1))
+    return outside("cable", f"cable that pulls in {int((pulls > 0).sum())} poses", columns, np.ones(1))
 
 
 def long_memory(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -83,7 +83,7 @@ def long_memory(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
         return np.asarray(state[s.pose])
 
     text = f"memory over {1 / (1 - keeps):.1f} poses"
-    return _outside("long_memory", text, on_axes(axes, shape), sizes(rng, len(axes)))
+    return outside("long_memory", text, on_axes(axes, shape), sizes(rng, len(axes)))
 
 
 def sunlight(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -97,7 +97,7 @@ def sunlight(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
         lit = np.maximum(s.attitude @ lamp @ face, 0.0)
         return np.asarray((lit[:, None] * force)[s.pose][:, :, None])
 
-    return _outside("sunlight", "light on one face", columns, np.ones(1))
+    return outside("sunlight", "light on one face", columns, np.ones(1))
 
 
 def slow_oscillation(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
@@ -108,17 +108,17 @@ def slow_oscillation(rng: np.random.Generator, scene: Scene, triad: Triad) -> Ef
         on_axes(axes, lambda s: np.sin(2 * np.pi * s.t_s / period)),
         on_axes(axes, lambda s: np.cos(2 * np.pi * s.t_s / period)),
     ]
-    return _outside("slow_oscillation", f"period of {period:.1f} s", several(*parts), sizes(rng, 2 * len(axes)))
+    return outside("slow_oscillation", f"period of {period:.1f} s", several(*parts), sizes(rng, 2 * len(axes)))
 
 
 def dead_zone(rng: np.random.Generator, scene: Scene, triad: Triad) -> Effect:
     """Stiction: less response near zero force, within 0.05 to 0.2 g."""
     width, axes = rng.uniform(0.05, 0.2), axes_drawn(rng)
     columns = on_axes(axes, lambda s: -s.force * np.exp(-((s.force / width) ** 2)))
-    return _outside("dead_zone", f"dead zone of {width:.3f} g", columns, sizes(rng, len(axes)))
+    return outside("dead_zone", f"dead zone of {width:.3f} g", columns, sizes(rng, len(axes)))
 
 
-def _outside(kind: str, text: str, columns: Callable[[Scene], np.ndarray], coefficients: np.ndarray) -> Effect:
+def outside(kind: str, text: str, columns: Callable[[Scene], np.ndarray], coefficients: np.ndarray) -> Effect:
     return Effect(kind, None, text, columns, coefficients, of_recording=True)
 
 
