@@ -11,9 +11,10 @@ from triaxcal.calibration import Calibration, HoldsAt, Residual
 from triaxcal.caution import BirgeRatio, ExcessVariance
 from triaxcal.posterior.average import Average, average, linear_alone, refusal
 from triaxcal.posterior.posterior import Posterior
-from triaxcal.posterior.rows import LINEAR, Rows
+from triaxcal.posterior.rows import Rows
 from triaxcal.problem import State, linearise
 from triaxcal.pure_error import lack_of_fit_p, pure_error_dof
+from triaxcal.uncertainty.linearised import held_gain
 
 
 def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
@@ -87,8 +88,4 @@ def _leverage(rows: Rows, used: list[int], made: Average) -> Floats:
     problem = replace(rows.problem.only(np.array(used)), further=None)
     _, J, error = linearise(problem, State.of(problem, made.sensor))
     weighted = J / error[:, None]
-    size = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
-    held = np.eye(len(size))[LINEAR:] / np.maximum(made.spread, 1e-300)[:, None]
-    stacked = np.concatenate([weighted, held]) / size
-    gain = np.linalg.pinv(stacked, rcond=1e-14)[:, : len(used)]
-    return np.asarray(np.clip(np.einsum("np,pn->n", weighted / size, gain), 0.0, 1.0))
+    return np.asarray(np.clip(np.einsum("np,pn->n", weighted, held_gain(weighted, made.spread)), 0.0, 1.0))

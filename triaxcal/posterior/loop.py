@@ -9,8 +9,6 @@ from enum import StrEnum
 from functools import cached_property
 
 from triaxcal.calibration import Calibration, Exclusion, HoldsAt
-from triaxcal.conditions import channels_of
-from triaxcal.effects import TO_COME, catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
@@ -24,9 +22,7 @@ from triaxcal.posterior.blind import Blind, blind_to
 from triaxcal.posterior.corrected import corrected
 from triaxcal.posterior.findings import Findings, findings
 from triaxcal.posterior.odds import Odds
-from triaxcal.posterior.posterior import Posterior, posterior
-from triaxcal.runs import by_run
-from triaxcal.search.candidates import still_conditions
+from triaxcal.posterior.posterior import Posterior, looked_for, posterior
 
 Coefficients = Mapping[str, tuple[float, float | None, str]]
 """Name → value, standard error, unit."""
@@ -132,11 +128,9 @@ def diagnose(
     moment = HoldsAt.of(sound, at)
     if moment is None:
         raise Refused("no pose without a fault")
-    moving = set(channels_of(sound)) - still_conditions(sound)
-    effects = by_run((*catalogue_for(moving), *TO_COME) if catalogue is None else catalogue, sound)
-    seen = posterior(poses, linear, signs=signs, catalogue=effects, odds=odds)
+    seen = posterior(poses, linear, signs=signs, catalogue=catalogue, odds=odds)
     before = replace(_without_outliers(poses, linear, signs, seen), holds_at=moment)
-    blind = blind_to(seen.evidence, effects)
+    blind = blind_to(seen.evidence, looked_for(poses, catalogue))
     before, after = (c.with_blind_to(tuple(blind)) for c in (before, corrected(before, seen, moment)))
     found, refused = findings(seen), refusal(seen)
     told = _Told(seen, moment, after)

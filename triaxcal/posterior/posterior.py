@@ -195,6 +195,15 @@ class Posterior:
         return float(logsumexp([found.total for found in self.sets]))
 
 
+def looked_for(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None) -> tuple[Effect, ...]:
+    """The effects of a ``catalogue``, run by run where there are several; where it is None, of all that are known for
+    the channels that move in these poses."""
+    sound = [p for p in poses if not p.fault]
+    if catalogue is None:
+        catalogue = (*catalogue_for(set(channels_of(sound)) - still_conditions(sound)), *TO_COME)
+    return by_run(catalogue, sound)
+
+
 def posterior(
     poses: Sequence[Pose],
     linear: Calibration,
@@ -207,9 +216,7 @@ def posterior(
     """Of what acts beside the ``linear`` fit of these poses. ``smallest_g`` is the least size of an effect that is
     asked about; several units that are compared have one."""
     odds = odds or Odds()
-    sound = [p for p in poses if not p.fault]
-    moving = set(channels_of(sound)) - still_conditions(sound)
-    effects = by_run((*catalogue_for(moving), *TO_COME) if catalogue is None else catalogue, sound)
+    effects = looked_for(poses, catalogue)
     rows = Rows.of(poses, linear, signs, effects)
     for _ in range(ROUNDS):
         evidence = Evidence(rows, terms_of(rows, effects, odds), odds, smallest_g)

@@ -43,7 +43,7 @@ class Linearised:
         _, J, self.error = everything(self.problem, self.state)
         # What the shapes of effects were chosen by blurs the parameters too.
         self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
-        self.gain = _gain(self.weighted, calibration.spread)
+        self.gain = held_gain(self.weighted, calibration.spread)
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
         """(p,n): shift of the parameters for an error of each residual (`triaxcal.problem.everything`)."""
@@ -77,7 +77,7 @@ class Linearised:
         return np.concatenate([-np.linalg.lstsq(nine, r, rcond=None)[0], np.zeros(len(self.G) - 9)])
 
 
-def _gain(weighted: Floats, spread: Floats | None) -> Floats:
+def held_gain(weighted: Floats, spread: Floats | None) -> Floats:
     """(p,n) of parameters by weighted residuals, where coefficients are held by their ``spread``. Columns are scaled
     first: those of a temperature and of a cube are decades apart."""
     norms = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)

@@ -11,10 +11,12 @@ from tests.triaxcal.posterior.conftest import MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.calibration import Exclusion
 from triaxcal.moment import Moment
+from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
-from triaxcal.posterior import Refusal
+from triaxcal.posterior import Refusal, posterior
 from triaxcal.posterior.blind import Why
 from triaxcal.posterior.loop import Call, Loop, Verdict, diagnose
+from triaxcal.runs import together
 
 Poses = Callable[..., list[Pose]]
 Knocked = Callable[[list[Pose], int, float], list[Pose]]
@@ -141,3 +143,9 @@ def test_poses_with_hardly_anything_to_spare_correct_nothing_that_nobody_knows(p
     loop = closed(poses_with(6)[:count])
     assert loop.after.terms == ("linear",)
     assert loop.findings == ()
+
+
+def test_effects_of_several_runs_are_looked_for_once(poses_with: Poses) -> None:
+    poses = together([poses_with(1), poses_with(2)])
+    terms = posterior(poses, fit(poses, signs=MINUS), signs=MINUS).evidence.terms
+    assert [t.name for t in closed(poses).seen.evidence.terms] == [t.name for t in terms]
