@@ -20,8 +20,8 @@ import numpy as np
 from benchmarks.next_recording import FOLDER, SENSORS, error_g, poses_of
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
+from triaxcal.loop import diagnose
 from triaxcal.next_recording import next_recording
-from triaxcal.posterior.loop import diagnose
 from triaxcal.posterior.together import together as of_units
 from triaxcal.runs import together
 from triaxcal.uncertainty import budget

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,16 +14,19 @@ from triaxcal.creep import with_creep_left
 from triaxcal.documents import Calibration
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.findings import Finding
 from triaxcal.held_out import HeldOut, magnitude_errors
+from triaxcal.loop import Call, Candidate, Finding
 from triaxcal.means import poses_of_means
 from triaxcal.moment import Moment
+from triaxcal.next_recording import NextRecording, next_recording
 from triaxcal.planning.directions import FULL, closed, directions
 from triaxcal.poses.pose import Pose, poses_of
+from triaxcal.posterior.findings import Unexplained
 from triaxcal.quality import QualityDetector, untrusted_poses
 from triaxcal.samples import Samples
 from triaxcal.stillness.detector import StillnessDetector
-from triaxcal.unexplained import Unexplained
+from triaxcal.text import diagnosis
+from triaxcal.units import ErrorUnit
 
 
 class PlannedPose(NamedTuple):
@@ -71,27 +74,26 @@ class Poses(tuple[Pose, ...]):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The closed loop: ``before`` is the linear calibration, ``calibration`` that with the effects that were found;
-    ``unexplained`` what is left, ``held_out`` the error in poses that no fit saw, ``advice`` what to do, a line
-    each."""
+    """The closed loop: ``before`` is the linear calibration, ``calibration`` the one to use, with the effects that were
+    found; ``findings`` act for certain, ``candidates`` more likely than not, and ``probabilities`` has that of every
+    effect that was looked for; ``unexplained`` is what no effect describes, ``held_out`` the error in poses that no fit
+    saw, ``advice`` what to do, a line each. ``call`` is whether the calibration can be used."""
 
     before: Calibration
     calibration: Calibration
+    call: Call
     findings: tuple[Finding, ...]
+    candidates: tuple[Candidate, ...]
+    probabilities: Mapping[str, float]
     unexplained: Unexplained
+    next_recording: NextRecording
     held_out: HeldOut | None
     advice: tuple[str, ...]
+    _lines: tuple[str, ...] = field(repr=False, default=())
 
     def summary(self) -> str:
-        """What was found, the error before and after, what is left and what to do, a line each."""
-        fitted, left = self.calibration.fitted, self.unexplained
-        return text.loop(
-            [(f.effect, f.verdict, f.alternatives) for f in self.findings],
-            (self.before.residual, fitted.residual),
-            (self.calibration.reference_unit, fitted.reference),
-            left.rms_g if left.significant else None,
-            self.advice,
-        )
+        """Whether it can be used, what acts, the error before and after, and what to do, a line each."""
+        return "\n".join(["Diagnosis", *(f"  {line}" for line in self._lines)])
 
     def __repr__(self) -> str:
         return self.summary()
@@ -228,8 +230,20 @@ def diagnose(
         Calibration(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
         for c in (closed_loop.before, closed_loop.after)
     )
+    small = ErrorUnit.of(reference_unit, closed_loop.after.reference)
+    following = next_recording(closed_loop.after, uncertainty.budget(closed_loop.after, stated))
     return Diagnosis(
-        before, after, closed_loop.findings, closed_loop.unexplained, closed_loop.held_out, closed_loop.advice
+        before,
+        after,
+        closed_loop.call,
+        closed_loop.findings,
+        closed_loop.candidates,
+        closed_loop.probabilities,
+        closed_loop.found.unexplained,
+        following,
+        closed_loop.held_out,
+        tuple(diagnosis.advice(closed_loop, small)),
+        diagnosis.lines(closed_loop, small, following),
     )
 
 

@@ -8,9 +8,11 @@ from typing import Any
 from triaxcal import text
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Exclusion, HoldsAt, Residual
+from triaxcal.next_recording import NextRecording, next_recording
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import (
     UNCERTAINTY_DIGITS,
+    chance,
     correlation,
     direction,
     error,
@@ -25,6 +27,8 @@ from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]
 LINEAR = ("scale_factor", "misalignment", "bias")
+WEIGHT = "weight"
+"""Beside the coefficients of an effect, where predictions average models: by which share they count."""
 _LEFT_OUT = {Exclusion.OUTLIER: "spoiled", Exclusion.CALLER: "caller", Exclusion.UNKNOWN_HISTORY: "unknown_history"}
 """As documents of 0.1 have it, beside ``excluded``; else the name of the fault."""
 
@@ -87,6 +91,7 @@ def calibration_document(
     whole = c.whole
     errors = dict(zip(whole.parameters, whole.standard_errors, strict=True))
     unit = output_unit or "output"
+    evaluated = budget(c, stated) if budgeted else None
 
     def group(name: str) -> list[Any]:
         return numbers([errors[f"{name}.{axis}"] for axis in "xyz"], UNCERTAINTY_DIGITS)
@@ -113,12 +118,14 @@ def calibration_document(
         "centre": numbers(c.sensor.centre),
         "effects": {
             effect.name: coefficients_document(whole.coefficients_of(effect.name), reference_unit)
+            | ({WEIGHT: chance(c.weights[effect.name])} if effect.name in c.weights else {})
             for effect, _ in c.sensor.effects
         },
         "standard_error": {name: group(name) for name in LINEAR},
         "parameters": list(whole.parameters),
         "correlation": correlation(whole.covariance),
-        **({"uncertainty": budget_document(c, budget(c, stated), reference_unit)} if budgeted else {}),
+        **({"uncertainty": budget_document(c, evaluated, reference_unit)} if evaluated else {}),
+        "next_recording": None if evaluated is None else next_recording_document(next_recording(c, evaluated)),
         "residual": residual_document(c.residual, c.reference),
         "poses": [
             {
@@ -132,6 +139,7 @@ def calibration_document(
                 "leverage": uncertainty(p.leverage),
                 "used": p.used,
                 "excluded": p.excluded,
+                **({} if p.outlier_probability is None else {"outlier_probability": chance(p.outlier_probability)}),
                 **({"left_out": _LEFT_OUT.get(p.excluded, p.pose.fault)} if p.excluded else {}),
                 "channels": {name: number(v) for name, v in p.pose.channels.items()},
             }
@@ -159,6 +167,14 @@ def _holds_at(moment: HoldsAt | None) -> Document | None:
         return None
     clock = {} if moment.time_s == moment.t_s else {"since_middle_s": number(moment.time_s)}
     return {"moment": moment.moment.value, "t_s": number(moment.t_s), **clock}
+
+
+def next_recording_document(following: NextRecording) -> Document:
+    return {
+        "expanded_uncertainty_g": uncertainty(following.expanded_uncertainty),
+        "start_to_start_g": uncertainty(following.start_to_start),
+        "source": following.source.value,
+    }
 
 
 def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:

@@ -10,7 +10,9 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, HoldsAt, Residual
+from triaxcal.calibration_document import WEIGHT
 from triaxcal.effects import Effect, effect_of
+from triaxcal.effects.contract import condition_of
 from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.errors import InvalidData
 from triaxcal.moment import Moment
@@ -36,6 +38,25 @@ def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: flo
     return said if isinstance(said, str) and said else reference_unit_of(magnitude)
 
 
+def logged_in(document: Mapping[str, Any], *, where: str) -> dict[str, Floats]:
+    """The channels of the poses of a calibration document, (n,) each, as conditions are named; none that a pose
+    lacks."""
+    poses = calibration_part(document, where=where).get("poses")
+    found = [p.get("channels") for p in poses if isinstance(p, Mapping)] if isinstance(poses, list) else []
+    rows = [row if isinstance(row, Mapping) else {} for row in found]
+    names = [str(n) for n in rows[0] if all(math.isfinite(_number(row.get(n))) for row in rows)] if rows else []
+    return {condition_of(n): np.array([_number(row[n]) for row in rows]) for n in names}
+
+
+def expanded_uncertainty_in(document: Mapping[str, Any], *, where: str) -> float | None:
+    """Of |a|, in the unit of the reference; None where the document has none."""
+    found: Any = calibration_part(document, where=where)
+    for key in ("uncertainty", "magnitude", "expanded_g"):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    value = _number(found)
+    return value if math.isfinite(value) else None
+
+
 def _floats(value: Any) -> Floats:
     """Raises ValueError for what is no number in JSON."""
     found = np.asarray(value)
@@ -51,7 +72,8 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
         k, m, b = (_floats(part[name]) for name in ("scale_factor", "misalignment", "bias"))
         effects = []
         for name, held in part.get("effects", {}).items():
-            effect, q = effect_of(name, {n: float(_floats(v["value"])) for n, v in held.items()})
+            values = {n: float(_floats(v["value"])) for n, v in held.items() if n != WEIGHT}
+            effect, q = effect_of(name, values)
             lacking = [n for n in (*(c.name for c in effect.coefficients), *effect.shape) if n not in held]
             if lacking:
                 raise KeyError(f"effects.{name}.{lacking[0]}")
@@ -91,6 +113,9 @@ def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
         dilution=_number(part.get("dilution")),
         inflation=unknown,
         dof=unknown,
+        weights={
+            name: w for name, held in part.get("effects", {}).items() if math.isfinite(w := _number(held.get(WEIGHT)))
+        },
         holds_at=holds_at_of(part, where=where),
     )
 

@@ -32,6 +32,11 @@ from triaxcal.effects.contract import (
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose
 
+MOVES = 3.0
+"""A channel stands still unless its means, or its rates, differ by so many of their standard errors (rms)."""
+SCATTER_MOVES = 0.1
+"""Scatter stands still unless it differs from pose to pose by this share, and by `MOVES` times what chance makes."""
+
 
 def conditions(channels: Mapping[str, Floats], reference: Mapping[str, float]) -> dict[str, Floats]:
     """Deviations of the channels from their references; a channel with no reference is left out."""
@@ -184,3 +189,26 @@ def of_readings(
         for name, value in reference.items()
     }
     return held, tuple(name for name in reference if name not in known and name != HELD)
+
+
+def still_conditions(poses: Sequence[Pose]) -> set[str]:
+    """Conditions that do not move from pose to pose by more than their own noise.
+
+    A coefficient of such a condition would be one of chance.
+    """
+    still = set()
+    for name in sorted(set.intersection(*(set(p.channels) for p in poses))):
+        if not _moves([p.channels[name] for p in poses], [p.channel_errors.get(name, 0.0) for p in poses]):
+            still.add(condition_of(name))
+        if not _moves([p.rates.get(name, 0.0) for p in poses], [p.rate_errors.get(name, 0.0) for p in poses]):
+            still.add(rate_of(condition_of(name)))
+    scatter = np.array([p.scatter for p in poses])
+    chance = np.sqrt(2 / np.array([max(p.samples, 2) for p in poses]))
+    share = scatter.std(axis=0) / np.maximum(scatter.mean(axis=0), 1e-300)
+    if not np.any(share > max(SCATTER_MOVES, MOVES * float(np.sqrt(np.mean(chance**2))))):
+        still |= set(SCATTER)
+    return still
+
+
+def _moves(values: list[float], errors: list[float]) -> bool:
+    return float(np.std(values)) > MOVES * float(np.sqrt(np.mean(np.square(errors))))

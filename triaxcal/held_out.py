@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,70 +12,37 @@ from triaxcal.calibration import Calibration
 from triaxcal.conditions import conditions_elsewhere
 from triaxcal.creep import with_creep_left
 from triaxcal.errors import InvalidData
-from triaxcal.figures import micro_g
 from triaxcal.poses.pose import Pose
-from triaxcal.search import NEAR, deviance
 from triaxcal.sensor import Sensor
+
+CLEARLY = 2.0
+"""Standard errors of the mean difference of the squares, pose by pose: by chance in one recording of forty."""
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """In g."""
+    """In the unit of the reference."""
 
     before_rms_g: float
     after_rms_g: float
     noise_floor_g: float
     """What the noise of these poses leaves, with so much of their creep as the extended model does not explain."""
     poses: int
-    instead: Mapping[str, float] = field(default_factory=dict)
-    """``after_rms_g`` with an alternative in the place of its finding, by name."""
-    better: tuple[str, ...] = ()
-    """The alternatives whose errors are clearly smaller, as far as these are near the smallest, that first."""
-    none_better: bool = False
-    """Whether the model before does clearly better than that after, and no alternative better than it."""
+    worse: bool = False
+    """Whether the linear calibration is clearly better in these poses."""
 
 
-def held_out(
-    before: Calibration, after: Calibration, check: Sequence[Pose], instead: Mapping[str, Calibration]
-) -> HeldOut:
-    """``instead`` are the models with an alternative in the place of its finding, by name. Raises InvalidData where
-    there is no check pose, or where these lack a channel that the effects need.
-    """
+def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HeldOut:
+    """Raises InvalidData where there is no check pose, or where these lack a channel that the effects need."""
     if not check:
         raise InvalidData("the check recording has no still pose")
     try:
         first, last = _errors(before, check), _errors(after, with_creep_left(check, after, elsewhere=True))
     except InvalidData as e:
         raise InvalidData(f"the check recording: {e}") from e
-    errors = {}
-    for name, model in instead.items():
-        try:
-            errors[name] = _errors(model, with_creep_left(check, model, elsewhere=True))
-        except InvalidData:  # a channel is not logged there
-            continue
-    rms = {name: _rms(miss) for name, (miss, _) in errors.items()}
-    misfit = {name: _deviance(*found) for name, found in errors.items()}
-    most = min([_deviance(*last), *(m + 2 * NEAR for m in misfit.values())]) - NEAR  # near the best, far from the last
-    linear = _deviance(first[0], last[1])
-    none_better = linear < min([_deviance(*last) - NEAR, *misfit.values()]) and _rms(first[0]) < _rms(last[0])
-    better = [] if none_better else sorted((n for n, m in misfit.items() if m < most), key=lambda n: rms[n])
-    return HeldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), rms, tuple(better), none_better)
-
-
-def better_of(held: HeldOut | None) -> list[str]:
-    """Advice where the check recording speaks for an alternative, or for no effect at all."""
-    if held is not None and held.none_better:
-        return [
-            f"in the check recording no effect does better than the linear model ({micro_g(held.before_rms_g)}, with "
-            f"what was found {micro_g(held.after_rms_g)}): diagnose both recordings together"
-        ]
-    if held is None or not held.better:
-        return []
-    named = " or ".join(f"{name} ({micro_g(held.instead[name])})" for name in held.better)
-    return [
-        f"the check recording speaks for {named} rather than what is in the model ({micro_g(held.after_rms_g)}): "
-        "diagnose both recordings together"
-    ]
+    more = last[0] ** 2 - first[0] ** 2
+    worse = len(more) > 1 and float(more.mean()) > CLEARLY * float(more.std(ddof=1)) / np.sqrt(len(more))
+    return HeldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), bool(worse))
 
 
 def magnitude_errors(
@@ -102,10 +69,6 @@ def _errors(c: Calibration, poses: Sequence[Pose]) -> tuple[Floats, Floats]:
     return magnitude_errors(
         c.sensor, poses, channel_reference=c.channel_reference, reference=c.reference, moment=c.moment
     )
-
-
-def _deviance(miss: Floats, error: Floats) -> float:
-    return float(deviance(np.array(np.sum((miss / error) ** 2)), len(miss)))
 
 
 def _rms(values: Floats) -> float:

@@ -30,10 +30,11 @@ class Source(StrEnum):
 
 @dataclass(frozen=True)
 class NextRecording:
-    """``expanded_uncertainty`` of |a|, rms over the sphere, at the reference conditions and the moment for which the
-    calibration holds; ``start_to_start`` the standard deviation of |a| from one recording to another. In the unit of
-    the reference."""
+    """``standard`` and ``expanded_uncertainty`` of |a|, rms over the sphere, at the reference conditions and the moment
+    for which the calibration holds; ``start_to_start`` the standard deviation of |a| from one recording to another. In
+    the unit of the reference."""
 
+    standard: float
     expanded_uncertainty: float
     start_to_start: float
     source: Source
@@ -53,7 +54,7 @@ def next_recording(c: Calibration, budget: Budget, start_to_start: float | None 
     # Welch and Satterthwaite, JCGM 100, G.4.
     effective = whole**4 / (own**4 / float(budget.magnitude.dof) + start**4 / dof + 1e-300) if whole > 0 else DOF_MOST
     coverage = float(t_ppf((1 + budget.magnitude.level) / 2, np.asarray(min(effective, DOF_MOST))))
-    return NextRecording(coverage * float(whole), start, source)
+    return NextRecording(float(whole), coverage * float(whole), start, source)
 
 
 def _between_runs(c: Calibration) -> tuple[float, float] | None:

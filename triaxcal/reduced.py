@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
+from triaxcal.calibration import Calibration, Residual
 from triaxcal.conditions import at_reference, of_moment
 from triaxcal.effects.contract import Effect, is_derived
 from triaxcal.planning.directions import directions
@@ -36,12 +36,14 @@ class Reduced:
     cost: float
 
 
-def reduced(c: Calibration, keep: Callable[[Effect], bool]) -> Reduced:
-    """Nine parameters and the effects that ``keep`` says of; the same calibration where that is all of them."""
+def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str, Floats] | None = None) -> Reduced:
+    """Nine parameters and the effects that ``keep`` says of; the same calibration where that is all of them.
+
+    ``logged`` are channels as they were in the poses, (n,) each, where the calibration has no poses of its own."""
     kept = [(effect, q) for effect, q in c.sensor.effects if keep(effect)]
     if len(kept) == len(c.sensor.effects):
         return Reduced(c, 0.0)
-    up, held = _readings(c)
+    up, held = _readings(c, logged or {})
     u = c.sensor.output(up, held)
     sensor = Sensor(c.sensor.scale_factor, c.sensor.misalignment, c.sensor.bias, tuple(kept))
     for _ in range(STEPS):
@@ -62,10 +64,20 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool]) -> Reduced:
         weights={name: p for name, p in c.weights.items() if name in names},
         channel_reference={name: v for name, v in c.channel_reference.items() if name in needed},
     )
-    return Reduced(calibration, float(np.sqrt(np.mean(off**2))))
+    return Reduced(_with_residual(calibration) if c.poses else calibration, float(np.sqrt(np.mean(off**2))))
 
 
-def _readings(c: Calibration) -> tuple[Floats, Mapping[str, Floats]]:
+def _with_residual(c: Calibration) -> Calibration:
+    """In the recording's own poses. How well it would do without one of them nobody asked."""
+    used = [p for p in c.poses if p.used]
+    u = np.array([p.pose.mean for p in used])
+    off = c.sensor.magnitude(u, c.conditions_of([p.pose for p in used]))[0] - c.reference
+    rms, largest = float(np.sqrt(np.mean(off**2))), float(np.max(np.abs(off)))
+    floor = c.residual.noise_floor_g
+    return replace(c, residual=Residual(rms, largest, None, floor, None))
+
+
+def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Mapping[str, Floats]]:
     """(m,3) specific forces all over the sphere under the conditions that a unit in use meets: logged channels as they
     were in some of the poses, every clock at the moment, everything else at its reference."""
     up = np.array([v for _, v in directions(SPHERE)]) * c.reference
@@ -73,7 +85,10 @@ def _readings(c: Calibration) -> tuple[Floats, Mapping[str, Floats]]:
     clocks = of_moment(c.channel_reference, c.moment)
     at_moment |= {n: np.array([t - c.channel_reference[n]]) for n, t in clocks.items() if n in c.channel_reference}
     poses = [p.pose for p in c.poses if p.used]
-    logged = {n: v for n, v in c.conditions_of(poses).items() if not is_derived(n)} if poses else {}
+    if poses:
+        logged = {n: v for n, v in c.conditions_of(poses).items() if not is_derived(n)}
+    else:
+        logged = {n: np.asarray(v) - c.channel_reference[n] for n, v in logged.items() if n in c.channel_reference}
     by_first = np.argsort(next(iter(logged.values())), kind="stable") if logged else np.zeros(1, dtype=int)
     some = by_first[np.linspace(0, len(by_first) - 1, CONDITIONS).astype(int)] if logged else by_first
     held = {n: logged[n][some] if n in logged else np.repeat(v, len(some)) for n, v in at_moment.items()}

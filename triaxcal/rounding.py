@@ -14,7 +14,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.units import SMALLEST
 
-DIGITS, UNCERTAINTY_DIGITS, PROBABILITY_DIGITS = 10, 6, 4
+DIGITS, UNCERTAINTY_DIGITS, PROBABILITY_DIGITS, CHANCE_DIGITS = 10, 6, 4, 4
 REGISTER_DIGITS = 12
 """So many tell any two float32 apart, and any two integers of a register."""
 GRID_G = 1e-11
@@ -44,6 +44,11 @@ def uncertainty(value: float | None) -> float | None:
 
 def probability(value: float | None) -> float | None:
     return number(value, PROBABILITY_DIGITS)
+
+
+def chance(p: float) -> float:
+    """A probability that a posterior gives, to a ten-thousandth: its model is not as certain as more digits say."""
+    return min(round(p, CHANCE_DIGITS) + 0.0, 1.0 - 10.0**-CHANCE_DIGITS)
 
 
 def numbers(values: Any, digits: int = DIGITS) -> list[Any]:

@@ -23,17 +23,19 @@ from triaxcald.tables.samples import Reading, read_table
 
 BLOCK = 65536
 """Samples at a time, of a text: its effects take some hundred bytes for each."""
+FAR = 3.0
+"""Beyond so many times the reference, or as small a part of it, the median is no matter of how the unit was moved."""
 
 
 @dataclass
 class Applied:
     """``blocks`` have the columns of the input, and behind them the calibrated readings; ``start_ns`` is where their
-    seconds begin, None for the first sample. ``missing`` has, once they are through, what the calibration needs
-    and the recording lacks; ``remarks`` say how a table was read."""
+    seconds begin, None for the first sample. ``cautions`` has, once they are through, what the calibration needs
+    and the recording lacks, and whether the readings can be of its unit; ``remarks`` say how a table was read."""
 
     blocks: Iterator[Rows]
     start_ns: int | None
-    missing: list[str] = field(default_factory=list)
+    cautions: list[str] = field(default_factory=list)
     remarks: tuple[str, ...] = ()
 
 
@@ -77,7 +79,7 @@ def applied(
 
     def calibrated() -> Iterator[Rows]:
         begin_ns: int | None = None
-        at = 0
+        at, lengths = 0, list[float]()
         for block in blocks:
             if begin_ns is None and len(block):
                 begin_ns = int(block.time_ns[0])
@@ -91,15 +93,29 @@ def applied(
                     own_recording=own_recording,
                     uncertainty=uncertainty,
                 )
-            found.missing += [m for w in told if (m := str(w.message)) not in found.missing]
+            found.cautions += [m for w in told if (m := str(w.message)) not in found.cautions]
             values = np.concatenate(a, axis=1) if uncertainty else a
+            if len(block):
+                lengths.append(float(np.median(np.linalg.norm(values[:, :3], axis=1))))
             cells = {n: v[at : at + len(block)] for n, v in beside.items()}
             at += len(block)
             held = {f"{n} (input)" if n in columns else n: v for n, v in {**Rows.of(block).columns, **cells}.items()}
             yield Rows(block.time_ns, held | dict(zip(columns, values.T, strict=True)))
+        found.cautions += _of_another_unit(calibration, name, lengths)
 
     found.blocks = calibrated()
     return found
+
+
+def _of_another_unit(calibration: Calibration, name: str, lengths: list[float]) -> list[str]:
+    """A line where the magnitude, in the median of each block, is nowhere near the reference."""
+    reference, unit = calibration.fitted.reference, calibration.reference_unit
+    if not lengths or reference / FAR < (typical := float(np.median(lengths))) < reference * FAR:
+        return []
+    return [
+        f"{name}: readings come out at {typical:.3g} {unit} in the median, and the reference is {reference:g} {unit}: "
+        "are the outputs in another unit than those that were calibrated?"
+    ]
 
 
 def _of_recording(path: Path, phase: Phase) -> Iterator[SampleBlock]:

@@ -16,15 +16,18 @@ from typing import Any
 
 import numpy as np
 
+from triaxcal import text
+from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.calibration_document import Document, budget_document, holds_of
 from triaxcal.conditions import channels_of, with_scale
 from triaxcal.effects import Effect
+from triaxcal.effects.in_run import of_clocks
 from triaxcal.effects.part import whole
 from triaxcal.figures import micro_g
 from triaxcal.loop import Loop, diagnose
-from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
+from triaxcal.reduced import Reduced, reduced
 from triaxcal.rounding import error, number
 from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Stated, budget
@@ -70,8 +73,8 @@ def certify(
     loop = diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
     profile = bundle.profile
     measured_ns = pipeline.first_host_ns or 0
-    held = _held_by_device(profile, loop.after, poses, signs, station.reference)
-    image = _image(profile, held, measured_ns // (DAY_S * 1_000_000_000)) if held else None
+    held = held_by_device(profile, loop.after)
+    image = image_of(profile, held.registers.calibration, measured_ns // (DAY_S * 1_000_000_000)) if held else None
     outside = _outside(loop, station.limits)
     document: Document = {
         "format": "triaxcal.certificate/1",
@@ -100,7 +103,7 @@ def certify(
             data_quality=pipeline.data_quality() + creeping(poses),
             output_unit=profile.output.unit,
             stated=station.stated,
-            held_by_device=held,
+            held_by_device=held.beside_process if held else None,
         ),
         "not_written": why_not_written(profile),
         "registers": _registers_document(image, held, loop, poses, station.stated) if image and held else None,
@@ -143,48 +146,50 @@ def why_not_written(profile: Profile) -> str | None:
     return f"the device has no register for {', '.join(missing)}" if missing else None
 
 
-def _held_by_device(
-    profile: Profile, full: Calibration, poses: list[Pose], signs: tuple[int, int, int], reference: float
-) -> Calibration | None:
-    """The calibration with those effects alone that the device has registers for.
+@dataclass(frozen=True)
+class HeldByDevice:
+    """What a device can hold of a calibration: ``registers`` are the whole correction, as nearly as its registers have
+    it, at the moment for which that holds. ``beside_process`` is the same beside what belongs to the recording and not
+    to the unit, in the recording's own poses."""
 
-    Refitted, not cut: without an effect the other coefficients have other best values. Effects of time stay in the
-    fit, since they belong to this recording and not to the unit; what the registers then hold is said in words.
-    """
+    registers: Reduced
+    beside_process: Calibration
+
+
+def held_by_device(
+    profile: Profile, full: Calibration, logged: Mapping[str, Floats] | None = None
+) -> HeldByDevice | None:
+    """None where the device cannot take a calibration at all. ``logged`` as `triaxcal.reduced.reduced` has it."""
     if why_not_written(profile):
         return None
-    kept = [
-        effect
-        for effect, _ in full.sensor.effects
-        if is_passing(effect) or all(profile.by_role(f"{effect.name}.{c.name}") for c in whole(effect).coefficients)
-    ]
-    if len(kept) == len(full.sensor.effects):
-        return full
-    held = fit(poses, signs=signs, reference=reference, effects=kept)
-    if not full.rivals:
-        return held
-    # Whatever it is called, it is not in the registers; what it makes of them is as open as with it.
-    named = " with ".join(effect.name for effect, _ in full.sensor.effects)
-    return replace(held, rivals={named: full, **full.rivals})
+
+    def has(effect: Effect) -> bool:
+        return all(profile.by_role(f"{effect.name}.{c.name}") for c in whole(effect).coefficients)
+
+    beside = reduced(full, lambda effect: has(effect) or is_passing(effect), logged).calibration
+    return HeldByDevice(reduced(full, has, logged), beside)
 
 
-def _image(profile: Profile, held: Calibration, date_days: int) -> RegisterImage:
-    wanted = {r: v for r, v in roles(held.sensor.whole, held.channel_reference).items() if profile.by_role(r)}
-    return build_image(profile, wanted, date_days=date_days)
+def image_of(profile: Profile, registers: Calibration, date_days: int) -> RegisterImage:
+    """Raises RegisterValueError where a value does not go into its register."""
+    wanted = roles(registers.sensor.whole, registers.channel_reference)
+    return build_image(profile, {r: v for r, v in wanted.items() if profile.by_role(r)}, date_days=date_days)
 
 
 def _registers_document(
-    image: RegisterImage, held: Calibration, loop: Loop, poses: list[Pose], stated: Stated
+    image: RegisterImage, held: HeldByDevice, loop: Loop, poses: list[Pose], stated: Stated
 ) -> Document:
-    in_registers = ["linear", *(e.name for e, _ in held.sensor.effects if not is_passing(e))]
+    registers = held.registers.calibration
+    in_registers = list(registers.terms)
     host = [name for name in loop.after.terms if name not in in_registers]
     return {
         "terms": in_registers,
         "left_to_host": host,
-        "holds": holds_of(held),
-        "rms_g": error(held.residual.rms_g),
-        "rounding_rms_g": error(rounding_cost(image, held, poses)),
-        "uncertainty": budget_document(held, budget(held, replace(stated, rounding=_steps(image)))),
+        "holds": registers_hold(registers, loop.after),
+        "rms_g": error(held.beside_process.residual.rms_g),
+        "cost_rms_g": error(held.registers.cost),
+        "rounding_rms_g": error(rounding_cost(image, registers, poses)),
+        "uncertainty": budget_document(registers, budget(registers, replace(stated, rounding=_steps(image)))),
         "words": [
             {
                 "register": w.register,
@@ -197,6 +202,14 @@ def _registers_document(
             for w in image.words
         ],
     }
+
+
+def registers_hold(registers: Calibration, full: Calibration) -> list[str]:
+    """Under which conditions the linear part of the registers is all of a reading, where ``full`` has effects of time:
+    at their moment."""
+    timed = any(of_clocks(effect) for effect, _ in full.sensor.effects)
+    moment = [text.as_at(full.holds_at)] if timed and full.holds_at is not None else []
+    return [*moment, *holds_of(registers)]
 
 
 def _steps(image: RegisterImage) -> dict[str, float]:

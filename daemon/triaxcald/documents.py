@@ -7,14 +7,28 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from triaxcal.calibration import Calibration
-from triaxcal.calibration_document import Document, calibration_document, coefficients_document, residual_document
-from triaxcal.figures import moment
-from triaxcal.loop import Loop
-from triaxcal.rounding import error, probability
-from triaxcal.uncertainty import Stated
+from triaxcal.calibration_document import (
+    WEIGHT,
+    Document,
+    calibration_document,
+    coefficients_document,
+    residual_document,
+)
+from triaxcal.held_out import HeldOut
+from triaxcal.loop import Finding, Loop, Verdict
+from triaxcal.next_recording import next_recording
+from triaxcal.posterior.average import Refusal
+from triaxcal.posterior.findings import Unexplained
+from triaxcal.rounding import chance, error, number
+from triaxcal.text import diagnosis
+from triaxcal.uncertainty import Stated, budget
 from triaxcal.units import ErrorUnit
 from triaxcald.choices import choices_of
 from triaxcald.doubts import UNIT
+
+NO_LONGER_OF_A_FINDING = ("p_value", "spoiled", "coincidence", "held_out_rms_g", "apart", "residual", "pose_residual_g")
+NO_LONGER_OF_WHAT_IS_UNEXPLAINED = ("p_value", "or_spoiled", "or_named", "only_inside")
+"""Keys of 0.1 that mean nothing since names have probabilities: others read them, and find null."""
 
 
 def to_text(document: Mapping[str, Any]) -> str:
@@ -38,47 +52,34 @@ def loop_document(
     calibration = calibration_document(
         loop.after, output_unit=output_unit, reference_unit=reference_unit, stated=stated
     )
-    reference, held = loop.after.reference, loop.held_out
+    reference = loop.after.reference
     small = ErrorUnit.of(reference_unit, reference)
     calibration["warnings"] += remarks
+    for finding in loop.findings:
+        if finding.verdict is Verdict.ADOPTED:
+            calibration["effects"][finding.effect][WEIGHT] = 1.0
     for pose, before in zip(calibration["poses"], loop.before.poses, strict=True):
         pose["before_residual_g"] = error(before.residual_g, reference)
     return {
         "format": "triaxcal.loop/1",
+        "call": loop.call.value,
+        "summary": list(diagnosis.lines(loop, small, next_recording(loop.after, budget(loop.after, stated)))),
         "before": residual_document(loop.before.residual, reference),
         "after": residual_document(loop.after.residual, reference),
-        **(
+        **({"held_out": _held_out(loop.held_out, reference)} if loop.held_out else {}),
+        "findings": [_finding(f, loop.refusal, reference_unit) for f in loop.findings],
+        "candidates": [
             {
-                "held_out": {
-                    "before_rms_g": error(held.before_rms_g, reference),
-                    "after_rms_g": error(held.after_rms_g, reference),
-                    "noise_floor_g": error(held.noise_floor_g, reference),
-                    "poses": held.poses,
-                }
+                "effect": c.effect,
+                "probability": chance(c.probability),
+                "coefficients": coefficients_document(c.coefficients, reference_unit),
             }
-            if held
-            else {}
-        ),
-        "findings": [
-            {
-                "effect": f.effect,
-                "verdict": f.verdict,
-                "p_value": probability(f.p_value),
-                "coefficients": coefficients_document(f.coefficients, reference_unit),
-                "alternatives": list(f.alternatives),
-                "spoiled": [moment(began) for began in f.spoiled],
-                "coincidence": probability(f.coincidence),
-                "held_out_rms_g": {n: error(held.instead[n], reference) for n in f.alternatives if n in held.instead}
-                if held
-                else {},
-                "reason": small.in_words(f.reason),
-                "remedy": f.remedy,
-                "apart": [small.in_words(line) for line in f.apart],
-                "residual": residual_document(f.step.residual, reference),
-                "pose_residual_g": [error(p.residual_g, reference) for p in f.step.poses],
-            }
-            for f in loop.findings
+            for c in loop.candidates
         ],
+        "probabilities": {name: chance(p) for name, p in loop.probabilities.items()},
+        "nothing_probability": chance(loop.found.nothing),
+        "another_unit": _another(loop),
+        "not_corrected": None if loop.refusal is None else loop.refusal.value,
         "choices": [
             {
                 "corrected_by": list(choice.corrected_by),
@@ -87,17 +88,56 @@ def loop_document(
             }
             for choice in choices_of(loop, held_by_device)
         ],
-        "unexplained": {
-            "significant": loop.unexplained.significant,
-            "p_value": probability(loop.unexplained.p_value),
-            "rms_g": error(loop.unexplained.rms_g, reference),
-            "lead": small.in_words(loop.unexplained.lead),
-            "or_spoiled": loop.unexplained.or_spoiled,
-            "or_named": loop.unexplained.or_named,
-            "only_inside": loop.unexplained.only_inside,
-        },
-        **({"doubts": [UNIT]} if unit_in_doubt else {}),
+        "unexplained": _unexplained(loop.found.unexplained, small, reference),
+        **({"doubts": [UNIT]} if unit_in_doubt or loop.found.another else {}),
         "data_quality": list(data_quality),
-        "advice": [small.in_words(line) for line in loop.advice],
+        "advice": list(diagnosis.advice(loop, small)),
         "calibration": calibration,
+    }
+
+
+def _finding(f: Finding, refusal: Refusal | None, reference_unit: str) -> Document:
+    return {
+        "effect": f.effect,
+        "verdict": f.verdict.value,
+        "probability": chance(f.probability),
+        "coefficients": coefficients_document(f.coefficients, reference_unit),
+        "alternatives": list(f.alternatives),
+        "probabilities": {name: chance(p) for name, p in f.alternatives.items()},
+        "reason": diagnosis.reason(f, refusal),
+        "remedy": f.remedy,
+        **dict.fromkeys(NO_LONGER_OF_A_FINDING),
+    }
+
+
+def _unexplained(part: Unexplained, small: ErrorUnit, reference: float) -> Document:
+    return {
+        "significant": part.significant,
+        "probability": chance(part.probability),
+        "kind": None if part.kind is None else part.kind.value,
+        "rms_g": error(part.rms_g, reference),
+        "lead": diagnosis.unexplained(part, small) if part.significant else "",
+        **dict.fromkeys(NO_LONGER_OF_WHAT_IS_UNEXPLAINED),
+    }
+
+
+def _another(loop: Loop) -> Document | None:
+    """From which pose on there is another unit, or another mounting; None where that is unlikely."""
+    found = loop.found.another
+    if found is None:
+        return None
+    began = loop.after.poses[found.pose].pose.began
+    return {
+        "start_s": number(began.start_s),
+        **({} if began.recording is None else {"recording": began.recording}),
+        "probability": chance(found.probability),
+    }
+
+
+def _held_out(held: HeldOut, reference: float) -> Document:
+    return {
+        "before_rms_g": error(held.before_rms_g, reference),
+        "after_rms_g": error(held.after_rms_g, reference),
+        "noise_floor_g": error(held.noise_floor_g, reference),
+        "poses": held.poses,
     }

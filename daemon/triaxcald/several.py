@@ -8,9 +8,14 @@ from typing import Any
 from triaxcal.agreement import Agreement, Common, SharedShape
 from triaxcal.calibration_document import Document
 from triaxcal.loop import Loop
-from triaxcal.rounding import error, number, probability, uncertainty
+from triaxcal.posterior.shapes import Shape
+from triaxcal.rounding import chance, error, number, uncertainty
 from triaxcal.runs import residuals_by_run
+from triaxcal.text.agreement import verdict
 from triaxcal.units import in_units_of
+
+NO_LONGER_OF_AN_EFFECT = ("worse", "gain", "units_gain", "shown_by")
+"""Keys of 0.1 that mean nothing since effects have probabilities: others read them, and find null."""
 
 
 def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Document:
@@ -36,8 +41,9 @@ def agreement_document(
     """``results`` are the units' own, `triaxcal.loop/1`, and ``names`` their recordings."""
     return {
         "format": "triaxcal.agreement/1",
-        "verdict": found.verdict,
-        "agreed": list(found.agreed),
+        "verdict": verdict(found),
+        "agreed": [name for group in found.agreed for name in group],
+        "nothing_probability": chance(found.nothing),
         "effects": [_effect(c, names, reference_unit) for c in found.effects],
         "units": [{"recording": n, "result": dict(r)} for n, r in zip(names, results, strict=True)],
     }
@@ -50,25 +56,25 @@ def _effect(c: Common, names: Sequence[str], reference_unit: str) -> Document:
     silent = [i for i in range(len(names)) if i not in (*c.named, *c.listed)]
     return {
         "effect": c.effect,
-        "worse": uncertainty(c.worse),
-        "gain": uncertainty(c.gain),
-        "units_gain": [uncertainty(gain) for gain in c.units_gain],
-        "shown_by": recordings(c.shown),
+        "probability": chance(c.probability),
+        "common_values_probability": chance(c.common),
+        "units_probability": [chance(p) for p in c.units],
         "named_by": recordings(c.named),
         "listed_by": recordings(c.listed),
         "not_found_by": recordings(silent),
         "shapes": {name: _shape(shape, names, reference_unit) for name, shape in c.shapes.items()},
+        **dict.fromkeys(NO_LONGER_OF_AN_EFFECT),
     }
 
 
 def _shape(s: SharedShape, names: Sequence[str], reference_unit: str) -> Mapping[str, Any]:
     return {
-        "value": number(s.value, 6),
-        "standard_error": uncertainty(s.standard_error),
-        "unit": in_units_of(s.unit, reference_unit),
-        "p_value": probability(s.p_value),
-        "own": [
-            {"recording": names[i], "value": number(value, 6), "standard_error": uncertainty(deviation)}
-            for i, (value, deviation) in zip(s.units, s.own, strict=True)
-        ],
+        **_value(s.shared),
+        "unit": in_units_of(s.shared.unit, reference_unit),
+        "p_value": None,
+        "own": [{"recording": names[i], **_value(own)} for i, own in s.own.items()],
     }
+
+
+def _value(s: Shape) -> Mapping[str, Any]:
+    return {"value": number(s.value, 6), "standard_error": uncertainty(s.standard_error)}

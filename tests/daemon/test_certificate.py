@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.calibration_reading import sensor_of
+from triaxcal.calibration_reading import calibration_of
 from triaxcal.errors import Refused
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.profile import BUILT_IN, Bundle, parse_bundle
-from triaxcald.certificate import Certified, certify, roles
+from triaxcald.certificate import Certified, certify, held_by_device, roles
 from triaxcald.documents import to_text
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
@@ -114,29 +114,36 @@ def test_the_registers_hold_the_result_and_what_rounding_costs_is_said(plain: Ce
     made = plain
     registers = made.document["registers"]
     assert registers["terms"] == ["linear", "second_order_nonlinearity"]
-    assert registers["left_to_host"] == []
+    assert set(registers["left_to_host"]) == set(made.loop.after.terms) - set(registers["terms"])
     assert registers["holds"] == []  # what depends on the direction alone has no conditions
     assert 0 < registers["rounding_rms_g"] < 1e-6
     words = {w["role"]: w for w in registers["words"]}
-    sensor, _, _ = sensor_of(made.document, where="certificate")
-    for role, value in roles(sensor, {}).items():
-        assert words[role]["wanted"] == pytest.approx(value, rel=1e-10)
+    held = held_by_device(_bundle().profile, calibration_of(made.document, where="certificate"))
+    assert held is not None
+    for role, value in roles(held.registers.calibration.sensor, {}).items():
+        assert words[role]["wanted"] == pytest.approx(value, rel=1e-8, abs=1e-12)
         assert words[role]["held"] == pytest.approx(value, rel=2**-23)
     assert words["temperature_bias.x"]["held"] == 0.0
     assert made.image is not None
     assert made.image.words[-1].role == "calibration_crc"
 
 
-def test_an_effect_without_registers_is_left_to_the_host_and_the_rest_fitted_anew(anew: Make, plain: Certified) -> None:
+def test_an_effect_without_registers_is_left_to_the_host_and_the_linear_part_comes_as_near_as_it_can(
+    anew: Make, plain: Certified
+) -> None:
     full, cut = plain, anew(_bundle(_without_second_order))
     assert cut.document["result"]["after"] == full.document["result"]["after"]
     registers = cut.document["registers"]
     assert registers["terms"] == ["linear"]
-    assert registers["left_to_host"] == ["second_order_nonlinearity"]
-    assert registers["rms_g"] == pytest.approx(full.document["result"]["before"]["rms_g"], rel=1e-6)
+    assert "second_order_nonlinearity" in registers["left_to_host"]
+    # What is left is what a linear fit leaves, and the cost says so over the sphere.
+    before = full.document["result"]["before"]["rms_g"]
+    assert registers["rms_g"] == pytest.approx(before, rel=0.1)
+    assert registers["cost_rms_g"] == pytest.approx(before, rel=0.3)
     words = {w["role"]: w["wanted"] for w in registers["words"]}
-    linear = cut.loop.before.sensor
-    np.testing.assert_allclose([words[f"bias.{a}"] for a in "xyz"], linear.bias, rtol=1e-9)
+    linear = cut.loop.before
+    off = [words[f"bias.{a}"] for a in "xyz"] - linear.sensor.bias
+    assert np.all(np.abs(off) < 0.3 * before)
 
 
 def test_a_device_without_calibration_registers_gets_a_certificate_all_the_same(
@@ -148,7 +155,7 @@ def test_a_device_without_calibration_registers_gets_a_certificate_all_the_same(
     made = anew(_bundle(without_roles))
     assert made.image is None
     assert made.document["registers"] is None
-    assert made.document["result"]["findings"]
+    assert made.document["result"]["calibration"]["effects"]
 
 
 def test_what_no_register_can_hold_is_refused(anew: Make) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from triaxcal.calibration import Exclusion
 from triaxcal.calibration_document import calibration_document, poses_document
-from triaxcal.calibration_reading import calibration_part, sensor_of
+from triaxcal.calibration_reading import calibration_of, calibration_part, sensor_of
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.part import Part
@@ -143,6 +143,46 @@ def test_a_loop_says_what_each_pose_was_before(poses: list[Pose]) -> None:
     after = np.array([p["residual_g"] for p in document["calibration"]["poses"]])
     assert np.sqrt(np.mean(before**2)) == pytest.approx(document["before"]["rms_g"], abs=2e-11)
     assert np.sqrt(np.mean(after**2)) == pytest.approx(document["after"]["rms_g"], abs=2e-11)
+
+
+def test_a_loop_has_the_keys_of_the_contract() -> None:
+    rng = np.random.default_rng(3)
+    warm = replace(TRUTH, effects=((effect_named("temperature_bias"), np.array([3e-4, -2e-4, 4e-4])),))
+    ups = np.array([v for _, v in directions(26)])
+    held = {"temp_c": 25 + rng.permutation(np.linspace(-5, 5, 26))}
+    loop = diagnose(noisy_poses(warm, ups, 1e-5, rng, channels=held, channel_reference={"temp_c": 25.0}), signs=SIGNS)
+    document = json.loads(to_text(loop_document(loop)))
+    assert document["call"] == loop.call
+    assert len(document["summary"]) == 4
+    (finding,) = document["findings"]
+    assert finding["verdict"] == loop.findings[0].verdict
+    assert finding["probability"] == document["probabilities"][finding["effect"]] > 0.5
+    assert set(finding["probabilities"]) == set(finding["alternatives"])
+    # What 0.1 had, and means nothing since names have probabilities.
+    assert [finding[key] for key in ("p_value", "coincidence", "spoiled", "apart", "residual")] == [None] * 5
+    left = document["unexplained"]
+    assert (left["significant"], left["p_value"], left["or_named"]) == (False, None, None)
+    assert 0 < left["probability"] < 0.5
+    assert document["not_corrected"] is document["another_unit"] is None
+    assert 0 < document["nothing_probability"] < 1e-3 or document["nothing_probability"] == 0.0
+    calibration = document["calibration"]
+    assert calibration["next_recording"]["source"] == "assumed"
+    assert calibration["next_recording"]["start_to_start_g"] == 2e-3
+    assert calibration["next_recording"]["expanded_uncertainty_g"] > 2 * 2e-3 * 0.9
+    assert all(0 <= p["outlier_probability"] < 0.5 for p in calibration["poses"])
+
+
+def test_each_effect_of_an_average_has_its_weight_and_that_comes_back(poses: list[Pose]) -> None:
+    loop = diagnose(poses, signs=SIGNS)
+    document = json.loads(to_text(loop_document(loop)))
+    weights = {name: held["weight"] for name, held in document["calibration"]["effects"].items()}
+    adopted = {f.effect for f in loop.findings if f.verdict == "adopted"}
+    assert weights == {
+        name: 1.0 if name in adopted else pytest.approx(p, abs=1e-4) for name, p in loop.after.weights.items()
+    }
+    back = calibration_of(document, where="x")
+    assert back.weights == weights
+    assert [e for e, _ in back.sensor.effects] == [e for e, _ in loop.after.sensor.effects]
 
 
 def test_an_effect_stands_in_the_document_in_full_whatever_part_of_it_was_fitted(poses: list[Pose]) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from triaxcal.calibration_document import assumed_in
 from triaxcal.uncertainty.basis import ThermometerAt, UnmodelledTemperature
-from triaxcald.remarks import SHARE, assumption, none_could_show, overlap
+from triaxcald.remarks import assumption, none_could_show
 
 
 @pytest.mark.parametrize(
@@ -29,16 +29,11 @@ def test_nothing_is_said_of_an_assumption_that_nobody_made() -> None:
     assert assumption(assumed_in(ThermometerAt(25.0))) == ""
 
 
-def test_shares_are_explained_where_there_are_several() -> None:
-    one, other = f"93{SHARE}the time", f"60{SHARE}temp_c"
-    assert overlap(f"{one}; {other}").startswith("each share is of the squares of all that is left")
-    assert overlap(f"{one}; inside the poses |a| moves too") == ""
-
-
 def test_none_could_show_where_none_of_direction_and_time_does() -> None:
     every = {
         "second_order_nonlinearity", "third_order_nonlinearity", "scale_factor_asymmetry", "cross_coupling",
-        "bias_drift", "warm_up", "bias_step", "hysteresis",
+        "bias_drift", "warm_up", "bias_step", "hysteresis", "fifth_order_nonlinearity", "compression",
+        "scale_factor_drift", "remanence",
     }  # fmt: skip
     assert none_could_show(every)
     assert none_could_show({*every, "temperature_bias"})

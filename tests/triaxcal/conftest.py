@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from triaxcal.effects import effect_named
+from triaxcal.planning.directions import directions
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.sensor import Sensor
 from triaxcal.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.synthetic import noisy_poses
+
+POSE_NOISE_G = 2e-5
+"""Of the poses that have whatever effects a test asks for."""
 
 
 @pytest.fixture(scope="session")
@@ -66,3 +72,32 @@ def detect() -> Callable[..., tuple[Windows, list[Span], list[Pose]]]:
         return windows, spans, poses_of(windows, spans)
 
     return run
+
+
+@pytest.fixture
+def poses_with(with_effects: Callable[..., Sensor]) -> Callable[..., list[Pose]]:
+    """Thirty poses all over the sphere, in an order of their own, and a temperature that goes up and down, as (seed,
+    name=coefficients). On faces, vertices and edges of a cube an axis reads four values alone, and odd functions of
+    that reading look alike."""
+    spread = np.array([up for _, up in directions(30)])
+
+    def make(seed: int, noise_g: float = POSE_NOISE_G, **effects: list[float]) -> list[Pose]:
+        rng = np.random.default_rng(seed)
+        ups = rng.permutation(spread)
+        warm = {"temp_c": 25 + 2 * np.sin(np.arange(len(ups)) / 3 + seed)}
+        reference = {"temp_c": 25.0}
+        return noisy_poses(with_effects(**effects), ups, noise_g, rng, channels=warm, channel_reference=reference)
+
+    return make
+
+
+@pytest.fixture
+def knocked() -> Callable[[list[Pose], int, float], list[Pose]]:
+    """The poses, one of them off by so much along its own direction, in g of the paper's unit."""
+
+    def make(poses: list[Pose], which: int, by_g: float) -> list[Pose]:
+        pose = poses[which]
+        off = replace(pose, mean=pose.mean * (1 + by_g))
+        return [*poses[:which], off, *poses[which + 1 :]]
+
+    return make

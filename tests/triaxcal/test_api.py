@@ -295,8 +295,19 @@ def test_the_budget_counts_what_the_calibration_was_made_with(poses: Any) -> Non
 def test_a_diagnosis_says_itself_in_a_few_lines(diagnosed: tc.Diagnosis) -> None:
     lines = repr(diagnosed).splitlines()
     assert lines[0] == "Diagnosis"
-    assert lines[1] == f"  {diagnosed.findings[0].effect}: {diagnosed.findings[0].verdict}"
-    assert any(line.startswith("  residual rms ") and line.endswith(" after") for line in lines)
+    assert lines[1] == f"  {diagnosed.call}"
+    assert lines[2].startswith(f"  {diagnosed.findings[0].effect} (")
+    assert lines[3].startswith("  residual rms ")
+    assert len(lines) == 5
+
+
+def test_a_diagnosis_has_what_acts_with_its_probability(diagnosed: tc.Diagnosis) -> None:
+    (finding,) = diagnosed.findings
+    assert diagnosed.probabilities[finding.effect] == finding.probability > 0.99
+    assert list(diagnosed.probabilities.values()) == sorted(diagnosed.probabilities.values(), reverse=True)
+    assert diagnosed.candidates == ()
+    assert diagnosed.unexplained.probability < 0.5
+    assert diagnosed.next_recording.expanded_uncertainty > diagnosed.next_recording.start_to_start
 
 
 @pytest.mark.parametrize("reference", ["1", None, 0.0, -1.0, float("nan"), [1.0]])

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import triaxcal.effects
-from triaxcal.effects import CATALOGUE, TIME, TO_COME, Effect, catalogue_for, effect_named, effect_of
+from triaxcal.effects import CATALOGUE, TIME, Effect, catalogue_for, effect_named, effect_of
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
@@ -43,21 +43,19 @@ from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.loop import diagnose
 from triaxcal.pose_fit import fit
-from triaxcal.search.candidates import Ground, faults_of
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
+from triaxcal.text.advice import advice
+from triaxcal.units import ErrorUnit
 
 # The names that others script against (the contract of the command line).
 AGREED = {
     "second_order_nonlinearity", "third_order_nonlinearity", "scale_factor_asymmetry", "cross_coupling",
     "temperature_bias", "temperature_bias_quadratic", "temperature_scale_factor", "thermal_gradient",
-    "bias_drift", "warm_up", "bias_step", "hysteresis", "vibration_rectification",
+    "bias_drift", "warm_up", "bias_step", "hysteresis", "vibration_rectification", "fifth_order_nonlinearity",
+    "compression", "scale_factor_drift", "temperature_lag", "remanence",
 }  # fmt: skip
-# Known to documents, and not looked for.
-AGREED_TO_COME = {
-    "fifth_order_nonlinearity", "compression", "scale_factor_drift", "temperature_lag", "remanence",
-}  # fmt: skip
-KNOWN = (*CATALOGUE, *TO_COME)
+KNOWN = CATALOGUE
 FORMS = [form for effect in KNOWN for form in effect.forms]
 CHANNEL_EFFECTS: list[Effect] = [ChannelBias("supply_v"), ChannelScaleFactor("supply_v")]
 EVERY = [*FORMS, *CHANNEL_EFFECTS]
@@ -126,18 +124,13 @@ def held(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("effect", KNOWN, ids=each)
 def test_the_name_is_one_agreed_on_and_units_and_remedy_are_stated(effect: Effect) -> None:
-    assert effect.name in AGREED | AGREED_TO_COME
+    assert effect.name in AGREED
     assert effect_named(effect.name) is effect
     assert effect.remedy.endswith(".")
 
 
 def test_the_catalogue_has_every_name_that_is_agreed_on_once() -> None:
     assert sorted(e.name for e in CATALOGUE) == sorted(AGREED)
-
-
-def test_what_is_to_come_is_known_by_its_name_and_looked_for_by_nobody() -> None:
-    assert sorted(e.name for e in TO_COME) == sorted(AGREED_TO_COME)
-    assert not {e.name for e in catalogue_for(HERE)} & AGREED_TO_COME
 
 
 @pytest.mark.parametrize("effect", EVERY, ids=each)
@@ -391,9 +384,7 @@ def test_every_effect_is_one_file_of_its_own_name() -> None:
 def test_the_conditions_that_need_no_channel_are_those_of_the_contract() -> None:
     assert set(DERIVED) == {TIME, SINCE_START, HELD, *BEFORE, *CHANGE, *SCATTER, RUN}
     for effect in CATALOGUE:
-        assert set(effect.needs) <= {*DERIVED, "temp_c", "temp_c.rate"}
-    for effect in TO_COME:
-        assert all(n in DERIVED or n == "temp_c" or lag_in(n) for n in effect.needs)
+        assert all(n in {*DERIVED, "temp_c", "temp_c.rate"} or lag_in(n) for n in effect.needs)
 
 
 # Effects of other packages.
@@ -584,16 +575,15 @@ class Failing(Radiation):
     poses = noisy_poses(sensor, twenty_six, 1.5e-5, rng, channels={"dose_gy": dose})
     loop = diagnose(poses, signs=(-1, -1, -1))
     assert [f.effect for f in loop.findings] == ["channel_bias:dose_gy"]
-    assert loop.search is not None
-    ground = Ground.at(loop.search.problem, loop.search.linear.state)
-    ((name, why),) = faults_of(ground, [*CATALOGUE, radiation]).items()
+    ((name, why),) = loop.faulty.items()
     assert name == "radiation"
     assert reason in why
-    assert f"the effect radiation of the package dosimetry-effects was left out: {why}" in loop.advice
+    said = list(advice(loop, ErrorUnit.of("g", 1.0)))
+    assert f"the effect radiation of the package dosimetry-effects was left out: {why}" in said
     # Who asks for it all the same gets one line that names it.
     asked = partial(fit, poses, signs=(-1, -1, -1), effects=[radiation])
     if method == "variants":
-        asked = partial(radiation.variants, ground.problem.conditions)
+        asked = partial(radiation.variants, loop.seen.evidence.rows.problem.conditions)
     with pytest.raises(InvalidData, match="the effect radiation of the package dosimetry-effects: "):
         asked()
 

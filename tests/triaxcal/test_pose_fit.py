@@ -37,8 +37,18 @@ COEFFICIENTS: dict[str, list[float]] = {
     "bias_step": [1e-3, -1e-3, 2e-3],
     "hysteresis": [1e-3, 1e-3, -2e-3],
     "vibration_rectification": [10.0, -20.0, 30.0],
+    "fifth_order_nonlinearity": [1e-3, -2e-3, 1e-3],
+    "compression": [3e-3, 2e-3, -3e-3],
+    "scale_factor_drift": [1e-5, -1e-5, 2e-5],
+    "temperature_lag": [1e-4, 2e-4, -1e-4],
+    "remanence": [1e-3, -1e-3, 2e-3],
 }
-SHAPES = {"warm_up": {"time_constant": 80.0}, "bias_step": {"at": 75.0}}
+SHAPES = {
+    "compression": {"knee": 0.5},
+    "temperature_lag": {"time_constant": 30.0},
+    "warm_up": {"time_constant": 80.0},
+    "bias_step": {"at": 75.0},
+}
 # On these poses a drift that bends and a step in the middle of one have columns of their own.
 ALL_ON = tuple(e.shaped(SHAPES[e.name]) if e.shape else e for e in CATALOGUE)
 
@@ -64,7 +74,7 @@ def everything_on(paper_unit: Sensor, directions: np.ndarray, seed: int = 0) -> 
         )
         for i, p in enumerate(noisy_poses(sensor, directions, 1e-4, rng, channels=there, channel_reference=reference))
     ]
-    problem = problem_of(poses, signs=MINUS)
+    problem = problem_of(poses, signs=MINUS, effects=ALL_ON)
     linear = start(problem, poses, MINUS)
     problem = with_history(problem, poses, linear.sensor(problem))
     theta = np.concatenate([linear.theta, *(np.array(COEFFICIENTS[e.name]) for e in ALL_ON)])

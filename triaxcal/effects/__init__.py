@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.catalogue import CATALOGUE, TO_COME
+from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR, ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import TIME, Coefficient, Effect, channel_of, is_derived
 from triaxcal.effects.empirical import Empirical
@@ -33,7 +33,7 @@ def effect_named(name: str) -> Effect:
     for prefix, made in ((BIAS, ChannelBias), (SCALE_FACTOR, ChannelScaleFactor)):
         if name.startswith(prefix) and len(name) > len(prefix):
             return made(name[len(prefix) :])
-    return {effect.name: effect for effect in (*plugins()[0], *CATALOGUE, *TO_COME, Empirical())}[name]
+    return {effect.name: effect for effect in (*plugins()[0], *CATALOGUE, Empirical())}[name]
 
 
 def effect_of(name: str, values: Mapping[str, float]) -> tuple[Effect, Floats]:
@@ -53,4 +53,4 @@ def effect_of(name: str, values: Mapping[str, float]) -> tuple[Effect, Floats]:
     raise KeyError(f"{name}.{next((n for n in values if n not in known), ', '.join(values))}")
 
 
-__all__ = ["CATALOGUE", "TIME", "TO_COME", "Coefficient", "Effect", "catalogue_for", "effect_named", "effect_of"]
+__all__ = ["CATALOGUE", "TIME", "Coefficient", "Effect", "catalogue_for", "effect_named", "effect_of"]

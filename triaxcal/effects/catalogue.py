@@ -36,15 +36,10 @@ CATALOGUE: tuple[Effect, ...] = (
     BiasStep(),
     Hysteresis(),
     VibrationRectification(),
-)
-"""Those that need no channel but the temperature."""
-
-# Not looked for yet: every further candidate raises the price of a name, and what a recording shows would change.
-TO_COME: tuple[Effect, ...] = (
     FifthOrderNonlinearity(),
     Compression(),
     ScaleFactorDrift(),
     TemperatureLag(),
     Remanence(),
 )
-"""Those that documents, fits and simulated units know by their names, and no search tries unless it is told to."""
+"""Those that need no channel but the temperature."""

@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.catalogue import CATALOGUE, TO_COME
+from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR
 from triaxcal.effects.contract import DERIVED, RUN, SINCE_START, Effect
 from triaxcal.effects.empirical import Empirical
@@ -151,7 +151,7 @@ def _check(effect: Any) -> None:
     """Raises whatever keeps what an effect says of itself from being used."""
     if not (isinstance(effect.name, str) and effect.name and effect.coefficients and isinstance(effect.remedy, str)):
         raise TypeError("an effect has a name, coefficients and a remedy")
-    if effect.name in (LINEAR, *(e.name for e in (*CATALOGUE, *TO_COME, Empirical(), *BETWEEN_RUNS))):
+    if effect.name in (LINEAR, *(e.name for e in (*CATALOGUE, Empirical(), *BETWEEN_RUNS))):
         raise ValueError(f"the name {effect.name} is taken by triaxcal")
     if effect.name.startswith((BIAS, SCALE_FACTOR)):
         raise ValueError(f"the name {effect.name} is that of an effect of a channel")

@@ -6,12 +6,12 @@ Grows beside the loop (`triaxcal.loop`), and is measured against it by `benchmar
 from triaxcal.posterior.actions import Action, Do
 from triaxcal.posterior.advice import Advice, Expected, advice
 from triaxcal.posterior.average import Average, Refusal, average, refusal
-from triaxcal.posterior.findings import Another, Findings, Named, Unmodelled, findings
+from triaxcal.posterior.findings import Another, Findings, Named, Unexplained, findings
 from triaxcal.posterior.odds import Odds
 from triaxcal.posterior.posterior import Posterior, posterior
 from triaxcal.posterior.together import Together, together
 
 __all__ = [
     "Action", "Advice", "Another", "Average", "Do", "Expected", "Findings", "Named", "Odds", "Posterior", "Refusal",
-    "Together", "Unmodelled", "advice", "average", "findings", "posterior", "refusal", "together",
+    "Together", "Unexplained", "advice", "average", "findings", "posterior", "refusal", "together",
 ]  # fmt: skip

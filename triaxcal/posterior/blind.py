@@ -8,9 +8,9 @@ from enum import StrEnum
 
 import numpy as np
 
+from triaxcal.conditions import still_conditions
 from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, rate_of
 from triaxcal.posterior.evidence import Evidence
-from triaxcal.search.candidates import still_conditions
 from triaxcal.visibility import VISIBLE
 
 

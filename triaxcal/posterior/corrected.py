@@ -12,6 +12,7 @@ from triaxcal.caution import BirgeRatio, ExcessVariance
 from triaxcal.posterior.average import Average, average, linear_alone, refusal
 from triaxcal.posterior.posterior import Posterior
 from triaxcal.posterior.rows import Rows
+from triaxcal.posterior.shapes import shapes_of
 from triaxcal.problem import State, linearise
 from triaxcal.pure_error import lack_of_fit_p, pure_error_dof
 from triaxcal.uncertainty.linearised import held_gain
@@ -32,6 +33,7 @@ def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
         thermal=made.thermal,
         spread=made.spread,
         weights=made.weights,
+        shape_errors=_shape_errors(seen, made),
         channel_reference={name: rows.problem.channel_reference[name] for name in needed},
         inflation=1.0,
         excess_g=0.0,
@@ -43,6 +45,17 @@ def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
         linear_only=before if made.sensor.effects else None,
     )
     return _with_residuals(after, rows, made) if made.sensor.effects else after
+
+
+def _shape_errors(seen: Posterior, made: Average) -> dict[str, float]:
+    """Of the shapes that stand for the effects, about what the posterior has of them."""
+    out = {}
+    for effect, _ in made.sensor.effects:
+        for name, shape in shapes_of(seen, effect.name).items():
+            if shape.standard_error is not None:
+                off = shape.value - effect.shape[name][0]
+                out[f"{effect.name}.{name}"] = float(np.hypot(shape.standard_error, off))
+    return out
 
 
 def _with_residuals(c: Calibration, rows: Rows, made: Average) -> Calibration:

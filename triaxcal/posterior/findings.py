@@ -27,15 +27,15 @@ class Named:
 
 
 @dataclass(frozen=True)
-class Unmodelled:
-    """Something acts that no name describes: with which ``probability``, with ``what`` it goes most likely, and how
+class Unexplained:
+    """Something acts that no name describes: with which ``probability``, of which ``kind`` it is most likely, and how
     large it then is, as an rms of |a| over the poses, in the unit of the reference."""
 
     probability: float
-    what: What | None
-    rms: float
-    likely: bool
-    """Whether it is to be told."""
+    kind: What | None
+    rms_g: float
+    significant: bool
+    """Whether it is likelier than not."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Findings:
     named: tuple[Named, ...]
     candidates: Mapping[str, float]
     outliers: Mapping[int, float]
-    unmodelled: Unmodelled
+    unexplained: Unexplained
     another: Another | None
     nothing: float
 
@@ -71,13 +71,13 @@ def findings(seen: Posterior) -> Findings:
         named=tuple(Named({name: seen.of_names[name] for name in group}) for group in seen.certain),
         candidates={n: p for n, p in seen.of_names.items() if p >= odds.reported and n not in certain},
         outliers=dict(sorted(outliers.items(), key=lambda item: -item[1])),
-        unmodelled=_unmodelled(seen),
+        unexplained=_unexplained(seen),
         another=Another(another, from_there_on) if from_there_on >= odds.reported else None,
         nothing=_nothing(seen),
     )
 
 
-def _unmodelled(seen: Posterior) -> Unmodelled:
+def _unexplained(seen: Posterior) -> Unexplained:
     rows, total = seen.evidence.rows, seen.of_unmodelled
     variance = 0.0
     for p, part in zip(seen.of_parts, seen.evidence.parts, strict=True):
@@ -86,7 +86,7 @@ def _unmodelled(seen: Posterior) -> Unmodelled:
             variance += float(p) * part.tau**2 * float(np.mean(squares))
     likeliest = next((what for what in seen.of_kinds if what is not What.INSIDE), None)
     rms = float(np.sqrt(variance / total)) if total > 0 else 0.0
-    return Unmodelled(total, likeliest, rms, total >= seen.evidence.odds.reported)
+    return Unexplained(total, likeliest, rms, total >= seen.evidence.odds.reported)
 
 
 def _nothing(seen: Posterior) -> float:

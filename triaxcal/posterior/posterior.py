@@ -13,8 +13,8 @@ from scipy.special import logsumexp
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
-from triaxcal.conditions import channels_of
-from triaxcal.effects import TO_COME, catalogue_for
+from triaxcal.conditions import channels_of, still_conditions
+from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.poses.pose import Pose
@@ -26,7 +26,6 @@ from triaxcal.posterior.terms import terms_of
 from triaxcal.posterior.unmodelled import What
 from triaxcal.problem import State, everything
 from triaxcal.runs import by_run
-from triaxcal.search.candidates import still_conditions
 
 ROUNDS = 3
 """Of linearising anew: each is a step of Gauss and Newton."""
@@ -58,6 +57,12 @@ class Posterior:
         """The outliers in a set."""
         poses = (self.evidence.terms[i].pose for i in found.members)
         return frozenset(pose for pose in poses if pose >= 0)
+
+    def resized(self, smallest_g: float) -> Posterior:
+        """The same sets with sizes that begin elsewhere, as `posterior` has them."""
+        evidence = Evidence(self.evidence.rows, self.evidence.terms, self.evidence.odds, smallest_g)
+        sets = [evidence.of_set(found.members, found.parts) for found in self.sets]
+        return Posterior(evidence, sorted(sets, key=lambda found: -found.total))
 
     def given(self, name: str) -> Posterior:
         """If this effect acts."""
@@ -200,7 +205,7 @@ def looked_for(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None)
     the channels that move in these poses."""
     sound = [p for p in poses if not p.fault]
     if catalogue is None:
-        catalogue = (*catalogue_for(set(channels_of(sound)) - still_conditions(sound)), *TO_COME)
+        catalogue = catalogue_for(set(channels_of(sound)) - still_conditions(sound))
     return by_run(catalogue, sound)
 
 

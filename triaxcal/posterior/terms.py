@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
+from triaxcal.conditions import still_conditions
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
-from triaxcal.effects.plugins import EffectFault
+from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.errors import Refused
 from triaxcal.planning.directions import directions
 from triaxcal.posterior.odds import Odds
 from triaxcal.posterior.rows import Rows
-from triaxcal.search.candidates import still_conditions
 
 FEWEST = 4
 """Poses that another unit or mounting has at least: fewer are outliers."""
@@ -59,6 +59,22 @@ def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds) -> list[Term]:
     share = np.log(odds.effect / max(len(able), 1))
     terms = [term for effect in able for term in _of_effect(rows, effect, share, odds)]
     return [*terms, *(_outlier(rows, i, odds) for i in range(rows.n)), *_another(rows, odds)]
+
+
+def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
+    """Effects of other packages that cannot be used in these poses, though they could be loaded: name → reason."""
+    found = {}
+    known, held = rows.problem.channel_reference, rows.problem.conditions
+    s = rows.state.sensor(rows.problem).along_axes(rows.problem.u, held)
+    for effect in catalogue:
+        if is_foreign(effect) and all(n in known for n in effect.needs):
+            try:
+                for variant in effect.variants(held):
+                    variant.basis(s, held)
+                    variant.slope(s, held)
+            except EffectFault as e:
+                found[effect.name] = e.reason
+    return found
 
 
 def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds) -> Iterator[Term]:

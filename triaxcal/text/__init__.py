@@ -6,11 +6,11 @@ line.
 
 from triaxcal.text.budget import basis, not_evaluated, remedy
 from triaxcal.text.cautions import caution
-from triaxcal.text.holds import holds, use
+from triaxcal.text.holds import as_at, holds, use
 from triaxcal.text.quality import quality, quality_line
-from triaxcal.text.summary import html, loop, poses, short, summary, verification
+from triaxcal.text.summary import html, poses, short, summary, verification
 
 __all__ = [
-    "basis", "caution", "holds", "html", "loop", "not_evaluated", "poses", "quality", "quality_line", "remedy",
+    "as_at", "basis", "caution", "holds", "html", "not_evaluated", "poses", "quality", "quality_line", "remedy",
     "short", "summary", "use", "verification",
 ]  # fmt: skip

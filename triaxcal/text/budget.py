@@ -57,9 +57,23 @@ def _(b: of.CompetingModels) -> str:
 
 
 @basis.register
+def _(b: of.AveragedModels) -> str:
+    which = f"; {', '.join(b.names)} may act or not" if b.names else ""
+    return f"the spread over all that may act, each by its probability{which}"
+
+
+@basis.register
 def _(b: of.UnmodelledTemperature) -> str:
     untold = "" if b.identifiable else ", but these poses cannot tell what that did"
     return f"{_both(b.effects)} not in the model; the temperature moved by {b.moved_k:.2g} K from pose to pose{untold}"
+
+
+@basis.register
+def _(b: of.ProbableTemperature) -> str:
+    return (
+        f"{_both(b.effects)}, which are not in the model, by the probability and the size that the poses leave them; "
+        f"the temperature moved by {b.moved_k:.2g} K from pose to pose"
+    )
 
 
 @basis.register

@@ -5,41 +5,38 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from triaxcal.figures import moment
+from triaxcal.loop import Call, Candidate, Finding, Loop, Verdict
 from triaxcal.next_recording import NextRecording, Source
 from triaxcal.poses.pose import Began
 from triaxcal.posterior.average import Refusal
-from triaxcal.posterior.blind import Blind, Why
-from triaxcal.posterior.findings import Findings, Unmodelled
-from triaxcal.posterior.loop import Call, Candidate, Finding, Verdict
-from triaxcal.posterior.unmodelled import What
+from triaxcal.posterior.findings import Findings, Unexplained
+from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
 from triaxcal.units import ErrorUnit
 
-ALMOST = 0.999
-"""Probabilities beyond are told as such: by which model they were reckoned matters more."""
-GOES_WITH = {
-    What.NOTHING: "each pose by itself",
-    What.DIRECTION: "the direction",
-    What.ODD: "the sign and the size of an axis's reading",
-    What.EVEN: "the size of an axis's reading",
-    What.BEFORE: "the pose before",
-    What.TIME: "the time",
-}
+__all__ = ["advice", "call", "cause", "chance", "errors", "lines", "reason", "unexplained"]
+
 CALLS = {
     Call.USABLE: "usable",
-    Call.RECORD_MORE: "usable as it is; more poses would tell more",
-    Call.INVESTIGATE: "investigate before use",
+    Call.RECORD_MORE: "record more",
+    Call.INVESTIGATE: "investigate",
 }
+
+
+def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) -> tuple[str, str, str, str]:
+    """The whole in four lines: the call, the cause, the error before and after, and what to do. ``following`` is the
+    next recording where a station knows more of the reference than the poses tell."""
+    began = {i: p.pose.began for i, p in enumerate(loop.after.poses)}
+    before, after = (c.residual.rms_g for c in (loop.before, loop.after))
+    return (
+        call(loop.call),
+        cause(loop.found, loop.findings, loop.candidates, began, small),
+        errors(before, after, following or loop.next_recording, small),
+        to_do(loop, small),
+    )
 
 
 def call(found: Call) -> str:
     return CALLS[found]
-
-
-def chance(p: float) -> str:
-    """A probability as it stands in a sentence."""
-    if p > ALMOST:
-        return f"more than {ALMOST}"
-    return f"less than {1 - ALMOST:.1g}" if p < 1 - ALMOST else f"{p:.2g}" if p < 0.99 else f"{p:.3f}"
 
 
 def cause(
@@ -71,8 +68,8 @@ def _causes(
         yield f"{_named(finding)} acts"
     for candidate in candidates:
         yield f"{candidate.effect} probably acts ({chance(candidate.probability)})"
-    if found.unmodelled.likely:
-        yield unmodelled(found.unmodelled, small)
+    if found.unexplained.significant:
+        yield unexplained(found.unexplained, small)
     if found.outliers:
         poses = ", ".join(f"{moment(began[i])} ({chance(p)})" for i, p in found.outliers.items())
         yield f"outliers, which are left out: {'the pose' if len(found.outliers) == 1 else 'poses'} at {poses}"
@@ -85,12 +82,12 @@ def _named(finding: Finding) -> str:
     return "one of " + ", ".join(f"{name} ({chance(p)})" for name, p in each.items())
 
 
-def unmodelled(part: Unmodelled, small: ErrorUnit) -> str:
+def unexplained(part: Unexplained, small: ErrorUnit) -> str:
     """What no effect of the catalogue describes."""
-    with_what = f"; it goes with {GOES_WITH[part.what]}" if part.what in GOES_WITH else ""
+    with_what = f"; it goes with {GOES_WITH[part.kind]}" if part.kind in GOES_WITH else ""
     return (
         f"something acts that no effect describes (probability {chance(part.probability)}), "
-        f"{small.in_full(part.rms)} rms{with_what}"
+        f"{small.in_full(part.rms_g)} rms{with_what}"
     )
 
 
@@ -106,41 +103,11 @@ def reason(finding: Finding, refusal: Refusal | None) -> str:
     return said
 
 
-REFUSED = {
-    Refusal.UNMODELLED: "something that no effect describes acts as well",
-    Refusal.ANOTHER: "one calibration does not hold in all poses",
-    Refusal.ONE_POSE: "what was found hangs on a single pose",
-}
-
-
 def errors(before_rms: float, after_rms: float, following: NextRecording, small: ErrorUnit) -> str:
     """The residual before and after, and what to expect of the next recording."""
     how = {Source.ASSUMED: "assumed", Source.MEASURED: "measured"}[following.source]
     start, within = small.in_full(following.start_to_start), small.in_full(following.expanded_uncertainty)
     return (
-        f"residual rms {small.in_full(before_rms)} before, {small.in_full(after_rms)} after; in the next recording "
-        f"within {within} (expanded, with {start} from start to start, {how})"
+        f"residual rms {small.in_full(before_rms)} before, {small.in_full(after_rms)} after; expanded uncertainty in "
+        f"the next recording {within} ({start} from start to start, {how})"
     )
-
-
-def blind(why: Blind) -> str:
-    """Why poses cannot show an effect in full."""
-    match why.why:
-        case Why.NOT_LOGGED:
-            return f"channel {why.channel} is not logged"
-        case Why.SOMETIMES_LOGGED:
-            return f"channel {why.channel} is not logged in every pose"
-        case Why.RATE_UNKNOWN:
-            return f"how fast {why.channel} changes is not known in every pose"
-        case Why.NOT_KNOWN:
-            return f"{why.channel} is not known"
-        case Why.STOOD_STILL:
-            return f"{why.channel} stood still"
-        case Why.EVEN_RATE:
-            return f"{why.channel} changes no faster in one pose than in another"
-        case Why.EVEN_SCATTER:
-            return "the readings scatter alike in all poses"
-        case Why.MOVED_ALONG:
-            return "too few poses, or what it goes with moved along with their directions"
-        case Why.FEW_DIRECTIONS:
-            return "the poses point in too few directions"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from triaxcal.calibration import HoldsAt
 from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import (
     DERIVED,
@@ -18,6 +19,7 @@ from triaxcal.effects.contract import (
     rate_of,
 )
 from triaxcal.figures import plain
+from triaxcal.moment import Moment
 
 
 def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several: bool = False) -> tuple[str, ...]:
@@ -28,6 +30,12 @@ def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several:
         of_conditions = (_at(n, reference.get(n, 0.0), several) for n in effect.needs if n != RUN)
         out += [effect.absent] if effect.absent else of_conditions
     return tuple(dict.fromkeys(out))
+
+
+def as_at(moment: HoldsAt) -> str:
+    """The moment of a recording for which a correction holds that knows no time."""
+    which = {Moment.END: "the end", Moment.MEAN: "the mean of the poses"}.get(moment.moment)
+    return f"as at {plain(moment.t_s, 6)} s of the recording" + (f" ({which})" if which else "")
 
 
 def use(effects: Iterable[Effect], *, linear_only: bool) -> str:

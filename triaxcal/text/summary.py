@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from triaxcal.calibration import Calibration, Residual
+from triaxcal.calibration import Calibration
 from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.poses.pose import Pose
 from triaxcal.units import ErrorUnit, grouped, in_units_of
@@ -30,29 +30,6 @@ def summary(c: Calibration, output_unit: str, reference_unit: str, warnings: Ite
     lines += [f"  {line}" for line in _quality(c, reference_unit)]
     lines += [f"  warning: {line}" for line in warnings]
     return "\n".join(lines)
-
-
-def loop(
-    findings: Iterable[tuple[str, str, Sequence[str]]],
-    errors: tuple[Residual, Residual],
-    reference: tuple[str, float],
-    unexplained_rms: float | None,
-    advice: Iterable[str],
-) -> str:
-    """What a closed loop says: ``findings`` (effect, verdict, alternatives), the ``errors`` before and after, the unit
-    and the magnitude of the ``reference``, what is unexplained (None for nothing), and what to do."""
-    small = ErrorUnit.of(*reference)
-    lines = [
-        f"{effect}: {verdict}" + (f" (or {', '.join(alternatives)})" if alternatives else "")
-        for effect, verdict, alternatives in findings
-    ]
-    before, after = (small.in_full(e.rms_g) for e in errors)
-    lines = lines or ["no effect found"]
-    lines.append(f"residual rms {before} before, {after} after")
-    if unexplained_rms is not None:
-        lines.append(f"unexplained: {small.in_full(unexplained_rms)}")
-    lines += [f"advice: {line}" for line in advice]
-    return "\n".join(["Diagnosis", *(f"  {line}" for line in lines)])
 
 
 def poses(found: Sequence[Pose], data_quality: Iterable[str]) -> str:

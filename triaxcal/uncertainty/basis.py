@@ -64,6 +64,13 @@ class CompetingModels(Basis):
 
 
 @dataclass(frozen=True)
+class AveragedModels(Basis):
+    """Over all that may act, each by its probability; ``names`` are those that are corrected and not certain."""
+
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class UnmodelledTemperature(Basis):
     """The effects that the model lacks; the temperature moved by ``moved_k`` from pose to pose. ``identifiable``:
     the poses can tell what that did."""
@@ -71,6 +78,15 @@ class UnmodelledTemperature(Basis):
     effects: tuple[str, ...]
     moved_k: float
     identifiable: bool
+
+
+@dataclass(frozen=True)
+class ProbableTemperature(Basis):
+    """The effects that the model lacks, each as probable and as large as the poses leave it; the temperature moved by
+    ``moved_k`` from pose to pose."""
+
+    effects: tuple[str, ...]
+    moved_k: float
 
 
 @dataclass(frozen=True)

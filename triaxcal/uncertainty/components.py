@@ -12,9 +12,9 @@ from triaxcal.calibration import Calibration
 from triaxcal.poses.pose import Pose
 from triaxcal.pure_error import pure_error_dof
 from triaxcal.uncertainty.basis import (
+    AveragedModels,
     Basis,
     BirgeFactor,
-    CompetingModels,
     CompleteModel,
     Creep,
     CreepHalved,
@@ -111,7 +111,7 @@ def _between(calibration: Calibration, linearised: Linearised, noise: Floats) ->
     thermal = 0.0 if calibration.thermal is None else calibration.thermal
     rest = positive(calibration.covariance - noise - thermal)
     names = tuple(name for name, p in calibration.weights.items() if p < CERTAIN)
-    basis, by = CompetingModels(names), ModelsToldApart()
+    basis, by = AveragedModels(names), ModelsToldApart()
     return [Component.of(linearised, "choice_of_effect", "B", np.inf, rest, basis, by)]
 
 

@@ -11,6 +11,7 @@ from triaxcal.problem import everything
 from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.uncertainty.basis import (
     PosesAtOtherTemperatures,
+    ProbableTemperature,
     Remedy,
     SteadierTemperature,
     TemperatureKnown,
@@ -74,9 +75,10 @@ def _as_probable(calibration: Calibration, linearised: Linearised) -> list[Compo
     """By the probability of each thermal effect and of its sizes, as the poses and what happens inside them tell."""
     if calibration.thermal is None or not calibration.thermal.any():
         return []
-    names = tuple(e.name for e in CATALOGUE if TEMPERATURE in e.needs and e not in linearised.effects)
+    present = {e.name for e in linearised.effects}
+    names = tuple(e.name for e in CATALOGUE if TEMPERATURE in e.needs and e.name not in present)
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
-    basis, by = UnmodelledTemperature(names, moved, identifiable=False), PosesAtOtherTemperatures(names)
+    basis, by = ProbableTemperature(names, moved), PosesAtOtherTemperatures(names)
     return [Component.of(linearised, "temperature", "B", np.inf, positive(calibration.thermal), basis, by)]
 
 

@@ -41,7 +41,7 @@ def apply_command(a: argparse.Namespace) -> int:
         say(f"{a.recording}: {remark}")
     with new_beside(a.output) as path:
         samples = _written(found, path, a.output.name)
-    warn(found.missing)
+    warn(found.cautions)
     say(f"{a.output}: {samples} samples, {', '.join(calibration.terms)}, in {calibration.reference_unit}")
     return 0
 

@@ -18,7 +18,7 @@ from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit
-from triaxcald.cli.results import show_calibration, show_loop
+from triaxcald.cli.results import show_calibration, show_loop, show_summary, text_of_held_out
 from triaxcald.cli.several import (
     as_one_unit,
     channels_of_some,
@@ -98,10 +98,14 @@ def diagnose_command(a: argparse.Namespace) -> int:
     if a.json:
         emit(document)
     else:
+        show_summary(document["summary"])
         if len(names) > 1:
             show_by_recording(loop, names, choice)
-        show_loop(loop, choice)
-        show_calibration(loop.after, choice)
+        if a.verbose:
+            show_loop(loop, choice)
+            show_calibration(loop.after, choice)
+        elif loop.held_out:
+            print(text_of_held_out(loop.held_out, choice.small))
         warn([*document["calibration"]["warnings"], *measured.data_quality])
     return judge(a.limit, loop.after.residual.rms_g)
 
@@ -113,7 +117,6 @@ def _loop(a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequ
             signs=choice.signs,
             reference=choice.reference,
             check=check,
-            empirical=a.empirical,
             at=a.at if a.at is not None else measured.holds_at or Moment.END,
         )
 

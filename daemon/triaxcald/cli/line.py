@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from triaxcal import text as of_metrology
+from triaxcal.posterior.odds import Odds
 from triaxcal.rounding import number
+from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal_drivers.profile import READINGS
 from triaxcald import text
 from triaxcald.cli.arguments import writable
@@ -24,7 +26,6 @@ from triaxcald.cli.showing import counted
 from triaxcald.exit_codes import SEVEREST
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
-from triaxcald.remarks import nothing_shows, without
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import load_station
 
@@ -105,16 +106,19 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         ["", "before", "after", "noise floor"],
         [*rows, *extra],
     )
-    for finding in loop.findings:
-        others = "".join(f" or {name}" for name in finding.rivals)
-        print(f"  {finding.verdict}: {finding.effect}{others}")
-        for name, (value, error, unit) in finding.coefficients.items():
-            told = f"{unit} (no standard error by itself)" if error is None else f"± {error:.1g} {unit}"
+    for line in o.certified.document["result"]["summary"]:
+        print(f"  {line}")
+    least = Odds().reported
+    likely = [effect for effect, _ in loop.after.sensor.effects if loop.after.weights[effect.name] >= least]
+    rest = {e.name: loop.after.weights[e.name] for e, _ in loop.after.sensor.effects if e not in likely}
+    if rest:
+        each = ", ".join(f"{name} ({of_diagnosis.chance(p)})" for name, p in rest.items())
+        print(f"  corrected as far as it is probable: {each}")
+    for effect in likely:
+        print(f"  corrected: {effect.name} (probability {of_diagnosis.chance(loop.after.weights[effect.name])})")
+        for name, (value, error, unit) in loop.after.coefficients_of(effect.name).items():
+            told = unit if error is None else f"± {error:.1g} {unit}"
             print(f"    {name} {value:+.4g} {told}")
-    if not loop.findings:
-        print(f"  {nothing_shows(loop)}")
-    if loop.unexplained.significant:
-        print(f"  unexplained: {micro(loop.unexplained.rms_g)} µg rms{without(loop)}; {loop.unexplained.lead}")
     if o.provisioned:
         print(f"  {text.provisioned(o.provisioned)}")
     if o.settling and o.error is None:

@@ -7,18 +7,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from triaxcal.calibration_reading import sensor_of
+from triaxcal.calibration import Calibration
+from triaxcal.calibration_reading import calibration_of, expanded_uncertainty_in, logged_in
 from triaxcal.errors import Refused
+from triaxcal.figures import micro_g
+from triaxcal.reduced import Reduced
 from triaxcal.rounding import REGISTER_DIGITS, number
+from triaxcal_drivers.profile import Profile
 from triaxcald import text
-from triaxcald.certificate import REFERENCE_TEMPERATURE, roles
+from triaxcald.certificate import held_by_device, image_of, why_not_written
 from triaxcald.choices import is_passing
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.errors import InputError
 from triaxcald.inputs import read_document
 from triaxcald.provision.identity import same_serial
-from triaxcald.provision.image import RegisterImage, build_image
+from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.station.config import Place, load_station
 from triaxcald.station.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
@@ -103,24 +107,41 @@ def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
     together: another unit, another unit of the reference vector, other signs, effects that the device cannot hold.
     """
     document = read_document(path)
-    sensor, channel_reference, reference = sensor_of(document, where=path)
+    full = calibration_of(document, where=path)
     profile = place.bundle.profile
-    if not 0.9 <= reference <= 1.1:
-        raise Refused(f"{path}: the reference is {reference:g}; registers are in units of g")
+    if not 0.9 <= full.reference <= 1.1:
+        raise Refused(f"{path}: the reference is {full.reference:g}; registers are in units of g")
     serial = _serial_of(document, path, place)
-    wanted = roles(sensor, channel_reference)
-    passing = {f"{e.name}.{c.name}" for e, _ in sensor.effects if is_passing(e) for c in e.coefficients}
-    homeless = [r for r in wanted if r not in passing and profile.by_role(r) is None and r != REFERENCE_TEMPERATURE]
-    if homeless:
-        raise Refused(
-            f"{path}: {profile.name} has no register for {', '.join(homeless)}; without them the other coefficients "
-            "would be wrong"
-        )
-    for axis, k, sign in zip("xyz", sensor.scale_factor, place.signs, strict=True):
+    if missing := why_not_written(profile):
+        raise Refused(f"{path}: {profile.name}: {missing}")
+    held = held_by_device(profile, full, logged_in(document, where=path))
+    assert held is not None
+    registers = held.registers.calibration
+    _require_little_lost(document, full, held.registers, path, profile)
+    for axis, k, sign in zip("xyz", registers.sensor.scale_factor, place.signs, strict=True):
         if k * sign < 0:
             raise Refused(f"{path}: scale_factor.{axis} is {k:.4g}, of another sign than the device's: fit with --sign")
-    held = {r: v for r, v in wanted.items() if profile.by_role(r)}
-    return build_image(profile, held, date_days=days_since_1970()), serial
+    return image_of(profile, registers, days_since_1970()), serial
+
+
+def _require_little_lost(
+    document: Mapping[str, Any], full: Calibration, registers: Reduced, path: str, profile: Profile
+) -> None:
+    """Raises Refused where the registers would be off by more than the calibration itself may be."""
+    lost = [effect.name for effect, _ in full.sensor.effects if effect.name not in registers.calibration.terms]
+    known = expanded_uncertainty_in(document, where=path)
+    passing = {effect.name for effect, _ in full.sensor.effects if is_passing(effect)}
+    if not set(lost) <= passing and not registers.cost <= (known or 0.0):
+        stated = "" if known is None else f", and its expanded uncertainty is {micro_g(known)}"
+        raise Refused(
+            f"{path}: {profile.name} has no registers for {', '.join(lost)}; the best that it can hold is off by "
+            f"{micro_g(registers.cost)} rms{stated}"
+        )
+    if lost:
+        say(
+            f"{profile.name} has no registers for {', '.join(lost)}: the other coefficients take their place, "
+            f"{micro_g(registers.cost)} rms off"
+        )
 
 
 def _serial_of(document: Mapping[str, Any], path: str, place: Place) -> str | None:

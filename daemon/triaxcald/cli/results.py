@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import math
+import textwrap
+from collections.abc import Sequence
 
 from triaxcal import text
 from triaxcal.calibration import Calibration, Residual
 from triaxcal.calibration_document import assumed_in, holds_of
 from triaxcal.effects import TEMPERATURE
 from triaxcal.figures import probability
+from triaxcal.held_out import HeldOut
 from triaxcal.loop import Loop
+from triaxcal.text import diagnosis
 from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 from triaxcald.cli.console import table
 from triaxcald.cli.showing import Choice, counted
-from triaxcald.remarks import assumption, nothing_shows, overlap, without
+from triaxcald.remarks import assumption
+
+WIDTH = 80
+WORTH_A_LINE = 0.01
+"""Effects of less probability are in the document alone."""
 
 
 def show_calibration(c: Calibration, choice: Choice) -> None:
@@ -93,7 +101,19 @@ def show_budget(b: Budget, choice: Choice) -> None:
         print(f"not evaluated: {text.not_evaluated(source, small.figure)}")
 
 
+def show_summary(lines: Sequence[str]) -> None:
+    """The four lines of a diagnosis (`triaxcal.text.diagnosis.lines`)."""
+    for name, line in zip(("verdict", "cause", "error", "next"), lines, strict=True):
+        print(textwrap.fill(f"{name:<9}{line}", WIDTH, subsequent_indent=" " * 9, break_long_words=False))
+
+
+def text_of_held_out(held: HeldOut, small: ErrorUnit) -> str:
+    before, after, floor = map(small.in_full, (held.before_rms_g, held.after_rms_g, held.noise_floor_g))
+    return f"held out rms {before} before, {after} after, noise floor {floor} ({held.poses} poses)"
+
+
 def show_loop(loop: Loop, choice: Choice) -> None:
+    """Errors, what acts with which probability, and the advice in full."""
     b, f, small = loop.before.residual, loop.after.residual, choice.small
     rows = [
         ["residual rms", small.told(b.rms_g), small.told(f.rms_g)],
@@ -101,18 +121,13 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     ]
     if loop.held_out:
         rows.append(["held-out rms", small.told(loop.held_out.before_rms_g), small.told(loop.held_out.after_rms_g)])
-        for name, rms in loop.held_out.instead.items():
-            rows.append([f"  with {name} instead", "", small.told(rms)])
     rows.append(["noise floor", small.told(b.noise_floor_g), small.told(f.noise_floor_g)])
     table(f"error of the magnitude, {small}", ["", "before", "after"], rows)
+    likely = [[name, diagnosis.chance(p)] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
+    rest = [["nothing", diagnosis.chance(loop.found.nothing)]]
+    rest += [["something that no effect describes", diagnosis.chance(loop.found.unexplained.probability)]]
+    table("what acts", ["", "probability"], [*likely, *rest])
     for finding in loop.findings:
-        print(f"{finding.verdict}: {finding.effect} ({small.in_words(finding.reason)})")
-    if not loop.findings:
-        print(nothing_shows(loop))
-    if loop.unexplained.significant:
-        lead = small.in_words(loop.unexplained.lead)
-        print(f"unexplained: {small.in_full(loop.unexplained.rms_g)} rms{without(loop)}; {lead}")
-        if said := overlap(lead):
-            print(f"shares of what is unexplained: {said}")
-    for line in loop.advice:
-        print(f"advice: {small.in_words(line)}")
+        print(f"{finding.verdict}: {finding.effect} ({diagnosis.reason(finding, loop.refusal)})")
+    for line in diagnosis.advice(loop, small):
+        print(f"advice: {line}")

@@ -8,13 +8,15 @@ from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
-from triaxcal.agreement import Agreement
+from triaxcal.agreement import Agreement, Answer
 from triaxcal.errors import Refused
-from triaxcal.figures import plain, probability
+from triaxcal.figures import plain
 from triaxcal.loop import Loop
 from triaxcal.runs import residuals_by_run, together
-from triaxcal.search.alternatives import NEAR
+from triaxcal.text import diagnosis
+from triaxcal.text.agreement import verdict
 from triaxcald.cli.console import table
+from triaxcald.cli.results import WORTH_A_LINE
 from triaxcald.cli.showing import Choice, chosen, read_recording, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
@@ -22,15 +24,11 @@ from triaxcald.likeness import shape_by_poses, shape_of, unlike_shapes
 from triaxcald.verification import unlike
 
 COLUMNS = {
-    "cross-validated": "rms error of |a| in each pose under a fit to all the others, without and with the findings",
-    "worse than the best": f"by how much its score, summed over the units, exceeds the best; {NEAR:g} is clear",
-    "gain": "by how much the summed score is better than without it",
-    "shown by": "units that gain more by it than chance would give",
-    "named by": "units that name it and nothing that would do as well",
-    "listed by": "units that have it beside what would do as well, or as that",
-    "not found by": "units that neither name nor list it",
+    "in all": "probability that the effect acts in every unit",
+    "one value": "probability that its coefficients are the same in all, if it does",
+    "in each unit by itself": "probability that it acts there, by that unit alone, in the order of the recordings",
 }
-"""What stands in the tables of several units."""
+"""What stands in the table of all units."""
 
 
 def measured_each(a: argparse.Namespace) -> list[Measured]:
@@ -157,15 +155,15 @@ def show_agreement(found: Agreement, names: Sequence[str], loops: Sequence[Loop]
     small = choices[0].small
     table(
         f"each unit by itself, {small}",
-        ["", "finding", "verdict", "would do as well", "cross-validated before", "after", "noise floor"],
+        ["", "finding", "probability", "or instead", "residual before", "after", "noise floor"],
         [
             [
                 name,
-                ", ".join(f.effect for f in loop.findings) or "none",
-                ", ".join(f.verdict for f in loop.findings),
-                ", ".join(dict.fromkeys(other for f in loop.findings for other in f.rivals)),
-                small.told(loop.before.residual.cross_validated_rms_g),
-                small.told(loop.after.residual.cross_validated_rms_g),
+                "\n".join(f.effect for f in loop.findings) or "none",
+                "\n".join(diagnosis.chance(f.probability) for f in loop.findings),
+                "\n".join(", ".join(f.alternatives) for f in loop.findings),
+                small.told(loop.before.residual.rms_g),
+                small.told(loop.after.residual.rms_g),
                 small.told(loop.after.residual.noise_floor_g),
             ]
             for name, loop in zip(names, loops, strict=True)
@@ -173,29 +171,24 @@ def show_agreement(found: Agreement, names: Sequence[str], loops: Sequence[Loop]
     )
     table(
         "all units together",
-        ["", "worse than the best", "gain", "shown by", "named by", "listed by", "not found by"],
+        ["", "in all", "one value", "in each unit by itself"],
         [
             [
                 c.effect,
-                f"{c.worse:.1f}",
-                f"{c.gain:.1f}",
-                len(c.shown),
-                len(c.named),
-                len(c.listed),
-                len(names) - len({*c.named, *c.listed}),
+                diagnosis.chance(c.probability),
+                diagnosis.chance(c.common),
+                " ".join(f"{p:.2f}" for p in c.units),
             ]
             for c in found.effects
+            if c.probability >= WORTH_A_LINE or max(c.units) >= WORTH_A_LINE
         ],
     )
     for column, meaning in COLUMNS.items():
         print(f"{column}: {meaning}")
-    for name, loop in zip(names, loops, strict=True):
-        for line in loop.advice:
-            if line.startswith("empirical: "):
-                print(f"{name}: {small.in_words(line)}")
-    print(f"the units {found.verdict}" if not found.verdict.startswith("no ") else found.verdict)
+    said = verdict(found)
+    print(said if found.answer is Answer.NOTHING else f"the units {said}")
     for c in found.effects:
-        for name, s in c.shapes.items():
-            known = "" if s.standard_error is None else f" ± {plain(s.standard_error, 2)}"
-            alike = "" if s.p_value is None else f"; the units' own values agree with p {probability(s.p_value)}"
-            print(f"{c.effect}: {name} {plain(s.value, 4)}{known} {s.unit}{alike}")
+        if any(c.effect in group for group in found.agreed):
+            for name, s in c.shapes.items():
+                known = "" if s.shared.standard_error is None else f" ± {plain(s.shared.standard_error, 2)}"
+                print(f"{c.effect}: {name} {plain(s.shared.value, 4)}{known} {s.shared.unit}")

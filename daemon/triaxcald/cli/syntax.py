@@ -108,7 +108,7 @@ def _on_recordings(commands: Any) -> None:
     p.add_argument(
         "--units", action="store_true", help="each recording is of another unit: judge each, then whether they agree"
     )
-    p.add_argument("--empirical", action="store_true", help="describe what no effect explains by a smooth term")
+    p.add_argument("--verbose", action="store_true", help="tables too: errors, probabilities, coefficients, budget")
     p.add_argument(
         "--at", type=moment, metavar="end|mean|SECONDS",
         help="of the recording: the moment for which effects of time hold elsewhere (default: end)",

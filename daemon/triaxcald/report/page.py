@@ -8,7 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from triaxcald.remarks import assumption, overlap
+from triaxcald.remarks import assumption
 from triaxcald.report import figures
 from triaxcald.report.budget import read_uncertainty
 from triaxcald.report.charts import bars_picture, stream_picture
@@ -59,7 +59,6 @@ def render_report(
         verdict=judge(outcome, limits, uncertainty.expanded_g if uncertainty else None, final_word(papers)),
         uncertainty=uncertainty,
         assumed=assumed,
-        overlap=overlap("; ".join(outcome.unexplained.leads if outcome.unexplained else ())),
         bars=bars_picture(outcome.stages, outcome.held_out, unit),
         sphere=sphere_picture(outcome.poses, outcome.stages, floor_g, unit),
         over_time=time_pictures(

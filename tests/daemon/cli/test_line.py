@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -22,6 +20,8 @@ UNIT = Sensor(
     ((ThirdOrderNonlinearity(), np.array([8e-4, -7e-4, 9e-4])),),
 )  # fmt: skip
 
+SUMMARY = ["usable", "third_order_nonlinearity acts", "residual rms", "use the calibration"]
+
 
 @pytest.fixture(scope="module")
 def loop() -> Loop:
@@ -30,7 +30,7 @@ def loop() -> Loop:
 
 
 def shown(loop: Loop, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    result = {"data_quality": ["missing_samples: 3 of 900"]}
+    result = {"data_quality": ["missing_samples: 3 of 900"], "summary": SUMMARY}
     document = {"unit": {"serial": "7"}, "not_written": "no registers", "outside": [], "result": result}
     show_outcome(
         Outcome("left", 0, {"verdict": "pass", "reason": ""}, Held(), certified=Certified(document, loop, None, True))
@@ -38,16 +38,18 @@ def shown(loop: Loop, capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [line.strip() for line in capsys.readouterr().out.splitlines()]
 
 
-def test_a_coefficient_is_told_with_its_standard_error(loop: Loop, capsys: pytest.CaptureFixture[str]) -> None:
-    value, error, unit = loop.findings[0].coefficients["x"]
-    assert f"x {value:+.4g} ± {error:.1g} {unit}" in shown(loop, capsys)
-
-
-def test_one_that_the_poses_show_in_a_combination_alone_is_told_without_it(
+def test_what_is_corrected_is_told_with_its_probability_and_its_coefficients(
     loop: Loop, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = loop.findings[0]
-    value, _, unit = found.coefficients["x"]
-    combined = replace(found, coefficients=dict(found.coefficients) | {"x": (value, None, unit)})
-    said = shown(replace(loop, findings=(combined,)), capsys)
-    assert f"x {value:+.4g} {unit} (no standard error by itself)" in said
+    said = shown(loop, capsys)
+    ((effect, _),) = loop.after.sensor.effects
+    assert f"corrected: {effect.name} (probability {loop.after.weights[effect.name]:.2g})" in said
+    for name, (value, error, unit) in loop.after.coefficients_of(effect.name).items():
+        assert error is not None
+        assert f"{name} {value:+.4g} ± {error:.1g} {unit}" in said
+
+
+def test_the_four_lines_of_the_diagnosis_come_first(loop: Loop, capsys: pytest.CaptureFixture[str]) -> None:
+    said = shown(loop, capsys)
+    first = next(i for i, line in enumerate(said) if line == SUMMARY[0])
+    assert said[first : first + 4] == SUMMARY

@@ -64,8 +64,8 @@ def test_what_has_no_name_goes_with_what_it_went_with(poses_with: Poses, paper_u
 
     poses = poses_with(3)
     found = told([replace(p, mean=p.mean + paper_unit.scale_factor * bias_g(p.t_s)) for p in poses])
-    assert found.unmodelled.probability > 0.9
-    assert found.unmodelled.what is What.TIME
+    assert found.unexplained.probability > 0.9
+    assert found.unexplained.kind is What.TIME
 
 
 def test_a_size_is_that_of_what_was_put_in(poses_with: Poses) -> None:
@@ -74,8 +74,8 @@ def test_a_size_is_that_of_what_was_put_in(poses_with: Poses) -> None:
     off_g = 20 * SIGMA_G * rng.standard_normal(30)
     poses = [replace(p, mean=p.mean * (1 + d)) for p, d in zip(poses_with(5), off_g, strict=True)]
     found = told(poses)
-    assert found.unmodelled.probability > 0.9
-    assert found.unmodelled.rms == pytest.approx(20 * SIGMA_G, rel=0.6)
+    assert found.unexplained.probability > 0.9
+    assert found.unexplained.rms_g == pytest.approx(20 * SIGMA_G, rel=0.6)
 
 
 def test_poses_are_counted_among_all_that_were_given(

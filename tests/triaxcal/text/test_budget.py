@@ -21,6 +21,16 @@ BASES: list[tuple[of.Basis, str]] = [
     (of.StatedReference(0.0, 34.0), "normal gravity at latitude 0°, height 34 m; its uncertainty as stated"),
     (of.RegisterSteps(12), "steps of 12 registers; rectangular"),
     (of.CompetingModels(("warm_up", "bias_drift")), "warm_up or bias_drift would do as well on these poses"),
+    (of.AveragedModels(()), "the spread over all that may act, each by its probability"),
+    (
+        of.AveragedModels(("hysteresis",)),
+        "the spread over all that may act, each by its probability; hysteresis may act or not",
+    ),
+    (
+        of.ProbableTemperature(THERMAL, 14.1),
+        "temperature_bias and temperature_scale_factor, which are not in the model, by the probability and the size "
+        "that the poses leave them; the temperature moved by 14 K from pose to pose",
+    ),
     (
         of.UnmodelledTemperature(THERMAL, 14.1, identifiable=False),
         "temperature_bias and temperature_scale_factor not in the model; the temperature moved by 14 K from pose to "

@@ -6,18 +6,17 @@ from dataclasses import replace
 
 import pytest
 
+from triaxcal.loop import Call, Candidate, Finding, Verdict
 from triaxcal.next_recording import NextRecording, Source
 from triaxcal.poses.pose import Began
 from triaxcal.posterior.average import Refusal
-from triaxcal.posterior.blind import Blind, Why
-from triaxcal.posterior.findings import Another, Findings, Unmodelled
-from triaxcal.posterior.loop import Call, Candidate, Finding, Verdict
+from triaxcal.posterior.findings import Another, Findings, Unexplained
 from triaxcal.posterior.unmodelled import What
 from triaxcal.text import diagnosis
 from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)
-NOTHING = Findings((), {}, {}, Unmodelled(0.04, What.TIME, 1e-5, False), None, 0.91)
+NOTHING = Findings((), {}, {}, Unexplained(0.04, What.TIME, 1e-5, False), None, 0.91)
 KNOWN = Finding("hysteresis", Verdict.ADOPTED, 0.99995, {}, {}, "Let it rest.")
 GROUP = Finding("warm_up", Verdict.CONFOUNDED, 0.72, {"bias_drift": 0.275}, {}, "Let it warm up.")
 BEGAN = {4: Began(132.0, None), 9: Began(301.5, None)}
@@ -44,7 +43,7 @@ def test_the_cause_is_told_with_its_probability() -> None:
 
 
 def test_what_has_no_name_is_told_with_its_size_and_what_it_goes_with() -> None:
-    found = replace(NOTHING, unmodelled=Unmodelled(0.97, What.BEFORE, 240e-6, True))
+    found = replace(NOTHING, unexplained=Unexplained(0.97, What.BEFORE, 240e-6, True))
     said = "something acts that no effect describes (probability 0.97), 240.0 µg rms; it goes with the pose before"
     assert cause(found) == said
 
@@ -69,10 +68,10 @@ def test_a_reason_says_why_a_known_effect_is_not_corrected() -> None:
 
 
 def test_errors_say_what_is_assumed_of_the_next_recording() -> None:
-    assumed = NextRecording(4.1e-3, 2e-3, Source.ASSUMED)
+    assumed = NextRecording(2.1e-3, 4.1e-3, 2e-3, Source.ASSUMED)
     said = diagnosis.errors(601e-6, 18e-6, assumed, SMALL)
     assert said == (
-        "residual rms 601.0 µg before, 18.0 µg after; in the next recording within 4100.0 µg (expanded, with 2000.0 µg "
+        "residual rms 601.0 µg before, 18.0 µg after; expanded uncertainty in the next recording 4100.0 µg (2000.0 µg "
         "from start to start, assumed)"
     )
 
@@ -80,11 +79,6 @@ def test_errors_say_what_is_assumed_of_the_next_recording() -> None:
 @pytest.mark.parametrize("refused", Refusal)
 def test_every_refusal_has_words(refused: Refusal) -> None:
     assert diagnosis.reason(replace(KNOWN, verdict=Verdict.CONFOUNDED), refused).count(";") == 1
-
-
-@pytest.mark.parametrize("why", Why)
-def test_every_reason_to_be_blind_has_words(why: Why) -> None:
-    assert diagnosis.blind(Blind(why, "temp_c"))
 
 
 @pytest.mark.parametrize("found", Call)

@@ -1,0 +1,147 @@
+"""What to do after a diagnosis: what to record next, how to be rid of an effect, and what the poses cannot show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from triaxcal.effects.plugins import package_of
+from triaxcal.figures import moment, plain, the_poses
+from triaxcal.loop import Call, Loop, Verdict
+from triaxcal.posterior.actions import Action, Do
+from triaxcal.posterior.average import Refusal
+from triaxcal.posterior.blind import Blind, Why
+from triaxcal.posterior.unmodelled import What
+from triaxcal.units import ErrorUnit
+
+ALMOST = 0.999
+"""Probabilities beyond are told as such: by which model they were reckoned matters more."""
+GOES_WITH = {
+    What.NOTHING: "each pose by itself",
+    What.DIRECTION: "the direction",
+    What.ODD: "the sign and the size of an axis's reading",
+    What.EVEN: "the size of an axis's reading",
+    What.BEFORE: "the pose before",
+    What.TIME: "the time",
+}
+REFUSED = {
+    Refusal.UNMODELLED: "something that no effect describes acts as well",
+    Refusal.ANOTHER: "one calibration does not hold in all poses",
+    Refusal.ONE_POSE: "what was found hangs on a single pose",
+}
+
+
+def chance(p: float) -> str:
+    """A probability as it stands in a sentence."""
+    if p > ALMOST:
+        return f"more than {ALMOST}"
+    return f"less than {1 - ALMOST:.1g}" if p < 1 - ALMOST else f"{p:.2g}" if p < 0.99 else f"{p:.3f}"
+
+
+def to_do(loop: Loop, small: ErrorUnit) -> str:
+    """The most urgent of `advice`, in one line."""
+    first = [*_poses_again(loop), *_apart(loop), *_next(loop, small)]
+    if first:
+        return "; ".join(first)
+    if loop.call is Call.INVESTIGATE:
+        return "find out what acts before the calibration is used; no further pose is expected to tell"
+    known = all(f.verdict is Verdict.ADOPTED for f in loop.findings) and not loop.candidates
+    return "use the calibration" + ("" if known else "; no further pose is expected to tell more")
+
+
+def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
+    """A line each, the most urgent first."""
+    yield from _poses_again(loop)
+    yield from _apart(loop)
+    yield from _next(loop, small)
+    for name, expected in loop.advice.expected.items():
+        yield f"{name}: probability {chance(expected.now)} now, {chance(expected.if_it_acts)} expected then if it acts"
+    for finding in loop.findings:
+        if finding.verdict is Verdict.ADOPTED:
+            yield f"{finding.effect}: {finding.remedy}"
+    if loop.refusal is not None:
+        yield f"no effect is corrected, because {REFUSED[loop.refusal]}"
+    if loop.held_out is not None and loop.held_out.worse:
+        before, after = small.in_full(loop.held_out.before_rms_g), small.in_full(loop.held_out.after_rms_g)
+        yield (
+            f"in the check recording the linear calibration is better ({before}, with what was found {after}): "
+            "diagnose both recordings together"
+        )
+    reasons = {name: blind(why) for name, why in loop.blind.items()}
+    for reason in dict.fromkeys(reasons.values()):
+        yield f"these poses cannot show in full {', '.join(n for n, r in reasons.items() if r == reason)}: {reason}"
+    for name, reason in loop.faulty.items():
+        yield f"the effect {name} of {package_of(name)} was left out: {reason}"
+
+
+def _poses_again(loop: Loop) -> Iterator[str]:
+    faulty = [p.pose for p in loop.after.poses if p.pose.fault]
+    for fault in dict.fromkeys(p.fault for p in faulty):
+        yield f"take again {the_poses(p.began for p in faulty if p.fault == fault)}: excluded ({fault})"
+    if loop.found.outliers:
+        poses = loop.after.poses
+        yield f"take again {the_poses(poses[i].pose.began for i in loop.found.outliers)}: outliers"
+
+
+def _apart(loop: Loop) -> Iterator[str]:
+    if loop.found.another is not None:
+        since = moment(loop.after.poses[loop.found.another.pose].pose.began)
+        yield f"check the mounting and the connector, and which unit it is, from the pose at {since} on"
+
+
+def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
+    actions = loop.advice.actions
+    if beside := [_beside(action) for action in actions if action.do in (Do.LOG, Do.HOLD)]:
+        yield "; ".join(beside)
+    if poses := [_pose(action, loop) for action in actions if action.do not in (Do.LOG, Do.HOLD)]:
+        yield f"record next, in this order: {', then '.join(poses)}"
+    if loop.too_uncertain:
+        following = loop.next_recording
+        start, whole = small.in_full(following.start_to_start), small.in_full(following.standard)
+        yield (
+            f"record more poses (triaxcal plan): the standard uncertainty in the next recording is {whole}, of which "
+            f"{start} would stay however many there are"
+        )
+
+
+def _beside(action: Action) -> str:
+    if action.do is Do.HOLD:
+        return f"hold each pose for {action.hold_s:.0f} s, since each has an error of its own"
+    return f"log {action.channel or 'what else may go with the time: the supply, a second temperature'}"
+
+
+def _pose(action: Action, loop: Loop) -> str:
+    again = None if action.again is None else moment(loop.after.poses[action.again].pose.began)
+    where = _direction(action)
+    pose = where if again is None else f"{where} as at {again}"
+    if action.do is Do.CHANNEL:
+        return f"{pose} with {action.channel} moved by {plain(action.by, sign='+')} and settled"
+    return f"{pose} after {action.pause_s:.0f} s of rest" if action.do is Do.PAUSE else pose
+
+
+def _direction(action: Action) -> str:
+    if action.label or action.up is None:
+        return action.label
+    return "up along (" + ", ".join(f"{v:+.2f}" for v in action.up) + ")"
+
+
+def blind(why: Blind) -> str:
+    """Why poses cannot show an effect in full."""
+    match why.why:
+        case Why.NOT_LOGGED:
+            return f"channel {why.channel} is not logged"
+        case Why.SOMETIMES_LOGGED:
+            return f"channel {why.channel} is not logged in every pose"
+        case Why.RATE_UNKNOWN:
+            return f"how fast {why.channel} changes is not known in every pose"
+        case Why.NOT_KNOWN:
+            return f"{why.channel} is not known"
+        case Why.STOOD_STILL:
+            return f"{why.channel} stood still"
+        case Why.EVEN_RATE:
+            return f"{why.channel} changes no faster in one pose than in another"
+        case Why.EVEN_SCATTER:
+            return "the readings scatter alike in all poses"
+        case Why.MOVED_ALONG:
+            return "too few poses, or what it goes with moved along with their directions"
+        case Why.FEW_DIRECTIONS:
+            return "the poses point in too few directions"
