@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from triaxcald.audit import contents, previews
 from triaxcald.audit.beside import beside, outcomes_beside
 from triaxcald.audit.differences import Difference, Kind, compare
-from triaxcald.audit.older import turned_back
+from triaxcald.audit.older import as_searched, turned_back
 from triaxcald.audit.results import (
     CANNOT,
     DRAWN_WITH,
@@ -53,7 +53,7 @@ class Notes:
     versions: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     report_as_listed: bool = False
     earlier: bool = False
-    """Sentences, and keys that its version did not make, were not compared."""
+    """What its search found was taken as it is. Sentences and keys of later versions were not compared."""
     losses: tuple[str, ...] = ()
     mended: bool = False
     not_beside: tuple[str, ...] = ()
@@ -85,7 +85,7 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
 
 
 EARLIER = frozenset({"0.1.0"})
-"""Versions whose documents have other sentences, and lack keys that are made now."""
+"""Versions that named effects by a search, and whose documents have other sentences and lack keys that are made now."""
 
 
 class _Audit:
@@ -139,7 +139,7 @@ class _Audit:
 
     @property
     def _earlier(self) -> bool:
-        """Whether a version made it whose sentences and keys are not those of this one."""
+        """Whether a version made it whose findings, sentences and keys are not those of this one."""
         return self._recording.metadata.get("software", {}).get("triaxcal") in EARLIER
 
     @property
@@ -151,7 +151,13 @@ class _Audit:
 
     def _again(self) -> Again | None:
         try:
-            return self._compute(self._recording, self._raw)
+            again = self._compute(self._recording, self._raw)
+            stored = _object(self._held.get(CERTIFICATE, b"")) if self._earlier else None
+            if stored is None or again.certified is None:
+                return again
+            return replace(
+                again, certified=as_searched(again.certified, stored, again.bundle.profile, again.station.limits)
+            )
         except CANNOT as e:
             self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=str(e) or repr(e))
             return None

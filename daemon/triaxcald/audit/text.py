@@ -105,7 +105,10 @@ def notes(of: Notes) -> list[str]:
         )
     found += [f"{name}: {then} then, {now} now" for name, (then, now) in of.versions.items()]
     if of.earlier:
-        found.append("an earlier version made it: all its numbers are compared, its sentences are not")
+        found.append(
+            "an earlier version made it, which named effects by a search that is gone: what that found is taken as the "
+            "certificate has it; raw records, poses, registers and verification are compared, sentences are not"
+        )
     if of.report_as_listed:
         found.append("report.html was not drawn again, since versions differ; it is compared with the outcome's digest")
     found += of.losses
@@ -120,7 +123,8 @@ def notes(of: Notes) -> list[str]:
 
 def heading(of: Audit) -> str:
     verdict = f"; verdict {of.verdict}" if of.verdict else ""
-    result = "differs" if of.differences else "the same, byte for byte"
+    same = "agrees, as far as this version can tell" if of.notes.earlier else "the same, byte for byte"
+    result = "differs" if of.differences else same
     return f"{of.recording}: {result} ({', '.join(of.checked)}){verdict}"
 
 

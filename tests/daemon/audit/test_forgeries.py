@@ -442,7 +442,7 @@ def test_an_edited_file_beside_a_recording_is_found_and_a_missing_one_is_noted(
     assert auditor.lines(path) == [f"unit.{name}: the file beside the recording is not the one in it"]
 
 
-GOLDEN = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"
+GOLDEN = Path(__file__).parents[3] / "recordings" / "by-0.1.0.mcap"
 OLDER: list[tuple[str, Make, str]] = [
     ("verification taken out", lambda f: f.drop(VERIFICATION), f"{VERIFICATION}: {MISSING}"),
     ("traffic taken out", lambda f: f.each(REGISTERS, lambda m: None), f"{BEFORE}: scale_factor_x: "),

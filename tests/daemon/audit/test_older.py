@@ -1,0 +1,56 @@
+"""Audits of a recording of 0.1.0: what its search found is taken as it stands, and all the rest has to agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.daemon.audit.forging import Forgery
+from triaxcald.audit import Audit, audit, text
+
+EARLIER = Path(__file__).parents[3] / "recordings" / "by-0.1.0.mcap"
+
+
+def audited(change: Callable[[Any], object], folder: Path) -> Audit:
+    """With a certificate that was changed."""
+    forgery = Forgery.of(EARLIER)
+    forgery.edit("certificate.json", change)
+    return audit(forgery.write(folder / "changed.mcap"))
+
+
+def test_what_its_search_found_is_taken_as_it_stands_and_that_is_said() -> None:
+    found = audit(EARLIER)
+    assert found.differences == ()
+    assert text.heading(found).startswith(f"{EARLIER}: agrees, as far as this version can tell (certificate.json, ")
+    assert any("named effects by a search that is gone" in note for note in text.notes(found.notes))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda c: c["result"]["calibration"]["poses"][3]["mean"].__setitem__(0, 1.0),
+            "certificate.json: result.calibration.poses[3].mean[0]: stored 1.0, computed again ",
+        ),
+        (
+            lambda c: c["registers"]["words"][0].update(wanted=-2.5),
+            "certificate.json: registers.words[0].raw: stored ",
+        ),
+        (
+            lambda c: c["registers"]["words"][0].update(raw="000020c0", wanted=-2.5),
+            "registers-after.json: scale_factor_x: the device holds ",
+        ),
+        (
+            lambda c: c["result"]["after"].update(rms_g=7e-5),
+            'certificate.json: verdict: stored "within limits", computed again "outside limits"',
+        ),
+        (lambda c: c.update(verdict="not judged"), 'certificate.json: verdict: stored "not judged", computed again "'),
+        (lambda c: c["recording"].update(poses=25), "certificate.json: recording.poses: stored 25, computed again 2"),
+        (lambda c: c["result"].pop("calibration"), "certificate.json: cannot be computed again: "),
+    ],
+)
+def test_a_certificate_that_was_changed_differs(change: Callable[[Any], object], said: str, tmp_path: Path) -> None:
+    assert any(text.difference(d).startswith(said) for d in audited(change, tmp_path).differences)
