@@ -1,7 +1,9 @@
-"""What a method makes of the benchmark's recordings, one line each, to set another method beside it by the seed.
+"""What the loop makes of the benchmark's recordings, one line each, to set another state of it beside by the seed.
 
-    python -m benchmarks.frozen --write benchmarks/frozen/loop.jsonl.gz [--jobs 2] [--range development]
-    python -m benchmarks.frozen --show benchmarks/frozen/loop.jsonl.gz
+    python -m benchmarks.frozen --write FILE.jsonl.gz [--jobs 2] [--range development]
+    python -m benchmarks.frozen --show benchmarks/results/loop-test.jsonl.gz benchmarks/results/posterior-test.jsonl.gz
+
+``loop-*`` are the results of the search for effects that the posterior has taken the place of.
 
 A recording is one of `tests/undeclared`; what is inside, and the error of |a| in fifteen poses of another recording,
 before and after, with and without the noise of these poses, are in its line. Methods are made on the development range
@@ -16,10 +18,9 @@ import itertools
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,18 +33,15 @@ from tests.undeclared import invented, physics, uncatalogued
 from tests.undeclared.examine import Case, still_poses
 from tests.undeclared.generator import CannotShow, Recording
 from tests.undeclared.told import rms_g
-from triaxcal.calibration import Calibration, HoldsAt
+from triaxcal.calibration import Calibration
 from triaxcal.held_out import magnitude_errors
 from triaxcal.loop import diagnose
-from triaxcal.moment import Moment
-from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
-from triaxcal.posterior import average, posterior, refusal
 
 RANGES = {"development": 0, "test": 500_000}
 """First seeds; the test range is not looked at while a method is made."""
 CERTAIN = 0.99
-"""What a verdict of the loop is taken to say."""
+"""What a verdict of the search, which knew no probabilities, is taken to say."""
 LEAST = 1e-4
 """What a statement is taken to leave open, or one false certainty would make the score infinite."""
 TOLD = 1e-3
@@ -56,7 +54,7 @@ WORSE = 1.05
 
 @dataclass(frozen=True)
 class Judged:
-    """What a method says: findings (name, verdict, alternatives), whether something is left, the calibrations, and the
+    """What is said: findings (name, verdict, alternatives), whether something is left, the calibrations, and the
     probability of names, where it says so."""
 
     found: tuple[tuple[str, str, tuple[str, ...]], ...]
@@ -64,9 +62,6 @@ class Judged:
     before: Calibration
     after: Calibration
     probabilities: tuple[tuple[str, float], ...] = ()
-
-
-Method = Callable[[Sequence[Pose], Sequence[float]], Judged]
 
 
 @dataclass(frozen=True)
@@ -95,7 +90,7 @@ class Line:
 
     @property
     def stated(self) -> dict[str, float]:
-        """The probability of each name; of verdicts what they amount to: a name adopted has 0.99, and those that are
+        """The probability of each name. Where only verdicts are known: a name adopted has 0.99, and those that are
         alternatives share it."""
         if self.probabilities:
             return dict(self.probabilities)
@@ -123,27 +118,12 @@ class Line:
         return not self.right and bool(listed & set(self.names))
 
 
-def of_loop(poses: Sequence[Pose], signs: Sequence[float]) -> Judged:
+def judged(poses: Sequence[Pose], signs: Sequence[float]) -> Judged:
+    """What the loop of today says."""
     loop = diagnose(poses, signs=signs)
-    found = tuple((f.effect, f.verdict, tuple(f.alternatives)) for f in loop.findings)
-    return Judged(found, bool(loop.unexplained.significant), loop.before, loop.after)
-
-
-def of_posterior(poses: Sequence[Pose], signs: Sequence[float]) -> Judged:
-    before = replace(fit(poses, signs=signs), holds_at=HoldsAt.of(poses, Moment.END))
-    seen = posterior(poses, before, signs=signs)
-    found = tuple((g[0], "adopted" if len(g) == 1 else "confounded", g[1:]) for g in seen.certain)
-    after = before
-    if refusal(seen) is None:
-        assert before.holds_at is not None
-        made = average(seen, before.holds_at)
-        reference = seen.evidence.rows.problem.channel_reference
-        after = replace(before, sensor=made.sensor, channel_reference=reference)
-    told = tuple((name, float(f"{p:.4g}")) for name, p in seen.of_names.items() if p >= TOLD)
-    return Judged(found, seen.of_unmodelled >= seen.evidence.odds.refused, before, after, told)
-
-
-METHODS: dict[str, Method] = {"loop": of_loop, "posterior": of_posterior}
+    found = tuple((f.effect, f.verdict.value, tuple(f.alternatives)) for f in loop.findings)
+    told = tuple((name, float(f"{p:.4g}")) for name, p in loop.probabilities.items() if p >= TOLD)
+    return Judged(found, loop.found.unexplained.significant, loop.before, loop.after, told)
 
 
 def cases(first: int, share: float = 1.0) -> Iterator[tuple[str, Case]]:
@@ -171,8 +151,8 @@ def cases(first: int, share: float = 1.0) -> Iterator[tuple[str, Case]]:
         yield "two", Case("two", i, PAIR, 14 if i % 3 == 2 else 26, NOISES[i % 3])
 
 
-def line(method: Method, asked: tuple[str, Case]) -> Line:
-    """Whatever goes wrong in the method is an outcome too."""
+def line(asked: tuple[str, Case]) -> Line:
+    """Whatever goes wrong is an outcome too."""
     section, case = asked
     bare = Line(section, case.kind, case.seed, case.poses, case.noise)
     try:
@@ -183,24 +163,24 @@ def line(method: Method, asked: tuple[str, Case]) -> Line:
     try:
         poses = still_poses(r.samples())
         begin = time.process_time()
-        judged = method(poses, r.signs)
+        said = judged(poses, r.signs)
         seconds = time.process_time() - begin
         check = still_poses(r.held_out_samples())
-        (before, quiet_before), (after, quiet_after) = (errors_g(r, check, c) for c in (judged.before, judged.after))
+        (before, quiet_before), (after, quiet_after) = (errors_g(r, check, c) for c in (said.before, said.after))
     except Exception as e:  # noqa: BLE001 -- a benchmark goes on
         return replace(bare, error=f"{type(e).__name__}: {e}")
-    floor = judged.before.residual.noise_floor_g
+    floor = said.before.residual.noise_floor_g
     return replace(
         bare,
-        found=judged.found,
-        unexplained=judged.unexplained,
+        found=said.found,
+        unexplained=said.unexplained,
         before_g=before,
         after_g=after,
         quiet_before_g=quiet_before,
         quiet_after_g=quiet_after,
         noise_floor_g=floor,
         seconds=seconds,
-        probabilities=judged.probabilities,
+        probabilities=said.probabilities,
     )
 
 
@@ -297,21 +277,21 @@ def reliability(lines: Sequence[Line]) -> Table:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", type=Path, metavar="FILE", help="run a method and freeze its results")
-    parser.add_argument("--show", type=Path, metavar="FILE", help="the table of frozen results")
-    parser.add_argument("--method", choices=METHODS, default="loop")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="run the loop and freeze its results")
+    parser.add_argument("--show", type=Path, metavar="FILE", nargs="+", default=[], help="tables of frozen results")
     parser.add_argument("--range", choices=RANGES, default="development", help="of seeds")
     parser.add_argument("--share", type=float, default=1.0, help="of the recordings; default all")
     parser.add_argument("--section", help="only this one, in the place of what FILE has of it")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     options = parser.parse_args(arguments)
-    if options.show:
-        print(table(read(options.show)))
-        print(reliability(read(options.show)))
+    for path in options.show:
+        print(path)
+        print(table(read(path)))
+        print(reliability(read(path)))
     if options.write:
         with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
             asked = [c for c in cases(RANGES[options.range], options.share) if options.section in (None, c[0])]
-            lines = list(pool.map(partial(line, METHODS[options.method]), asked, chunksize=2))
+            lines = list(pool.map(line, asked, chunksize=2))
         if options.section and options.write.exists():
             lines = [*(one for one in read(options.write) if one.section != options.section), *lines]
         write(options.write, lines)

@@ -15,10 +15,11 @@ from pathlib import Path
 
 from pictures import draw
 
-from triaxcal.caution import HighLeverage, OutlierSetsTied, PoorSpread
+from triaxcal.caution import HighLeverage, PoorSpread
 from triaxcal.errors import Refused
 from triaxcal.loop import Loop, diagnose
 from triaxcal.text import caution
+from triaxcal.text.diagnosis import chance
 from triaxcald.inputs import Measured, measure
 from triaxcald.tables.own_text import read_csv
 
@@ -40,7 +41,7 @@ def row(name: str, measured: Measured) -> str:
     before, after = loop.before.residual, loop.after.residual
     numbers = [before.noise_floor_g, before.rms_g, before.cross_validated_rms_g]
     numbers_after = [after.rms_g, after.cross_validated_rms_g]
-    left = loop.unexplained.rms_g if loop.unexplained.significant else None
+    left = loop.found.unexplained.rms_g if loop.found.unexplained.significant else None
     cells = [name, str(len(measured.poses)), *map(micro, numbers), findings(loop)]
     cells += [*map(micro, numbers_after), micro(left), warnings(loop, measured)]
     return f"| {' | '.join(cells)} |"
@@ -51,9 +52,10 @@ def micro(value: float | None) -> str:
 
 
 def findings(loop: Loop) -> str:
-    """An effect in question has what would do as well behind it."""
-    named = [f.effect if f.verdict == "adopted" else f"{f.effect} (or {', '.join(f.rivals)})" for f in loop.findings]
-    return "; ".join(named) or "none"
+    """Names that are certain, alone or as one of several, and likely ones, each with its probability."""
+    groups = [{f.effect: f.probability, **f.alternatives} for f in loop.findings]
+    groups += [{c.effect: c.probability} for c in loop.candidates]
+    return "; ".join(" or ".join(f"{name} {chance(p)}" for name, p in of.items()) for of in groups) or "none"
 
 
 def warnings(loop: Loop, measured: Measured) -> str:
@@ -63,9 +65,8 @@ def warnings(loop: Loop, measured: Measured) -> str:
     found += [line.split(",")[0].replace("_", " ") for line in measured.data_quality]
     cautions = loop.after.cautions
     found += [caution(c).split(":")[0] for c in cautions if isinstance(c, PoorSpread | HighLeverage)]
-    aside = sum(not p.used for p in loop.after.poses)
-    found += [f"{aside} poses set aside" if aside > 1 else "1 pose set aside"] if aside else []
-    found += ["spoiled poses that cannot be told apart" for c in cautions if isinstance(c, OutlierSetsTied)]
+    excluded = sum(not p.used for p in loop.after.poses)
+    found += [f"{excluded} {'poses' if excluded > 1 else 'pose'} excluded"] if excluded else []
     return "; ".join(found) or "none"
 
 

@@ -1,6 +1,6 @@
 """What a calibration of one measured recording does on the next one of the same sensor.
 
-    python -m benchmarks.next_recording [--methods posterior loop] [--list]
+    python -m benchmarks.next_recording [--list]
 
 The recordings are runs 1 to 5 of eight sensors on one board, one after the other, in ../shared/datasets/mimu4444. The
 error of |a| in the poses of a run under the calibration of the run before, which holds at the end of that run, over
@@ -13,12 +13,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.frozen import METHODS, WORSE
+from benchmarks.frozen import WORSE, judged
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from triaxcal.calibration import Calibration
@@ -43,41 +42,39 @@ def error_g(c: Calibration, poses: Sequence[Pose]) -> float:
     return float(np.sqrt(np.mean(miss**2)))
 
 
-def of_sensor(method: str, sensor: int) -> list[tuple[int, float, float, str]]:
+def of_sensor(sensor: int) -> list[tuple[int, float, float, str]]:
     """(run, error of the linear fit on the next run, error after, what was found) each."""
     runs = {run: poses_of(run, sensor) for run in RUNS}
     out = []
     for run in RUNS[:-1]:
-        judged = METHODS[method](runs[run], SIGNS)
-        found = ", ".join(f"{name} {verdict}" for name, verdict, _ in judged.found)
-        found += "; unexplained" if judged.unexplained else ""
-        out.append((run, error_g(judged.before, runs[run + 1]), error_g(judged.after, runs[run + 1]), found))
+        said = judged(runs[run], SIGNS)
+        found = ", ".join(f"{name} {verdict}" for name, verdict, _ in said.found)
+        found += "; unexplained" if said.unexplained else ""
+        out.append((run, error_g(said.before, runs[run + 1]), error_g(said.after, runs[run + 1]), found))
     return out
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--list", action="store_true", help="a line for each pair")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     options = parser.parse_args(arguments)
     if not FOLDER.is_dir():
         sys.stderr.write(f"{FOLDER}: no recordings there\n")
         return 2
+    with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
+        found = list(pool.map(of_sensor, SENSORS))
+    ratios = np.array([[after / before for _, before, after, _ in of_one] for of_one in found])
     rows = []
-    for method in options.methods:
-        with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
-            found = list(pool.map(partial(of_sensor, method), SENSORS))
-        ratios = np.array([[after / before for _, before, after, _ in of_one] for of_one in found])
-        for run, of_run in zip([*map(str, RUNS[:-1]), "all"], [*ratios.T, ratios.ravel()], strict=True):
-            pair = f"{run} → {int(run) + 1}" if run.isdecimal() else run
-            better, worse = np.mean(of_run < 1 / WORSE), np.mean(of_run > WORSE)
-            figures = [f"{np.exp(np.mean(np.log(of_run))):.3f}", f"{of_run.min():.2f}", f"{of_run.max():.2f}"]
-            rows.append([method, pair, *figures, f"{100 * better:.0f}", f"{100 * worse:.0f}"])
-        for sensor, of_one in zip(SENSORS, found, strict=True) if options.list else ():
-            for run, before, after, said in of_one:
-                print(f"{method} {sensor} {run}: {before * 1e6:.0f} -> {after * 1e6:.0f} µg  {said}")
-    head = ["method", "runs", "after / before", "best", "worst", "better by 5 %, %", "worse by 5 %, %"]
+    for run, of_run in zip([*map(str, RUNS[:-1]), "all"], [*ratios.T, ratios.ravel()], strict=True):
+        pair = f"{run} → {int(run) + 1}" if run.isdecimal() else run
+        better, worse = np.mean(of_run < 1 / WORSE), np.mean(of_run > WORSE)
+        figures = [f"{np.exp(np.mean(np.log(of_run))):.3f}", f"{of_run.min():.2f}", f"{of_run.max():.2f}"]
+        rows.append([pair, *figures, f"{100 * better:.0f}", f"{100 * worse:.0f}"])
+    for sensor, of_one in zip(SENSORS, found, strict=True) if options.list else ():
+        for run, before, after, said in of_one:
+            print(f"{sensor} {run}: {before * 1e6:.0f} -> {after * 1e6:.0f} µg  {said}")
+    head = ["runs", "after / before", "best", "worst", "better by 5 %, %", "worse by 5 %, %"]
     print(Table("Error on the next recording over that of the linear fit, eight sensors", head, rows))
     return 0
 

@@ -20,11 +20,16 @@ import numpy as np
 from benchmarks.next_recording import FOLDER, SENSORS, error_g, poses_of
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
+from triaxcal.agreement import Common, agreement
 from triaxcal.loop import diagnose
 from triaxcal.next_recording import next_recording
-from triaxcal.posterior.together import together as of_units
 from triaxcal.runs import together
+from triaxcal.text.agreement import verdict
+from triaxcal.text.diagnosis import chance
 from triaxcal.uncertainty import budget
+
+LEAST = 0.05
+"""Effects of less probability, in all sensors and in each, are not listed."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +72,19 @@ def _shape(shape: dict[str, tuple[float, str]]) -> str:
 
 
 def agree() -> Table:
-    seen = [diagnose(together([poses_of(run, s) for run in range(1, 6)])).seen for s in SENSORS]
-    found = of_units(seen)
-    rows = [[n, f"{p:.4f}", f"{found.common[n]:.3f}"] for n, p in found.probability.items() if p > 1e-3]
-    title = "In all eight sensors together, by five runs"
-    return Table(
-        title, ["effect", "probability", "its values are common"], [*rows, ["none", f"{found.nothing:.2g}", ""]]
-    )
+    found = agreement([diagnose(together([poses_of(run, s) for run in range(1, 6)])) for s in SENSORS])
+    rows = [
+        [c.effect, chance(c.probability), chance(c.common), " ".join(f"{p:.2f}" for p in c.units), _shared(c)]
+        for c in found.effects
+        if max(c.probability, *c.units) > LEAST
+    ]
+    head = ["effect", "in all", "one value", "in each sensor by itself", "shape"]
+    return Table(f"All eight sensors, by five runs each: {verdict(found)}", head, rows)
+
+
+def _shared(c: Common) -> str:
+    of_all = (shape.shared for shape in c.shapes.values())
+    return ", ".join(f"{s.value:.0f} ± {s.standard_error or float('nan'):.0f} {s.unit}" for s in of_all)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -117,8 +117,9 @@ def _confusion(all_found: Sequence[Outcome]) -> Iterable[Table]:
         found = [o for o in all_found if o.case.poses == poses]
         if not found:
             continue
-        head = ["truth", "n", "adopted", "confounded, truth in it", "wrong unique name", "confounded, truth not in it"]
-        head += ["unexplained only", "nothing", "any wrong unique", "named, yet unexplained", "other names first"]
+        head = ["truth", "n", "adopted", "confounded, truth in it", "truth a candidate", "wrong unique name"]
+        head += ["other names listed or likely", "unexplained only", "nothing", "any wrong unique"]
+        head += ["named, yet unexplained", "other names first"]
         groups = [(k, [o for o in found if o.case.kind == k]) for k in physics.KINDS]
         rows = []
         for kind, group in [*((k, g) for k, g in groups if g), ("all, %", found)]:
@@ -128,7 +129,8 @@ def _confusion(all_found: Sequence[Outcome]) -> Iterable[Table]:
             total = kind == "all, %"
             names = Counter(o.found[0][0] for o in group if o.found and o.found[0][0] not in o.names)
             first = "" if total else ", ".join(f"{n} {c}" for n, c in names.most_common(4))
-            share = [verdicts[v] for v in ("adopted", "confounded", "wrong", "astray", "unexplained", "nothing")]
+            told = ("adopted", "confounded", "candidate", "wrong", "astray", "unexplained", "nothing")
+            share = [verdicts[v] for v in told]
             counts = [percent(c, len(group)) if total else str(c) for c in [*share, wrong, open_]]
             rows.append([kind, str(len(group)), *counts, first])
         yield Table(f"What is named first, one effect of s = 20 to 200, {poses} poses", head, rows)
@@ -152,8 +154,9 @@ def _held_out(found: Sequence[Outcome], poses: int) -> Table:
     ]
     rows = []
     groups = [(k, [o for o in found if o.case.kind == k]) for k in physics.KINDS]
-    unique, either = ([o for o in found if o.verdict == v] for v in ("adopted", "confounded"))
+    unique, either, likely = ([o for o in found if o.verdict == v] for v in ("adopted", "confounded", "candidate"))
     sums = [("all", list(found)), ("all named uniquely", unique), ("all confounded with the truth in it", either)]
+    sums.append(("all with the truth a candidate", likely))
     for kind, group in [*groups, *sums]:
         ratios = np.array([(o.after_ratio, o.told_ratio) for o in group if np.isfinite(o.after_ratio)])
         if not len(ratios):
@@ -171,14 +174,16 @@ def _nothing(found: Sequence[Outcome]) -> Iterable[Table]:
     for noise in ("white", "first_order"):
         for poses in (26, 14):
             group = [o for o in found if o.case.noise == noise and o.case.poses == poses]
-            findings, left = sum(bool(o.found) for o in group), sum(o.unexplained for o in group)
-            cells = [f"{c} ({percent(c, len(group))} %)" for c in (findings, left)]
+            findings, likely = sum(bool(o.found) for o in group), sum(bool(o.candidates) for o in group)
+            left, seen = sum(o.unexplained for o in group), sum(o.detected for o in group)
+            cells = [f"{c} ({percent(c, len(group))} %)" for c in (findings, likely, left, seen)]
             rows.append([noise, str(poses), str(len(group)), *cells])
-    yield Table("Nothing inside", ["noise", "poses", "n", "findings", "unexplained significant"], rows)
+    head = ["noise", "poses", "n", "findings", "candidates", "unexplained", "something likelier than nothing"]
+    yield Table("Nothing inside", head, rows)
 
 
 def _power(found: Sequence[Outcome]) -> Iterable[Table]:
-    head = ["s", "n", "told, %", "detected, %", "of told", "truth named or listed, %", "wrong unique, %"]
+    head = ["s", "n", "told, %", "detected, %", "of told", "truth named, listed or likely, %", "wrong unique, %"]
     rows = []
     for s in SIZES:
         group = [o for o in found if o.case.size[0] == s]
@@ -186,27 +191,27 @@ def _power(found: Sequence[Outcome]) -> Iterable[Table]:
         told = 100 * float(np.mean([o.told_power for o in group])) if group else np.nan
         detected = 100 * sum(o.detected for o in group) / max(n, 1)
         row = [f"{s:g}", str(n), f"{told:.1f}", f"{detected:.1f}", f"{detected / told:.2f}"]
-        rows.append([*row, percent(sum(o.listed for o in group), n), percent(sum(o.wrong for o in group), n)])
+        rows.append([*row, percent(sum(o.stated for o in group), n), percent(sum(o.wrong for o in group), n)])
     yield Table("Power, 26 poses; told: the test that was told the effect, at 1 % false alarms", head, rows)
     five = [o for o in found if o.case.size[0] == ASKED]
     rows = []
     for kind in physics.KINDS:
         group = [o for o in five if o.case.kind == kind]
         told = 100 * float(np.mean([o.told_power for o in group])) if group else np.nan
-        cells = [percent(sum(o.detected for o in group), len(group)), percent(sum(o.listed for o in group), len(group))]
+        cells = [percent(sum(o.detected for o in group), len(group)), percent(sum(o.stated for o in group), len(group))]
         rows.append([kind, str(len(group)), f"{told:.0f}", *cells])
-    yield Table("By effect, s = 5", ["truth", "n", "told, %", "detected, %", "truth named or listed, %"], rows)
+    yield Table("By effect, s = 5", ["truth", "n", "told, %", "detected, %", "truth named, listed or likely, %"], rows)
 
 
 def _two(found: Sequence[Outcome]) -> Iterable[Table]:
     apart = [o for o in found if min(o.beside, default=0.0) >= APART]
     rows = []
     for name, group in (("all", found), (f"each of s ≥ {APART:g} beside the other", apart)):
-        both = [sum(n in o.listed_names for n in o.names) for o in group]
+        both = [sum(n in o.stated_names for n in o.names) for o in group]
         cells = [percent(sum(b == k for b in both), len(group)) for k in (2, 1, 0)]
         rows.append([name, str(len(group)), *cells, percent(sum(o.wrong for o in group), len(group))])
     head = ["pairs", "n", "both, %", "one, %", "neither, %", "wrong unique, %"]
-    yield Table("Two at once, s = 20 to 40 each, 26 poses: named or listed", head, rows)
+    yield Table("Two at once, s = 20 to 40 each, 26 poses: named, listed or likely", head, rows)
 
 
 def _outside(all_found: Sequence[Outcome]) -> Iterable[Table]:
@@ -224,7 +229,7 @@ def _of_no_catalogue(found: Sequence[Outcome], poses: int) -> Table:
         if not group:
             continue
         left, wrong = sum(o.unexplained for o in group), sum(o.wrong for o in group)
-        only = sum(o.unexplained and not o.found for o in group)
+        only = sum(o.unexplained and not o.stated_names for o in group)
         names = Counter(n for o in group for n, verdict, _ in o.found if verdict == "adopted")
         cells = [percent(c, len(group)) for c in (left, only, wrong)]
         rows.append([kind, str(len(group)), *cells, ", ".join(f"{n} {c}" for n, c in names.most_common(3))])
@@ -237,13 +242,13 @@ def misses(section: str, outcomes: Sequence[Outcome]) -> list[str]:
         if o.error:
             return True
         if section == "confusion":
-            return o.wrong or o.verdict not in ("adopted", "confounded") or o.after_ratio > max(1.1, 1.1 * o.told_ratio)
+            return o.wrong or not o.stated or o.after_ratio > max(1.1, 1.1 * o.told_ratio)
         if section == "none":
             return o.detected
         if section == "power":
             return o.case.size[0] in (5.0, 20.0) and (o.wrong or not o.detected)
         if section == "two":
-            return o.wrong or not all(n in o.listed_names for n in o.names)
+            return o.wrong or not set(o.names) <= o.stated_names
         return o.wrong or not o.unexplained
 
     return [o.line for o in outcomes if failed(o)]

@@ -398,6 +398,7 @@ NAMED = frozenset(
         "channel_reference",
         "effects",
         "coefficients",
+        "probabilities",
         "sees",
         "levels",
         "promised",

@@ -1,7 +1,7 @@
 """Several units in one environment, eight sensors on a board say: which effects act in all of them.
 
 Every unit has its own linear model and its own coefficients of an effect. They may share which effect it is, its size,
-and its shape (a time constant, the moment of a step); existence is asked of all together (`triaxcal.posterior.together`).
+and its shape (a time constant, the moment of a step). Existence is asked of all together.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Answer(StrEnum):
     PERHAPS = "perhaps"
     """An effect probably acts in every unit."""
     DISAGREE = "disagree"
-    """Some unit shows an effect that another lacks."""
+    """Some unit shows an effect, and none probably acts in every unit."""
     NOTHING = "nothing"
     """No unit shows an effect."""
 
@@ -78,14 +78,19 @@ def agreement(loops: Sequence[Loop]) -> Agreement:
     elif likeliest >= odds.reported:
         answer, agreed = Answer.PERHAPS, ((first,),)
     else:
-        answer = Answer.DISAGREE if any(loop.findings for loop in loops) else Answer.NOTHING
+        shown = found.nothing < odds.reported or any(loop.findings or loop.candidates for loop in loops)
+        answer = Answer.DISAGREE if shown else Answer.NOTHING
     return Agreement(
         answer,
         agreed,
-        min((found.one_of(group) for group in agreed), default=0.0),
+        min((_probability(group, found) for group in agreed), default=0.0),
         tuple(_common(name, found, loops) for name in found.probability),
         found.nothing,
     )
+
+
+def _probability(group: tuple[str, ...], found: Together) -> float:
+    return found.probability[group[0]] if len(group) == 1 else found.one_of(group)
 
 
 def _common(name: str, found: Together, loops: Sequence[Loop]) -> Common:

@@ -124,8 +124,7 @@ class Calibration:
     standard deviation of |a| that every pose has beside its noise (`triaxcal.beyond`). ``dof`` are the effective
     degrees of freedom behind the standard errors. ``shape_errors`` are standard errors of the effects' shapes, by
     "effect.name"; ``shared`` are coefficients, named so, that only a combination of them is known of. ``trends``: how
-    |a| goes inside the poses was fitted along with their means. ``rivals`` are models that explain the same poses as
-    well, by what they have in the place of an effect; standard errors are those of this model, were it the right one.
+    |a| goes inside the poses was fitted along with their means.
     ``weights`` is the probability of each effect where the coefficients are means over all that may act. Then
     ``spread`` (p,) are the standard deviations of the coefficients before the poses were seen, and ``thermal``
     (9+p,9+p) is the part of the covariance that thermal effects make which the model has not.
@@ -149,7 +148,6 @@ class Calibration:
     trends: bool = False
     blind_to: tuple[str, ...] = ()
     cautions: tuple[Caution, ...] = ()
-    rivals: Mapping[str, Calibration] = field(default_factory=dict, repr=False)
     weights: Mapping[str, float] = field(default_factory=dict)
     spread: Floats | None = field(default=None, repr=False)
     thermal: Floats | None = field(default=None, repr=False)

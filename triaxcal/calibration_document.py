@@ -223,4 +223,4 @@ def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Doc
 
 def assumed_in(basis: Basis) -> tuple[str, ...]:
     """The effects whose size a line of the budget (`triaxcal.uncertainty.Component`) assumes."""
-    return basis.effects if isinstance(basis, UnmodelledTemperature) else ()
+    return basis.effects if isinstance(basis, UnmodelledTemperature) and not basis.stated else ()

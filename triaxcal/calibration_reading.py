@@ -39,10 +39,11 @@ def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: flo
 
 
 def logged_in(document: Mapping[str, Any], *, where: str) -> dict[str, Floats]:
-    """The channels of the poses of a calibration document, (n,) each, as conditions are named; none that a pose
-    lacks."""
+    """The channels of the poses of a calibration document that were used, (n,) each, as conditions are named; none that
+    one of these lacks."""
     poses = calibration_part(document, where=where).get("poses")
-    found = [p.get("channels") for p in poses if isinstance(p, Mapping)] if isinstance(poses, list) else []
+    used = [p for p in poses if isinstance(p, Mapping) and p.get("used", True)] if isinstance(poses, list) else []
+    found = [p.get("channels") for p in used]
     rows = [row if isinstance(row, Mapping) else {} for row in found]
     names = [str(n) for n in rows[0] if all(math.isfinite(_number(row.get(n))) for row in rows)] if rows else []
     return {condition_of(n): np.array([_number(row[n]) for row in rows]) for n in names}

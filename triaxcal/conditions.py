@@ -173,6 +173,13 @@ def at_reference(names: Iterable[str], n: int) -> dict[str, Floats]:
     return {name: np.full(n, np.inf if name in (SINCE_START, RUN) else 0.0) for name in names}
 
 
+def at_moment(reference: Mapping[str, float], n: int, moment: tuple[float, float] | None) -> dict[str, Floats]:
+    """n times the conditions that a unit in use meets: no deviation, and the clocks at the ``moment`` (`of_moment`)."""
+    clocks = of_moment(reference, moment)
+    held = {name: np.full(n, t - reference[name]) for name, t in clocks.items() if name in reference}
+    return at_reference(reference, n) | held
+
+
 def of_readings(
     channels: Mapping[str, Floats], reference: Mapping[str, float], n: int, clocks: Mapping[str, Floats | float]
 ) -> tuple[dict[str, Floats], tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Tails and quantiles of the usual distributions, by the functions that ``scipy.stats`` calls too.
+"""Tails and quantiles of the usual distributions, by the functions that ``scipy.stats`` calls too; sums of likelihoods.
 
 That package takes longer to import than most commands take for their work. Degrees of freedom and shapes that are not
 above zero give NaN. Arguments may be arrays, which broadcast.
@@ -6,6 +6,7 @@ above zero give NaN. Arguments may be arrays, which broadcast.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -74,3 +75,14 @@ def beta_cdf(x: Given, a: Given, b: Given) -> Floats:
 
 def _defined(value: Any, where: Bools | np.bool_) -> Floats:
     return np.where(where, value, np.nan)
+
+
+def log_sum_exp(log: Sequence[Any] | Floats, axis: int | tuple[int, ...] | None = None) -> Floats:
+    """The logarithm of a sum of what is given by its logarithm, along axes; −∞ counts nothing. SciPy's takes ten times
+    as long for a few hundred values, and the posterior takes a thousand such sums."""
+    values = np.asarray(log)
+    largest = np.max(values, axis=axis, keepdims=True)
+    largest = np.where(np.isfinite(largest), largest, 0.0)
+    with np.errstate(divide="ignore"):
+        found = np.log(np.sum(np.exp(values - largest), axis=axis)) + np.squeeze(largest, axis=axis)
+    return np.asarray(found)

@@ -10,7 +10,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.caution import Caution
-from triaxcal.conditions import at_reference, of_moment
+from triaxcal.conditions import at_moment
 from triaxcal.effects.contract import SINCE_START, TIME, Effect, reshaped
 
 STEP = 1e-4
@@ -39,7 +39,8 @@ def extrapolated(c: Calibration) -> Extrapolated | None:
         if {TIME, SINCE_START} & set(effect.needs):
             B = _basis(effect, c)
             variance += np.einsum("ap,pq,aq->a", B, c.covariance[own, own], B)
-            variance += _by_shapes(effect, q, c) ** 2
+            if c.spread is None:  # what an average does not know of a shape is in its covariance
+                variance += _by_shapes(effect, q, c) ** 2
     if beyond_s <= 0 or not variance.any():
         return None
     return Extrapolated(float(beyond_s), float(np.sqrt(variance.max())))
@@ -47,10 +48,8 @@ def extrapolated(c: Calibration) -> Extrapolated | None:
 
 def _basis(effect: Effect, c: Calibration) -> Floats:
     """(3,p) at the moment, with no specific force and everything else at its reference."""
-    held = at_reference(effect.needs, 1)
-    clocks = of_moment(c.channel_reference, c.moment)
-    held |= {n: np.array([clocks[n] - c.channel_reference[n]]) for n in clocks if n in effect.needs}
-    return np.asarray(effect.basis(np.zeros((1, 3)), held)[0])
+    needed = {name: c.channel_reference[name] for name in effect.needs}
+    return np.asarray(effect.basis(np.zeros((1, 3)), at_moment(needed, 1, c.moment))[0])
 
 
 def _by_shapes(effect: Effect, q: Floats, c: Calibration) -> Floats:

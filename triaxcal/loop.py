@@ -16,14 +16,14 @@ from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
 from triaxcal.held_out import HeldOut, held_out
 from triaxcal.moment import Moment
-from triaxcal.next_recording import NextRecording, next_recording
+from triaxcal.next_recording import START_TO_START, NextRecording, next_recording
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
-from triaxcal.posterior.advice import Advice, advice
+from triaxcal.posterior.advice import Advice, advice, decided
 from triaxcal.posterior.average import Refusal, average, refusal
 from triaxcal.posterior.blind import Blind, blind_to
 from triaxcal.posterior.corrected import corrected
-from triaxcal.posterior.findings import Findings, findings
+from triaxcal.posterior.findings import Findings, Named, findings
 from triaxcal.posterior.odds import Odds
 from triaxcal.posterior.posterior import Posterior, looked_for, posterior
 from triaxcal.posterior.terms import faults_of
@@ -54,9 +54,9 @@ class Call(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect that acts for certain, alone or as the likeliest of ``alternatives``, each with its probability. The
-    ``coefficients`` are those that are corrected, or else those if it is this effect that acts; ``remedy`` is how to be
-    rid of it."""
+    """An effect that acts for certain, alone or as the likeliest of ``alternatives``, each with its probability;
+    ``together`` is that of at least one of them. The ``coefficients`` are those that are corrected, or else those if it
+    is this effect that acts; ``remedy`` is how to be rid of it."""
 
     effect: str
     verdict: Verdict
@@ -64,6 +64,7 @@ class Finding:
     alternatives: Mapping[str, float]
     coefficients: Coefficients
     remedy: str
+    together: float
 
 
 @dataclass(frozen=True)
@@ -113,15 +114,15 @@ class Loop:
     @cached_property
     def too_uncertain(self) -> bool:
         """Whether more poses would make the next recording better, whatever acts: the calibration's own uncertainty is
-        more than half of what is expected there."""
-        return bool(self.next_recording.standard > np.sqrt(2) * self.next_recording.start_to_start)
+        more than half of what is expected there of a usual unit."""
+        known = max(self.next_recording.start_to_start, START_TO_START * self.after.reference)
+        return bool(self.next_recording.standard > np.sqrt(2) * known)
 
     @property
     def call(self) -> Call:
         if self.refusal in (Refusal.UNMODELLED, Refusal.ANOTHER):
             return Call.INVESTIGATE
-        certain = all(f.verdict is Verdict.ADOPTED for f in self.findings)
-        known = certain and not self.candidates and not self.found.outliers
+        known = decided(self.seen) and not self.candidates
         more = self.too_uncertain or self.found.outliers or (not known and self.advice.actions)
         return Call.RECORD_MORE if more else Call.USABLE
 
@@ -160,7 +161,7 @@ def diagnose(
         before=before,
         after=after,
         found=found,
-        findings=tuple(told.finding(named.probabilities, refused) for named in found.named),
+        findings=tuple(told.finding(named, refused) for named in found.named),
         candidates=tuple(Candidate(name, p, told.given(name)[0]) for name, p in found.candidates.items()),
         refusal=refused,
         held_out=None if sound_check is None else held_out(before, after, sound_check),
@@ -192,7 +193,8 @@ class _Told:
     moment: HoldsAt
     after: Calibration
 
-    def finding(self, probabilities: Mapping[str, float], refused: Refusal | None) -> Finding:
+    def finding(self, named: Named, refused: Refusal | None) -> Finding:
+        probabilities = named.probabilities
         name, *others = probabilities
         adopted = not others and refused is None
         coefficients, remedy = self._corrected(name) if adopted else self.given(name)
@@ -203,6 +205,7 @@ class _Told:
             alternatives={other: probabilities[other] for other in others},
             coefficients=coefficients,
             remedy=remedy,
+            together=named.together,
         )
 
     def given(self, name: str) -> tuple[Coefficients, str]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
-from triaxcal.conditions import at_reference, of_moment
+from triaxcal.conditions import at_moment
 from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects.contract import RUN
 from triaxcal.uncertainty import Budget
@@ -75,15 +75,17 @@ def _between_runs(c: Calibration) -> tuple[float, float] | None:
             variances.append(variance)
     if len(biases) < 2:
         return None
-    spread = np.var(biases, axis=0, ddof=1) - np.mean(variances, axis=0)
-    return float(np.sqrt(max(spread.sum(), 0.0) / 3)), 3.0 * (len(biases) - 1)
+    by_noise = np.mean(variances, axis=0).sum()
+    spread = np.var(biases, axis=0, ddof=1).sum() - by_noise
+    # Starts that agree within their noise may differ by as much as their mean is uncertain.
+    return float(np.sqrt(max(spread, by_noise / len(biases)) / 3)), 3.0 * (len(biases) - 1)
 
 
 def _in_run(c: Calibration, run: int) -> Floats:
     """(3,) what effects of the clocks, and of single runs, add to the bias in a run at the moment of its clock."""
-    held = at_reference(c.channel_reference, 1)
-    clocks = of_moment(c.channel_reference, c.moment) | {RUN: float(run)}
-    held |= {n: np.array([v - c.channel_reference[n]]) for n, v in clocks.items() if n in c.channel_reference}
+    held = at_moment(c.channel_reference, 1, c.moment)
+    if RUN in held:
+        held[RUN] = np.array([run - c.channel_reference[RUN]])
     return np.asarray(c.sensor.departure(np.zeros((1, 3)), held)[0])
 
 

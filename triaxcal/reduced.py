@@ -14,7 +14,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Residual
-from triaxcal.conditions import at_reference, of_moment
+from triaxcal.conditions import at_moment
 from triaxcal.effects.contract import Effect, is_derived
 from triaxcal.planning.directions import directions
 from triaxcal.sensor import Sensor
@@ -81,9 +81,7 @@ def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Map
     """(m,3) specific forces all over the sphere under the conditions that a unit in use meets: logged channels as they
     were in some of the poses, every clock at the moment, everything else at its reference."""
     up = np.array([v for _, v in directions(SPHERE)]) * c.reference
-    at_moment = at_reference(c.channel_reference, 1)
-    clocks = of_moment(c.channel_reference, c.moment)
-    at_moment |= {n: np.array([t - c.channel_reference[n]]) for n, t in clocks.items() if n in c.channel_reference}
+    in_use = at_moment(c.channel_reference, 1, c.moment)
     poses = [p.pose for p in c.poses if p.used]
     if poses:
         logged = {n: v for n, v in c.conditions_of(poses).items() if not is_derived(n)}
@@ -91,7 +89,7 @@ def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Map
         logged = {n: np.asarray(v) - c.channel_reference[n] for n, v in logged.items() if n in c.channel_reference}
     by_first = np.argsort(next(iter(logged.values())), kind="stable") if logged else np.zeros(1, dtype=int)
     some = by_first[np.linspace(0, len(by_first) - 1, CONDITIONS).astype(int)] if logged else by_first
-    held = {n: logged[n][some] if n in logged else np.repeat(v, len(some)) for n, v in at_moment.items()}
+    held = {n: logged[n][some] if n in logged else np.repeat(v, len(some)) for n, v in in_use.items()}
     return np.tile(up, (len(some), 1)), {n: np.repeat(v, len(up)) for n, v in held.items()}
 
 

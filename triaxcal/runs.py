@@ -15,7 +15,7 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.effects.contract import RUN, Effect
 from triaxcal.effects.in_run import InRuns, longest, of_clocks
-from triaxcal.effects.run_bias import BETWEEN_RUNS, RunBias
+from triaxcal.effects.run_bias import BETWEEN_RUNS
 from triaxcal.effects.wrapped import Wrapped
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose, Run
@@ -48,12 +48,6 @@ def by_run(catalogue: Sequence[Effect], poses: Sequence[Pose]) -> tuple[Effect, 
     if runs == 1:
         return tuple(catalogue)
     return (*(ByRun(e, runs) if of_clocks(e) else e for e in catalogue), *(replace(e, runs=runs) for e in BETWEEN_RUNS))
-
-
-def expected_of(poses: Sequence[Pose]) -> tuple[Effect, ...]:
-    """What several runs nearly always show: that the bias does not come back quite the same."""
-    runs = poses[0].run.of
-    return (RunBias(runs),) if runs > 1 else ()
 
 
 @dataclass(frozen=True)

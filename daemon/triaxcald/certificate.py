@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -72,10 +72,12 @@ def certify(
     Raises Refused where the poses cannot carry the answer, RegisterValueError where the registers cannot."""
     loop = diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
     profile = bundle.profile
+    stated = station.stated(profile)
     measured_ns = pipeline.first_host_ns or 0
     held = held_by_device(profile, loop.after)
     image = image_of(profile, held.registers.calibration, measured_ns // (DAY_S * 1_000_000_000)) if held else None
-    outside = _outside(loop, station.limits)
+    after = loop.after.residual
+    outside = over_limits({"rms_g": after.rms_g, "cross_validated_rms_g": after.cross_validated_rms_g}, station.limits)
     document: Document = {
         "format": "triaxcal.certificate/1",
         "unit": {
@@ -96,17 +98,17 @@ def certify(
         "software": dict(computed_with),
         "settings": {"signs": list(signs), "reference": number(station.reference)},
         "limits": {k: number(v) for k, v in station.limits.model_dump(exclude={"verification_rms_g"}).items() if v},
-        "verdict": "outside limits" if outside else "within limits" if _judged(station.limits) else "not judged",
+        "verdict": verdict_of(outside, station.limits),
         "outside": outside,
         "result": loop_document(
             loop,
             data_quality=pipeline.data_quality() + creeping(poses),
             output_unit=profile.output.unit,
-            stated=station.stated,
+            stated=stated,
             held_by_device=held.beside_process if held else None,
         ),
         "not_written": why_not_written(profile),
-        "registers": _registers_document(image, held, loop, poses, station.stated) if image and held else None,
+        "registers": _registers_document(image, held, loop, poses, stated) if image and held else None,
     }
     return Certified(document, loop, image, not outside)
 
@@ -189,7 +191,9 @@ def _registers_document(
         "rms_g": error(held.beside_process.residual.rms_g),
         "cost_rms_g": error(held.registers.cost),
         "rounding_rms_g": error(rounding_cost(image, registers, poses)),
-        "uncertainty": budget_document(registers, budget(registers, replace(stated, rounding=_steps(image)))),
+        "uncertainty": budget_document(
+            registers, budget(registers, replace(stated, rounding=_steps(image), not_held=held.registers.cost))
+        ),
         "words": [
             {
                 "register": w.register,
@@ -245,17 +249,16 @@ def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) ->
     return float(np.sqrt(np.mean((np.linalg.norm(worse.specific_force(u, shifted), axis=1) - exact) ** 2)))
 
 
-def _judged(limits: Limits) -> bool:
-    return limits.rms_g is not None or limits.cross_validated_rms_g is not None
+def verdict_of(outside: Sequence[str], limits: Limits) -> str:
+    judged = limits.rms_g is not None or limits.cross_validated_rms_g is not None
+    return "outside limits" if outside else "within limits" if judged else "not judged"
 
 
-def _outside(loop: Loop, limits: Limits) -> list[str]:
-    residual = loop.after.residual
+def over_limits(measured: Mapping[str, float | None], limits: Limits) -> list[str]:
+    """A line for each figure, by its key, that is above its limit, or that is not known."""
     out = []
-    for name, value, limit in (
-        ("rms_g", residual.rms_g, limits.rms_g),
-        ("cross_validated_rms_g", residual.cross_validated_rms_g, limits.cross_validated_rms_g),
-    ):
+    for name, limit in (("rms_g", limits.rms_g), ("cross_validated_rms_g", limits.cross_validated_rms_g)):
+        value = measured.get(name)
         if limit is not None and not (value is not None and value <= limit):
             out.append(f"{name} {micro_g(value)} is above the limit {micro_g(limit)}")
     return out

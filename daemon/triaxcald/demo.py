@@ -160,5 +160,5 @@ def _kept(check: Verification | None) -> bool:
 def _found(unit: SimulatedUnit, outcome: Outcome) -> bool:
     if outcome.certified is None:
         return False
-    likely = [name for name, p in outcome.certified.loop.probabilities.items() if p >= Odds().reported]
-    return likely == list(unit.truth)
+    likely = {name for name, p in outcome.certified.loop.probabilities.items() if p >= Odds().reported}
+    return likely == set(unit.truth)

@@ -146,7 +146,10 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str, moments:
     if STATION_FILE in recording.attachments:
         where = f"{recording.name}: {STATION_FILE}"
         station = parse_station(recording.attachments[STATION_FILE], where=where)
-    reference, stated, at = (station.reference, station.stated, station.moment) if station else (None, None, None)
+    stated = Stated(thermal_sensitivity=bundle.profile.output.thermal_sensitivity_per_k)
+    reference, at = None, None
+    if station is not None:
+        reference, stated, at = station.reference, station.stated(bundle.profile), station.moment
     meant = recording.metadata.get("unit", {})
     unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
     return Measured(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from triaxcal.agreement import Agreement, Common, SharedShape
+from triaxcal.agreement import Agreement, Answer, Common, SharedShape
 from triaxcal.calibration_document import Document
 from triaxcal.loop import Loop
 from triaxcal.posterior.shapes import Shape
@@ -42,7 +42,10 @@ def agreement_document(
     return {
         "format": "triaxcal.agreement/1",
         "verdict": verdict(found),
-        "agreed": [name for group in found.agreed for name in group],
+        "answer": found.answer.value,
+        "agreed": [group[0] for group in found.agreed if len(group) == 1] if found.answer is Answer.AGREE else [],
+        "agreed_one_of": [list(group) for group in found.agreed if len(group) > 1],
+        "probability": chance(found.probability),
         "nothing_probability": chance(found.nothing),
         "effects": [_effect(c, names, reference_unit) for c in found.effects],
         "units": [{"recording": n, "result": dict(r)} for n, r in zip(names, results, strict=True)],

@@ -53,6 +53,10 @@ class Output(Strict):
         tuple[float, float, float] | None,
         Field(description="output per g, with its sign; guides the operator and gives the signs"),
     ] = None
+    thermal_sensitivity_per_k: Annotated[
+        float | None,
+        Field(ge=0, le=0.1, description="by how much 1 K changes bias [g] and scale factor [relative], for the budget"),
+    ] = None
 
     @model_validator(mode="after")
     def _not_zero(self) -> Self:

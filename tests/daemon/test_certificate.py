@@ -187,7 +187,8 @@ def test_the_registers_have_a_budget_of_their_own_with_their_steps_in_it(plain: 
     document = plain.document
     free = {x["source"]: x for x in document["result"]["calibration"]["uncertainty"]["budget"]}
     held = {x["source"]: x for x in document["registers"]["uncertainty"]["budget"]}
-    assert set(held) - set(free) == {"register_rounding"}
+    assert set(held) - set(free) == {"register_rounding", "not_held"}
+    assert held["not_held"]["magnitude_g"] == pytest.approx(document["registers"]["cost_rms_g"], rel=0.1, abs=1e-8)
     # float32 near 2.4 has steps of 2^-22
     assert held["register_rounding"]["scale_factor"] == pytest.approx([2**-22 / 12**0.5] * 3, rel=1e-5)
     assert 0 < held["register_rounding"]["magnitude_g"] < 1e-6

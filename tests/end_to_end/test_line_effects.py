@@ -24,7 +24,7 @@ def test_a_unit_with_an_effect_that_no_register_takes_is_told_of_with_every_coef
         done = triaxcal("run", station)
     said = [line.strip() for line in done.out.splitlines()]
     assert done.code == 0, done.err
-    first = said.index("adopted: bias_step") + 1
+    first = next(i for i, line in enumerate(said) if line.startswith("corrected: bias_step (probability ")) + 1
     for (name, truth), line in zip(STEP.items(), said[first : first + len(STEP)], strict=True):
         found = re.fullmatch(rf"{name} (\S+) ± (\S+) .*", line)
         assert found, line

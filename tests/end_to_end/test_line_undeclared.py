@@ -59,10 +59,15 @@ class Finished:
         return [{f["effect"], *f["alternatives"]} for f in self.result["findings"]]
 
     @property
+    def likely(self) -> set[str]:
+        """Effects that are likelier than not."""
+        return {name for name, p in self.result["probabilities"].items() if p >= 0.5}
+
+    @property
     def standard_error(self) -> dict[str, float]:
-        """By role, of what was found."""
-        found = self.result["findings"]
-        return {f"{f['effect']}.{x}": c["standard_error"] for f in found for x, c in f["coefficients"].items()}
+        """By role, of what is corrected."""
+        effects = self.result["calibration"]["effects"].items()
+        return {f"{name}.{x}": c[x]["standard_error"] for name, c in effects for x in c if x != "weight"}
 
     @property
     def noise_g(self) -> float:
@@ -170,8 +175,8 @@ def test_what_a_part_at_fault_does_is_found_written_and_gone_from_the_output_aft
     run: Callable[..., Finished], faults: list[Fault], effects: set[str]
 ) -> None:
     unit = run(*faults, seed=31)
-    assert len(unit.listed) == len(effects)
-    assert all(any(effect in may_be for may_be in unit.listed) for effect in effects)
+    assert unit.likely == effects
+    assert all(unit.result["probabilities"][effect] > 0.9 for effect in effects)
     assert unit.result["unexplained"]["significant"] is False
     assert unit.document["outcome"]["device_state"] == "new_verified"
     assert unit.document["exit_code"] == 0
@@ -218,7 +223,9 @@ def test_what_no_catalogue_has_stays_unexplained_and_the_unit_as_it_was(run: Cal
     assert result["findings"] == []
     assert result["unexplained"]["significant"] is True
     assert result["unexplained"]["rms_g"] > LIMIT_G
-    assert any(line.startswith("something is left that no candidate explains") for line in result["advice"])
+    assert result["call"] == "investigate"
+    assert result["not_corrected"] == "unmodelled"
+    assert result["calibration"]["effects"] == {}
     (why,) = unit.document["outcome"]["outside"]
     assert why.startswith("rms_g ")
     assert unit.document["registers_written"] == []

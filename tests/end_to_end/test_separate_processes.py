@@ -16,7 +16,7 @@ from triaxcald.simulation.memory import Stored, factory_calibration
 
 UNIT = {
     "unit", "exit_code", "error", "wanted_poses", "serial", "recording", "certificate", "report", "before", "after",
-    "findings", "choices", "registers_written", "verification", "device_state", "records_lost",
+    "findings", "candidates", "choices", "registers_written", "verification", "device_state", "records_lost",
     "outcome", "outcome_file",
 }  # fmt: skip
 

@@ -579,7 +579,7 @@ class Failing(Radiation):
     assert name == "radiation"
     assert reason in why
     said = list(advice(loop, ErrorUnit.of("g", 1.0)))
-    assert f"the effect radiation of the package dosimetry-effects was left out: {why}" in said
+    assert f"the effect radiation of the package dosimetry-effects cannot be used: {why}" in said
     # Who asks for it all the same gets one line that names it.
     asked = partial(fit, poses, signs=(-1, -1, -1), effects=[radiation])
     if method == "variants":

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from triaxcal.effects import CATALOGUE, TIME, effect_named
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SCATTER, SINCE_START, rate_of
+from triaxcal.effects.contract import BEFORE, CHANGE, HELD, LAGS_S, SCATTER, SINCE_START, lag_of, rate_of
 from triaxcal.errors import Refused
 from triaxcal.sensor import Sensor
 
@@ -28,6 +28,11 @@ EVERYTHING: dict[str, list[float]] = {
     "bias_step": [1e-3, -1e-3, 2e-3],
     "hysteresis": [1e-3, 1e-3, -2e-3],
     "vibration_rectification": [10.0, -20.0, 30.0],
+    "fifth_order_nonlinearity": [2e-3, -3e-3, 1e-3],
+    "compression": [5e-3, -4e-3, 6e-3],
+    "scale_factor_drift": [1e-5, -2e-5, 1e-5],
+    "temperature_lag": [1e-3, -1e-3, 2e-3],
+    "remanence": [1e-3, -1e-3, 1e-3],
 }
 
 
@@ -35,6 +40,7 @@ def conditions(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     within = {name: rng.uniform(-1, 1, n) for name in (*BEFORE, *CHANGE)}
     within |= {name: rng.uniform(0, 1e-4, n) for name in SCATTER}
     there = {"temp_c": rng.uniform(-15, 15, n), rate_of("temp_c"): rng.uniform(-0.1, 0.1, n)}
+    there |= {lag_of("temp_c", constant_s): rng.uniform(-3, 3, n) for constant_s in LAGS_S}
     # The step of the catalogue is at 0 s: poses on either side of it.
     times = {TIME: rng.uniform(-300, 300, n), SINCE_START: rng.uniform(-10, 300, n), HELD: np.full(n, 10.0)}
     return within | there | times
@@ -74,7 +80,7 @@ def test_an_effect_adds_to_the_reading_in_g_along_the_sensitive_axis(with_effect
 
 def test_the_magnitude_s_gradient_is_its_central_difference(with_effects: Callable[..., Sensor]) -> None:
     sensor = with_effects(**EVERYTHING)
-    assert len(sensor.effects) == len(CATALOGUE)
+    assert {effect.name for effect, _ in sensor.effects} == {effect.name for effect in CATALOGUE}
     rng = np.random.default_rng(1)
     held = conditions(15, rng)
     u = sensor.output(rng.standard_normal((15, 3)), held)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import traceback
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,8 +44,9 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """``found`` (name, verdict, alternatives) in order; ``after_ratio`` and ``told_ratio`` are errors in held-out
-    poses, of the loop and of a fit that was told the effects, over those of nine parameters on the noise alone.
+    """``found`` (name, verdict, alternatives) in order; ``candidates`` and ``probability`` are of names, and
+    ``nothing`` is the probability that nothing acts; ``after_ratio`` and ``told_ratio`` are errors in held-out poses,
+    of the loop and of a fit that was told the effects, over those of nine parameters on the noise alone.
     """
 
     case: Case
@@ -56,6 +58,9 @@ class Outcome:
     imitation: tuple[str, float] = ("", float("nan"))
     """Where a catalogue has no name: the one that leaves least, and s of what it leaves."""
     found: tuple[tuple[str, str, tuple[str, ...]], ...] = ()
+    candidates: tuple[str, ...] = ()
+    probability: Mapping[str, float] = field(default_factory=dict)
+    nothing: float = 1.0
     unexplained: bool = False
     after_ratio: float = float("nan")
     told_ratio: float = float("nan")
@@ -70,15 +75,21 @@ class Outcome:
 
     @property
     def verdict(self) -> str:
-        """adopted, confounded (with the truth in it), wrong, astray (confounded without it), unexplained, nothing."""
+        """adopted, confounded (with the truth in it), candidate (the truth is likely), wrong, astray (other names are
+        listed or likely), unexplained, nothing."""
         listed = any(v == "confounded" and set(self.names) & {e, *others} for e, v, others in self.found)
+        likely = set(self.names) & set(self.candidates)
         if not self.found:
+            if self.candidates:
+                return "candidate" if likely else "astray"
             return "unexplained" if self.unexplained else "nothing"
         first, verdict, _ = self.found[0]
         if verdict == "adopted" and first in self.names:
             return "adopted"
         if listed:
             return "confounded"
+        if likely and verdict != "adopted":
+            return "candidate"
         return "wrong" if verdict == "adopted" else "astray"
 
     @property
@@ -88,20 +99,29 @@ class Outcome:
 
     @property
     def detected(self) -> bool:
-        return bool(self.found) or self.unexplained
+        """Whether it is likelier than not that something acts."""
+        return self.nothing < 0.5
 
     @property
     def listed_names(self) -> set[str]:
-        return {n for e, v, others in self.found for n in (e, *(others if v == "confounded" else ()))}
+        return {n for e, _, others in self.found for n in (e, *others)}
 
     @property
-    def listed(self) -> bool:
-        return bool(self.listed_names & set(self.names))
+    def stated_names(self) -> set[str]:
+        """Those that are named, listed with others, or likely."""
+        return self.listed_names | set(self.candidates)
+
+    @property
+    def stated(self) -> bool:
+        return bool(self.stated_names & set(self.names))
 
     @property
     def line(self) -> str:
-        found = "; ".join(f"{e} {v}" + (f" (or {', '.join(a)})" if a else "") for e, v, a in self.found) or "no finding"
+        known = [f"{e} {v}" + (f" (or {', '.join(a)})" if a else "") for e, v, a in self.found]
+        likely = [f"{name} likely ({self.probability[name]:.2f})" for name in self.candidates]
+        found = "; ".join([*known, *likely]) or "no finding"
         left = ", unexplained" if self.unexplained else ""
+        left += f", nothing {self.nothing:.2f}" if self.nothing > 0.01 else ""
         poses = "" if self.poses_found == self.poses_made else f", poses {self.poses_found}/{self.poses_made}"
         poses += f", moving in {self.moving}" if self.moving else ""
         poses += f", errors overstated {self.overstated:.1f}" if self.overstated > 1.3 else ""
@@ -163,8 +183,11 @@ def _compared(truth: Outcome, r: Recording) -> Outcome:
         truth = replace(truth, after_ratio=_held_out(loop, check, r) / _alone(r), told_ratio=told / nine)
     return replace(
         truth,
-        found=tuple((f.effect, f.verdict, tuple(f.alternatives)) for f in loop.findings),
-        unexplained=bool(loop.unexplained.significant),
+        found=tuple((f.effect, f.verdict.value, tuple(f.alternatives)) for f in loop.findings),
+        candidates=tuple(candidate.effect for candidate in loop.candidates),
+        probability=dict(loop.probabilities),
+        nothing=loop.found.nothing,
+        unexplained=loop.found.unexplained.significant,
         poses_found=len(poses),
         moving=moving(poses, r),
         overstated=overstated(loop, r),
@@ -177,7 +200,9 @@ def _held_out(loop: Loop, check: list[Pose], r: Recording) -> float:
     if len(check) != r.held_out.scene.poses or not any(e.of_recording for e in r.effects):
         return loop.held_out.after_rms_g if loop.held_out else float("nan")
     c = loop.after
-    miss, _ = magnitude_errors(c.sensor, check, channel_reference=c.channel_reference, reference=c.reference)
+    miss, _ = magnitude_errors(
+        c.sensor, check, channel_reference=c.channel_reference, reference=c.reference, moment=c.moment
+    )
     return rms_g(r, miss)
 
 
@@ -222,7 +247,10 @@ def describe(case: Case) -> str:
             f"{[i for i, p in enumerate(part.poses) if not p.used]}"
         )
     for f in loop.findings:
-        lines.append(f"{f.effect} {f.verdict} {f.alternatives} p {f.p_value:.1e} {dict(f.coefficients)}: {f.reason}")
-    lines.append(f"unexplained: {loop.unexplained}")
+        lines.append(f"{f.effect} {f.verdict} {f.probability:.4f} {dict(f.alternatives)} {dict(f.coefficients)}")
+    lines += [f"{c.effect} likely {c.probability:.3f} {dict(c.coefficients)}" for c in loop.candidates]
+    lines.append(f"probabilities: { {name: round(p, 3) for name, p in loop.probabilities.items() if p >= 0.01} }")
+    lines.append(f"outliers: {dict(loop.found.outliers)}; nothing: {loop.found.nothing:.3f}; refused: {loop.refusal}")
+    lines.append(f"unexplained: {loop.found.unexplained}")
     lines.append(f"held out: {loop.held_out}; told over noise alone {np.divide(*told_errors_g(r)[::-1]):.2f}")
     return "\n".join(lines)

@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.distributions import log_sum_exp
 from triaxcal.effects import TEMPERATURE
 from triaxcal.poses.pose import Pose
 from triaxcal.posterior.actions import LONGER, OPEN, Action, Do, Options
@@ -23,7 +23,7 @@ from triaxcal.posterior.rows import Rows
 from triaxcal.posterior.unmodelled import What
 
 SHARE = 0.99
-"""Of the probability that the sets hold which are asked, if so few do (`triaxcal.posterior.average.CELLS`)."""
+"""Of the probability that the sets hold which are asked, if so few do (`triaxcal.posterior.solved.CELLS`)."""
 DRAWS = 256
 """Of what the poses may show: an expected entropy is then known to a few hundredths."""
 LEAST = 0.05
@@ -184,7 +184,7 @@ class _Chances:
         off = (shown - mean) @ np.linalg.inv(lower).transpose(0, 2, 1)
         log = -0.5 * np.sum(off**2, axis=2) - np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)[:, None]
         weight = self.future.log_weight + log
-        return weight - logsumexp(weight, axis=0), shown
+        return weight - log_sum_exp(weight, axis=0), shown
 
     def with_shown(self, shown: Floats) -> Floats:
         """(S,K) with one pose more, the means first."""

@@ -7,35 +7,30 @@ the coefficients are those that come nearest, in the poses and in the next recor
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.special import logsumexp
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import HoldsAt
-from triaxcal.conditions import at_reference, of_moment
+from triaxcal.conditions import at_moment
 from triaxcal.effects import CATALOGUE, TEMPERATURE
 from triaxcal.effects.contract import Effect
+from triaxcal.effects.plugins import EffectFault
 from triaxcal.planning.directions import directions
-from triaxcal.posterior.evidence import SetEvidence
 from triaxcal.posterior.posterior import Posterior
 from triaxcal.posterior.rows import LINEAR
+from triaxcal.posterior.solved import NEGLIGIBLE, Solved, solved_cells
 from triaxcal.posterior.unmodelled import What, place
 from triaxcal.problem import State, everything, parameters_by_theta
 from triaxcal.sensor import Sensor
 
-NEGLIGIBLE = 1e-6
-"""The probability of a set that moves no average."""
 NOTICEABLE = 0.1
 """Of the standard error of a pose: a name that is unlikely and corrects less is not listed."""
 BIAS = slice(3, 6)
 """Of the nine parameters as the fit has them: to one of these a bias adds as it is."""
-CELLS = 400
-"""Sets, with one part and one choice of sizes each, whose covariances are mixed: the likeliest. The others are as these
-are."""
 THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
 EARNED = 0.03
 """Of the mean square of what an unlikely name may do: a name that corrects less only adds coefficients that nobody
@@ -90,22 +85,23 @@ def refusal(seen: Posterior) -> Refusal | None:
     return None
 
 
-def average(seen: Posterior, at: HoldsAt) -> Average:
-    """Over all sets, sizes and parts; it holds for another recording as at a moment of this one."""
-    listed = _likeliest(seen)
-    made = _of_listed(seen, at, listed)
+def average(seen: Posterior, at: HoldsAt, solved: Sequence[Solved] | None = None) -> Average:
+    """Over all sets, sizes and parts; it holds for another recording as at a moment of this one. ``solved`` are the
+    likeliest sets (`solved_cells`), where they are known."""
+    listed, solved = _likeliest(seen), solved_cells(seen) if solved is None else solved
+    made = _of_listed(seen, at, listed, solved)
     kept = [effect for effect in listed if _earns(seen, made, effect)]
-    return made if len(kept) == len(listed) else _of_listed(seen, at, kept)
+    return made if len(kept) == len(listed) else _of_listed(seen, at, kept, solved)
 
 
-def _of_listed(seen: Posterior, at: HoldsAt, listed: Sequence[Effect]) -> Average:
+def _of_listed(seen: Posterior, at: HoldsAt, listed: Sequence[Effect], solved: Sequence[Solved]) -> Average:
     carried = _Carried.of(seen, at, listed)
     mean, left = _mean(seen, carried)
     state = _settled(seen, mean, carried)
     sensor = state.sensor(seen.evidence.rows.problem)
     wander = _wander(seen, left, at.t_s)
     moved = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + wander, sensor.effects)
-    return _with_errors(seen, at, carried, moved, state, mean, wander)
+    return _with_errors(seen, at, carried, moved, state, mean, wander, solved)
 
 
 def _earns(seen: Posterior, made: Average, effect: Effect) -> bool:
@@ -122,19 +118,27 @@ def _earns(seen: Posterior, made: Average, effect: Effect) -> bool:
     return corrects >= EARNED * (corrects + float(np.sum(np.diag(made.covariance)[own] / size**2)))
 
 
-def linear_alone(seen: Posterior, at: HoldsAt, linear: Sensor) -> Average:
+def linear_alone(seen: Posterior, at: HoldsAt, linear: Sensor, solved: Sequence[Solved]) -> Average:
     """The ``linear`` sensor with the errors that all likely sets make of it: what is handed on where no effect is
     corrected."""
     rows = seen.evidence.rows
     state = State.of(rows.problem, linear)
-    return _with_errors(seen, at, _Carried.of(seen, at, []), linear, state, state.theta - rows.state.theta, np.zeros(3))
+    carried, mean = _Carried.of(seen, at, []), state.theta - rows.state.theta
+    return _with_errors(seen, at, carried, linear, state, mean, np.zeros(3), solved)
 
 
 def _with_errors(
-    seen: Posterior, at: HoldsAt, carried: _Carried, sensor: Sensor, state: State, mean: Floats, wander: Floats
+    seen: Posterior,
+    at: HoldsAt,
+    carried: _Carried,
+    sensor: Sensor,
+    state: State,
+    mean: Floats,
+    wander: Floats,
+    solved: Sequence[Solved],
 ) -> Average:
     G = parameters_by_theta(seen.evidence.rows.problem, state)
-    spread = _Spread.of(seen, mean, carried, wander, at.t_s)
+    spread = _Spread.of(seen, solved, mean, carried, wander, at.t_s)
     weights = {effect.name: seen.of_names[effect.name] for effect in carried.effects}
     return Average(sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, wander)
 
@@ -210,7 +214,10 @@ def _both(seen: Posterior, effect: Effect, elsewhere: _Elsewhere) -> Floats:
     """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of |a| in the next recording."""
     rows = seen.evidence.rows
     _, along, by_v, held = elsewhere
-    there = -np.einsum("ni,nip->np", by_v, effect.basis(along, held)) / rows.of_a_pose
+    try:
+        there = -np.einsum("ni,nip->np", by_v, effect.basis(along, held)) / rows.of_a_pose
+    except EffectFault:  # of another package, which does not say what it adds there
+        there = np.zeros((len(along), len(effect.coefficients)))
     return np.concatenate([rows.by_coefficients(effect), there])
 
 
@@ -221,9 +228,7 @@ def _elsewhere(seen: Posterior, at: HoldsAt) -> _Elsewhere:
     up = np.array([v for _, v in directions(SPHERE)]) * rows.problem.reference
     found = place(rows, rows.state.sensor(rows.problem).output(up, {}))
     reference = rows.problem.channel_reference
-    held = at_reference(reference, len(up))
-    clocks = of_moment(reference, at.clocks)
-    held |= {name: np.full(len(up), v - reference[name]) for name, v in clocks.items() if name in reference}
+    held = at_moment(reference, len(up), at.clocks)
     return found.linear / rows.of_a_pose, found.along, -found.by_v, held
 
 
@@ -262,70 +267,45 @@ class _Spread:
     prior: Floats
 
     @classmethod
-    def of(cls, seen: Posterior, mean: Floats, carried: _Carried, wander: Floats, t_s: float) -> _Spread:
+    def of(
+        cls, seen: Posterior, solved: Sequence[Solved], mean: Floats, carried: _Carried, wander: Floats, t_s: float
+    ) -> _Spread:
         """Within each set, part and choice of sizes, and between them. The biases are those of the moment, with what a
         process in time adds."""
         listed = {effect.name for effect in carried.effects}
         whole, thermal = np.zeros((2, len(mean), len(mean)))
         prior, total = np.zeros(len(mean) - LINEAR), 0.0
-        for share, names, size, here in _cells(seen, mean, carried, wander, t_s):
-            total += share
-            whole += share * here
-            prior += share * size
-            if names & (THERMAL - listed):
-                thermal += share * here
+        for cells in solved:
+            size, here = _moments(cells, seen, mean, carried, wander, t_s)
+            total += float(cells.share.sum())
+            whole += here
+            prior += size
+            if cells.names & (THERMAL - listed):
+                thermal += here
         return cls(whole / total, thermal / total, prior / total)
 
 
-def _cells(
-    seen: Posterior, mean: Floats, carried: _Carried, wander: Floats, t_s: float
-) -> Iterator[tuple[float, frozenset[str], Floats, Floats]]:
-    """Of each likely set, part and choice of sizes: its probability, its names, the variances (p,) that its sizes give
-    the coefficients, and the second moments (9+p,9+p) about the mean."""
-    evidence = seen.evidence
-    rows = evidence.rows
-    inverse: dict[int, Floats] = {}
-    for log_share, found, row, cell in likely_cells(seen):
-        part = found.parts[row]
-        if part not in inverse:
-            inverse[part] = np.linalg.inv(evidence.covariance(part))
-        places = evidence.places(found.members)
-        design = np.concatenate([rows.linear, evidence.columns[:, places]], axis=1)
-        precision = design.T @ inverse[part] @ design
-        sizes = np.repeat(found.sizes[cell], [evidence.terms[i].rank for i in found.members])
-        precision[LINEAR:, LINEAR:] += np.diag(sizes**-2.0)
-        within = np.linalg.inv(precision)
-        here = within @ (design.T @ (inverse[part] @ rows.y))
-        left = rows.y - design @ here
-        to = np.concatenate([np.zeros((len(mean), LINEAR)), carried.by_term[:, places]], axis=1)
-        size = np.sum((to[LINEAR:, LINEAR:] * sizes) ** 2, axis=1)
-        to[:LINEAR, :LINEAR] += np.diag(1 / rows.lengths)
-        off = to @ here - mean
-        off[BIAS] -= wander
-        wandering = np.zeros((3, 3))
-        assumed = evidence.parts[part]
-        if assumed.kind is not None and assumed.kind.what is What.TIME:
-            there = assumed.tau**2 * assumed.kind.bias_at(rows, t_s)
-            off[BIAS] += there @ inverse[part] @ left
-            wandering = assumed.tau**2 * assumed.kind.scale * np.eye(3) - there @ inverse[part] @ there.T
-            to[BIAS] -= there @ inverse[part] @ design
-        spread = to @ within @ to.T
-        spread[BIAS, BIAS] += wandering
-        noise = rows.noise_given(float(rows.y @ inverse[part] @ left))
-        yield float(np.exp(log_share)), seen.names_of(found), size, spread * noise + np.outer(off, off)
-
-
-def likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
-    """The logarithm of its probability, the set, and the places of part and sizes."""
-    total = float(logsumexp([found.total for found in seen.sets]))
-    cells = []
-    for found in seen.sets:
-        if found.total - total < np.log(NEGLIGIBLE):
-            break
-        flat = found.log.ravel()
-        few = np.argpartition(-flat, CELLS // 4)[: CELLS // 4] if len(flat) > CELLS // 4 else range(len(flat))
-        cells += [(float(flat[i]) - total, found, *divmod(int(i), found.log.shape[1])) for i in few]
-    return sorted(cells, key=lambda cell: -cell[0])[:CELLS]
+def _moments(
+    cells: Solved, seen: Posterior, mean: Floats, carried: _Carried, wander: Floats, t_s: float
+) -> tuple[Floats, Floats]:
+    """Sums over the choices, by their share: the variances (p,) that the sizes give the coefficients of an average,
+    and the second moments (9+p,9+p) about its mean."""
+    rows, assumed = seen.evidence.rows, seen.evidence.parts[cells.part]
+    to = np.concatenate([np.zeros((len(mean), LINEAR)), carried.by_term[:, cells.places]], axis=1)
+    size = cells.share @ (cells.sizes**2 @ (to[LINEAR:, LINEAR:] ** 2).T)
+    to[:LINEAR, :LINEAR] += np.diag(1 / rows.lengths)
+    off = cells.here @ to.T - mean
+    off[:, BIAS] -= wander
+    wandering = np.zeros((3, 3))
+    if assumed.kind is not None and assumed.kind.what is What.TIME:
+        there = assumed.tau**2 * assumed.kind.bias_at(rows, t_s) @ cells.inverse
+        off[:, BIAS] += cells.left @ there.T
+        wandering = assumed.tau**2 * (assumed.kind.scale * np.eye(3) - there @ assumed.kind.bias_at(rows, t_s).T)
+        to[BIAS] -= there @ cells.design
+    shared = cells.share * cells.noise
+    spread = to @ np.tensordot(shared, cells.within, axes=1) @ to.T
+    spread[BIAS, BIAS] += shared.sum() * wandering
+    return size, spread + (cells.share[:, None] * off).T @ off
 
 
 def _settled(seen: Posterior, deviation: Floats, carried: _Carried) -> State:

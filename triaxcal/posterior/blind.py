@@ -50,7 +50,8 @@ def _in_full(evidence: Evidence, name: str) -> bool:
     for term in evidence.terms:
         if term.name == name and term.effect is not None and len(term.kept) == len(term.effect.coefficients):
             columns = term.columns / np.maximum(np.linalg.norm(term.columns, axis=0), 1e-300)
-            if np.linalg.svd(beside @ columns, compute_uv=False)[-1] > VISIBLE:
+            left = beside @ columns
+            if min(left.shape) == term.rank and np.linalg.svd(left, compute_uv=False)[-1] > VISIBLE:
                 return True
     return False
 

@@ -13,6 +13,7 @@ from triaxcal.posterior.average import Average, average, linear_alone, refusal
 from triaxcal.posterior.posterior import Posterior
 from triaxcal.posterior.rows import Rows
 from triaxcal.posterior.shapes import shapes_of
+from triaxcal.posterior.solved import solved_cells
 from triaxcal.problem import State, linearise
 from triaxcal.pure_error import lack_of_fit_p, pure_error_dof
 from triaxcal.uncertainty.linearised import held_gain
@@ -21,9 +22,10 @@ from triaxcal.uncertainty.linearised import held_gain
 def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
     """With the likely effects at their mean coefficients. ``before`` is the linear calibration of all poses that were
     given: where no effect is to be corrected (`refusal`), it stays, with the errors that all likely sets make of it."""
-    made = None if refusal(seen) else average(seen, at)
+    solved = solved_cells(seen)
+    made = None if refusal(seen) else average(seen, at, solved)
     if made is None or not made.sensor.effects:
-        made = linear_alone(seen, at, before.sensor)
+        made = linear_alone(seen, at, before.sensor, solved)
     rows = seen.evidence.rows
     needed = dict.fromkeys(name for effect, _ in made.sensor.effects for name in effect.needs)
     after = replace(
@@ -59,7 +61,18 @@ def _shape_errors(seen: Posterior, made: Average) -> dict[str, float]:
 
 
 def _with_residuals(c: Calibration, rows: Rows, made: Average) -> Calibration:
-    """In the recording's own poses, at their own times."""
+    """In the recording's own poses, at their own times. Of poses with a fault that lack a channel nothing is known."""
+    logged = set.intersection(*(set(p.pose.channels) for p in c.poses if p.used))
+    known = [i for i, p in enumerate(c.poses) if logged <= set(p.pose.channels)]
+    nan = float("nan")
+    unknown = (i for i in range(len(c.poses)) if i not in known)
+    rest = {i: replace(c.poses[i], residual_g=nan, studentized=nan, raised_g=None) for i in unknown}
+    found = _with_known_residuals(replace(c, poses=tuple(c.poses[i] for i in known)), rows, made, known)
+    both = dict(zip(known, found.poses, strict=True)) | rest
+    return replace(found, poses=tuple(both[i] for i in range(len(c.poses))))
+
+
+def _with_known_residuals(c: Calibration, rows: Rows, made: Average, places: list[int]) -> Calibration:
     poses = [p.pose for p in c.poses]
     u, held = np.array([p.mean for p in poses]), c.conditions_of(poses)
     length, by_u = c.sensor.magnitude(u, held)
@@ -68,8 +81,9 @@ def _with_residuals(c: Calibration, rows: Rows, made: Average) -> Calibration:
     r = length - c.reference
     error = np.sqrt(np.einsum("ni,nij,nj->n", by_u, np.array([p.covariance for p in poses]), by_u))
     leverage = np.zeros(len(poses))
-    used = [k for k, place in enumerate(rows.places) if c.poses[place].used]
-    of_used = rows.places[used]
+    of_place = {place: i for i, place in enumerate(places)}
+    used = [k for k, place in enumerate(rows.places) if c.poses[of_place[int(place)]].used]
+    of_used = np.array([of_place[int(place)] for place in rows.places[used]])
     leverage[of_used] = _leverage(rows, used, made)
     free = np.maximum(1 - leverage, 1e-6)
     results = tuple(

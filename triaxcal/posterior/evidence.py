@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
 from triaxcal.arrays import Floats, Ints
+from triaxcal.distributions import log_sum_exp
 from triaxcal.posterior.odds import Odds
 from triaxcal.posterior.rows import Rows
 from triaxcal.posterior.terms import Term
@@ -53,12 +53,12 @@ class SetEvidence:
 
     @cached_property
     def total(self) -> float:
-        return float(logsumexp(self.log))
+        return float(log_sum_exp(self.log))
 
     @cached_property
     def by_part(self) -> Floats:
         """(P,) logarithms."""
-        return np.asarray(logsumexp(self.log, axis=1))
+        return np.asarray(log_sum_exp(self.log, axis=1))
 
 
 class Evidence:
@@ -124,11 +124,9 @@ class Evidence:
         if places.shape[1] == 1:
             information = weight @ columns[:, :, 0] ** 2 - np.sum(shared[:, places[:, 0]] ** 2, axis=0)
             return np.maximum(information, 0.0)[:, None], score[places] ** 2
-        stacked = np.sqrt(weight)[:, None, None] * columns
-        matrix = np.einsum("mtq,mtr->tqr", stacked, stacked, optimize=True)
+        matrix = _squared(np.sqrt(weight)[:, None, None] * columns)
         if len(shared):
-            beside = shared[:, places]
-            matrix = matrix - np.einsum("ktq,ktr->tqr", beside, beside, optimize=True)
+            matrix = matrix - _squared(shared[:, places])
         information, axes = np.linalg.eigh(matrix)
         return np.maximum(information, 0.0), np.einsum("tqr,tq->tr", axes, score[places]) ** 2
 
@@ -159,12 +157,12 @@ class Evidence:
         """(T,R) about the logarithm of the evidence of a set with each further term at each size, under the part in
         this ``row`` of it: at those ``cells`` of the members' sizes that are best without the term."""
         best = np.argsort(-found.log[row])[:cells]
-        share = found.by_part[row] - logsumexp(found.log[row][best])
+        share = found.by_part[row] - log_sum_exp(found.log[row][best])
         each = []
         for cell in best:
             with_each, without = self.each_with(found.parts[row], found.members, found.sizes[cell])
             each.append(found.log[row][cell] + share + with_each - without)
-        return np.asarray(logsumexp(each, axis=0))
+        return np.asarray(log_sum_exp(each, axis=0))
 
     def of_set(self, members: tuple[int, ...], parts: Sequence[int]) -> SetEvidence:
         """Sizes of three and more terms go by every second step of the grid."""
@@ -186,6 +184,11 @@ class Evidence:
         gain, log_det, mean = _absorbed(information, score, [self.terms[i].rank for i in members], grids)
         log = self.rows.log_likelihood(chi2 - gain) - 0.5 * log_det + base
         return SetEvidence(members, tuple(parts), sizes, log, mean)
+
+
+def _squared(columns: Floats) -> Floats:
+    """(t,q,q) of (m,t,q): the products of each term's columns."""
+    return np.asarray(columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2))
 
 
 def _absorbed(

@@ -13,9 +13,11 @@ from triaxcal.posterior.unmodelled import What
 
 @dataclass(frozen=True)
 class Named:
-    """One of these effects acts for certain, each with its probability, the likeliest first. A name alone is known."""
+    """One of these effects acts for certain, each with its probability, the likeliest first; ``together`` is that of at
+    least one. A name alone is known."""
 
     probabilities: Mapping[str, float]
+    together: float
 
     @property
     def effect(self) -> str:
@@ -68,7 +70,7 @@ def findings(seen: Posterior) -> Findings:
     another = int(places[int(np.argmax(seen.of_another))])
     from_there_on = float(seen.of_another.sum())
     return Findings(
-        named=tuple(Named({name: seen.of_names[name] for name in group}) for group in seen.certain),
+        named=tuple(Named({name: seen.of_names[name] for name in group}, seen.any_of(group)) for group in seen.certain),
         candidates={n: p for n, p in seen.of_names.items() if p >= odds.reported and n not in certain},
         outliers=dict(sorted(outliers.items(), key=lambda item: -item[1])),
         unexplained=_unexplained(seen),

@@ -48,6 +48,11 @@ class Odds:
     curved: float = 1.0
     """Where the likeliest effects make more of chi-square by their curvature, all is linearised anew about them: so
     much changes no evidence by more than a factor of 1.6."""
+    narrow: float = 0.98
+    """Where two neighbouring values of a shape hold so much of an effect's probability, each is divided: a normal
+    distribution of more than a third of their distance has less there."""
+    divided: int = 4
+    """Values in the place of one."""
     window: float = 1e4
     """Sets of less probability than the best by this factor are left out (Occam's window; Madigan and Raftery 1994,
     J. Am. Stat. Assoc. 89:1535)."""

@@ -9,26 +9,27 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import channels_of, still_conditions
+from triaxcal.distributions import log_sum_exp
 from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
+from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
 from triaxcal.poses.pose import Pose
 from triaxcal.posterior.evidence import Evidence, SetEvidence
 from triaxcal.posterior.odds import Odds
 from triaxcal.posterior.rows import Rows
 from triaxcal.posterior.sets import likely_sets
-from triaxcal.posterior.terms import terms_of
+from triaxcal.posterior.terms import Finer, Variant, terms_of, variant_of
 from triaxcal.posterior.unmodelled import What
 from triaxcal.problem import State, everything
 from triaxcal.runs import by_run
 
-ROUNDS = 3
-"""Of linearising anew: each is a step of Gauss and Newton."""
+ROUNDS = 4
+"""Of linearising anew, each a step of Gauss and Newton, and of dividing shapes."""
 PARTS = 3
 """Unmodelled parts beside which a name is asked about without a pose, the likeliest beside the name."""
 ALTERNATIVES = 8
@@ -46,7 +47,7 @@ class Posterior:
     def weight(self) -> Floats:
         """(S,) probability of each set."""
         total = np.array([found.total for found in self.sets])
-        return np.asarray(np.exp(total - logsumexp(total)))
+        return np.asarray(np.exp(total - log_sum_exp(total)))
 
     def names_of(self, found: SetEvidence) -> frozenset[str]:
         """The effects in a set."""
@@ -189,15 +190,15 @@ class Posterior:
             members = tuple(sorted((*rest, i)))
             beside = evidence.of_set(members, parts)
             others = [other.kind not in {evidence.terms[k].kind for k in members} for other in evidence.terms]
-            each = logsumexp([evidence.with_further(beside, row, cells=1) for row in range(len(parts))], axis=(0, 2))
+            each = log_sum_exp([evidence.with_further(beside, row, cells=1) for row in range(len(parts))], axis=(0, 2))
             each = np.where(others, each + evidence.log_prior, -np.inf)
-            acts, none = logsumexp(each[mine]), logsumexp([beside.total, *each[~mine]])
+            acts, none = log_sum_exp(each[mine]), log_sum_exp([beside.total, *each[~mine]])
             out[term.pose] = np.exp(acts - np.logaddexp(acts, none))
         return out
 
     @cached_property
     def _total(self) -> float:
-        return float(logsumexp([found.total for found in self.sets]))
+        return float(log_sum_exp([found.total for found in self.sets]))
 
 
 def looked_for(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None) -> tuple[Effect, ...]:
@@ -222,15 +223,61 @@ def posterior(
     asked about; several units that are compared have one."""
     odds = odds or Odds()
     effects = looked_for(poses, catalogue)
-    rows = Rows.of(poses, linear, signs, effects)
+    rows, finer = Rows.of(poses, linear, signs, effects), list[Finer]()
     for _ in range(ROUNDS):
-        evidence = Evidence(rows, terms_of(rows, effects, odds), odds, smallest_g)
+        evidence = Evidence(rows, terms_of(rows, effects, odds, finer), odds, smallest_g)
         seen = Posterior(evidence, likely_sets(evidence))
-        point = _point_of(seen)
-        if point is None:
+        point, split = _point_of(seen), finer_shapes(seen)
+        if point is None and not split:
             break
-        rows = rows.about(point)
+        rows, finer = rows if point is None else rows.about(point), [*finer, split]
     return seen
+
+
+def finer_shapes(seen: Posterior) -> Finer:
+    """Where two neighbouring values of a shape hold nearly all of the probability of a likely effect, what to divide
+    each into: where the effect is strong, the values of the grid are further apart than the poses tell them."""
+    out: dict[Variant, Sequence[Effect]] = {}
+    terms, odds = seen.evidence.terms, seen.evidence.odds
+    weights = np.zeros(len(terms))
+    for w, found in zip(seen.weight, seen.sets, strict=True):
+        weights[list(found.members)] += w
+    for name in (name for name, p in seen.of_names.items() if p >= odds.reported):
+        forms: dict[tuple[str, ...], dict[Variant, list[int]]] = defaultdict(lambda: defaultdict(list))
+        for i, term in enumerate(terms):
+            if term.effect is not None and term.name == name and len(term.effect.shape) == 1:
+                key = variant_of(term.effect)
+                forms[key[1]][key].append(i)
+        for of_form in forms.values():
+            shapes = [(terms[index[0]].effect, float(weights[index].sum())) for index in of_form.values()]
+            if sum(share for _, share in shapes) >= odds.reported * seen.of_names[name]:
+                out |= _divided([(effect, share) for effect, share in shapes if effect is not None], odds)
+    return out
+
+
+def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
+    """By the probability of each variant of one form of an effect, whose shape is one number."""
+    if len(of_shapes) < 2:
+        return {}
+    (shape,) = of_shapes[0][0].shape
+    ascending = sorted(of_shapes, key=lambda one: one[0].shape[shape][0])
+    value = np.array([effect.shape[shape][0] for effect, _ in ascending])
+    share = np.array([p for _, p in ascending])
+    first = int(np.argmax(share[1:] + share[:-1]))
+    if share[first : first + 2].sum() < odds.narrow * share.sum():
+        return {}
+    edges = np.concatenate([[1.5 * value[0] - 0.5 * value[1]], (value[1:] + value[:-1]) / 2, [value[-1]]])
+    out: dict[Variant, Sequence[Effect]] = {}
+    for k in (first, first + 1):
+        effect = ascending[k][0]
+        inside = edges[k] + (edges[k + 1] - edges[k]) * (np.arange(odds.divided) + 0.5) / odds.divided
+        try:
+            made = [effect.shaped({shape: float(v)}) for v in inside if v > 0 or value[0] <= 0]
+        except EffectFault:  # one of another package knows no values but its own
+            return {}
+        if all(one.needs == effect.needs for one in made):  # a lag is known for some time constants alone
+            out[variant_of(effect)] = (effect, *made)
+    return out
 
 
 def _point_of(seen: Posterior) -> State | None:

@@ -14,10 +14,10 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.plugins import EffectFault
-from triaxcal.posterior.average import likely_cells
 from triaxcal.posterior.evidence import Evidence, SetEvidence
 from triaxcal.posterior.posterior import Posterior
 from triaxcal.posterior.rows import Rows
+from triaxcal.posterior.solved import likely_cells
 from triaxcal.posterior.terms import Term
 from triaxcal.posterior.unmodelled import Held, What
 

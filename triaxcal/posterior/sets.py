@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from scipy.special import logsumexp
 
 from triaxcal.arrays import Floats
+from triaxcal.distributions import log_sum_exp
 from triaxcal.posterior.evidence import Evidence, SetEvidence
 
 Scores = dict[tuple[int, ...], float]
@@ -28,9 +28,9 @@ def likely_sets(evidence: Evidence) -> list[SetEvidence]:
     """Those within the window, the best first; the empty one is among them."""
     every = range(len(evidence.parts))
     singles = [evidence.each_with(part) for part in every]
-    of_each = logsumexp([of_terms for of_terms, _ in singles], axis=(0, 2)) + evidence.log_prior
+    of_each = log_sum_exp([of_terms for of_terms, _ in singles], axis=(0, 2)) + evidence.log_prior
     level: Scores = {(i,): float(score) for i, score in enumerate(of_each)}
-    scores: Scores = {(): float(logsumexp([alone for _, alone in singles]))} | level
+    scores: Scores = {(): float(log_sum_exp([alone for _, alone in singles]))} | level
     for depth in range(1, evidence.odds.together):
         level = _grown(evidence, level, depth)
         scores |= level
@@ -74,8 +74,8 @@ def _beside(evidence: Evidence, members: tuple[int, ...]) -> Floats:
     alone = evidence.of_set(members, range(len(evidence.parts)))
     likely = np.argsort(-alone.by_part)[:3]
     rows = dict.fromkeys([0, *map(int, likely)])
-    each = [logsumexp(evidence.with_further(alone, row, cells=2), axis=1) for row in rows]
-    return np.asarray(logsumexp(each, axis=0) + evidence.log_prior)
+    each = [log_sum_exp(evidence.with_further(alone, row, cells=1), axis=1) for row in rows]
+    return np.asarray(log_sum_exp(each, axis=0) + evidence.log_prior)
 
 
 def _go_together(evidence: Evidence, members: tuple[int, ...], other: int) -> bool:
@@ -92,5 +92,5 @@ def _parts_that_matter(evidence: Evidence, leaders: list[tuple[int, ...]]) -> li
     share = np.zeros(len(evidence.parts))
     for members in leaders:
         by_part = evidence.of_set(members, range(len(evidence.parts))).by_part
-        share = np.maximum(share, np.exp(by_part - logsumexp(by_part)))
+        share = np.maximum(share, np.exp(by_part - log_sum_exp(by_part)))
     return [part for part in range(len(share)) if part == 0 or share[part] > NO_PART]

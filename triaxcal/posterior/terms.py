@@ -23,6 +23,8 @@ FEWEST = 4
 SPHERE = 48
 """Directions over which the size of an effect is reckoned."""
 NOTHING_G = 1e-12
+ABSORBED = 1e-6
+"""Of a term's columns: what the nine parameters leave no more of is theirs, to rounding."""
 AXES = 3
 
 
@@ -48,16 +50,26 @@ class Term:
         return int(self.columns.shape[1])
 
 
-def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds) -> list[Term]:
+Variant = tuple[str, tuple[str, ...], tuple[float, ...]]
+"""An effect's name, coefficients and shape: foreign effects need not be equal to themselves."""
+Finer = Mapping[Variant, Sequence[Effect]]
+"""Variants that share the prior of the one whose place they take, among which it stands itself."""
+
+
+def variant_of(effect: Effect) -> Variant:
+    return effect.name, tuple(c.name for c in effect.coefficients), tuple(v for v, _ in effect.shape.values())
+
+
+def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = ()) -> list[Term]:
     """Every form, shape and choice of axes of every effect that can act in these poses, every pose as an outlier, and
-    every pose as the first of another unit or mounting."""
+    every pose as the first of another unit or mounting. ``finer`` are divisions of shapes, one after the other."""
     still = still_conditions(rows.poses)
     known = rows.problem.channel_reference
     if not np.ptp(rows.t_s) > 0:  # means whose times nobody knows
         still = still | {TIME, SINCE_START}
     able = [e for e in catalogue if all(name in known and name not in still for name in e.needs)]
     share = np.log(odds.effect / max(len(able), 1))
-    terms = [term for effect in able for term in _of_effect(rows, effect, share, odds)]
+    terms = [term for effect in able for term in _of_effect(rows, effect, share, odds, finer)]
     return [*terms, *(_outlier(rows, i, odds) for i in range(rows.n)), *_another(rows, odds)]
 
 
@@ -72,12 +84,13 @@ def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
                 for variant in effect.variants(held):
                     variant.basis(s, held)
                     variant.slope(s, held)
+                    rows.by_coefficients(variant)
             except EffectFault as e:
                 found[effect.name] = e.reason
     return found
 
 
-def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds) -> Iterator[Term]:
+def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds, finer: Sequence[Finer]) -> Iterator[Term]:
     try:
         variants = effect.variants(rows.problem.conditions)
     except (EffectFault, Refused):
@@ -87,7 +100,7 @@ def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds) -> Iterator
         forms[tuple(c.name for c in variant.coefficients)].append(variant)
     for shapes in forms.values():
         chosen = list(_axes([c.part for c in shapes[0].coefficients], odds))
-        for shape in shapes:
+        for shape, of_shape in _divided(shapes, finer):
             made = _columns(rows, shape)
             if made is None:
                 continue
@@ -97,8 +110,20 @@ def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds) -> Iterator
                 if (size[index] < NOTHING_G).any():
                     continue
                 mix = 1 / (size[index] * np.sqrt(len(index)))
-                prior = share + np.log(of_axes / len(forms) / len(shapes))
-                yield Term(effect.name, effect.name, columns[:, index] * mix, mix, prior, shape, kept)
+                own = columns[:, index] * mix
+                if np.linalg.norm(rows.beside.T @ own) < ABSORBED * np.linalg.norm(own):
+                    continue
+                prior = share + np.log(of_axes * of_shape / len(forms))
+                yield Term(effect.name, effect.name, own, mix, prior, shape, kept)
+
+
+def _divided(shapes: Sequence[Effect], finer: Sequence[Finer]) -> list[tuple[Effect, float]]:
+    """The variants, and with which share of the prior."""
+    out = [(shape, 1 / len(shapes)) for shape in shapes]
+    for division in finer:
+        each = [(division.get(variant_of(shape), (shape,)), share) for shape, share in out]
+        out = [(shape, share / len(ones)) for ones, share in each for shape in ones]
+    return out
 
 
 def _axes(parts: Sequence[str], odds: Odds) -> Iterator[tuple[tuple[int, ...], float]]:

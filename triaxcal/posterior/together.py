@@ -10,13 +10,12 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from triaxcal.arrays import Floats
+from triaxcal.distributions import log_sum_exp
 from triaxcal.posterior.evidence import Evidence, SetEvidence
 from triaxcal.posterior.posterior import Posterior
 from triaxcal.posterior.shapes import Shape, shapes_by
@@ -26,6 +25,8 @@ LIKELY = 3
 """Sets of a unit, the likeliest, beside which an effect is asked about."""
 NEGLIGIBLE = 14.0
 """In the logarithm: parts that are less likely by more add nothing."""
+STEPS = 6
+"""Towards coefficients that units share: each weighs the units by the noise that is left in them."""
 Form = tuple[str, tuple[str, ...], tuple[int, ...]]
 """A name, the coefficients of a form, and those of them that are free."""
 
@@ -34,23 +35,18 @@ Form = tuple[str, tuple[str, ...], tuple[int, ...]]
 class Together:
     """Hypotheses are that one effect acts in every unit, of one form, shape and size, or that each unit is for itself.
 
-    ``shared`` is the probability of the first by name, ``apart`` that of the second. ``common`` is the probability that
-    the values are one for all, if that effect is the shared one, and ``shapes`` has what its shape then is. ``nothing``
-    is the probability that no effect acts in any unit.
+    ``shared`` is the probability of the first by name, ``apart`` that of the second. ``probability`` is that each
+    effect acts in every unit, whatever else does, the likeliest first; ``common`` that its values then are one for all,
+    and ``shapes`` has what its shape is. ``nothing`` is the probability that no effect acts in any unit.
     """
 
     units: Sequence[Posterior]
     shared: Mapping[str, float]
     apart: float
+    probability: Mapping[str, float]
     common: Mapping[str, float]
     shapes: Mapping[str, Mapping[str, Shape]]
     nothing: float
-
-    @cached_property
-    def probability(self) -> Mapping[str, float]:
-        """That each effect acts in every unit, whatever else does, the likeliest first."""
-        found = {name: self.one_of((name,)) for name in self.shared}
-        return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     def one_of(self, names: Sequence[str]) -> float:
         """The probability that one of these effects, the same, acts in every unit; at least, where units that share
@@ -60,7 +56,7 @@ class Together:
             if other in names:
                 total += p
             elif p > np.exp(-NEGLIGIBLE):
-                total += p * max(_product(_beside(unit, name, other) for unit in self.units) for name in names)
+                total += p * max(_product(_acts_beside(unit, name, other) for unit in self.units) for name in names)
         return total
 
     def certain(self, level: float) -> tuple[tuple[str, ...], ...]:
@@ -78,11 +74,38 @@ class Together:
 
 def together(units: Sequence[Posterior]) -> Together:
     """Of units whose posteriors are of one catalogue and one grid of sizes (`Posterior.resized`). Names that some unit
-    cannot show are left out."""
+    cannot show are left out. Where an effect acts in all, another is asked about beside it."""
+    found, given = _asked(units, frozenset()), units
+    odds, acting = units[0].evidence.odds, list[str]()
+    while len(acting) < odds.together - 1:
+        name = next((n for n, p in found.probability.items() if p >= odds.certain and n not in acting), None)
+        if name is None:
+            break
+        given, acting = [unit.given(name) for unit in given], [*acting, name]
+        if not all(unit.sets for unit in given):
+            break
+        found = _beside(found, _asked(given, frozenset(acting)), found.probability[name])
+    return found
+
+
+def _beside(found: Together, more: Together, p: float) -> Together:
+    """With what was asked beside an effect that acts in all with probability ``p``."""
+    better = {n: p * q for n, q in more.probability.items() if p * q > found.probability[n]}
+    of_names = dict(found.probability) | better
+    return replace(
+        found,
+        probability=dict(sorted(of_names.items(), key=lambda item: -item[1])),
+        common=dict(found.common) | {n: more.common[n] for n in better},
+        shapes=dict(found.shapes) | {n: more.shapes[n] for n in better},
+    )
+
+
+def _asked(units: Sequence[Posterior], acting: frozenset[str]) -> Together:
+    """Beside effects that are ``acting`` in all sets of every unit."""
     first = units[0].evidence
     terms = [_terms(unit.evidence) for unit in units]
-    forms = [form for form in terms[0] if all(form in of_unit for of_unit in terms)]
-    bases = [_bases(unit) for unit in units]
+    forms = [form for form in terms[0] if form[0] not in acting and all(form in of_unit for of_unit in terms)]
+    bases = [_bases(unit, acting) for unit in units]
     own: dict[str, list[float]] = defaultdict(list)
     one: dict[str, list[float]] = defaultdict(list)
     index: dict[str, list[int]] = defaultdict(list)
@@ -98,35 +121,31 @@ def together(units: Sequence[Posterior]) -> Together:
             of_own = np.sum([ratio[i] for ratio, i in zip(ratios, alike, strict=True)], axis=0)
             of_one = [_mean(_of_common_values(units, equations, alike)) for equations in settings]
             own[name].append(prior + _mean(of_own))
-            one[name].append(prior + float(logsumexp(of_one)) - np.log(len(settings)))
+            one[name].append(prior + float(log_sum_exp(of_one)) - np.log(len(settings)))
             index[name].append(alike[0])
     apart = float(np.log1p(-first.odds.effect))
-    weight = {name: float(logsumexp([*own[name], *one[name]])) for name in own}
-    total = float(logsumexp([apart, *weight.values()]))
+    weight = {name: float(log_sum_exp([*own[name], *one[name]])) for name in own}
+    total = float(log_sum_exp([apart, *weight.values()]))
     shared = {name: float(np.exp(w - total)) for name, w in weight.items()}
-    of_values = {name: float(np.exp(logsumexp(one[name]) - weight[name])) for name in own}
+    of_values = {name: float(np.exp(log_sum_exp(one[name]) - weight[name])) for name in own}
     shapes = {
         name: shapes_by(
             [first.terms[i] for i in index[name]], np.exp(np.logaddexp(own[name], one[name]) - weight[name])
         )
         for name in own
     }
-    none = np.prod([unit.of_sets_of_names.get(frozenset(), 0.0) for unit in units])
-    return Together(
-        units,
-        dict(sorted(shared.items(), key=lambda item: -item[1])),
-        float(np.exp(apart - total)),
-        of_values,
-        shapes,
-        float(np.exp(apart - total) * none),
-    )
+    alone = float(np.exp(apart - total))
+    none = _product(unit.of_sets_of_names.get(frozenset(), 0.0) for unit in units)
+    found = Together(units, shared, alone, {}, of_values, shapes, alone * none)
+    acts = {name: found.one_of((name,)) for name in shared}
+    return replace(found, probability=dict(sorted(acts.items(), key=lambda item: -item[1])))
 
 
 def _product(probabilities: Iterable[float]) -> float:
     return float(np.prod([*probabilities]))
 
 
-def _beside(unit: Posterior, name: str, other: str) -> float:
+def _acts_beside(unit: Posterior, name: str, other: str) -> float:
     """The probability that an effect acts in a unit in which the other does."""
     with_other = {names: p for names, p in unit.of_sets_of_names.items() if other in names}
     total = sum(with_other.values())
@@ -134,7 +153,7 @@ def _beside(unit: Posterior, name: str, other: str) -> float:
 
 
 def _mean(by_size: Floats) -> float:
-    return float(logsumexp(by_size) - np.log(len(by_size)))
+    return float(log_sum_exp(by_size) - np.log(len(by_size)))
 
 
 def _terms(evidence: Evidence) -> dict[Form, list[int]]:
@@ -177,12 +196,14 @@ class _Base:
     with_each: Floats
 
 
-def _bases(unit: Posterior) -> list[_Base]:
-    """The likeliest sets, what is left of the likeliest without some of its terms, and the empty one."""
+def _bases(unit: Posterior, acting: frozenset[str]) -> list[_Base]:
+    """The likeliest sets, and what is left of the likeliest without some of its terms, but for effects that are
+    ``acting``; where none is, the empty set too."""
     evidence = unit.evidence
     best = unit.sets[0].members
-    less = [kept for k in range(len(best)) for kept in itertools.combinations(best, k)]
-    sets = dict.fromkeys([(), *less, *(found.members for found in unit.sets[:LIKELY])])
+    less = [kept for k in range(len(best) + 1) for kept in itertools.combinations(best, k)]
+    some = [*less, *(found.members for found in unit.sets[:LIKELY])]
+    sets = [m for m in dict.fromkeys(some) if acting <= {evidence.terms[i].name for i in m}]
     known = {found.members: found for found in unit.sets}
     # Whatever part is likely beside some set: an effect may take the place of a part.
     likely = [row for row, part in enumerate(unit.sets[0].parts) if unit.of_parts[part] > np.exp(-NEGLIGIBLE)]
@@ -190,7 +211,7 @@ def _bases(unit: Posterior) -> list[_Base]:
     for members in sets:
         found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
         rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE).tolist()}
-        whole = logsumexp([evidence.with_further(found, row, cells=1) for row in sorted(rows)], axis=0)
+        whole = log_sum_exp([evidence.with_further(found, row, cells=1) for row in sorted(rows)], axis=0)
         whole = whole + np.log(len(evidence.sizes))
         out.append(_Base(found, unit.names_of(found), np.asarray(whole)))
     return out
@@ -199,8 +220,8 @@ def _bases(unit: Posterior) -> list[_Base]:
 def _ratio(unit: Posterior, bases: Sequence[_Base], name: str) -> Floats:
     """(T,R) the logarithm of the evidence of the unit with each term at each size, over that of the unit by itself."""
     others = [base for base in bases if name not in base.names]
-    with_each = logsumexp([base.with_each for base in others], axis=0)
-    without = logsumexp([base.found.total for base in others])
+    with_each = log_sum_exp([base.with_each for base in others], axis=0)
+    without = log_sum_exp([base.found.total for base in others])
     return np.asarray(with_each - without + _log_without(unit, bases, name))
 
 
@@ -208,16 +229,19 @@ def _log_without(unit: Posterior, bases: Sequence[_Base], name: str) -> float:
     """The logarithm of the evidence of the unit without that name, over that of the unit by itself."""
     every = {found.members: found for found in (*(base.found for base in bases), *unit.sets)}.values()
     others = [found.total for found in every if name not in unit.names_of(found)]
-    return float(logsumexp(others) - logsumexp([found.total for found in every]))
+    return float(log_sum_exp(others) - log_sum_exp([found.total for found in every]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """``information`` (C,C) and ``score`` (C,) of the scaled coefficients of all terms, over the variance of the noise,
-    beside one set with one part and one choice of sizes, whose share of the unit by itself is ``log_share``."""
+    """``information`` (C,C) and ``score`` (C,) of the scaled coefficients of all terms, in standard errors, beside one
+    set with one part and one choice of sizes that leave ``chi2``. Its share of the unit by itself is ``log_share``;
+    ``variance`` is that of the noise where one more term explains what it can."""
 
     information: Floats
     score: Floats
+    chi2: float
+    variance: float
     log_share: float
 
 
@@ -228,13 +252,12 @@ def _equations(unit: Posterior, bases: Sequence[_Base], name: str, none: bool) -
     others = [base for base in bases if name not in base.names]
     found = max(others, key=lambda base: base.with_each[mine].max()).found
     row = found.parts.index(0) if none and 0 in found.parts else int(np.argmax(found.by_part))
-    sizes = found.sizes[int(np.argmax(found.log[row]))]
-    without = float(logsumexp([base.found.total for base in others]))
+    cell = int(np.argmax(found.log[row]))
+    without = float(log_sum_exp([base.found.total for base in others]))
     share = float(found.by_part[row]) - without + _log_without(unit, bases, name)
-    information, score, chi2 = evidence.normal_equations(found.parts[row], found.members, sizes)
+    information, score, chi2 = evidence.normal_equations(found.parts[row], found.members, found.sizes[cell])
     explained = max(_explained(evidence, information, score, i) for i in mine)
-    variance = max(evidence.rows.noise_given(chi2 - explained), 1.0)
-    return _Equations(information / variance, score / variance, share)
+    return _Equations(information, score, chi2, evidence.rows.noise_given(chi2 - explained), share)
 
 
 def _explained(evidence: Evidence, information: Floats, score: Floats, term: int) -> float:
@@ -244,16 +267,42 @@ def _explained(evidence: Evidence, information: Floats, score: Floats, term: int
 
 
 def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations], index: Sequence[int]) -> Floats:
-    """(R,) the same gain, where all have the coefficients of the first, for a noise that is known."""
+    """(R,) the same ratio, where all have the coefficients of the first: by Laplace's method about the coefficients
+    that explain most, as the noise of no unit is known beforehand. Two such points are looked for, since a unit may as
+    well lack the effect and be noisy."""
     first = units[0].evidence.terms[index[0]]
-    information, score = np.zeros((first.rank, first.rank)), np.zeros(first.rank)
+    information, score = [], []
     for unit, of_unit, i in zip(units, equations, index, strict=True):
         scale = first.mix / unit.evidence.terms[i].mix
         places = unit.evidence.places([i])
-        information += scale[:, None] * of_unit.information[np.ix_(places, places)] * scale
-        score += scale * of_unit.score[places]
-    size = units[0].evidence.sizes[:, None, None]
-    precision = np.eye(first.rank) + size**2 * information
-    found = np.linalg.solve(precision, np.broadcast_to(score[:, None], (len(size), first.rank, 1)))[:, :, 0]
-    gain = 0.5 * size[:, 0, 0] ** 2 * (found @ score) - 0.5 * np.linalg.slogdet(precision)[1]
-    return np.asarray(gain + sum(of_unit.log_share for of_unit in equations))
+        information.append(scale[:, None] * of_unit.information[np.ix_(places, places)] * scale)
+        score.append(scale * of_unit.score[places])
+    shared = np.array(information), np.array(score), np.array([of_unit.chi2 for of_unit in equations])
+    explained = np.array([of_unit.variance for of_unit in equations])
+    noisy = np.array([u.evidence.rows.noise_given(e.chi2) for u, e in zip(units, equations, strict=True)])
+    found = [_about(units, *shared, start) for start in (explained, noisy)]
+    return np.asarray(np.max(found, axis=0) + sum(of_unit.log_share for of_unit in equations))
+
+
+def _about(units: Sequence[Posterior], information: Floats, score: Floats, chi2: Floats, start: Floats) -> Floats:
+    """(R,) the logarithm of the evidence of coefficients that U units share over that of none, for each size. Of each
+    unit ``information`` (U,q,q), ``score`` (U,q) and ``chi2`` (U,) without them; ``start`` (U,) are variances of the
+    noise."""
+    size = units[0].evidence.sizes
+    prior = np.eye(score.shape[1]) / size[:, None, None] ** 2
+    variance = np.broadcast_to(start, (len(size), len(units)))
+    for _ in range(STEPS):
+        precision = prior + np.einsum("ru,uqp->rqp", 1 / variance, information)
+        values = np.linalg.solve(precision, ((1 / variance) @ score)[:, :, None])[:, :, 0]
+        squares = np.einsum("rq,uqp,rp->ru", values, information, values)
+        left = np.maximum(chi2 - 2 * values @ score.T + squares, 0.0)
+        variance = np.array(
+            [[u.evidence.rows.noise_given(float(x)) for u, x in zip(units, row, strict=True)] for row in left]
+        )
+    gain = np.zeros(len(size))
+    for k, unit in enumerate(units):
+        rows = unit.evidence.rows
+        gain += rows.log_likelihood(left[:, k]) - rows.log_likelihood(chi2[k])
+    precision = prior + np.einsum("ru,uqp->rqp", 1 / variance, information)
+    log_det = np.linalg.slogdet(precision * size[:, None, None] ** 2)[1]
+    return np.asarray(gain - 0.5 * np.sum((values / size[:, None]) ** 2, axis=1) - 0.5 * log_det)

@@ -70,7 +70,7 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     for reason in dict.fromkeys(reasons.values()):
         yield f"these poses cannot show in full {', '.join(n for n, r in reasons.items() if r == reason)}: {reason}"
     for name, reason in loop.faulty.items():
-        yield f"the effect {name} of {package_of(name)} was left out: {reason}"
+        yield f"the effect {name} of {package_of(name)} cannot be used: {reason}"
 
 
 def _poses_again(loop: Loop) -> Iterator[str]:

@@ -52,8 +52,8 @@ def _(b: of.RegisterSteps) -> str:
 
 
 @basis.register
-def _(b: of.CompetingModels) -> str:
-    return f"{' or '.join(b.names) or 'something else'} would do as well on these poses"
+def _(b: of.NotHeld) -> str:
+    return "effects that the registers do not have: the other coefficients take their place, as nearly as they can"
 
 
 @basis.register
@@ -65,7 +65,9 @@ def _(b: of.AveragedModels) -> str:
 @basis.register
 def _(b: of.UnmodelledTemperature) -> str:
     untold = "" if b.identifiable else ", but these poses cannot tell what that did"
-    return f"{_both(b.effects)} not in the model; the temperature moved by {b.moved_k:.2g} K from pose to pose{untold}"
+    how = f", with a sensitivity {AS_STATED}" if b.stated else ""
+    moved = f"the temperature moved by {b.moved_k:.2g} K from pose to pose"
+    return f"{_both(b.effects)} not in the model{how}; {moved}{untold}"
 
 
 @basis.register
@@ -94,6 +96,8 @@ def remedy(r: of.Remedy, small: Callable[[float], str] = micro_g) -> str:
             return "find what the model lacks (diagnose, and what it advises); more poses, some of them repeated"
         case of.ReferenceKnown(to_g):
             return f"know the reference to {small(to_g)}"
+        case of.HostCorrects():
+            return "correct in the host what the registers cannot hold"
         case of.FinerRegisters():
             return "registers with one bit more"
         case of.ModelsToldApart():

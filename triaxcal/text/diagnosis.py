@@ -15,6 +15,9 @@ from triaxcal.units import ErrorUnit
 
 __all__ = ["advice", "call", "cause", "chance", "errors", "lines", "reason", "unexplained"]
 
+EVEN = 0.5
+LIKELIEST = 3
+"""Effects that are told where none is likely."""
 CALLS = {
     Call.USABLE: "usable",
     Call.RECORD_MORE: "record more",
@@ -29,7 +32,7 @@ def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) 
     before, after = (c.residual.rms_g for c in (loop.before, loop.after))
     return (
         call(loop.call),
-        cause(loop.found, loop.findings, loop.candidates, began, small),
+        cause(loop.found, loop.findings, loop.candidates, began, small, loop.probabilities),
         errors(before, after, following or loop.next_recording, small),
         to_do(loop, small),
     )
@@ -45,10 +48,18 @@ def cause(
     candidates: Sequence[Candidate],
     began: Mapping[int, Began],
     small: ErrorUnit,
+    probabilities: Mapping[str, float],
 ) -> str:
-    """What acts, each with its probability; ``began`` says when the poses began, by their place."""
+    """What acts, each with its probability; ``began`` says when the poses began, by their place. ``probabilities`` are
+    those of all effects, the likeliest first."""
     said = [*_causes(found, findings, candidates, began, small)]
-    return "; ".join(said) or f"no effect shows (nothing acts with probability {chance(found.nothing)})"
+    if said:
+        return "; ".join(said)
+    if found.nothing >= EVEN:
+        return f"no effect shows (nothing acts with probability {chance(found.nothing)})"
+    likely = [f"{name} ({chance(p)})" for name, p in probabilities.items()][:LIKELIEST]
+    none = f"something that no effect describes ({chance(found.unexplained.probability)})"
+    return f"something acts, and these poses do not tell what; the likeliest are {', '.join(likely)}; or {none}"
 
 
 def _causes(
@@ -72,7 +83,7 @@ def _causes(
         yield unexplained(found.unexplained, small)
     if found.outliers:
         poses = ", ".join(f"{moment(began[i])} ({chance(p)})" for i, p in found.outliers.items())
-        yield f"outliers, which are left out: {'the pose' if len(found.outliers) == 1 else 'poses'} at {poses}"
+        yield f"{'an outlier: the pose' if len(found.outliers) == 1 else 'outliers: the poses'} at {poses}"
 
 
 def _named(finding: Finding) -> str:
@@ -96,7 +107,7 @@ def reason(finding: Finding, refusal: Refusal | None) -> str:
     said = f"it acts with probability {chance(finding.probability)}"
     if finding.alternatives:
         others = ", ".join(f"{name} {chance(p)}" for name, p in finding.alternatives.items())
-        together = chance(finding.probability + sum(finding.alternatives.values()))
+        together = chance(finding.together)
         said += f", or else {others}: one of them with {together}"
     if finding.verdict is Verdict.CONFOUNDED and refusal is not None:
         said += f"; not corrected, because {REFUSED[refusal]}"

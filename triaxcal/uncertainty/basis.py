@@ -57,10 +57,8 @@ class RegisterSteps(Basis):
 
 
 @dataclass(frozen=True)
-class CompetingModels(Basis):
-    """They explain the poses as well."""
-
-    names: tuple[str, ...]
+class NotHeld(Basis):
+    """What holds the result lacks effects, whose place the other coefficients take."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +71,12 @@ class AveragedModels(Basis):
 @dataclass(frozen=True)
 class UnmodelledTemperature(Basis):
     """The effects that the model lacks; the temperature moved by ``moved_k`` from pose to pose. ``identifiable``:
-    the poses can tell what that did."""
+    the poses can tell what that did. ``stated``: somebody said how sensitive such units are."""
 
     effects: tuple[str, ...]
     moved_k: float
     identifiable: bool
+    stated: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,6 +123,11 @@ class ReferenceKnown(Remedy):
     """To the standard uncertainty ``to_g``, in the unit of the reference vector."""
 
     to_g: float
+
+
+@dataclass(frozen=True)
+class HostCorrects(Remedy):
+    """Correct in the host what the registers cannot hold."""
 
 
 @dataclass(frozen=True)

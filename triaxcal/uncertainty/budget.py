@@ -20,8 +20,7 @@ from triaxcal.uncertainty.basis import (
     TemperatureNotLogged,
     ThermometerNotStated,
 )
-from triaxcal.uncertainty.choice import choice
-from triaxcal.uncertainty.components import Component, reference, rounding, statistical
+from triaxcal.uncertainty.components import Component, not_held, reference, rounding, statistical
 from triaxcal.uncertainty.linearised import Linearised
 from triaxcal.uncertainty.stated import Stated
 from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
@@ -75,10 +74,10 @@ def budget(calibration: Calibration, stated: Stated | None = None, level: float 
     """The budget of a calibration fitted to still poses (`triaxcal.pose_fit.fit`)."""
     stated = stated or Stated()
     linearised = Linearised(calibration)
-    thermal, beyond = temperature(calibration, linearised)
+    thermal, beyond = temperature(calibration, linearised, stated)
     found = [*statistical(calibration, linearised, beyond), *reference(linearised, stated), *thermal]
     found += thermometer(calibration, linearised, stated)
-    found += choice(calibration, linearised)
+    found += not_held(calibration, stated)
     found += rounding(calibration, linearised, stated)
     found.sort(key=lambda c: -c.magnitude)
     return Budget(

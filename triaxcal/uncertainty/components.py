@@ -20,8 +20,10 @@ from triaxcal.uncertainty.basis import (
     CreepHalved,
     Excess,
     FinerRegisters,
+    HostCorrects,
     LongerOrMorePoses,
     ModelsToldApart,
+    NotHeld,
     ReferenceKnown,
     RegisterSteps,
     Remedy,
@@ -137,6 +139,13 @@ def reference(linearised: Linearised, stated: Stated) -> list[Component]:
     shift = linearised.by_residual[:, : len(linearised.problem.u)].sum(axis=1) * stated.reference
     by = ReferenceKnown(stated.reference / 2)
     return [Component.of(linearised, "reference", "B", np.inf, np.outer(shift, shift), stated.reference_basis, by)]
+
+
+def not_held(calibration: Calibration, stated: Stated) -> list[Component]:
+    if not stated.not_held:
+        return []
+    none = np.zeros(len(calibration.parameters))
+    return [Component("not_held", "B", np.inf, none, stated.not_held, NotHeld(), HostCorrects())]
 
 
 def rounding(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[Component]:

@@ -10,7 +10,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.beyond import Beyond
 from triaxcal.calibration import Calibration
-from triaxcal.conditions import at_reference
+from triaxcal.conditions import at_moment
 from triaxcal.planning.directions import directions
 from triaxcal.problem import Problem, State, by_shape, everything, linearise, parameters_by_theta
 from triaxcal.start import problem_of, with_history
@@ -55,9 +55,9 @@ class Linearised:
         """(m,p): change of |a| over the sphere by the parameters."""
 
     def _sphere(self, calibration: Calibration, shift: Mapping[str, float]) -> Problem:
-        """Outputs of the unit all over the sphere, at the reference conditions but for ``shift``."""
+        """Outputs of the unit all over the sphere, under the conditions of its use but for ``shift``."""
         reference = self.problem.channel_reference
-        held = at_reference(reference, len(self.up))
+        held = at_moment(reference, len(self.up), calibration.moment)
         u = calibration.sensor.output(self.up, held)
         channels = {n: held[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
         none = np.zeros((len(u), 3, 3))

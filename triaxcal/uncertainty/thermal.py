@@ -26,14 +26,16 @@ from triaxcal.uncertainty.stated import Stated
 SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
 """Standard deviation, before any data, of a coefficient that the fit has not taken up: in references per kelvin, and
 per kelvin. Typical of a mass-market MEMS accelerometer's data sheet; a navigation unit is ten times better."""
+NO_SENSITIVITY = 1e-12
 
 
-def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[Component], float]:
+def temperature(calibration: Calibration, linearised: Linearised, stated: Stated) -> tuple[list[Component], float]:
     """What thermal effects that the fit has not taken up may have done to its parameters; and the share of the
     residuals' variance beyond noise that they do not explain, 0…1, lest it count twice.
 
-    A coefficient that did not show is not zero: it is what the data leave of `SENSITIVITY_PER_K`, a mean and a spread
-    by Bayes' rule, and the parameters of a fit without it are off by what it does to them.
+    A coefficient that did not show is not zero: it is what the data leave of the sensitivity that was ``stated``, or of
+    `SENSITIVITY_PER_K`, a mean and a spread by Bayes' rule. The parameters of a fit without it are off by what it does
+    to them.
     """
     if calibration.spread is not None:
         return _as_probable(calibration, linearised), 1.0
@@ -44,7 +46,7 @@ def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[
     r, J, _ = everything(linearised.problem, linearised.state.extended(missing))
     # What residuals show beyond noise may be these very effects.
     s = linearised.noise
-    spread = np.concatenate([[_sensitivity(e, calibration.reference)] * len(e.coefficients) for e in missing])
+    spread = np.concatenate([[_sensitivity(e, calibration.reference, stated)] * len(e.coefficients) for e in missing])
     p = len(linearised.state.theta)
     Z = J[:, p:] * spread / s[:, None]
     absorbed = linearised.gain @ (J[:, p:] * spread / linearised.error[:, None])
@@ -67,7 +69,8 @@ def temperature(calibration: Calibration, linearised: Linearised) -> tuple[list[
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
     names = tuple(e.name for e in missing)
     by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
-    basis = UnmodelledTemperature(names, moved, identifiable=not isinstance(by, PosesAtOtherTemperatures))
+    told = not isinstance(by, PosesAtOtherTemperatures)
+    basis = UnmodelledTemperature(names, moved, told, stated=stated.thermal_sensitivity is not None)
     return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)], beyond
 
 
@@ -112,9 +115,11 @@ def _thermal_but(effects: tuple[Effect, ...]) -> list[Effect]:
     return [e for e in CATALOGUE if e.name in SENSITIVITY_PER_K and e.name not in present]
 
 
-def _sensitivity(effect: Effect, reference: float) -> float:
+def _sensitivity(effect: Effect, reference: float, stated: Stated) -> float:
     per_reference = reference if effect.coefficients[0].unit.startswith("g") else 1.0
-    return SENSITIVITY_PER_K[effect.name] * per_reference
+    known = stated.thermal_sensitivity
+    # A width of zero has no inverse; so little makes nothing.
+    return (SENSITIVITY_PER_K[effect.name] if known is None else max(known, NO_SENSITIVITY)) * per_reference
 
 
 def thermometer(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[Component]:

@@ -184,6 +184,12 @@ def add_uncertainty(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--thermometer-uncertainty", type=not_negative, metavar="K", help="its standard uncertainty, in kelvin"
     )
+    parser.add_argument(
+        "--thermal-sensitivity",
+        type=not_negative,
+        metavar="S",
+        help="by how much 1 K changes the bias of such units, in references, and their scale factors, relatively",
+    )
 
 
 def writable(path: Path | None) -> None:

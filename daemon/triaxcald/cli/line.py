@@ -71,6 +71,7 @@ def _document(o: Outcome) -> dict[str, Any]:
         "before": result["before"] if result else None,
         "after": result["after"] if result else None,
         "findings": result["findings"] if result else [],
+        "candidates": result["candidates"] if result else [],
         "choices": result["choices"] if result else [],
         "registers_written": list(o.provisioned.written) if o.provisioned else [],
         "device_state": o.device_state,

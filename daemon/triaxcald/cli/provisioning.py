@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration
 from triaxcal.calibration_reading import calibration_of, expanded_uncertainty_in, logged_in
+from triaxcal.effects.contract import is_derived
 from triaxcal.errors import Refused
 from triaxcal.figures import micro_g
 from triaxcal.reduced import Reduced
@@ -114,10 +116,11 @@ def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
     serial = _serial_of(document, path, place)
     if missing := why_not_written(profile):
         raise Refused(f"{path}: {profile.name}: {missing}")
-    held = held_by_device(profile, full, logged_in(document, where=path))
+    logged = logged_in(document, where=path)
+    held = held_by_device(profile, full, logged)
     assert held is not None
     registers = held.registers.calibration
-    _require_little_lost(document, full, held.registers, path, profile)
+    _require_little_lost(document, full, held.registers, path, profile, logged)
     for axis, k, sign in zip("xyz", registers.sensor.scale_factor, place.signs, strict=True):
         if k * sign < 0:
             raise Refused(f"{path}: scale_factor.{axis} is {k:.4g}, of another sign than the device's: fit with --sign")
@@ -125,9 +128,15 @@ def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
 
 
 def _require_little_lost(
-    document: Mapping[str, Any], full: Calibration, registers: Reduced, path: str, profile: Profile
+    document: Mapping[str, Any],
+    full: Calibration,
+    registers: Reduced,
+    path: str,
+    profile: Profile,
+    logged: Mapping[str, Floats],
 ) -> None:
-    """Raises Refused where the registers would be off by more than the calibration itself may be."""
+    """Raises Refused where the registers would be off by more than the calibration itself may be, or where nobody knows
+    by how much: ``logged`` are the channels that are known as they were in the poses."""
     lost = [effect.name for effect, _ in full.sensor.effects if effect.name not in registers.calibration.terms]
     known = expanded_uncertainty_in(document, where=path)
     passing = {effect.name for effect, _ in full.sensor.effects if is_passing(effect)}
@@ -137,9 +146,18 @@ def _require_little_lost(
             f"{path}: {profile.name} has no registers for {', '.join(lost)}; the best that it can hold is off by "
             f"{micro_g(registers.cost)} rms{stated}"
         )
-    if lost:
+    for effect, _ in full.sensor.effects:
+        unknown = [name for name in effect.needs if name not in logged and not is_derived(name)]
+        if effect.name in lost and unknown:
+            raise Refused(
+                f"{path}: {profile.name} has no registers for {effect.name}, and the poses do not say how "
+                f"{', '.join(unknown)} moved: what that costs is not known"
+            )
+    if passing & set(lost):
+        say(f"{', '.join(name for name in lost if name in passing)}: left to the host, and in no register")
+    if others := [name for name in lost if name not in passing]:
         say(
-            f"{profile.name} has no registers for {', '.join(lost)}: the other coefficients take their place, "
+            f"{profile.name} has no registers for {', '.join(others)}: the other coefficients take their place, "
             f"{micro_g(registers.cost)} rms off"
         )
 

@@ -86,11 +86,13 @@ def _stated(a: argparse.Namespace, measured: Measured) -> Stated:
     latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
     own = measured.stated or Stated()
     thermometer = getattr(a, "thermometer_uncertainty", None)
+    sensitivity = getattr(a, "thermal_sensitivity", None)
     said = Stated.at(
         latitude,
         height,
         getattr(a, "reference_uncertainty", None),
         thermometer_k=own.thermometer_k if thermometer is None else thermometer,
+        thermal_sensitivity=own.thermal_sensitivity if sensitivity is None else sensitivity,
     )
     if said.reference is None and a.reference is None:
         return replace(said, reference=own.reference, reference_basis=own.reference_basis)

@@ -37,7 +37,7 @@ def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | N
     if a.passport_error is not None and not a.passport:
         raise InputError("--passport-error: there is no --passport")
     way = "--turning" if a.turning else "--attitudes" if a.attitudes else "--passport" if a.passport else None
-    for option in ("reference_uncertainty", "thermometer_uncertainty"):
+    for option in ("reference_uncertainty", "thermometer_uncertainty", "thermal_sensitivity"):
         if way and getattr(a, option) is not None:
             raise InputError(f"--{option.replace('_', '-')}: with {way} there is no budget that it would count in")
     return _turning if a.turning else _attitudes if a.attitudes else _passport if a.passport else None

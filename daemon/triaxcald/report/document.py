@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.calibration import Exclusion
+from triaxcal.calibration_document import WEIGHT
 from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names
@@ -23,6 +24,8 @@ _OF_A_POSE = (
 )  # fmt: skip
 
 
+CANDIDATE = "candidate"
+"""The verdict on an effect that probably acts; documents have it under ``candidates``."""
 _NOT_AGAIN = (Exclusion.UNKNOWN_HISTORY, Exclusion.CALLER)
 """Poses that are not to be taken again, though the fit excludes them."""
 
@@ -66,24 +69,18 @@ class Finding:
     effect: str
     verdict: str
     in_model: bool
-    p_value: float | None
+    probability: float | None
     coefficients: tuple[Coefficient, ...]
     alternatives: tuple[str, ...]
     reason: str | None
     remedy: str | None
-    apart: tuple[str, ...] = ()
-    """What to record so as to tell it from its alternatives."""
-    spoiled: tuple[str, ...] = ()
-    """When poses began that, were they spoiled, would do as well."""
-    coincidence: float | None = None
-    """Where it may be something in no catalogue: the probability that poses like these look as if it were an effect."""
-    held_out_g: Mapping[str, float | None] = field(default_factory=dict)
-    """The error in the check recording with an alternative in its place, by name."""
+    probabilities: Mapping[str, float | None] = field(default_factory=dict)
+    """Of its alternatives, by name."""
 
     @property
     def in_question(self) -> bool:
-        """Whether anything else would do as well."""
-        return bool(self.alternatives or self.spoiled) or self.coincidence is not None
+        """Whether it need not be this effect that acts."""
+        return bool(self.alternatives) or self.verdict == CANDIDATE
 
     def shape(self, name: str) -> float | None:
         """The value of a coefficient, such as the moment of a step."""
@@ -93,19 +90,16 @@ class Finding:
 @dataclass(frozen=True)
 class Unexplained:
     significant: bool
-    p_value: float | None
+    probability: float | None
     rms_g: float | None
-    leads: tuple[str, ...]
-    or_spoiled: bool = False
-    or_named: bool = False
-    only_inside: bool = False
+    lead: str
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Everything the page shows of one document. `stages` run from the plain model to the final one;
-    `searched` tells a loop, which looked for effects, from a fit, which did not. `recordings` are their names where
-    there are several.
+    """Everything the page shows of a document. `stages` are the plain model and the final one; `findings` end with the
+    candidates; `searched` tells a loop, which looked for effects, from a fit, which did not. `recordings` are their
+    names where there are several.
     """
 
     refused: str | None
@@ -114,6 +108,8 @@ class Outcome:
     held_out: HeldOut | None
     findings: tuple[Finding, ...]
     unexplained: Unexplained | None
+    nothing_probability: float | None
+    not_corrected: str
     linear: tuple[Coefficient, ...]
     effects: tuple[tuple[str, tuple[Coefficient, ...]], ...]
     matrix: tuple[Vector, ...] | None
@@ -169,10 +165,15 @@ def read_document(document: Mapping[str, object]) -> Outcome:
     return Outcome(
         refused=_refusal(document, calibration),
         searched=looped,
-        stages=stages_of(document, calibration, before_g, after_g, held_out),
+        stages=stages_of(document, calibration, (before_g, after_g), held_out),
         held_out=held_out,
-        findings=tuple(_findings(document.get("findings"), terms)),
+        findings=(
+            *_findings(document.get("findings"), terms),
+            *_findings(document.get("candidates"), terms, verdict=CANDIDATE),
+        ),
         unexplained=_unexplained(document.get("unexplained")),
+        nothing_probability=number(document.get("nothing_probability")),
+        not_corrected=str(document.get("not_corrected") or ""),
         linear=tuple(_linear(calibration, units)),
         effects=tuple((name, _coefficients(values)) for name, values in effects.items()),
         matrix=matrix,
@@ -226,36 +227,30 @@ def _unexplained(value: object) -> Unexplained | None:
     known = mapping(value)
     if not known:
         return None
-    lead = known.get("lead")
     return Unexplained(
         bool(known.get("significant")),
-        number(known.get("p_value")),
+        number(known.get("probability")),
         number(known.get("rms_g")),
-        tuple(part for part in words(lead or "").split("; ") if part),
-        bool(known.get("or_spoiled")),
-        bool(known.get("or_named")),
-        bool(known.get("only_inside")),
+        words(known.get("lead") or ""),
     )
 
 
-def _findings(value: object, terms: set[str]) -> Iterator[Finding]:
+def _findings(value: object, terms: set[str], verdict: str = "") -> Iterator[Finding]:
+    """``verdict`` is that of entries which have none."""
     for entry in value if isinstance(value, (list, tuple)) else []:
         known = mapping(entry)
         effect = str(known.get("effect", ""))
         reason, remedy = known.get("reason"), known.get("remedy")
         yield Finding(
             effect=effect,
-            verdict=str(known.get("verdict", "")),
+            verdict=str(known.get("verdict", verdict)),
             in_model=effect in terms,
-            p_value=number(known.get("p_value")),
+            probability=number(known.get("probability")),
             coefficients=_coefficients(known.get("coefficients")),
             alternatives=texts(known.get("alternatives")),
             reason=None if reason is None else words(reason),
             remedy=None if remedy is None else words(remedy),
-            apart=texts(known.get("apart")),
-            spoiled=texts(known.get("spoiled")),
-            coincidence=number(known.get("coincidence")),
-            held_out_g=numbers(known.get("held_out_rms_g")),
+            probabilities=numbers(known.get("probabilities")),
         )
 
 
@@ -265,7 +260,7 @@ def _coefficients(value: object) -> tuple[Coefficient, ...]:
         unit = str(known.get("unit") or "")
         return Coefficient(str(name), number(known.get("value")), number(known.get("standard_error")), unit)
 
-    return tuple(one(name, entry) for name, entry in mapping(value).items())
+    return tuple(one(name, entry) for name, entry in mapping(value).items() if name != WEIGHT)
 
 
 def _linear(calibration: Mapping[str, object], units: object) -> Iterator[Coefficient]:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from triaxcal.text import advice as text
 from triaxcal.units import ErrorUnit
 
 MICRO_G = ErrorUnit()
@@ -96,6 +97,11 @@ def p_value(p: float | None) -> str:
     if p is None:
         return MISSING
     return f"< {power(-6)}" if p < 1e-6 else digits(p, 2)
+
+
+def chance(p: float | None) -> str:
+    """The probability that something acts, as the sentences have it."""
+    return MISSING if p is None else text.chance(p)
 
 
 def plus_minus(value: float | None, standard_error: float | None, unit: str) -> str:

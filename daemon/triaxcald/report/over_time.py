@@ -1,4 +1,4 @@
-"""The residuals along the time of each recording, step by step, above the channels that moved meanwhile."""
+"""The residuals along the time of each recording, before and after, above the channels that moved meanwhile."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def time_picture(
         for axes, stage in zip(panels, shown, strict=False):
             _noise_band(axes, noise_floor_g, unit)
             _residuals(axes, place, poses, stage, colours[stage.label], unit)
-            axes.set_title(stage.title, loc="left", weight="bold")
+            axes.set_title(stage.label, loc="left", weight="bold")
             axes.set_ylabel(f"residual, {unit_label(unit)}")
         _mark_conspicuous(panels[len(shown) - 1], place, poses, shown[-1], unit)
         for axes, (channel, values) in zip(panels[len(shown) :], logged.items(), strict=True):

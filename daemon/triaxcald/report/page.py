@@ -28,7 +28,7 @@ from triaxcald.report.verdict import final_word, judge
 _SHOWN_ELSEWHERE = {
     "format", "calibration", "loop", "before", "after", "held_out", "findings", "unexplained", "poses",
     "limits", "data_quality", "advice", "residual", "result", "registers", "verification", "not_written", "device",
-    "choices", "outcome",
+    "choices", "outcome", "candidates", "probabilities", "summary",
 }  # fmt: skip
 _LONGEST_LIST = 16
 
@@ -108,8 +108,8 @@ def _environment() -> Environment:
     )
     environment.globals["factor"] = factor
     for function in (
-        in_plain, figures.digits, figures.effect_title, figures.fixed, figures.in_full, figures.micro, figures.micro_g,
-        figures.p_value, figures.plus_minus, figures.unit_label,
+        in_plain, figures.chance, figures.digits, figures.effect_title, figures.fixed, figures.in_full, figures.micro,
+        figures.micro_g, figures.p_value, figures.plus_minus, figures.unit_label,
     ):  # fmt: skip
         environment.filters[function.__name__] = function
     return environment

@@ -51,7 +51,7 @@ def sphere_picture(
             for axes, side in zip(pair, (1, -1), strict=True):
                 _hemisphere(axes, side, poses, stage, norm)
                 axes.text(0, -1.52, "+Z half" if side > 0 else "−Z half", ha="center", color=MUTED, fontsize=8)
-            pair[0].set_title(stage.title, loc="left", weight="bold", pad=8)
+            pair[0].set_title(stage.label, loc="left", weight="bold", pad=8)
         for axes in grid.flat[2 * len(shown) :]:
             axes.axis("off")
         _colour_bar(figure, grid, norm, 0.2 / height_in, unit)

@@ -1,17 +1,15 @@
-"""The steps of the loop: the plain model, the model with each effect in turn, and the errors of each."""
+"""The plain model, the one that is handed on, and the errors of each."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcald.report.figures import clean, effect_title, number
+from triaxcald.report.figures import number
 from triaxcald.report.untrusted import mapping
-
-AFTER = "After"
 
 
 @dataclass(frozen=True)
@@ -27,22 +25,12 @@ class Residual:
 
 @dataclass(frozen=True)
 class Stage:
-    """The model at one step of the loop: its errors and, where known, the residual of every pose in g.
-
-    ``adds`` is the effect by which it differs from the step before.
-    """
+    """A model: its errors and, where known, the residual of every pose in g."""
 
     label: str
     residual: Residual
     held_out_rms_g: float | None = None
     pose_residual_g: NDArray[np.float64] | None = None
-    adds: str = ""
-    p_value: float | None = None
-
-    @property
-    def title(self) -> str:
-        """The label, with the effect that the last step added."""
-        return f"{self.label}: + {self.adds}" if self.label == AFTER and self.adds else self.label
 
 
 @dataclass(frozen=True)
@@ -74,11 +62,11 @@ def held_out_of(document: Mapping[str, object]) -> HeldOut | None:
 def stages_of(
     document: Mapping[str, object],
     calibration: Mapping[str, object],
-    before_g: Sequence[float | None],
-    after_g: Sequence[float | None],
+    by_pose_g: tuple[Sequence[float | None], Sequence[float | None]],
     held_out: HeldOut | None,
 ) -> tuple[Stage, ...]:
-    """Before, after each effect but the last, and after the last one; ``before_g`` and ``after_g`` by pose."""
+    """Before and after; one where they are the same. ``by_pose_g`` has the residuals of both."""
+    before_g, after_g = by_pose_g
     after = residual_of(document.get("after")) or residual_of(calibration.get("residual"))
     before = residual_of(document.get("before"))
     if before is None and after is None:
@@ -87,32 +75,7 @@ def stages_of(
     if before is None or before == after:
         return (Stage("This model", after or Residual(), held_after_g, _series(after_g)),)
     first = Stage("Before", before, held_out.before_rms_g if held_out else None, _series(before_g))
-    if after is None:
-        return (first,)
-    steps = list(_steps(document.get("findings"), {str(t) for t in _entries(calibration.get("terms"))}, len(after_g)))
-    adds, p_value = (steps[-1].adds, steps[-1].p_value) if steps else ("", None)
-    last = Stage(AFTER, after, held_after_g, _series(after_g), adds, p_value)
-    return (first, *(s for s in steps[:-1] if s.residual != Residual()), last)
-
-
-def _steps(findings: object, terms: set[str], pose_count: int) -> Iterator[Stage]:
-    """The effects that the model took, in order, each with the errors of the model that it made."""
-    for known in map(mapping, _entries(findings)):
-        effect = str(known.get("effect", ""))
-        if effect not in terms:
-            continue
-        per_pose = known.get("pose_residual_g")
-        series = _series([number(value) for value in per_pose]) if isinstance(per_pose, list) else None
-        whole = series if series is not None and series.size == pose_count else None
-        title = clean(effect_title(effect)).lower()
-        yield Stage(
-            f"+ {title}", residual_of(known.get("residual")) or Residual(), None, whole, title,
-            number(known.get("p_value")),
-        )  # fmt: skip
-
-
-def _entries(value: object) -> Sequence[object]:
-    return value if isinstance(value, (list, tuple)) else ()
+    return (first,) if after is None else (first, Stage("After", after, held_after_g, _series(after_g)))
 
 
 def _series(values: Sequence[float | None]) -> NDArray[np.float64] | None:

@@ -10,7 +10,7 @@ from triaxcal.pure_error import LACK_OF_FIT
 from triaxcal.units import ErrorUnit
 from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show
-from triaxcald.report.document import Finding, Outcome
+from triaxcald.report.document import CANDIDATE, Finding, Outcome
 from triaxcald.report.faults import faults_of
 from triaxcald.report.figures import micro_g
 from triaxcald.report.meanings import told
@@ -19,7 +19,14 @@ from triaxcald.report.untrusted import mapping
 Kind = Literal["within", "outside", "unexplained", "refused"]
 _WITHIN, _OUTSIDE, _UNEXPLAINED = "Within limits", "Outside a limit", "Unexplained error left"
 _NO_LIMIT = "No limit was declared; the verdict compares with the noise floor alone."
+_WHAT_IS_LEFT = {
+    True: "something probably acts that no effect describes",
+    False: "more is left than the noise of the poses accounts for",
+}
+"""Of a search for effects, and of a fit."""
 _MOST_NAMED = 3
+EVEN = 0.5
+"""Below this probability of nothing something acts, whatever that is."""
 
 
 @dataclass(frozen=True)
@@ -109,14 +116,7 @@ def _judged(
         return Verdict("outside", _OUTSIDE, f"{', '.join(exceeded)}: over the limit. {errors}", reservations, checks)
     if _unexplained(outcome):
         kept = "Every declared limit is kept, but " if checks and not open_checks and not failed else ""
-        headline, what = _UNEXPLAINED, f"more is left than the noise of the poses accounts for. {errors}"
-        if outcome.unexplained is not None and outcome.unexplained.or_spoiled:
-            headline = "Spoiled poses or an effect"
-            what = f"something spoiled poses, which were left out, or an effect acts. {_errors(outcome)}"
-        elif outcome.unexplained is not None and outcome.unexplained.or_named:
-            headline, what = _effects(outcome), f"what was found need not be the cause. {errors}"
-        elif outcome.unexplained is not None and outcome.unexplained.only_inside:
-            what = f"what was found does not explain how the magnitude moves inside the poses. {errors}"
+        headline, what = _UNEXPLAINED, f"{_WHAT_IS_LEFT[outcome.searched]}. {errors}"
         if _spoiled(outcome) or _rejected(outcome):
             headline = f"{headline}; poses to take again"
         sentence = f"{kept}{what}" if kept else f"{what[0].upper()}{what[1:]}"
@@ -125,7 +125,7 @@ def _judged(
         return Verdict("unexplained", "Not assessed", f"Too little was measured for a verdict. {errors}",
                        reservations, checks)  # fmt: skip
     headline = _WITHIN if checks else _without_limits(outcome)
-    nothing_sure = _lacks_fit(outcome) or _could_find_nothing(outcome)
+    nothing_sure = _lacks_fit(outcome) or _could_find_nothing(outcome) or _something(outcome)
     uncertain = not checks and (_uncertain(outcome) or (not outcome.findings and nothing_sure))
     if _spoiled(outcome) or _rejected(outcome):
         headline, uncertain = f"{headline}; poses to take again", True
@@ -138,17 +138,27 @@ def _without_limits(outcome: Outcome) -> str:
     if _could_find_nothing(outcome):
         return "No effect could show in full"
     if not outcome.findings:
-        return "Nothing found beyond noise" if not _lacks_fit(outcome) else "Nothing certain found beyond noise"
+        sure = not _lacks_fit(outcome) and not _something(outcome)
+        return "Nothing found beyond noise" if sure else "Nothing certain found beyond noise"
     return _effects(outcome)
 
 
 def _effects(outcome: Outcome) -> str:
     what = "Effect" if len(outcome.findings) == 1 else f"{len(outcome.findings)} effects"
+    if all(finding.verdict == CANDIDATE for finding in outcome.findings):
+        return f"{what} probable, not certain"
+    if outcome.not_corrected:
+        return f"{what} found, none corrected"
     return f"{what} found, cause uncertain" if _uncertain(outcome) else f"{what} found and corrected"
 
 
 def _could_find_nothing(outcome: Outcome) -> bool:
     return outcome.searched and not outcome.findings and none_could_show(outcome.blind_to)
+
+
+def _something(outcome: Outcome) -> bool:
+    """Whether it is likelier than not that something acts."""
+    return outcome.nothing_probability is not None and outcome.nothing_probability < EVEN
 
 
 def _spoiled(outcome: Outcome) -> bool:
@@ -170,9 +180,14 @@ def _found(outcome: Outcome) -> str:
         return ""
     if _could_find_nothing(outcome):
         return "These poses are too few, or such that no effect beyond the linear model could show in full. "
+    if not outcome.findings and _something(outcome):
+        return "Something acts beyond the linear model, and these poses do not tell what. "
     if not outcome.findings:
         return "No effect beyond the linear model was found. "
-    return f"Found: {'; '.join(_named(finding, outcome) for finding in outcome.findings)}. "
+    certain = [_named(finding, outcome) for finding in outcome.findings if finding.verdict != CANDIDATE]
+    probable = [_named(finding, outcome) for finding in outcome.findings if finding.verdict == CANDIDATE]
+    told_of = (("Found", certain), ("Probable", probable))
+    return "".join(f"{what}: {'; '.join(said)}. " for what, said in told_of if said)
 
 
 def _named(finding: Finding, outcome: Outcome) -> str:
@@ -183,8 +198,6 @@ def _named(finding: Finding, outcome: Outcome) -> str:
         title = known.title.lower()
         clauses.append(known.clause if known.clause == title else f"{known.clause} ({title})")
     clauses += ["others"] if len(names) > _MOST_NAMED else []
-    clauses += ["spoiled poses"] if finding.spoiled else []
-    clauses += ["something in no catalogue"] if finding.coincidence is not None else []
     doubt = "" if len(clauses) == 1 else " – these poses cannot tell which"
     return " or ".join(clauses) + doubt
 
@@ -201,7 +214,7 @@ def _checks(outcome: Outcome, limits: Mapping[str, float | None]) -> list[LimitC
 
 
 def _tested(outcome: Outcome) -> bool:
-    if outcome.unexplained is not None and outcome.unexplained.p_value is not None:
+    if outcome.unexplained is not None and outcome.unexplained.probability is not None:
         return True
     return outcome.final.lack_of_fit_p is not None
 
@@ -250,7 +263,7 @@ def _reservations(outcome: Outcome, checks: tuple[LimitCheck, ...]) -> list[str]
     rejected = _rejected(outcome)
     found = []
     if _spoiled(outcome):
-        found.append("Faults in the recording spoil poses, which have to be taken again: see below.")
+        found.append("Poses with faults are excluded, and have to be taken again: see below.")
     if rejected:
         found.append(f"{rejected} of {len(outcome.poses)} poses not used.")
     if not checks:

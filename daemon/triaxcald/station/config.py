@@ -23,7 +23,7 @@ from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import CORRECTED, Bundle, Strict, load_bundle, parse_toml, validate
+from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict, load_bundle, parse_toml, validate
 from triaxcal_drivers.toml_text import SIZE_MOST
 from triaxcald.errors import InputError
 from triaxcald.provision.identity import same_serial
@@ -101,6 +101,10 @@ class StationFile(Strict):
     thermometer_uncertainty_k: Annotated[
         float | None, Field(ge=0, le=100, description="standard uncertainty of the units' thermometers")
     ] = None
+    thermal_sensitivity_per_k: Annotated[
+        float | None,
+        Field(ge=0, le=0.1, description="by how much 1 K changes bias [g] and scale factor [relative] of such units"),
+    ] = None
     holds_at: Annotated[
         Literal["end", "mean"] | Annotated[float, Field(ge=0, allow_inf_nan=False)],
         Field(description="moment of the recording, in s from its start, for which effects of time hold elsewhere"),
@@ -122,11 +126,15 @@ class StationFile(Strict):
         """As `triaxcal.loop.diagnose` has it."""
         return Moment(self.holds_at) if isinstance(self.holds_at, str) else self.holds_at
 
-    @property
-    def stated(self) -> Stated:
-        """What the station says of uncertainties."""
+    def stated(self, profile: Profile) -> Stated:
+        """What the station says of uncertainties, and the device's ``profile`` of its thermal sensitivity."""
+        own = self.thermal_sensitivity_per_k
         return Stated.at(
-            self.latitude_deg, self.height_m, self.reference_uncertainty, thermometer_k=self.thermometer_uncertainty_k
+            self.latitude_deg,
+            self.height_m,
+            self.reference_uncertainty,
+            thermometer_k=self.thermometer_uncertainty_k,
+            thermal_sensitivity=profile.output.thermal_sensitivity_per_k if own is None else own,
         )
 
     @model_validator(mode="after")

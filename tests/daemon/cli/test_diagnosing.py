@@ -1,4 +1,4 @@
-"""What diagnose says at the console: conditions, shapes, probabilities, the empirical term, units side by side."""
+"""What diagnose says: conditions, shapes, probabilities, what no effect describes, units side by side."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcal.units import ErrorUnit
 from triaxcald.cli.results import cross_validated
 from triaxcald.cli.several import COLUMNS
-from triaxcald.remarks import SHARE, overlap
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
 K = 2.0
+FINDING = {"effect", "verdict", "probability", "coefficients", "alternatives", "probabilities", "reason", "remedy"}
+OF_0_1 = {"p_value", "spoiled", "coincidence", "held_out_rms_g", "apart", "residual", "pose_residual_g"}
 
 
 def write(path: Path, seed: int, *, settling_g: float = 0.0, step_g: float = 0.0, swell: float = 0.0,
@@ -48,8 +49,9 @@ def write(path: Path, seed: int, *, settling_g: float = 0.0, step_g: float = 0.0
 @pytest.fixture(scope="module")
 def folder(once: Callable[..., Path]) -> Path:
     def make(folder: Path) -> None:
-        write(folder / "settling.csv", 1, settling_g=5e-3)
+        write(folder / "settling.csv", 1, settling_g=2e-3)
         write(folder / "rippled.csv", 3, ripple=1e-3)
+        write(folder / "plain.csv", 3)
         write(folder / "warm.csv", 6, settling_g=5e-3, warms_k=1.0)
 
     return once("diagnosing", make)
@@ -75,20 +77,21 @@ def warm(folder: Path) -> Path:
     return folder / "warm.csv"
 
 
-def empirical_lines(said: str) -> list[str]:
-    return [line for line in said.splitlines() if "empirical: " in line]
+@pytest.fixture
+def plain(folder: Path) -> Path:
+    return folder / "plain.csv"
 
 
 def cells(said: str, name: str) -> list[str]:
     """Of the row of that name."""
-    row = next(line for line in said.splitlines() if f" {name} " in line)
+    row = next(line for line in said.splitlines() if line.startswith(f"│ {name} "))
     return [cell.strip() for cell in row.strip("│ ").split("│")]
 
 
 def test_a_warm_up_is_told_with_its_time_constant_and_the_values_are_said_to_hold_long_after_it(
     settling: Path, asked: Run
 ) -> None:
-    said = asked("diagnose", settling).out
+    said = asked("diagnose", settling, "--verbose").out
     document = asked("diagnose", settling, "--json").json
     _, value, error, _, unit = cells(said, "warm_up.time_constant")
     assert float(value) == pytest.approx(40.0, abs=5 * float(error))
@@ -102,7 +105,7 @@ def test_a_warm_up_is_told_with_its_time_constant_and_the_values_are_said_to_hol
 
 
 def test_a_step_is_told_with_its_moment_and_the_values_are_said_to_hold_after_it(knocked: Path, triaxcal: Run) -> None:
-    said = triaxcal("diagnose", knocked).out
+    said = triaxcal("diagnose", knocked, "--verbose").out
     _, moment, error, _, unit = cells(said, "bias_step.at")
     assert float(moment) == pytest.approx(87.5, abs=HOLD_S + MOVE_S)
     assert unit == "s"
@@ -141,65 +144,65 @@ def test_a_budget_that_temperature_dominates_says_what_of_it_is_assumed(
     assert "assumption" not in asked("fit", rippled).out
 
 
-def test_no_probability_is_said_to_be_nothing_and_no_error_has_an_exponent(
+def test_no_probability_is_said_to_be_nothing_or_certainty_and_no_error_has_an_exponent(
     rippled: Path, settling: Path, asked: Run
 ) -> None:
-    said = asked("diagnose", rippled).out + asked("diagnose", settling).out
+    said = "".join(asked("diagnose", recording, "--verbose").out for recording in (rippled, settling))
     assert "lack of fit p < 1e-12" in said
-    assert "familywise p < 1e-12" in said
-    assert not re.search(r"p 0(?![.\d])|e[+-]\d+ µg", said)
+    assert cells(said, "something that no effect describes")[1] == "more than 0.999"
+    assert cells(said, "nothing")[1] == "less than 0.001"
+    assert not re.search(r"(p|probability|\() ?[01](?![.\d])|e[+-]\d+ µg", said)
 
 
-def test_the_reason_has_the_errors_of_the_table_above_it(settling: Path, asked: Run) -> None:
-    said = asked("diagnose", settling).out
-    _, before, after = cells(said, "cross-validated rms")
-    assert f"falls from {before} µg to {after} µg (noise floor" in said
+def test_what_is_said_of_errors_and_probabilities_has_the_figures_of_the_tables(settling: Path, asked: Run) -> None:
+    said = asked("diagnose", settling, "--verbose").out
+    _, before, after = cells(said, "residual rms")
+    assert f"\nerror    residual rms {before} µg before, {after} µg after; " in said
+    _, likely = cells(said, "warm_up")
+    assert f"\ncause    warm_up ({likely}) acts\n" in said
+    assert f"\nadopted: warm_up (it acts with probability {likely})\n" in said
 
 
-def test_what_no_effect_explains_is_described_only_where_that_is_asked_for(tmp_path: Path, triaxcal: Run) -> None:
+def test_a_finding_has_its_probability_and_keys_that_mean_nothing_any_more_are_null(settling: Path, asked: Run) -> None:
+    document = asked("diagnose", settling, "--json").json
+    (finding,) = document["findings"]
+    assert set(finding) == FINDING | OF_0_1
+    assert {finding[key] for key in OF_0_1} == {None}
+    assert (finding["effect"], finding["verdict"]) == ("warm_up", "adopted")
+    assert finding["probability"] == document["probabilities"]["warm_up"] >= 0.99
+    assert (finding["alternatives"], finding["probabilities"]) == ([], {})
+    assert document["calibration"]["effects"]["warm_up"]["weight"] == 1.0
+    assert (document["call"], document["not_corrected"], document["another_unit"]) == ("usable", None, None)
+
+
+def test_what_no_effect_describes_is_told_with_its_probability_and_nothing_is_corrected(
+    tmp_path: Path, triaxcal: Run
+) -> None:
     recording = write(tmp_path / "swollen.csv", 4, swell=4e-3)
-    plainly = triaxcal("diagnose", recording, "--json").json
-    assert not empirical_lines("\n".join(plainly["advice"]))
-    assert "empirical" not in plainly["calibration"]["terms"]
-    assert plainly["unexplained"]["significant"]
-    assert plainly["unexplained"]["lead"].count(SHARE) == 1
-    assert overlap(plainly["unexplained"]["lead"]) == ""
-    described = triaxcal("diagnose", recording, "--empirical", "--json").json
-    assert described["calibration"]["terms"][-1] == described["findings"][-1]["effect"] == "empirical"
-    errors = [d["after"]["cross_validated_rms_g"] for d in (plainly, described)]
-    assert errors[1] < errors[0] / 1.4
-    assert f"from {errors[0] * 1e6:.1f} µg to {errors[1] * 1e6:.1f} µg" in described["findings"][-1]["reason"]
-    assert not described["unexplained"]["significant"]
+    document = triaxcal("diagnose", recording, "--json").json
+    part = document["unexplained"]
+    assert part["significant"]
+    assert part["probability"] >= 0.99
+    assert part["lead"].startswith("something acts that no effect describes (probability more than 0.999), ")
+    assert f" {1e6 * part['rms_g']:.1f} µg rms; it goes with " in part["lead"]
+    assert document["summary"][:2] == ["investigate", part["lead"]]
+    assert (document["findings"], document["candidates"], document["not_corrected"]) == ([], [], "unmodelled")
+    assert document["calibration"]["terms"] == ["linear"]
+    assert document["after"] == document["before"]
 
 
-def test_the_console_explains_the_shares_of_what_is_left(
-    rippled: Path, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
+def test_units_side_by_side_are_told_each_by_itself_and_every_column_is_explained(
+    plain: Path, settling: Path, triaxcal: Run
 ) -> None:
-    monkeypatch.setattr("triaxcald.cli.results.overlap", lambda lead: f"of {lead}")
-    said = triaxcal("diagnose", rippled).out
-    assert re.search(r"unexplained: \S+ µg rms; (.+)\nshares of what is unexplained: of \1\n", said)
-
-
-def test_one_line_says_why_the_empirical_term_is_not_in_the_model(
-    rippled: Path, settling: Path, triaxcal: Run, asked: Run
-) -> None:
-    (tried,) = empirical_lines(triaxcal("diagnose", rippled, "--empirical").out)
-    after = asked("diagnose", rippled, "--json").json["after"]["cross_validated_rms_g"]
-    assert tried.startswith("advice: empirical: tried, but not in the model: ")
-    assert f"the cross-validated error goes from {after * 1e6:.1f} µg to " in tried
-    (not_tried,) = empirical_lines(triaxcal("diagnose", settling, "--empirical").out)
-    assert not_tried.startswith("advice: empirical: not tried, as what is left is no more than noise explains (p ")
-
-
-def test_units_side_by_side_each_say_it_too_and_every_column_is_explained(
-    rippled: Path, settling: Path, triaxcal: Run
-) -> None:
-    said = triaxcal("diagnose", "--units", settling, rippled, "--empirical").out
-    assert [line.split(": ")[0] for line in empirical_lines(said)] == [str(settling), str(rippled)]
-    tables, explained = said.split("\ncross-validated: ", 1)
+    done = triaxcal("diagnose", "--units", settling, plain)
+    assert f"warning: {settling}: creeping_pose: " in done.err
+    assert f"warning: {plain}: " not in done.err
+    tables, explained = done.out.split(f"\n{next(iter(COLUMNS))}: ", 1)
     for column in COLUMNS:
         assert column in tables
-        assert column == "cross-validated" or f"\n{column}: " in explained
+        assert f"\n{column}: {COLUMNS[column]}\n" in f"\n{next(iter(COLUMNS))}: {explained}"
+    assert cells(tables, str(settling))[1] == "warm_up"
+    assert cells(tables, str(plain))[1] == "none"
 
 
 @pytest.mark.parametrize("column", COLUMNS)
@@ -208,15 +211,16 @@ def test_the_reference_explains_the_columns_of_units_in_the_same_words(column: s
     assert f"| {column} | {COLUMNS[column].replace('|a|', chr(92) + '|a' + chr(92) + '|')} |" in page
 
 
-def test_of_poses_that_can_show_no_effect_the_console_says_so_and_not_that_there_is_none(
-    tmp_path: Path, rippled: Path, triaxcal: Run, asked: Run
+def test_of_poses_that_can_show_no_effect_the_console_says_so_and_why(
+    tmp_path: Path, plain: Path, triaxcal: Run, asked: Run
 ) -> None:
     few = tmp_path / "ten.csv"
-    few.write_text("".join(rippled.read_text("utf-8").splitlines(keepends=True)[: int(10 * 7 * RATE_HZ)]), "utf-8")
-    assert "no effect of the catalogue shows; none could in full, with so few or such poses\n" in (
-        triaxcal("diagnose", few).out
-    )
-    assert "none could" not in asked("diagnose", rippled).out
+    few.write_text("".join(plain.read_text("utf-8").splitlines(keepends=True)[: int(10 * 7 * RATE_HZ)]), "utf-8")
+    said = triaxcal("diagnose", few, "--verbose").out
+    assert "\ncause    no effect shows (nothing acts with probability 0." in said
+    (line,) = re.findall("advice: these poses cannot show in full (.*): the poses point in too few directions\n", said)
+    assert {"second_order_nonlinearity", "scale_factor_asymmetry", "cross_coupling"} <= set(line.split(", "))
+    assert "too few" not in asked("diagnose", plain, "--verbose").out
 
 
 def test_an_error_that_cannot_be_cross_validated_is_no_dash_in_a_sentence() -> None:

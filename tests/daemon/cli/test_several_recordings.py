@@ -17,6 +17,11 @@ from triaxcald.cli.commands import parser
 
 Run = Callable[..., Any]
 RATE_HZ, HOLD_S, MOVE_S = 25.0, 6.0, 1.0
+EFFECT = {
+    "effect", "probability", "common_values_probability", "units_probability", "named_by", "listed_by", "not_found_by",
+    "shapes",
+}  # fmt: skip
+OF_0_1 = {"worse", "gain", "units_gain", "shown_by"}
 BY_RECORDING = {"recording", "poses", "before_rms_g", "after_rms_g", "noise_floor_g"}
 
 
@@ -133,14 +138,20 @@ def test_units_that_warm_up_alike_agree_on_it(settling: list[Path], triaxcal: Ru
     assert document["verdict"] == "agree on warm_up"
     assert document["agreed"] == ["warm_up"]
     first = document["effects"][0]
-    assert set(first) == {
-        "effect", "worse", "gain", "units_gain", "shown_by", "named_by", "listed_by", "not_found_by", "shapes",
-    }  # fmt: skip
-    assert first["shown_by"] == [str(p) for p in settling]
+    assert set(first) == EFFECT | OF_0_1
+    assert {first[key] for key in OF_0_1} == {None}
+    assert first["effect"] == "warm_up"
+    assert first["probability"] >= 0.99
+    assert 0 <= first["common_values_probability"] <= 1
+    assert len(first["units_probability"]) == 2
+    assert document["nothing_probability"] < 0.01
+    found = [*first["named_by"], *first["listed_by"], *first["not_found_by"]]
+    assert sorted(found) == [str(p) for p in settling]
     shared = first["shapes"]["time_constant"]
     assert set(shared) == {"value", "standard_error", "unit", "p_value", "own"}
     assert shared["value"] == pytest.approx(30.0, abs=5 * shared["standard_error"])
-    assert [o["recording"] for o in shared["own"]] == first["shown_by"]
+    assert shared["p_value"] is None
+    assert [o["recording"] for o in shared["own"]] == [str(p) for p in settling]
     assert [u["result"]["format"] for u in document["units"]] == ["triaxcal.loop/1"] * 2
     assert [u["recording"] for u in document["units"]] == [str(p) for p in settling]
 

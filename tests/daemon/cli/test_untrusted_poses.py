@@ -164,6 +164,6 @@ def test_fit_says_how_many_of_the_poses_it_left_out(folder: Path, triaxcal: Run)
 
 def test_diagnose_advises_to_take_such_a_pose_again(folder: Path, triaxcal: Run, asked: Run) -> None:
     said = triaxcal("diagnose", folder / "rail.csv").out
-    assert "\nadvice: take again the pose at 0.1 s: left out (saturation)\n" in said
+    assert "\nnext     take again the pose at 0.1 s: excluded (saturation)\n" in said
     advice = asked("diagnose", folder / "clean.csv", "--json").json["advice"]
     assert not [line for line in advice if "take again" in line]

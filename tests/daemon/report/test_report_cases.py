@@ -76,7 +76,7 @@ def words(loop: dict[str, Any]) -> dict[str, Any]:
 
 
 def add(document: dict[str, Any], effect: str, coefficients: dict[str, Any], **more: Any) -> None:
-    """A finding in the model, with the residual of its step."""
+    """A finding in the model."""
     first = not document["findings"]
     if first:
         document["before"] = {**document["after"], "rms_g": 9e-4, "cross_validated_rms_g": 1.1e-3}
@@ -88,14 +88,12 @@ def add(document: dict[str, Any], effect: str, coefficients: dict[str, Any], **m
     document["findings"].append(
         {
             "effect": effect,
-            "verdict": "confounded" if more.get("alternatives") or more.get("spoiled") else "adopted",
-            "p_value": 1e-9,
+            "verdict": "confounded" if more.get("alternatives") else "adopted",
+            "probability": 0.9998,
             "coefficients": known,
             "alternatives": [],
             "reason": "with it the error falls",
             "remedy": "Wait.",
-            "residual": {"rms_g": 2.22e-5, "cross_validated_rms_g": 3.33e-5},
-            "pose_residual_g": [1e-5] * 14,
         }
         | more
     )
@@ -106,7 +104,7 @@ def test_nothing_found_says_so_in_the_first_sentence(page_of_nothing: tuple[str,
     assert text.index("Nothing found beyond noise") < text.index("No effect beyond the linear model was found.") < 300
     assert 'class="verdict within"' in html
     assert "Poses to take again" not in text
-    assert "Step by step" not in text
+    assert "The linear model, and the one with what is corrected" not in text
 
 
 def test_an_adopted_effect_has_words_formula_shape_and_what_to_change(words: dict[str, Any]) -> None:
@@ -163,39 +161,37 @@ def test_a_step_between_poses_lies_there_where_its_error_is_that_of_a_rectangle(
     assert f"between pose 4 and pose 5, that is between {begin:.1f} s and {end:.1f} s{words}" in page(loop)[1]
 
 
-def test_confounded_effects_are_all_told_in_words_with_what_would_tell_them_apart(words: dict[str, Any]) -> None:
+def test_confounded_effects_are_all_told_in_words_with_their_probabilities(words: dict[str, Any]) -> None:
     others = ["bias_drift", "warm_up", "channel_bias:fan_rpm"]
-    add(words, "temperature_bias", {"y": (-2e-5, 1e-6, "g/K")}, alternatives=others,
-        apart=["record again while temp_c moves by itself"])  # fmt: skip
+    likely = {"bias_drift": 0.3, "warm_up": 0.0321}
+    add(words, "temperature_bias", {"y": (-2e-5, 1e-6, "g/K")}, alternatives=others, probabilities=likely,
+        probability=0.6543)  # fmt: skip
     html, text = page(words)
     assert 'class="verdict unexplained"' in html
     assert text.index("Effect found, cause uncertain") < text.index("or others – these poses cannot tell which") < 450
     for said in (
-        "Bias drift: the bias drifts with time",
-        "Warm up: the bias settles",
+        "Bias drift: the bias drifts with time (0.3)",
         "Channel bias: fan_rpm: the bias goes with fan_rpm",
     ):
         assert said in text
-    assert "Would tell them apart Record again while temp_c moves by itself" in text
-    assert "elsewhere it holds only if the name is right" in text
+    assert re.search(r"Warm up: the bias settles [^()]*\(0\.032\)", text)
+    assert "Probability 0.65 " in text
+    assert "it is not certain that this effect acts, and it is corrected by as much as it is probable" in text
 
 
-def test_a_check_recording_has_its_error_beside_every_name_that_fits_as_well(words: dict[str, Any]) -> None:
-    others = {"alternatives": ["warm_up", "bias_step"], "held_out_rms_g": {"warm_up": 3.45e-4}}
-    add(words, "bias_drift", {"x": (8.27e-4, 1.5e-5, "g/s")}, **others)
-    _, text = page(words)
-    assert text.count("in the check recording)") == 1
-    assert re.search(r"Warm up: [^()]*\(345 µg in the check recording\)", text)
-
-
-def test_poses_that_would_do_as_well_as_the_effect_are_named_beside_it(words: dict[str, Any]) -> None:
-    apart = ["take the pose at 10.7 s and the pose at 82.9 s again"]
-    add(words, "bias_drift", {"x": (8.27e-4, 1.5e-5, "g/s")}, spoiled=["10.7 s", "82.9 s"], apart=apart)
-    _, text = page(words)
-    assert "or spoiled poses – these poses cannot tell which" in text
-    assert "No effect, had something spoiled the poses at 10.7 s and 82.9 s" in text
-    assert "Would tell them apart take the pose at 10.7 s and the pose at 82.9 s again".lower() in text.lower()
-    assert "The name: the correction is good for these poses" in text
+def test_an_effect_that_probably_acts_is_told_with_its_probability_and_called_no_finding(words: dict[str, Any]) -> None:
+    known = {axis: {"value": 1e-4, "standard_error": 1e-5, "unit": "g/g^2"} for axis in "xyz"}
+    words["candidates"] = [{"effect": "second_order_nonlinearity", "probability": 0.81, "coefficients": known}]
+    words["calibration"]["effects"] = {"second_order_nonlinearity": {**known, "weight": 0.81}}
+    html, text = page(words)
+    assert 'class="verdict unexplained"' in html
+    assert text.index("Effect probable, not certain") < text.index("Probable: the output bends with the square") < 300
+    assert "1. Second-order nonlinearity candidate" in text
+    assert "Probability 0.81 " in text
+    assert "No effect beyond the linear model was found" not in text
+    assert "What to change" not in text
+    assert "Second-order nonlinearity, x |" in text
+    assert "Second-order nonlinearity, weight" not in text
 
 
 def test_a_confounded_effect_within_its_limits_is_within_limits(words: dict[str, Any]) -> None:
@@ -204,47 +200,39 @@ def test_a_confounded_effect_within_its_limits_is_within_limits(words: dict[str,
     assert 'class="verdict within"' in html
 
 
-def test_two_effects_are_a_ladder_of_three_models_above_the_channels_that_moved(loop: dict[str, Any]) -> None:
+def test_two_effects_are_corrected_at_once_in_pictures_above_the_channels_that_moved(loop: dict[str, Any]) -> None:
     add(loop, "channel_bias:supply_v", {"x": (1e-4, 1e-5, "g/[supply_v]")})
     add(loop, "hysteresis", {"x": (1e-4, 1e-5, "g/g")}, alternatives=["bias_drift"])
     html, text = page(loop)
     assert "2 effects found, cause uncertain" in text
-    assert "Linear model | 900 µg | 1100 µg" in text
-    assert "+ channel bias: supply_v | 22.2 µg | 33.3 µg" in text
-    last_ug = loop["after"]["rms_g"] * 1e6
-    assert f"+ hysteresis | {last_ug:.1f} µg" in text or f"+ hysteresis | {last_ug:.2f} µg" in text
+    assert "Before | 900 µg | 1100 µg" in text
+    last = loop["after"]
+    assert f"After | {1e6 * last['rms_g']:.3g} µg | {1e6 * last['cross_validated_rms_g']:.3g} µg" in text
     bars, sphere, time = (next(line for line in labels(html) if what in line) for what in ("Bars", "sphere", "time"))
-    for picture in (bars, sphere, time):
-        assert "+ channel bias: supply_v" in picture
-    assert re.search(r"before and \+ channel bias: supply_v and after, above temp_c$", time)
-    assert html.count(">After: + hysteresis</text>") == 2  # the panels of the last step say what it added
+    assert "Before 900 µg" in bars
+    assert "before and after" in sphere
+    assert time.endswith("before and after, above temp_c")
 
 
-def test_the_leads_of_what_is_unexplained_are_a_list(words: dict[str, Any]) -> None:
-    lead = f"93% goes with an odd pattern; the nearest effect is cross_coupling, not adopted: p = 0.9; {HOSTILE}"
-    words["unexplained"] = {"significant": True, "p_value": 1e-9, "rms_g": 2e-4, "lead": lead}
+def test_what_no_effect_describes_is_told_in_the_words_of_the_document(words: dict[str, Any]) -> None:
+    lead = f"something acts that no effect describes (probability 0.98), 281.0 µg rms; {HOSTILE}"
+    words["unexplained"] = {"significant": True, "probability": 0.98, "kind": "time", "rms_g": 2.81e-4, "lead": lead}
     html, text = page(words)
     assert 'class="verdict unexplained"' in html
-    assert "<li>93% goes with an odd pattern</li>" in html
-    assert "<li>The nearest effect is cross coupling, not adopted: p = 0.9</li>" in html
+    assert "Something probably acts that no effect describes." in text
+    assert f"Something acts that no effect describes (probability 0.98), 281.0 µg rms; {HOSTILE}." in text
     assert text.count(HOSTILE) == 1
+    words["unexplained"]["lead"] = None
+    assert "Something probably acts that no effect describes, 281 µg rms." in page(words)[1]
 
 
-def test_shares_that_overlap_are_said_to_be_no_parts_of_a_whole(words: dict[str, Any]) -> None:
-    said = "Each share is of the squares of all that is left, by that pattern alone; patterns overlap"
-    one, other = "93% of it goes with an odd pattern", "60% of it goes with a wave along the output of axis x, 1 g long"
-    for lead, told in ((f"{one}; {other}", True), (one, False)):
-        words["unexplained"] = {"significant": True, "p_value": 1e-9, "rms_g": 2e-4, "lead": lead}
-        assert (said in page(words)[1]) == told
-
-
-def test_how_much_is_left_is_told_only_where_it_is_significant(words: dict[str, Any]) -> None:
-    words["unexplained"] = {"significant": False, "p_value": 0.4, "rms_g": 2.81e-6, "lead": ""}
+def test_how_large_it_is_is_told_only_where_something_probably_acts_that_no_effect_describes(
+    words: dict[str, Any],
+) -> None:
+    words["unexplained"] = {"significant": False, "probability": 0.043, "rms_g": 2.81e-6, "lead": ""}
     _, text = page(words)
-    assert "Nothing beyond noise shows, p: 0.40." in text
+    assert "Nothing that no effect describes shows; its probability is 0.043." in text
     assert "2.81" not in text
-    words["unexplained"] |= {"significant": True, "p_value": 1e-3}
-    assert "More is left than noise accounts for: 2.81 µg rms beyond the noise floor, p: 0.0010." in page(words)[1]
 
 
 @pytest.mark.parametrize(
@@ -317,42 +305,26 @@ def test_a_first_pose_of_unknown_history_is_left_out_and_not_to_be_taken_again(b
     assert "poses to take again" in page(bare)[1]
 
 
-def test_poses_left_out_or_an_effect_is_said_to_be_open(bare: dict[str, Any]) -> None:
-    bare["unexplained"] |= {"significant": True, "p_value": 2e-4, "lead": "most of it is the pose at 166.0 s"}
-    _, text = page(bare)
-    assert "Unexplained error left" in text
-    bare["calibration"]["poses"][4]["used"] = False
+def test_an_outlier_beside_what_no_effect_describes_is_to_be_taken_again(bare: dict[str, Any]) -> None:
+    bare["unexplained"] |= {"significant": True, "probability": 0.9, "lead": "something acts"}
+    assert "Unexplained error left Something" in page(bare)[1]
+    bare["calibration"]["poses"][4] |= {"used": False, "excluded": "outlier"}
     assert "Unexplained error left; poses to take again" in page(bare)[1]
-    bare["unexplained"]["or_spoiled"] = True
-    _, text = page(bare)
-    assert "Spoiled poses or an effect; poses to take again" in text
-    assert "Unexplained error left" not in text
 
 
-def test_effects_that_may_be_none_of_what_acts_are_said_to_be_in_question(bare: dict[str, Any]) -> None:
+def test_an_effect_that_is_known_and_not_corrected_is_in_question_no_more_than_its_name(bare: dict[str, Any]) -> None:
     bare["findings"] = [
-        {"effect": "bias_drift", "verdict": "confounded", "p_value": 1e-9, "coefficients": {}, "alternatives": [],
-         "spoiled": [], "coincidence": 0.08, "apart": ["take more poses"], "reason": "", "remedy": ""}
+        {"effect": "bias_drift", "verdict": "confounded", "probability": 0.997, "coefficients": {}, "alternatives": [],
+         "reason": "it acts with probability 0.997; not corrected, because what was found hangs on a single pose",
+         "remedy": ""}
     ]  # fmt: skip
-    bare["unexplained"] |= {"significant": True, "p_value": 1e-9, "or_named": True, "lead": "it need not be bias_drift"}
     html, text = page(bare)
     assert 'class="verdict unexplained"' in html
     assert "Effect found, cause uncertain" in text
-    assert "What was found need not be the cause." in text
-    assert "or something in no catalogue – these poses cannot tell which" in text
-    assert "one effect or another would explain as much with a probability of 0.080" in text
-    assert "Would tell them apart" in text
-    assert "More is left than noise accounts for" not in text
-    assert "It need not be" in text
-
-
-def test_what_moves_inside_the_poses_is_told_from_what_their_means_leave(bare: dict[str, Any]) -> None:
-    bare["unexplained"] |= {"significant": True, "p_value": 1e-9, "rms_g": 2e-5, "only_inside": True}
-    _, text = page(bare)
-    assert "What was found does not explain how the magnitude moves inside the poses." in text
-    assert "inside them the magnitude moves otherwise than foretold, 20.0 µg rms" in text
-    assert "a test of the trends inside the poses" in text
-    assert "More is left than" not in text
+    assert "not corrected, because what was found hangs on a single pose." in text
+    assert "Probability 0.997 Or instead none" in text
+    assert "it is not certain that this effect acts" not in text
+    assert "Who corrects it Nobody: it is not in the model" in text
 
 
 def test_nothing_found_is_not_certain_where_the_fit_is_worse_than_noise(bare: dict[str, Any]) -> None:
@@ -373,7 +345,7 @@ def test_faults_that_spoil_poses_come_first_and_the_rest_stay_remarks(words: dic
     ]
     _, text = page(words)
     top, rest = text.split("Residual, rms", 1)
-    assert "Faults in the recording spoil poses" in top
+    assert "Poses with faults are excluded, and have to be taken again" in top
     assert "Readings at the end of the range : x at 2.1 in 687 samples" in top
     assert "50.0 Hz" not in top
     assert rest.index("✗ take again") < rest.index("Mains hum | 50.0 Hz, amplitude y 0.0014 | no pose to take again")

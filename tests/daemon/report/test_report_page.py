@@ -127,8 +127,8 @@ def test_a_finding_shows_coefficients_with_errors_and_units_alternatives_reason_
     assert "e = q s²" in page.text
     assert "Bias drift: the bias drifts with time" in page.text
     assert "Warm up: the bias settles after the start" in page.text
-    assert "Record again while temp_c moves by itself" in page.text
-    assert "Temperature rose steadily with time" in page.text
+    assert "It acts with probability 0.7, or else bias drift 0.2, warm up 0.095: one of them with 0.995." in page.text
+    assert re.search(r"Warm up: the bias settles after the start[^()]*\(0\.095\)", page.text)
     assert "Repeat four poses at another temperature." in page.text
     assert "the bias drifts with time (bias drift) or the bias settles" in page.text
     assert "these poses cannot tell which" in page.text
@@ -228,7 +228,7 @@ def test_what_is_missing_is_a_dash(changed: dict[str, Any]) -> None:
     calibration["condition"] = float("inf")
     calibration["matrix"] = [[None] * 3] * 3
     calibration["poses"] = [dict.fromkeys(pose) for pose in calibration["poses"]]
-    changed["findings"][0].update(p_value=None, reason=None, remedy=None)
+    changed["findings"][0].update(probability=None, reason=None, remedy=None)
     page = render(changed)
     assert not re.search(r"\b(None|nan|inf)\b", page.text)
     assert page.row("Scale factor x (kx)")[1].endswith("V/g ± —")
@@ -278,11 +278,11 @@ def test_the_headline_is_the_stations_own_word_on_the_unit(
 
 
 def test_a_significant_remainder_is_unexplained_even_within_the_limits(bare: dict[str, Any]) -> None:
-    left = {"significant": True, "p_value": 1e-9, "rms_g": 4e-5, "lead": "grows with time"}
+    left = {"significant": True, "probability": 0.98, "rms_g": 4e-5, "lead": "something acts; it goes with the time"}
     page = render({**bare, "unexplained": left}, certificate=samples.certificate())
     assert page.verdict == "unexplained"
-    assert "Every declared limit is kept, but more is left" in page.text
-    assert "Grows with time" in page.text
+    assert "Every declared limit is kept, but something probably acts that no effect describes." in page.text
+    assert "Something acts; it goes with the time." in page.text
 
 
 @pytest.mark.parametrize("limits", [{"held_out_rms_g": 1e-4}, {"rms_g": None}, {"no_such_quantity": 1.0}])
@@ -309,16 +309,6 @@ def test_directions_come_from_the_matrix_where_the_document_has_none(changed: di
         del pose["direction"], pose["before_residual_g"]
     labels = [attributes["aria-label"] or "" for attributes in render(changed).named("svg")]
     assert [label for label in labels if "over the sphere for 26 poses, after" in label]
-
-
-def test_every_effect_of_the_model_is_a_step_whether_its_name_is_certain_or_not(changed: dict[str, Any]) -> None:
-    changed["calibration"]["terms"].append("temperature_bias")
-    page = render(changed)
-    labels = [attributes["aria-label"] or "" for attributes in page.named("svg")]
-    assert "+ second-order nonlinearity 25.0 µg" in labels[0]
-    assert "before and + second-order nonlinearity and after" in labels[2]
-    assert page.row("+ second-order nonlinearity")[1:3] == ["25.0 µg", "36.0 µg"]
-    assert page.row("+ temperature bias")[6] == "0.0040"
 
 
 def test_a_rejected_pose_is_counted_and_named(changed: dict[str, Any]) -> None:

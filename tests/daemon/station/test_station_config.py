@@ -9,8 +9,11 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.profile import load_bundle
 from triaxcald.errors import InputError
 from triaxcald.station.config import load_station
+
+PROFILE = load_bundle(Path("triax-ref-can")).profile
 
 GOOD = """\
 format = "triaxcal.station/1"
@@ -204,13 +207,29 @@ def test_a_place_on_earth_says_what_the_reference_is_and_how_well(tmp_path: Path
     path.write_text(GOOD.replace('name = "bench"', 'name = "bench"\nlatitude_deg = 50.45\nheight_m = 179', 1))
     file = load_station(path).file
     assert file.reference == pytest.approx(9.8104 / 9.80665, abs=1e-4)
-    assert file.stated.reference == pytest.approx(43e-6, rel=0.01)
+    assert file.stated(PROFILE).reference == pytest.approx(43e-6, rel=0.01)
     path.write_text(GOOD.replace('name = "bench"', 'name = "bench"\nreference = 1.0004\nreference_uncertainty = 2e-6'))
     file = load_station(path).file
-    assert (file.reference, file.stated.reference) == (1.0004, 2e-6)
+    assert (file.reference, file.stated(PROFILE).reference) == (1.0004, 2e-6)
     path.write_text(GOOD)
     file = load_station(path).file
-    assert (file.reference, file.stated.reference, file.stated.thermometer_k) == (1.0, None, None)
+    stated = file.stated(PROFILE)
+    assert (file.reference, stated.reference, stated.thermometer_k, stated.thermal_sensitivity) == (
+        1.0,
+        None,
+        None,
+        None,
+    )
+
+
+def test_the_station_comes_before_the_profile_in_what_a_kelvin_does(tmp_path: Path) -> None:
+    path = tmp_path / "station.toml"
+    sensitive = PROFILE.output.model_copy(update={"thermal_sensitivity_per_k": 2e-5})
+    profile = PROFILE.model_copy(update={"output": sensitive})
+    path.write_text(GOOD)
+    assert load_station(path).file.stated(profile).thermal_sensitivity == 2e-5
+    path.write_text(GOOD.replace('name = "bench"', 'name = "bench"\nthermal_sensitivity_per_k = 1e-5', 1))
+    assert load_station(path).file.stated(profile).thermal_sensitivity == 1e-5
 
 
 @pytest.mark.parametrize(

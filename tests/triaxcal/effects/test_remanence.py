@@ -16,6 +16,7 @@ from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.remanence import Remanence
 from triaxcal.loop import diagnose
 from triaxcal.pose_fit import fit
+from triaxcal.posterior.blind import Blind, Why
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
@@ -74,4 +75,4 @@ def test_poses_that_all_follow_the_same_one_say_that_they_cannot_show_it(
     poses = noisy_poses(with_effect(effect, [0, 0, 0]), twenty_six, 1.5e-5, np.random.default_rng(0))
     loop = diagnose([replace(p, before=rest) for p in poses], signs=MINUS, catalogue=[effect])
     assert loop.after.blind_to == (effect.name,)
-    assert "too few poses, or what it goes with moved along with their directions" in " ".join(loop.advice)
+    assert loop.blind[effect.name] == Blind(Why.MOVED_ALONG)

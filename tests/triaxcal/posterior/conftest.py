@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from triaxcal.effects import effect_named
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.posterior.rows import Rows
@@ -11,6 +12,16 @@ from triaxcal.posterior.rows import Rows
 SIGMA_G = 2e-5
 MINUS = (-1.0, -1.0, -1.0)
 """Signs of the paper's unit."""
+
+
+FEW = tuple(
+    effect_named(name)
+    for name in (
+        "second_order_nonlinearity", "third_order_nonlinearity", "scale_factor_asymmetry", "temperature_bias",
+        "hysteresis", "bias_drift", "warm_up",
+    )
+)  # fmt: skip
+"""What is looked for where the subject is another: half of the time goes into the moments of a step."""
 
 
 def rows_of(poses: Sequence[Pose], signs: Sequence[float]) -> Rows:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from tests.triaxcal.posterior.conftest import MINUS, SIGMA_G
+from tests.triaxcal.posterior.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SINCE_START, TIME
@@ -32,7 +32,7 @@ HOLD_S = 10.0
 
 
 def seen_in(poses: list[Pose]) -> Posterior:
-    return posterior(poses, fit(poses, signs=MINUS), signs=MINUS)
+    return posterior(poses, fit(poses, signs=MINUS), signs=MINUS, catalogue=FEW)
 
 
 def gone_on(unit: Sensor, poses: list[Pose], last: np.ndarray, actions: Sequence[Action], seed: int) -> list[Pose]:
@@ -200,7 +200,7 @@ def test_poses_with_an_error_of_their_own_are_held_longer(poses_with: Poses) -> 
 def test_a_temperature_that_went_with_time_is_moved_or_time_goes_without_it(
     poses_with: Poses, paper_unit: Sensor
 ) -> None:
-    poses = [replace(p, channels={"temp_c": 20 + p.t_s / 60}) for p in poses_with(3)]
+    poses = [replace(p, channels={"temp_c": 20 + p.t_s / 60}) for p in poses_with(4)]
     drift = np.array([4e-7, -3e-7, 5e-7])
     moved_along = [replace(p, mean=p.mean + paper_unit.scale_factor * drift * p.t_s) for p in poses]
     made = advice(posterior(moved_along, fit(moved_along, signs=MINUS), signs=MINUS, catalogue=CATALOGUE))

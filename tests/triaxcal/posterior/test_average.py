@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.triaxcal.posterior.conftest import MINUS, SIGMA_G
+from tests.triaxcal.posterior.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.calibration import HoldsAt
 from triaxcal.moment import Moment
@@ -20,7 +20,7 @@ from triaxcal.sensor import Sensor
 
 
 def seen_in(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> Posterior:
-    return posterior(poses, fit(poses, signs=signs), signs=signs)
+    return posterior(poses, fit(poses, signs=signs), signs=signs, catalogue=FEW)
 
 
 def at(t_s: float) -> HoldsAt:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tests.triaxcal.posterior.conftest import MINUS, SIGMA_G
+from tests.triaxcal.posterior.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.calibration import Calibration, HoldsAt
 from triaxcal.moment import Moment
@@ -24,7 +24,7 @@ START = HoldsAt(Moment.SECONDS, 0.0, 0.0)
 
 def of(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> tuple[Calibration, Calibration]:
     before = fit(poses, signs=signs)
-    return before, corrected(before, posterior(poses, before, signs=signs), START)
+    return before, corrected(before, posterior(poses, before, signs=signs, catalogue=FEW), START)
 
 
 def test_coefficients_are_as_uncertain_as_the_budget_says(

@@ -20,7 +20,10 @@ BASES: list[tuple[of.Basis, str]] = [
     ),
     (of.StatedReference(0.0, 34.0), "normal gravity at latitude 0°, height 34 m; its uncertainty as stated"),
     (of.RegisterSteps(12), "steps of 12 registers; rectangular"),
-    (of.CompetingModels(("warm_up", "bias_drift")), "warm_up or bias_drift would do as well on these poses"),
+    (
+        of.NotHeld(),
+        "effects that the registers do not have: the other coefficients take their place, as nearly as they can",
+    ),
     (of.AveragedModels(()), "the spread over all that may act, each by its probability"),
     (
         of.AveragedModels(("hysteresis",)),
@@ -48,6 +51,7 @@ REMEDIES: list[tuple[of.Remedy, str]] = [
     ),
     (of.ReferenceKnown(5e-5), "know the reference to 50.0 µg"),
     (of.FinerRegisters(), "registers with one bit more"),
+    (of.HostCorrects(), "correct in the host what the registers cannot hold"),
     (of.ModelsToldApart(), "record what tells them apart, as advised"),
     (
         of.TemperatureModelled(THERMAL[:1]),

@@ -17,13 +17,14 @@ from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)
 NOTHING = Findings((), {}, {}, Unexplained(0.04, What.TIME, 1e-5, False), None, 0.91)
-KNOWN = Finding("hysteresis", Verdict.ADOPTED, 0.99995, {}, {}, "Let it rest.")
-GROUP = Finding("warm_up", Verdict.CONFOUNDED, 0.72, {"bias_drift": 0.275}, {}, "Let it warm up.")
+KNOWN = Finding("hysteresis", Verdict.ADOPTED, 0.99995, {}, {}, "Let it rest.", 0.99995)
+GROUP = Finding("warm_up", Verdict.CONFOUNDED, 0.72, {"bias_drift": 0.275}, {}, "Let it warm up.", 0.995)
 BEGAN = {4: Began(132.0, None), 9: Began(301.5, None)}
 
 
 def cause(found: Findings, findings: tuple[Finding, ...] = (), candidates: tuple[Candidate, ...] = ()) -> str:
-    return diagnosis.cause(found, findings, candidates, BEGAN, SMALL)
+    likely = {"warm_up": 0.46, "bias_drift": 0.41, "hysteresis": 0.1, "remanence": 0.01}
+    return diagnosis.cause(found, findings, candidates, BEGAN, SMALL, likely)
 
 
 @pytest.mark.parametrize(
@@ -36,6 +37,10 @@ def test_a_probability_is_told_as_exactly_as_it_is_known(p: float, said: str) ->
 
 def test_the_cause_is_told_with_its_probability() -> None:
     assert cause(NOTHING) == "no effect shows (nothing acts with probability 0.91)"
+    assert cause(replace(NOTHING, nothing=0.02)).startswith(
+        "something acts, and these poses do not tell what; the likeliest are warm_up (0.46), bias_drift (0.41), "
+        "hysteresis (0.1); or something that no effect describes ("
+    )
     assert cause(NOTHING, (KNOWN,)) == "hysteresis (more than 0.999) acts"
     assert cause(NOTHING, (GROUP,)) == "one of warm_up (0.72), bias_drift (0.28) acts"
     likely = Candidate("third_order_nonlinearity", 0.63, {})
@@ -55,7 +60,7 @@ def test_another_unit_is_told_with_the_pose_it_begins_at() -> None:
 
 
 def test_outliers_are_told_each_with_its_moment() -> None:
-    assert cause(replace(NOTHING, outliers={9: 0.98})) == "outliers, which are left out: the pose at 301.5 s (0.98)"
+    assert cause(replace(NOTHING, outliers={9: 0.98})) == "an outlier: the pose at 301.5 s (0.98)"
 
 
 def test_a_reason_says_why_a_known_effect_is_not_corrected() -> None:

@@ -59,6 +59,30 @@ def test_what_temperature_may_have_done_grows_with_how_far_it_moved(paper_unit: 
     assert wild < 1.5 * NOISE
 
 
+def test_what_was_stated_of_the_sensitivity_takes_the_place_of_what_is_typical(
+    paper_unit: Sensor, fourteen: np.ndarray
+) -> None:
+    """Where the poses tell nothing, the line is as large as the sensitivity."""
+    poses = _warming(paper_unit, fourteen, np.linspace(24.9, 25.1, 14), noise=1e-3)
+    c = fit(poses, signs=SIGNS, aside=())
+
+    def line(sensitivity: float | None) -> Component | None:
+        found = budget(c, Stated(thermal_sensitivity=sensitivity)).components
+        return next((x for x in found if x.source == "temperature"), None)
+
+    typical, better, tenth = line(None), line(5e-5), line(5e-6)
+    assert typical is not None
+    assert better is not None
+    assert tenth is not None
+    assert better.magnitude == pytest.approx(10 * tenth.magnitude, rel=0.01)
+    assert 5 * better.magnitude < typical.magnitude < 11 * better.magnitude
+    assert isinstance(typical.basis, UnmodelledTemperature)
+    assert isinstance(better.basis, UnmodelledTemperature)
+    assert (typical.basis.stated, better.basis.stated) == (False, True)
+    nothing = line(0.0)
+    assert nothing is None or nothing.magnitude < 1e-9
+
+
 @pytest.mark.parametrize("steady_c", [22.45, -3.49, 1 / 3])
 def test_a_steady_temperature_costs_nothing_whatever_it_is(
     paper_unit: Sensor, twenty_six: np.ndarray, steady_c: float
