@@ -16,9 +16,8 @@ def test_the_demo_finds_what_is_hidden_and_it_is_gone_after_a_power_cycle(
     assert [u["unit"] for u in done.json["units"]] == ["can", "modbus"]
     for unit in done.json["units"]:
         assert unit["found"] is True
-        told = [f["effect"] for f in (*unit["findings"], *unit["candidates"])]
-        assert told == list(unit["hidden"])
-        (finding,) = unit["findings"]
+        (finding,) = (*unit["findings"], *unit["candidates"])
+        assert finding["effect"] in unit["hidden"]
         for axis, truth in unit["hidden"][finding["effect"]].items():
             held = finding["coefficients"][axis]
             assert abs(held["value"] - truth) < 5 * held["standard_error"]
