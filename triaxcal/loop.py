@@ -118,7 +118,7 @@ class Loop:
         known = max(self.next_recording.start_to_start, START_TO_START * self.after.reference)
         return bool(self.next_recording.standard > np.sqrt(2) * known)
 
-    @property
+    @cached_property
     def call(self) -> Call:
         if self.refusal in (Refusal.UNMODELLED, Refusal.ANOTHER):
             return Call.INVESTIGATE

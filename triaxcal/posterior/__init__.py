@@ -1,6 +1,6 @@
 """What acts beyond the linear model, with which probability: one evidence for effects, outliers and what has no name.
 
-Grows beside the loop (`triaxcal.loop`), and is measured against it by `benchmarks.frozen`; nothing uses it yet.
+`triaxcal.loop` tells what follows from it; `benchmarks.frozen` holds it against what went before.
 """
 
 from triaxcal.posterior.actions import Action, Do

@@ -87,21 +87,29 @@ class Posterior:
         return dict(sorted(out.items(), key=lambda item: -item[1]))
 
     @cached_property
+    def of_terms(self) -> Floats:
+        """(T,) the probability of each term of the evidence."""
+        out = np.zeros(len(self.evidence.terms))
+        for w, found in zip(self.weight, self.sets, strict=True):
+            out[list(found.members)] += w
+        return out
+
+    @cached_property
     def of_outliers(self) -> Floats:
         """(n,) the probability that each pose is an outlier."""
         out = np.zeros(self.evidence.rows.n)
-        for w, found in zip(self.weight, self.sets, strict=True):
-            out[list(self.poses_of(found))] += w
+        for p, term in zip(self.of_terms, self.evidence.terms, strict=True):
+            if term.pose >= 0:
+                out[term.pose] = p
         return out
 
     @cached_property
     def of_another(self) -> Floats:
         """(n,) the probability that from each pose on there is another unit, or another mounting."""
         out = np.zeros(self.evidence.rows.n)
-        for w, found in zip(self.weight, self.sets, strict=True):
-            for i in found.members:
-                if self.evidence.terms[i].another >= 0:
-                    out[self.evidence.terms[i].another] += w
+        for p, term in zip(self.of_terms, self.evidence.terms, strict=True):
+            if term.another >= 0:
+                out[term.another] = p
         return out
 
     @cached_property
@@ -239,9 +247,6 @@ def finer_shapes(seen: Posterior) -> Finer:
     each into: where the effect is strong, the values of the grid are further apart than the poses tell them."""
     out: dict[Variant, Sequence[Effect]] = {}
     terms, odds = seen.evidence.terms, seen.evidence.odds
-    weights = np.zeros(len(terms))
-    for w, found in zip(seen.weight, seen.sets, strict=True):
-        weights[list(found.members)] += w
     for name in (name for name, p in seen.of_names.items() if p >= odds.reported):
         forms: dict[tuple[str, ...], dict[Variant, list[int]]] = defaultdict(lambda: defaultdict(list))
         for i, term in enumerate(terms):
@@ -249,7 +254,7 @@ def finer_shapes(seen: Posterior) -> Finer:
                 key = variant_of(term.effect)
                 forms[key[1]][key].append(i)
         for of_form in forms.values():
-            shapes = [(terms[index[0]].effect, float(weights[index].sum())) for index in of_form.values()]
+            shapes = [(terms[index[0]].effect, float(seen.of_terms[index].sum())) for index in of_form.values()]
             if sum(share for _, share in shapes) >= odds.reported * seen.of_names[name]:
                 out |= _divided([(effect, share) for effect, share in shapes if effect is not None], odds)
     return out

@@ -27,10 +27,7 @@ class Shape:
 
 def shapes_of(seen: Posterior, name: str) -> Mapping[str, Shape]:
     """Of an effect, by the name of the shape, if that effect acts; none where it has none."""
-    terms = seen.evidence.terms
-    weights = np.zeros(len(terms))
-    for w, found in zip(seen.weight, seen.sets, strict=True):
-        weights[list(found.members)] += w
+    terms, weights = seen.evidence.terms, seen.of_terms
     mine = [i for i, term in enumerate(terms) if term.effect is not None and term.name == name]
     return shapes_by([terms[i] for i in mine], weights[mine]) if weights[mine].any() else {}
 
