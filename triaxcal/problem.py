@@ -39,6 +39,15 @@ CONVERGED = 1e-12
 class Further(Protocol):
     """What poses tell beside their means: a residual of each, which the model should make zero."""
 
+    @property
+    def inside(self) -> Problem:
+        """The poses at all places that are asked, one after the other."""
+        ...
+
+    def along(self, values: Floats) -> Floats:
+        """(n,…) of each pose, from ``values`` (k·n,…) `inside`."""
+        ...
+
     def linearise(self, state: State, jacobian: bool = True) -> Linearised:
         """As `linearise` has it for the means."""
         ...
@@ -174,13 +183,18 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearis
     length, s, a, by_s, by_v = sensor.radius(problem.u, held)
     x = (problem.u - problem.middle) / problem.half
     angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
-    effects = [-np.einsum("ni,nip->np", by_v, e.basis(s, held)) for e in state.effects]
+    effects = [by_coefficients(by_v, e.basis(s, held)) for e in state.effects]
     J = np.concatenate([by_v * x, -by_v, angles, *effects], axis=1)
     by_u = by_v / sensor.scale_factor
     variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
     # Poses without any scatter (made up, or below the resolution) would otherwise weigh infinitely.
     variance = np.maximum(variance, (1e-12 * problem.reference) ** 2) + problem.excess**2
     return length - problem.reference, J, np.sqrt(variance)
+
+
+def by_coefficients(by_v: Floats, basis: Floats) -> Floats:
+    """(n,p) derivatives of |a| by an effect's coefficients."""
+    return np.asarray(-np.einsum("ni,nip->np", by_v, basis))
 
 
 def by_shape(problem: Problem, state: State) -> Floats:

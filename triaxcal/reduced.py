@@ -16,7 +16,7 @@ from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, Residual
 from triaxcal.conditions import at_moment
 from triaxcal.effects.contract import Effect, is_derived
-from triaxcal.planning.directions import directions
+from triaxcal.planning.directions import spiral
 from triaxcal.sensor import Sensor
 
 SPHERE = 50
@@ -80,7 +80,7 @@ def _with_residual(c: Calibration) -> Calibration:
 def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Mapping[str, Floats]]:
     """(m,3) specific forces all over the sphere under the conditions that a unit in use meets: logged channels as they
     were in some of the poses, every clock at the moment, everything else at its reference."""
-    up = np.array([v for _, v in directions(SPHERE)]) * c.reference
+    up = spiral(SPHERE) * c.reference
     in_use = at_moment(c.channel_reference, 1, c.moment)
     poses = [p.pose for p in c.poses if p.used]
     if poses:

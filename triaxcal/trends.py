@@ -60,13 +60,11 @@ class Trends:
 
     def linearise(self, state: State, jacobian: bool = True) -> Linearised:
         """By how much |a| goes along each pose where it should stay, as `triaxcal.problem.linearise` has it."""
-        slope = PLACES / (PLACES @ PLACES)
         everywhere, by_theta, _ = linearise(self.inside, state, jacobian)
-        n = len(self.middle.u)
-        r = slope @ everywhere.reshape(len(slope), n)
+        r = self.along(everywhere)
         if not jacobian:
             return r, by_theta, np.empty(0)
-        J = np.tensordot(slope, by_theta.reshape(len(slope), n, -1), 1)
+        J = self.along(by_theta)
         here, _, error = linearise(self.middle, state)
         variance = error**2
         # In one order whatever the process, or audits would differ in the last digits.
@@ -75,6 +73,11 @@ class Trends:
             there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
             variance = variance + (there - here) ** 2
         return r, J, self.wider * np.sqrt(variance)
+
+    def along(self, values: Floats) -> Floats:
+        """(n,…) by how much ``values`` (k·n,…) at all `PLACES` go up along each pose."""
+        slope = PLACES / (PLACES @ PLACES)
+        return np.tensordot(slope, values.reshape(len(slope), -1, *values.shape[1:]), 1)
 
     def widened(self, factor: Floats) -> Trends:
         return replace(self, wider=self.wider * factor)

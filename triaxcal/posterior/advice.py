@@ -7,13 +7,12 @@ the other, each beside those before it; the best is that with the most informati
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.distributions import log_sum_exp
 from triaxcal.effects import TEMPERATURE
 from triaxcal.poses.pose import Pose
 from triaxcal.posterior.actions import LONGER, OPEN, Action, Do, Options
@@ -106,21 +105,22 @@ def _beside_poses(seen: Posterior) -> Iterator[Action]:
 
 
 class _Future:
-    """Draws of what the actions taken so far will show: of draw s the rows ``shown`` (S,K), under the cell ``truth``
-    (S,). ``log_weight`` (C,S) is that of each cell after them."""
+    """Draws of what the actions taken so far will show: of draw s the rows ``shown`` (S,K), those of one pose side by
+    side, under the cell ``truth`` (S,)."""
 
     def __init__(self, cells: Cells) -> None:
         self.cells = cells
         order = np.argsort(cells.of, kind="stable")
         ends = np.cumsum(cells.weight[order])
         self.truth: Ints = order[np.minimum(np.searchsorted(ends, (np.arange(DRAWS) + 0.5) / DRAWS), len(ends) - 1)]
-        self.log_weight = np.tile(np.log(cells.weight)[:, None], DRAWS)
         self.of = np.eye(len(cells.hypotheses))[:, cells.of]
+        self.weight = np.tile(cells.weight[:, None], DRAWS)
+        """(C,S) of each cell after the actions."""
         self.actions: list[Action] = []
         self.poses: list[Pose] = []
         self.shown: Floats = np.empty((DRAWS, 0))
         self.rng = np.random.default_rng(0)
-        self.entropy = self.entropy_after = float(_entropy(self.of @ cells.weight))
+        self.entropy = self.entropy_after = self._entropy_of(self.weight)
 
     def take(self, options: Options, again: int | None = None) -> bool:
         """The best action of all, if it is worth its price; or the best that takes a pose ``again``, whatever that is
@@ -128,16 +128,18 @@ class _Future:
         found = options.after(self.poses)
         rows = options.rows.to_come([*self.poses, *(pose for _, pose in found)])
         chances = _Chances(self, rows, self.rng.standard_normal((DRAWS, len(rows.y) // rows.n)))
-        weights = [chances.log_weight(len(self.poses) + i)[0] for i in range(len(found))]
-        gain = np.array([self.entropy_after - self._entropy_of(w) for w in weights])
+        gain = np.empty(len(found))
+        for i in range(len(found)):
+            shown = chances.shown_with(len(self.poses) + i)
+            gain[i] = self.entropy_after - self._entropy_of(chances.weight(len(self.poses) + i, shown))
         rate = gain / [action.price for action, _ in found]
         if again is not None:
             rate[[action.do is not Do.REPEAT or action.again != again for action, _ in found]] = -np.inf
         best = int(np.argmax(rate >= rate.max() - ALIKE * abs(rate.max())))
         if again is None and rate[best] < LEAST:
             return False
-        self.log_weight, shown = chances.log_weight(len(self.poses) + best)
-        self.shown = chances.with_shown(shown)
+        self.shown = chances.shown_with(len(self.poses) + best)
+        self.weight = chances.weight(len(self.poses) + best, self.shown)
         action, pose = found[best]
         self.actions.append(replace(action, information=float(gain[best])))
         self.poses.append(pose)
@@ -147,11 +149,11 @@ class _Future:
     def if_it_acts(self, name: str, p: float) -> float:
         """The mean of p′² over that of p′, where p′ is the probability after the actions: draws in which the name acts
         are as frequent as p′ says."""
-        after = self.cells.with_name(name) @ np.exp(self.log_weight)
+        after = self.cells.with_name(name) @ self.weight
         return float(np.mean(after**2) / np.mean(after)) if after.any() else p
 
-    def _entropy_of(self, log_weight: Floats) -> float:
-        return float(np.mean(_entropy(self.of @ np.exp(log_weight))))
+    def _entropy_of(self, weight: Floats) -> float:
+        return float(np.mean(_entropy(self.of @ weight)))
 
 
 class _Chances:
@@ -161,35 +163,37 @@ class _Chances:
     def __init__(self, future: _Future, rows: Rows, normal: Floats) -> None:
         self.future, self.rows, self.normal = future, rows, normal
         self.mean, self.covariance = future.cells.predicted(rows)
-        k = len(future.poses)
-        self.slopes = rows.n if rows.slopes else 0
-        self.taken = self._places(range(k))
+        self.taken = self._places(range(len(future.poses)))
         inner = self.covariance[:, self.taken[:, None], self.taken]
         self.gain = np.linalg.solve(inner, self.covariance[:, self.taken])
-        self.off = future.shown - self.mean[:, None, self.taken]
+        self.off = future.shown - self.mean[future.truth[:, None], self.taken]
 
-    def _places(self, poses: Sequence[int]) -> Ints:
-        """Of the rows of poses, the means first."""
-        index = np.array(poses, dtype=int)
-        return np.concatenate([index, index + self.slopes]) if self.slopes else index
+    def _places(self, poses: Iterable[int]) -> Ints:
+        """Of the rows of poses."""
+        index = np.array(list(poses), dtype=int)[:, None]
+        return np.ravel([index, index + self.rows.n] if self.rows.slopes else index, order="F")
 
-    def log_weight(self, pose: int) -> tuple[Floats, Floats]:
-        """(C,S) of the cells after this pose too, and what it shows (S,r)."""
+    def shown_with(self, pose: int) -> Floats:
+        """(S,K) what was shown and what this pose shows, by the cell that is true in each draw."""
         at, truth = self._places([pose]), self.future.truth
         gain = self.gain[:, :, at]
-        mean = self.mean[:, None, at] + self.off @ gain
         crossed = self.covariance[:, at[:, None], self.taken]
-        lower = np.linalg.cholesky(self.covariance[:, at[:, None], at] - crossed @ gain)
-        shown = mean[truth, np.arange(len(truth))] + np.einsum("srq,sq->sr", lower[truth], self.normal)
-        off = (shown - mean) @ np.linalg.inv(lower).transpose(0, 2, 1)
-        log = -0.5 * np.sum(off**2, axis=2) - np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)[:, None]
-        weight = self.future.log_weight + log
-        return weight - log_sum_exp(weight, axis=0), shown
+        lower = np.linalg.cholesky(self.covariance[:, at[:, None], at] - crossed @ gain)[truth]
+        mean = self.mean[truth[:, None], at] + np.einsum("sk,skr->sr", self.off, gain[truth])
+        return np.concatenate([self.future.shown, mean + np.einsum("srq,sq->sr", lower, self.normal)], axis=1)
 
-    def with_shown(self, shown: Floats) -> Floats:
-        """(S,K) with one pose more, the means first."""
-        k, before = len(self.future.poses), self.future.shown
-        return np.concatenate([before[:, :k], shown[:, :1], before[:, k:], shown[:, 1:]], axis=1)
+    def weight(self, pose: int, shown: Floats) -> Floats:
+        """(C,S) of the cells after this pose too: by products of the precision of each cell with the squares of what is
+        shown, one product of matrices for all draws."""
+        at = np.concatenate([self.taken, self._places([pose])])
+        mean, precision = self.mean[:, at], np.linalg.inv(self.covariance[:, at[:, None], at])
+        scored = np.einsum("cij,cj->ci", precision, mean)
+        pairs = (shown[:, :, None] * shown[:, None]).reshape(len(shown), -1)
+        squares = precision.reshape(len(mean), -1) @ pairs.T - 2 * scored @ shown.T
+        own = np.log(self.future.cells.weight) + 0.5 * (np.linalg.slogdet(precision)[1] - np.sum(scored * mean, axis=1))
+        log = own[:, None] - 0.5 * squares
+        weight = np.exp(log - log.max(axis=0))
+        return np.asarray(weight / weight.sum(axis=0))
 
 
 def _entropy(p: Floats) -> Floats:

@@ -19,7 +19,7 @@ from triaxcal.conditions import at_moment
 from triaxcal.effects import CATALOGUE, TEMPERATURE
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
-from triaxcal.planning.directions import directions
+from triaxcal.planning.directions import cube_directions
 from triaxcal.posterior.posterior import Posterior
 from triaxcal.posterior.rows import LINEAR
 from triaxcal.posterior.solved import NEGLIGIBLE, Solved, solved_cells
@@ -37,8 +37,6 @@ EARNED = 0.03
 knows."""
 STEPS = 3
 """Of Newton's method, for nine parameters a few parts in a thousand from where they go."""
-SPHERE = 26
-"""Directions in which the next recording is asked about."""
 
 
 _Elsewhere = tuple[Floats, Floats, Floats, dict[str, Floats]]
@@ -225,7 +223,7 @@ def _elsewhere(seen: Posterior, at: HoldsAt) -> _Elsewhere:
     """Of M readings all over the sphere, as of the next recording: derivatives by the linear parameters (M,9) over the
     error of a pose, readings along the axes and derivatives by the biases (M,3), and the conditions."""
     rows = seen.evidence.rows
-    up = np.array([v for _, v in directions(SPHERE)]) * rows.problem.reference
+    up = np.array([v for _, v in cube_directions()]) * rows.problem.reference
     found = place(rows, rows.state.sensor(rows.problem).output(up, {}))
     reference = rows.problem.channel_reference
     held = at_moment(reference, len(up), at.clocks)

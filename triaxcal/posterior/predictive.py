@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,9 +17,9 @@ from triaxcal.effects.plugins import EffectFault
 from triaxcal.posterior.evidence import Evidence, SetEvidence
 from triaxcal.posterior.posterior import Posterior
 from triaxcal.posterior.rows import Rows
-from triaxcal.posterior.solved import likely_cells
+from triaxcal.posterior.solved import Solved, solved_cells
 from triaxcal.posterior.terms import Term
-from triaxcal.posterior.unmodelled import Held, What
+from triaxcal.posterior.unmodelled import Held, Kind, What
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Cells:
     ``of`` (C,) is the place of each cell's hypothesis among the ``hypotheses``."""
 
     seen: Posterior
-    places: Sequence[tuple[SetEvidence, int, int]]
+    solved: Sequence[Solved]
     weight: Floats
     hypotheses: Sequence[Hypothesis]
     of: Ints
@@ -48,17 +48,15 @@ class Cells:
     @classmethod
     def likeliest(cls, seen: Posterior, share: float) -> Cells:
         """Those that hold this share of the probability, or as many as there are."""
-        cells = likely_cells(seen)
-        weight = np.exp([log_share for log_share, *_ in cells])
-        kept = int(np.searchsorted(np.cumsum(weight), share)) + 1
-        cells, weight = cells[:kept], weight[:kept]
-        each = [_hypothesis(seen, found, row) for _, found, row, _ in cells]
+        solved = solved_cells(seen, share)
+        each = [_hypothesis(seen, cells.found, cells.part) for cells in solved]
         hypotheses = list(dict.fromkeys(each))
-        of = np.array([hypotheses.index(h) for h in each])
+        of = np.repeat([hypotheses.index(h) for h in each], [len(cells.share) for cells in solved])
+        weight = np.concatenate([cells.share for cells in solved])
         whole = probabilities(seen)
         wanted = np.array([whole[h] for h in hypotheses])
         weight = weight * (wanted / np.bincount(of, weight))[of]
-        return cls(seen, [(found, row, cell) for _, found, row, cell in cells], weight / weight.sum(), hypotheses, of)
+        return cls(seen, solved, weight / weight.sum(), hypotheses, of)
 
     def with_name(self, name: str) -> Floats:
         """(C,) one where the effect acts, else zero."""
@@ -67,19 +65,30 @@ class Cells:
     def predicted(self, rows: Rows) -> tuple[Floats, Floats]:
         """Mean (C,M) and covariance (C,M,M) of M rows to come, over their errors."""
         evidence = self.seen.evidence
-        members = sorted({i for found, *_ in self.places for i in found.members})
-        columns = _columns(evidence, members, rows)
+        columns = _columns(evidence, sorted({i for cells in self.solved for i in cells.found.members}), rows)
         here, there = Held.of(evidence.rows), Held.of(rows)
-        kriging: dict[int, _Kriging] = {}
+        of_parts: dict[int, tuple[Floats, Floats]] = {}
         mean, covariance = [], []
-        for found, row, cell in self.places:
-            part = found.parts[row]
-            if part not in kriging:
-                kriging[part] = _Kriging.of(evidence, part, rows, here, there, columns)
-            one, spread = kriging[part].given(evidence, found, row, cell)
-            mean.append(one)
-            covariance.append(spread)
-        return np.array(mean), np.array(covariance)
+        for cells in self.solved:
+            kind, tau = evidence.parts[cells.part].kind, evidence.parts[cells.part].tau
+            if cells.part not in of_parts:
+                of_parts[cells.part] = _unmodelled(kind, tau, here, there, cells.inverse)
+            to, error = of_parts[cells.part]
+            design = np.concatenate([rows.linear, columns[:, cells.places]], axis=1) - to @ cells.design
+            mean.append(to @ evidence.rows.y + cells.here @ design.T)
+            covariance.append(cells.noise[:, None, None] * (error + design @ cells.within @ design.T))
+        return np.concatenate(mean), np.concatenate(covariance)
+
+
+def _unmodelled(kind: Kind | None, tau: float, here: Held, there: Held, inverse: Floats) -> tuple[Floats, Floats]:
+    """Of the rows to come, noise and what no term describes: the best linear prediction (M,N) by the rows seen, of
+    whose covariance this is the ``inverse``, and the covariance (M,M) of its error."""
+    k, n = len(there.error), len(here.error)
+    if kind is None:
+        return np.zeros((k, n)), np.eye(k)
+    crossed = tau**2 * kind.covariance_of(there, here)
+    to = crossed @ inverse
+    return to, np.eye(k) + tau**2 * kind.covariance_of(there, there) - to @ crossed.T
 
 
 def probabilities(seen: Posterior) -> Mapping[Hypothesis, float]:
@@ -87,17 +96,24 @@ def probabilities(seen: Posterior) -> Mapping[Hypothesis, float]:
     out: dict[Hypothesis, float] = defaultdict(float)
     for weight, found in zip(seen.weight, seen.sets, strict=True):
         share = weight * np.exp(found.by_part - found.total)
-        for row, p in enumerate(share):
-            out[_hypothesis(seen, found, row)] += float(p)
+        by_what: dict[What | None, float] = defaultdict(float)
+        for part, p in zip(found.parts, share, strict=True):
+            by_what[_what(seen, part)] += float(p)
+        any_of = _hypothesis(seen, found, 0)
+        for what, p in by_what.items():
+            out[replace(any_of, unmodelled=what)] += p
     return out
 
 
-def _hypothesis(seen: Posterior, found: SetEvidence, row: int) -> Hypothesis:
+def _hypothesis(seen: Posterior, found: SetEvidence, part: int) -> Hypothesis:
     terms = (seen.evidence.terms[i] for i in found.members)
     another = max((term.another for term in terms), default=-1)
-    kind = seen.evidence.parts[found.parts[row]].kind
-    what = None if kind is None or kind.what is What.INSIDE else kind.what
-    return Hypothesis(seen.names_of(found), seen.poses_of(found), another, what)
+    return Hypothesis(seen.names_of(found), seen.poses_of(found), another, _what(seen, part))
+
+
+def _what(seen: Posterior, part: int) -> What | None:
+    kind = seen.evidence.parts[part].kind
+    return None if kind is None or kind.what is What.INSIDE else kind.what
 
 
 def _columns(evidence: Evidence, members: Sequence[int], rows: Rows) -> Floats:
@@ -123,44 +139,3 @@ def _of_term(term: Term, rows: Rows, known: dict[int, Floats]) -> Floats:
             columns = np.full((len(rows.y), len(term.effect.coefficients)), np.nan)
         known[id(term.effect)] = np.where(np.isfinite(columns), columns, 0.0)
     return np.asarray(known[id(term.effect)][:, list(term.kept)] * term.mix)
-
-
-@dataclass(frozen=True, eq=False)
-class _Kriging:
-    """Beside one part of the evidence: ``precision`` (N,N) of the rows seen beside the nine parameters, ``to`` (M,N)
-    the best linear prediction by these, ``error`` (M,M) its covariance, and ``columns`` (M,C) of all terms in the rows
-    to come, less what the prediction makes of theirs in the rows seen."""
-
-    precision: Floats
-    to: Floats
-    error: Floats
-    columns: Floats
-
-    @classmethod
-    def of(cls, evidence: Evidence, part: int, rows: Rows, here: Held, there: Held, columns: Floats) -> _Kriging:
-        seen, assumed = evidence.rows, evidence.parts[part]
-        inverse = np.linalg.inv(evidence.covariance(part))
-        weighted = inverse @ seen.linear
-        of_nine = np.linalg.inv(seen.linear.T @ weighted)
-        error: Floats = np.eye(len(rows.y))
-        crossed: Floats = np.zeros((len(rows.y), len(seen.y)))
-        if assumed.kind is not None:
-            error = error + assumed.tau**2 * assumed.kind.covariance_of(there, there)
-            crossed = assumed.tau**2 * assumed.kind.covariance_of(there, here)
-        left = rows.linear - crossed @ weighted
-        to = crossed @ inverse + left @ of_nine @ weighted.T
-        error = error - crossed @ inverse @ crossed.T + left @ of_nine @ left.T
-        precision = inverse - weighted @ of_nine @ weighted.T
-        return cls(precision, to, error, columns - to @ evidence.columns)
-
-    def given(self, evidence: Evidence, found: SetEvidence, row: int, cell: int) -> tuple[Floats, Floats]:
-        """Mean (M,) and covariance (M,M), for the noise that this cell leaves."""
-        rows, places = evidence.rows, evidence.places(found.members)
-        sizes = np.repeat(found.sizes[cell], [evidence.terms[i].rank for i in found.members])
-        own, scaled = evidence.columns[:, places], found.mean[row, cell]
-        weighted = self.precision @ own
-        spread = np.linalg.inv(own.T @ weighted + np.diag(sizes**-2.0))
-        chi2 = float(rows.y @ self.precision @ rows.y - (weighted.T @ rows.y) @ scaled)
-        columns = self.columns[:, places]
-        mean = self.to @ rows.y + columns @ scaled
-        return mean, rows.noise_given(chi2) * (self.error + columns @ spread @ columns.T)

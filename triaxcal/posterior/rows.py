@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.pose import Pose
-from triaxcal.problem import Problem, State, everything
+from triaxcal.problem import Problem, State, by_coefficients, everything
 from triaxcal.pure_error import noise_levels
+from triaxcal.sensor import Radius
 from triaxcal.start import begun
 from triaxcal.trends import Trends
 
@@ -118,8 +120,24 @@ class Rows:
 
     def by_coefficients(self, effect: Effect) -> Floats:
         """(N,p) derivatives of the rows by the coefficients of an effect."""
-        _, J, _ = everything(self.problem, self.point.extended([effect]))
-        return np.asarray(J[:, len(self.point.theta) :] / self.error[:, None])
+        if id(effect) not in self._known:
+            problems, further = self._asked, self.problem.further
+            each = [by_coefficients(r.by_v, effect.basis(r.s, problem.conditions)) for problem, r in problems]
+            both = each if further is None else [each[0], further.along(each[1])]
+            self._known[id(effect)] = effect, np.concatenate(both) / self.error[:, None]
+        return self._known[id(effect)][1]
+
+    @cached_property
+    def _known(self) -> dict[int, tuple[Effect, Floats]]:
+        """What was asked before, of effects that stay alive so long: those of other packages need not be equal to
+        themselves."""
+        return {}
+
+    @cached_property
+    def _asked(self) -> list[tuple[Problem, Radius]]:
+        """Where effects are asked: in the means, and inside the poses where these know their slopes."""
+        problems = [self.problem, *([] if self.problem.further is None else [self.problem.further.inside])]
+        return [(p, self.point.sensor(p).radius(p.u, p.conditions)) for p in problems]
 
     @property
     def state(self) -> State:

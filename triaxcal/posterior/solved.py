@@ -27,6 +27,7 @@ class Solved:
     are the means and ``within`` (k,d,d) the covariances but for the ``noise`` (k,); ``left`` (k,N) the rows that are
     left, ``design`` (N,d) the derivatives of the rows and ``inverse`` (N,N) that of their covariance."""
 
+    found: SetEvidence
     names: frozenset[str]
     places: Ints
     part: int
@@ -40,13 +41,13 @@ class Solved:
     inverse: Floats
 
 
-def solved_cells(seen: Posterior) -> list[Solved]:
-    """Of the likeliest cells, those of one set and part together."""
+def solved_cells(seen: Posterior, share: float = 1.0) -> list[Solved]:
+    """Of the likeliest cells that hold this ``share`` of the probability, those of one set and part together."""
     evidence = seen.evidence
     rows = evidence.rows
     together: dict[tuple[int, int], list[tuple[float, int]]] = defaultdict(list)
     sets: dict[int, SetEvidence] = {}
-    for log_share, found, row, cell in likely_cells(seen):
+    for log_share, found, row, cell in _likely_cells(seen, share):
         sets[id(found)] = found
         together[id(found), row].append((np.exp(log_share), cell))
     inverse: dict[int, Floats] = {}
@@ -58,7 +59,7 @@ def solved_cells(seen: Posterior) -> list[Solved]:
             inverse[part] = np.linalg.inv(evidence.covariance(part))
         design = np.concatenate([rows.linear, evidence.columns[:, places]], axis=1)
         weighted = design.T @ inverse[part]
-        share, chosen = np.array([p for p, _ in cells]), [cell for _, cell in cells]
+        of, chosen = np.array([p for p, _ in cells]), [cell for _, cell in cells]
         sizes = np.repeat(found.sizes[chosen], [evidence.terms[i].rank for i in found.members], axis=1)
         precision = np.tile(weighted @ design, (len(cells), 1, 1))
         own = np.arange(LINEAR, design.shape[1])
@@ -68,11 +69,11 @@ def solved_cells(seen: Posterior) -> list[Solved]:
         left = rows.y - here @ design.T
         noise = np.array([rows.noise_given(float(chi2)) for chi2 in left @ (inverse[part] @ rows.y)])
         names = seen.names_of(found)
-        out.append(Solved(names, places, part, share, sizes, here, within, noise, left, design, inverse[part]))
+        out.append(Solved(found, names, places, part, of, sizes, here, within, noise, left, design, inverse[part]))
     return out
 
 
-def likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
+def _likely_cells(seen: Posterior, share: float) -> list[tuple[float, SetEvidence, int, int]]:
     """The logarithm of its probability, the set, and the places of part and sizes."""
     total = float(log_sum_exp([found.total for found in seen.sets]))
     log, of_set, where = [], [], []
@@ -86,5 +87,6 @@ def likely_cells(seen: Posterior) -> list[tuple[float, SetEvidence, int, int]]:
         where.append(few)
     every = np.concatenate(log)
     best = np.argsort(-every, kind="stable")[:CELLS]
+    best = best[: int(np.searchsorted(np.cumsum(np.exp(every[best])), share)) + 1]
     chosen = zip(every[best], np.concatenate(of_set)[best], np.concatenate(where)[best], strict=True)
     return [(float(p), seen.sets[k], *divmod(int(i), seen.sets[k].log.shape[1])) for p, k, i in chosen]

@@ -14,7 +14,7 @@ from triaxcal.conditions import still_conditions
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
 from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.errors import Refused
-from triaxcal.planning.directions import directions
+from triaxcal.planning.directions import spiral
 from triaxcal.posterior.odds import Odds
 from triaxcal.posterior.rows import Rows
 
@@ -152,7 +152,9 @@ def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
     try:
         columns = rows.by_coefficients(effect)
         held = rows.problem.conditions
-        up = np.array([v for _, v in directions(SPHERE)]) * rows.problem.reference
+        if is_foreign(effect):  # it may not know its slope
+            effect.slope(rows.state.sensor(rows.problem).along_axes(rows.problem.u, held), held)
+        up = spiral(SPHERE) * rows.problem.reference
         every: Mapping[str, Floats] = {name: np.repeat(values, len(up)) for name, values in held.items()}
         basis = effect.basis(np.tile(up, (rows.n, 1)), every).reshape(rows.n, len(up), AXES, -1)
     except (EffectFault, Refused):

@@ -16,7 +16,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import BEFORE
-from triaxcal.planning.directions import directions
+from triaxcal.planning.directions import spiral
 from triaxcal.posterior.rows import Rows
 
 SPHERE = 300
@@ -203,7 +203,7 @@ class _Sphere:
     @classmethod
     def of(cls, rows: Rows) -> _Sphere:
         sensor = rows.state.sensor(rows.problem)
-        up = np.array([v for _, v in directions(SPHERE)]) * rows.problem.reference
+        up = spiral(SPHERE) * rows.problem.reference
         everywhere = place(rows, sensor.output(up, {}))
         return cls(everywhere, np.linalg.pinv(everywhere.linear))
 

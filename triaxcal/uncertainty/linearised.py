@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.beyond import Beyond
 from triaxcal.calibration import Calibration
 from triaxcal.conditions import at_moment
-from triaxcal.planning.directions import directions
+from triaxcal.planning.directions import spiral
 from triaxcal.problem import Problem, State, by_shape, everything, linearise, parameters_by_theta
 from triaxcal.start import problem_of, with_history
 from triaxcal.trends import with_trends
@@ -47,7 +47,7 @@ class Linearised:
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
         """(p,n): shift of the parameters for an error of each residual (`triaxcal.problem.everything`)."""
-        self.up = np.array([v for _, v in directions(SPHERE)]) * calibration.reference
+        self.up = spiral(SPHERE) * calibration.reference
         """(m,3) specific force all over the sphere."""
         self.sphere = self._sphere(calibration, {})
         _, J, _ = linearise(self.sphere, self.state)

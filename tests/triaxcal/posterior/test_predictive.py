@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.posterior.evidence import Evidence
 from triaxcal.posterior.odds import Odds
 from triaxcal.posterior.posterior import Posterior
-from triaxcal.posterior.predictive import Cells, probabilities
+from triaxcal.posterior.predictive import Cells
 from triaxcal.posterior.rows import Rows
 from triaxcal.posterior.terms import terms_of
 from triaxcal.posterior.unmodelled import Held, What
@@ -70,9 +71,8 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
     found = evidence.of_set(members, [part])
     cell = int(np.argmax(found.log[0]))
     ahead = rows.to_come(poses_with(8)[:5])
-    seen = Posterior(evidence, [found])
-    one = Cells(seen, [(found, 0, cell)], np.ones(1), [next(iter(probabilities(seen)))], np.zeros(1, dtype=int))
-    mean, covariance = one.predicted(ahead)
+    one = replace(found, sizes=found.sizes[[cell]], log=found.log[:, [cell]], mean=found.mean[:, [cell]])
+    mean, covariance = Cells.likeliest(Posterior(evidence, [one]), 1.0).predicted(ahead)
 
     def design(of_rows: Rows) -> np.ndarray:
         columns = []
