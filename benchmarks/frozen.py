@@ -29,7 +29,7 @@ import numpy as np
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from benchmarks.undeclared import LARGE, NOISES, PAIR
-from tests.undeclared import invented, physics, uncatalogued
+from tests.undeclared import invented, invented_later, physics, uncatalogued
 from tests.undeclared.examine import Case, still_poses
 from tests.undeclared.generator import CannotShow, Recording
 from tests.undeclared.told import rms_g
@@ -135,8 +135,10 @@ def cases(first: int, share: float = 1.0) -> Iterator[tuple[str, Case]]:
     def turn(kinds: Sequence[str], i: int) -> tuple[str, int, str]:
         return kinds[i % len(kinds)], i, NOISES[(i + i // len(kinds)) % len(NOISES)]
 
-    # Effects that were invented after the method was fixed are those of the test range alone.
-    further = [("invented", invented.KINDS, 100, 100)] if first == RANGES["test"] else []
+    # Effects that were invented after the method was fixed are those of the test range alone; "later" ones by somebody
+    # who did not know it, after the others had been looked at.
+    later = ("invented", invented.KINDS, 100, 100), ("later", invented_later.KINDS, 100, 100)
+    further = later if first == RANGES["test"] else ()
     for section, kinds, count_26, count_14 in (
         ("catalogue", physics.KINDS, 165, 165),
         ("outside", uncatalogued.KINDS, 150, 150),
@@ -234,7 +236,7 @@ def _of_plain(key: str, value: Any) -> Any:
 def table(lines: Sequence[Line]) -> Table:
     """The rows of the comparison: names, and the error after over that before."""
     rows = []
-    for section in ("catalogue", "outside", "invented", "two", "nothing"):
+    for section in ("catalogue", "outside", "invented", "later", "two", "nothing"):
         for poses in (26, 14):
             group = [one for one in lines if one.section == section and one.poses == poses and not one.error]
             if not group:

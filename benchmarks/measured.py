@@ -1,7 +1,7 @@
 """Writes the table and the pictures of docs/measured.md: what is found in the measured recordings.
 
-    python benchmarks/measured.py            # prints the table
-    python benchmarks/measured.py --write    # puts it into docs/measured.md, and the pictures into docs/pictures
+    python -m benchmarks.measured            # prints the table
+    python -m benchmarks.measured --write    # puts it into docs/measured.md, and the pictures into docs/pictures
 
 The recordings are expected in ../shared/datasets, beside the project; --datasets names another folder.
 """
@@ -13,8 +13,8 @@ import re
 import sys
 from pathlib import Path
 
-from pictures import draw
-
+from benchmarks.pages import DOCS, PICTURES, write
+from benchmarks.pictures import draw
 from triaxcal.caution import HighLeverage, PoorSpread
 from triaxcal.errors import Refused
 from triaxcal.loop import Loop, diagnose
@@ -24,7 +24,6 @@ from triaxcald.inputs import Measured, measure
 from triaxcald.tables.own_text import read_csv
 
 PROJECT = Path(__file__).parents[1]
-PICTURES = PROJECT / "docs" / "pictures"
 HEAD = (
     "| recording | poses | noise floor | residual | cross-validated | findings "
     "| residual after | cross-validated after | left over | warnings |"
@@ -92,14 +91,6 @@ def name_of(folder: Path, file: Path) -> str:
     return str(file.relative_to(folder)).removesuffix(".csv.gz")
 
 
-def replaced(text: str, mark: str, content: str) -> str:
-    """``text`` with what stands between the marks replaced. Raises ValueError where they are missing."""
-    begin, end = f"<!-- {mark}: begin -->", f"<!-- {mark}: end -->"
-    if begin not in text or end not in text:
-        raise ValueError(f"the marks {begin} and {end} are missing")
-    return re.sub(f"{begin}.*{end}", lambda _: f"{begin}\n{content}\n{end}", text, flags=re.DOTALL)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description="The table of docs/measured.md.")
     parser.add_argument("--datasets", type=Path, default=PROJECT.parent / "shared" / "datasets")
@@ -113,14 +104,7 @@ def main() -> int:
     table = "\n".join([HEAD, RULE, *(row(name_of(chosen.datasets, f), m) for f, m in found.items())])
     print(table)
     if chosen.write:
-        page = PROJECT / "docs" / "measured.md"
-        try:
-            text = replaced(page.read_text("utf-8"), "table", table)
-            text = replaced(text, "pictures", pictures(chosen.datasets, files, found))
-        except ValueError as e:
-            sys.stderr.write(f"{page}: {e}\n")
-            return 2
-        page.write_text(text, "utf-8")
+        return write(DOCS / "measured.md", {"table": table, "pictures": pictures(chosen.datasets, files, found)})
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Pictures of recordings: the outputs over time with the still spans, small enough to keep with the documentation."""
+"""Pictures of recordings and of what was found in them, small enough to keep with the documentation."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.transforms import blended_transform_factory
 from PIL import Image
 
@@ -19,6 +20,8 @@ from triaxcal.arrays import Floats
 from triaxcal.poses.pose import Pose
 from triaxcal.samples import Samples
 
+Line = tuple[str, str, Floats, Floats]
+"""Name, style, moments in s, values."""
 COLOURS = ("#1f5fa8", "#c1272d", "#2c8a3d")
 COLUMNS = 1400
 
@@ -57,6 +60,40 @@ def draw(path: Path, title: str, shown: Samples, each: Sequence[tuple[str, Seque
     lower.set_xlabel("s", fontsize=7)
     lower.tick_params(labelsize=7)
     lower.set_xlim(t_s[0], t_s[-1])
+    _save(path, figure)
+
+
+def draw_by_run(path: Path, label: str, panels: Sequence[Sequence[Line]]) -> None:
+    """A panel for every run, on one axis of values."""
+    figure, axes = plt.subplots(1, len(panels), figsize=(11, 2.8), sharey=True, layout="constrained")
+    for k, (ax, lines) in enumerate(zip(axes, panels, strict=True), 1):
+        for name, style, t_s, value in lines:
+            ax.plot(t_s, value, style, label=name, ms=4, lw=1)
+        ax.axhline(0, color="#888888", lw=0.5)
+        ax.set_title(f"run {k}", fontsize=8, loc="left")
+        ax.set_xlabel("s", fontsize=7)
+        ax.tick_params(labelsize=7)
+    axes[0].set_ylabel(label, fontsize=7)
+    axes[-1].legend(fontsize=6, frameon=False, ncols=2)
+    _save(path, figure)
+
+
+def draw_pairs(path: Path, labels: tuple[str, str], before: Floats, after: Floats, of: Sequence[str]) -> None:
+    """Errors after over errors before, logarithmic, with the line on which nothing changes; ``of`` are the groups."""
+    figure, ax = plt.subplots(figsize=(4.6, 4.2), layout="constrained")
+    for name in dict.fromkeys(of):
+        index = [i for i, other in enumerate(of) if other == name]
+        ax.loglog(before[index], after[index], "o", ms=4, label=name)
+    ends = np.array([min(before.min(), after.min()) / 1.2, max(before.max(), after.max()) * 1.2])
+    ax.loglog(ends, ends, color="#888888", lw=0.7)
+    ax.set_xlabel(labels[0], fontsize=7)
+    ax.set_ylabel(labels[1], fontsize=7)
+    ax.tick_params(labelsize=7)
+    ax.legend(fontsize=6, frameon=False)
+    _save(path, figure)
+
+
+def _save(path: Path, figure: Figure) -> None:
     held = io.BytesIO()
     figure.savefig(held, format="png", dpi=110)
     plt.close(figure)

@@ -86,8 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             found = list(pool.map(partial(session, kind), range(count)))
             acts = sum(f.nothing <= 1 - CERTAIN for f in found)
             truth = [EFFECTS[i % len(EFFECTS)] for i in range(count)]
-            listed = sum(t in f.certain(CERTAIN) for f, t in zip(found, truth, strict=True))
-            alone = sum(f.certain(CERTAIN) == (t,) for f, t in zip(found, truth, strict=True))
+            listed = sum(any(t in group for group in f.certain(CERTAIN)) for f, t in zip(found, truth, strict=True))
+            alone = sum(f.certain(CERTAIN) == ((t,),) for f, t in zip(found, truth, strict=True))
             common = [f.common[t] > 0.5 for f, t in zip(found, truth, strict=True) if t in f.common]
             rows.append([kind, str(count), str(acts), str(listed), str(alone), str(sum(common))])
             print(

@@ -12,22 +12,13 @@ import pytest
 
 from tests.hostile.rows import ROWS, SECRET, Row
 
-TIMES_MOST = 4.0  # what refusing an empty file takes, about 0.7 s of processor time with the imports that it needs
-BYTES_MOST = 300 * 10**6
+TIMES_MOST = 1.0  # what importing the whole program takes on the same machine in the same minute, about 2 s
+BYTES_MOST = 300 * 10**6  # of which the program takes 160
 BATCHES = 4
 
 
-def _empty(folder: Path) -> list[str]:
-    (folder / "empty.csv").touch()
-    return ["poses", "empty.csv"]
-
-
-ORDINARY = Row("an empty file", _empty, 2, "empty file")
-
-
-def run(hostile: list[Row], folder: Path) -> list[dict[str, Any]]:
-    """What came of each row, its time in that of an ordinary refusal on the same machine in the same minute."""
-    rows = [ORDINARY, *hostile]
+def run(rows: list[Row], folder: Path) -> list[dict[str, Any]]:
+    """What came of each row, its time in that of the imports."""
     given, before = [], []
     for i, row in enumerate(rows):
         own = folder / str(i)
@@ -42,13 +33,13 @@ def run(hostile: list[Row], folder: Path) -> list[dict[str, Any]]:
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    found: list[dict[str, Any]] = json.loads(done.stdout)
+    measured = json.loads(done.stdout)
+    found: list[dict[str, Any]] = measured["commands"]
     for i, (outcome, names) in enumerate(zip(found, before, strict=True)):
         left = {p for p in (folder / str(i)).rglob("*") if p.name not in (".out", ".err")}
         outcome["left"] = sorted(str(p) for p in left - set(names))
-    ordinary, *others = found
-    assert faults(ORDINARY, ordinary) == []
-    return [{**o, "times": o["seconds"] / ordinary["seconds"]} for o in others]
+        outcome["times"] = outcome["seconds"] / measured["imports"]
+    return found
 
 
 def faults(row: Row, outcome: dict[str, Any]) -> list[str]:
@@ -61,8 +52,8 @@ def faults(row: Row, outcome: dict[str, Any]) -> list[str]:
         found.append(f"said {told[-1500:]!r}, expected one line with {row.words!r}")
     if SECRET[:8] in told:
         found.append("showed what is in a foreign file")
-    if (times := outcome.get("times", 1.0)) > TIMES_MOST:
-        found.append(f"took {times:.1f} times the processor time of {ORDINARY.what}")
+    if outcome["times"] > TIMES_MOST:
+        found.append(f"took {outcome['times']:.1f} times the processor time of all imports")
     if outcome["bytes"] > BYTES_MOST:
         found.append(f"took {outcome['bytes'] / 1e6:.0f} MB")
     if outcome["left"]:

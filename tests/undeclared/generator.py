@@ -1,8 +1,8 @@
 """Recordings with an effect inside that nobody declares, and what is true of them.
 
 A recording is a random triad in random poses with random noise; the effect is one of `physics.KINDS`, one of
-`uncatalogued.KINDS` or of `invented.KINDS`, two of the first ("two") or nothing ("none"). Its size is s, see `visible`:
-what is drawn is scaled until s is what was asked for.
+`uncatalogued.KINDS`, of `invented.KINDS` or of `invented_later.KINDS`, two of the first ("two") or nothing ("none").
+Its size is s, see `visible`: what is drawn is scaled until s is what was asked for.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.undeclared import invented, physics, uncatalogued
+from tests.undeclared import invented, invented_later, physics, uncatalogued
 from tests.undeclared.noise import Noise
 from tests.undeclared.physics import Effect
 from tests.undeclared.scene import (
@@ -31,10 +31,16 @@ from tests.undeclared.scene import (
 from tests.undeclared.visible import Linear, magnitude, nine_of, standard_errors
 from triaxcal.samples import Samples
 
-KINDS = (*physics.KINDS, *uncatalogued.KINDS, *invented.KINDS)
+KINDS = (*physics.KINDS, *uncatalogued.KINDS, *invented.KINDS, *invented_later.KINDS)
 LARGEST_G = 0.05
 """An effect that adds more than this in any pose is no longer a small error of a sensor."""
-OF_TEMPERATURE = ("temperature_bias", "temperature_bias_quadratic", "temperature_scale_factor", "thermal_gradient")
+OF_TEMPERATURE = (
+    "temperature_bias",
+    "temperature_bias_quadratic",
+    "temperature_scale_factor",
+    "thermal_gradient",
+    "angle_by_temperature",
+)
 LEAST_SWING_C = 0.2
 """No sensor shows an effect of a temperature that moves by less."""
 DRAWS = 300
@@ -130,7 +136,10 @@ def recording(
 def _effect(rng: np.random.Generator, name: str, here: Scene, channel: str, triad: Triad) -> Effect:
     if name in physics.KINDS:
         return physics.drawn(rng, name, here, channel)
-    return (invented if name in invented.KINDS else uncatalogued).drawn(rng, name, here, triad)
+    for further in (invented, invented_later):
+        if name in further.KINDS:
+            return further.drawn(rng, name, here, triad)
+    return uncatalogued.drawn(rng, name, here, triad)
 
 
 def _kinds_of(rng: np.random.Generator, kind: str) -> list[str]:

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import least_squares
 
-from tests.undeclared import physics, uncatalogued
+from tests.undeclared import invented_later, physics, uncatalogued
 from tests.undeclared.generator import KINDS, LARGEST_G, Recording, recording
 from tests.undeclared.imitation import best_imitation
 from tests.undeclared.noise import Noise, Shaking
@@ -184,6 +184,58 @@ def test_the_size_is_what_a_fit_of_nine_parameters_leaves(poses: int) -> None:
             left[effect] += chi_square(r, effect=effect)
     assert stats.norm.sf(abs(left[False] - dof) / np.sqrt(2 * dof)) > 1e-4
     assert stats.norm.sf(abs(left[True] - dof - sizes) / np.sqrt(2 * (dof + 2 * sizes))) > 1e-4
+
+
+@pytest.mark.parametrize("kind", invented_later.KINDS)
+@pytest.mark.parametrize("poses", [26, 14])
+def test_what_was_invented_later_shows_with_the_size_asked_for(kind: str, poses: int) -> None:
+    """Without a name, small, and in the next recording of the unit only if it is the unit's own."""
+    r = recording(11, kind, (20.0, 200.0), poses)
+    assert r.names == ()
+    assert 19.8 <= r.sizes[0] <= 202.0
+    assert r.ranks[0] >= 1
+    assert np.abs(r.take.scene.by_pose(r.take.added_g)).max() <= LARGEST_G
+    assert r.held_out.added_g.any() != r.effects[0].of_recording
+
+
+def later_on_all_axes(kind: str, here: Scene) -> Effect:
+    """The first draw of what was invented later that has a coefficient on each axis, one each."""
+    draws = (invented_later.drawn(np.random.default_rng(seed), kind, here, SQUARE) for seed in range(200))
+    return replace(next(e for e in draws if len(e.coefficients) == 3), coefficients=np.ones(3))
+
+
+def test_what_was_invented_later_is_what_its_words_say() -> None:
+    here = by_hand()
+    supply = later_on_all_axes("shared_supply", here)
+    assert pose_means(supply, here)[2] == pytest.approx([0.84, 1.12, 0])
+    coil = later_on_all_axes("self_heating", here)
+    tau, heated = float(coil.text.split("heat, ")[1].split(" s")[0]), coil.added(here)
+    assert heated[: here.end[0]] == pytest.approx(np.tile([1.0, 0, 0], (here.end[0], 1)))
+    first, last = here.begin[3], here.end[3] - 1
+    to_go = heated[[first, last]] - UPS[3] ** 3
+    assert to_go[1] == pytest.approx(to_go[0] * np.exp(-(last - first) / 100 / tau), rel=0.01)
+    hands = later_on_all_axes("hand_heat", here).added(here)
+    for begin, end in zip(here.begin, here.end, strict=True):
+        assert np.all(np.diff(hands[begin:end], axis=0) < 0)
+    cracked = later_on_all_axes("gain_step", here).added(here)
+    at = int(np.argmax(cracked.any(axis=1)))
+    assert cracked[at:] == pytest.approx(here.force[at:])
+    turned = later_on_all_axes("angle_by_temperature", here).added(here)
+    warmer = np.ptp(turned[here.begin[3] : here.end[3]], axis=0) / (0.1 * (here.held_s[3] - 0.01))
+    assert warmer == pytest.approx([0.2, 0.8, 0])  # of (0, −0.6, 0.8) g: x by y and z, y by z
+    zeroed = np.diff(later_on_all_axes("auto_zero", here).added(here)[:, 0])
+    assert 2 <= np.sum(zeroed < 0) <= 8
+
+
+def test_a_chip_lies_under_one_pose_and_an_adapter_under_many() -> None:
+    here, rng = by_hand(), np.random.default_rng(12)
+    chip = pose_means(invented_later.drawn(rng, "chip_under_case", here, SQUARE), here)
+    assert np.sum(chip.any(axis=1)) == 1
+    adapter = pose_means(invented_later.drawn(rng, "adapters", here, SQUARE), here)
+    faces, edges = adapter[[0, 1, 4]], adapter[[2, 3]]
+    assert faces == pytest.approx(np.tile(faces[0], (3, 1)))
+    assert edges == pytest.approx(np.tile(edges[0], (2, 1)))
+    assert np.abs(faces[0] - edges[0]).min() > 1e-3
 
 
 def test_what_nine_parameters_can_do_has_no_size() -> None:
