@@ -7,14 +7,12 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
-from scipy import linalg
 
 from triaxcal.arrays import Floats
 from triaxcal.caution import Caution
 from triaxcal.conditions import channels_of, conditions, of_moment, of_readings, with_scale
 from triaxcal.distributions import t_ppf
 from triaxcal.effects.contract import SINCE_START, TIME
-from triaxcal.effects.part import Part, mix_of
 from triaxcal.errors import InvalidData
 from triaxcal.moment import Moment
 from triaxcal.poses.pose import Pose
@@ -123,8 +121,7 @@ class Calibration:
     ``inflation``, at least 1 unless no pose knows its noise (then the residuals alone set it); or by ``excess_g``, a
     standard deviation of |a| that every pose has beside its noise (`triaxcal.beyond`). ``dof`` are the effective
     degrees of freedom behind the standard errors. ``shape_errors`` are standard errors of the effects' shapes, by
-    "effect.name"; ``shared`` are coefficients, named so, that only a combination of them is known of. ``trends``: how
-    |a| goes inside the poses was fitted along with their means.
+    "effect.name". ``trends``: how |a| goes inside the poses was fitted along with their means.
     ``weights`` is the probability of each effect where the coefficients are means over all that may act. Then
     ``spread`` (p,) are the standard deviations of the coefficients before the poses were seen, and ``thermal``
     (9+p,9+p) is the part of the covariance that thermal effects make which the model has not.
@@ -144,7 +141,6 @@ class Calibration:
     dof: float
     excess_g: float = 0.0
     shape_errors: Mapping[str, float] = field(default_factory=dict)
-    shared: frozenset[str] = frozenset()
     trends: bool = False
     blind_to: tuple[str, ...] = ()
     cautions: tuple[Caution, ...] = ()
@@ -179,37 +175,17 @@ class Calibration:
         """Of `parameters`."""
         return np.sqrt(np.diag(self.covariance))
 
-    @property
-    def whole(self) -> Calibration:
-        """The same calibration with every effect in full; what a part leaves out is zero, without error."""
-        blocks = [np.eye(9), *(mix_of(e) for e, _ in self.sensor.effects)]
-        mix = linalg.block_diag(*blocks)
-        shared = {
-            f"{e.name}.{c.name}"
-            for e, _ in self.sensor.effects
-            if isinstance(e, Part) and not e.selects
-            for c in e.whole.coefficients
-        }
-        return replace(
-            self,
-            sensor=self.sensor.whole,
-            covariance=mix @ self.covariance @ mix.T,
-            thermal=None if self.thermal is None else mix @ self.thermal @ mix.T,
-            spread=None if self.spread is None else np.abs(mix[9:, 9:]) @ self.spread,
-            shared=frozenset(shared),
-        )
-
     def coefficients_of(self, name: str) -> dict[str, tuple[float, float | None, str]]:
         """name → (value, standard error, unit) of the coefficients of the effect of that name, and of its shape.
 
-        The standard error is None where |a| does not tell it: of coefficients that show by a combination of them alone,
-        each. That of the moment of a step holds that it may have been anywhere between two poses.
+        The standard error is None where the poses do not tell it. That of the moment of a step holds that it may have
+        been anywhere between two poses.
         Raises KeyError for an effect that is not in the model.
         """
         errors = dict(zip(self.parameters, self.standard_errors, strict=True))
         effect, q = {e.name: (e, q) for e, q in self.sensor.effects}[name]
         out: dict[str, tuple[float, float | None, str]] = {
-            c.name: (float(v), None if (n := f"{name}.{c.name}") in self.shared else float(errors[n]), c.unit)
+            c.name: (float(v), float(errors[f"{name}.{c.name}"]), c.unit)
             for c, v in zip(effect.coefficients, q, strict=True)
         }
         for name, (value, unit) in effect.shape.items():

@@ -88,8 +88,7 @@ def calibration_document(
 ) -> Document:
     """``reference_unit`` names the unit of the reference vector; keys keep their ``_g`` whatever it is. ``stated`` are
     uncertainties that no recording can tell. ``budgeted``: with the budget, which is that of a fit to still poses."""
-    whole = c.whole
-    errors = dict(zip(whole.parameters, whole.standard_errors, strict=True))
+    errors = dict(zip(c.parameters, c.standard_errors, strict=True))
     unit = output_unit or "output"
     evaluated = budget(c, stated) if budgeted else None
 
@@ -117,13 +116,13 @@ def calibration_document(
         "matrix": numbers(c.sensor.matrix),
         "centre": numbers(c.sensor.centre),
         "effects": {
-            effect.name: coefficients_document(whole.coefficients_of(effect.name), reference_unit)
+            effect.name: coefficients_document(c.coefficients_of(effect.name), reference_unit)
             | ({WEIGHT: chance(c.weights[effect.name])} if effect.name in c.weights else {})
             for effect, _ in c.sensor.effects
         },
         "standard_error": {name: group(name) for name in LINEAR},
-        "parameters": list(whole.parameters),
-        "correlation": correlation(whole.covariance),
+        "parameters": list(c.parameters),
+        "correlation": correlation(c.covariance),
         **({"uncertainty": budget_document(c, evaluated, reference_unit)} if evaluated else {}),
         "next_recording": None if evaluated is None else next_recording_document(next_recording(c, evaluated)),
         "residual": residual_document(c.residual, c.reference),

@@ -56,21 +56,9 @@ def f_sf(x: Given, above: Given, below: Given) -> Floats:
     return _defined(special.fdtrc(above, below, np.maximum(x, 0.0)), np.greater(above, 0) & np.greater(below, 0))
 
 
-def f_logsf(x: Given, above: Given, below: Given) -> Floats:
-    """Its logarithm, exact near 1 too."""
-    x = np.maximum(x, 0.0)
-    with np.errstate(divide="ignore"):
-        tail, body = np.log(special.fdtrc(above, below, x)), np.log1p(-special.fdtr(above, below, x))
-    return np.where(x > special.fdtri(above, below, 0.5), tail, body)
-
-
 def gamma_sf(x: Given, shape: Given) -> Floats:
     """Probability of a gamma variable of scale 1 above ``x``."""
     return _defined(special.gammaincc(shape, np.maximum(x, 0.0)), np.greater(shape, 0))
-
-
-def beta_cdf(x: Given, a: Given, b: Given) -> Floats:
-    return _defined(special.betainc(a, b, np.clip(x, 0.0, 1.0)), np.greater(a, 0) & np.greater(b, 0))
 
 
 def _defined(value: Any, where: Bools | np.bool_) -> Floats:

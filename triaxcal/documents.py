@@ -114,8 +114,7 @@ class Calibration:
     @property
     def effects(self) -> dict[str, dict[str, tuple[float, float | None, str]]]:
         """name → coefficient → (value, standard error, unit)."""
-        whole = self._fitted.whole
-        return {e.name: whole.coefficients_of(e.name) for e, _ in self._fitted.sensor.effects}
+        return {e.name: self._fitted.coefficients_of(e.name) for e, _ in self._fitted.sensor.effects}
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -307,7 +306,7 @@ class Calibration:
 
     def _steps(self, u: Floats, held: Mapping[str, Floats]) -> Iterator[Floats]:
         """(n,3) each: one standard error along each principal axis of the parameters' covariance, and what it does."""
-        c = self._fitted.whole
+        c = self._fitted
         covariance = c.covariance * np.outer(*[self._beyond_the_fit(c)] * 2)
         if not np.isfinite(covariance).all():
             yield np.full(u.shape, np.nan)

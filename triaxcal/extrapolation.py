@@ -15,12 +15,13 @@ from triaxcal.effects.contract import SINCE_START, TIME, Effect, reshaped
 
 STEP = 1e-4
 """Relative step of the derivative by a shape, far above rounding and far below the curvature of any effect."""
+FACES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
 @dataclass(frozen=True)
 class Extrapolated(Caution):
-    """It holds ``beyond_s`` after the last pose; what effects of time make of the bias there has this standard
-    uncertainty (of the axis where it is largest), in the unit of the reference vector."""
+    """It holds ``beyond_s`` after the last pose; what effects of time make of the readings there has this standard
+    uncertainty (of the axis and the face where it is largest), in the unit of the reference vector."""
 
     beyond_s: float
     uncertainty_g: float
@@ -32,7 +33,7 @@ def extrapolated(c: Calibration) -> Extrapolated | None:
         return None
     last = max(p.pose.run.index for p in c.poses)
     beyond_s = c.holds_at.t_s - max(p.pose.end_s for p in c.poses if p.pose.run.index == last)
-    at, variance = 9, np.zeros(3)
+    at, variance = 9, np.zeros(len(FACES) * 3)
     for effect, q in c.sensor.effects:
         own = slice(at, at + len(q))
         at += len(q)
@@ -47,16 +48,17 @@ def extrapolated(c: Calibration) -> Extrapolated | None:
 
 
 def _basis(effect: Effect, c: Calibration) -> Floats:
-    """(3,p) at the moment, with no specific force and everything else at its reference."""
+    """(18,p) at the moment, on each face and axis, with everything else at its reference."""
     needed = {name: c.channel_reference[name] for name in effect.needs}
-    return np.asarray(effect.basis(np.zeros((1, 3)), at_moment(needed, 1, c.moment))[0])
+    basis = effect.basis(c.reference * FACES, at_moment(needed, len(FACES), c.moment))
+    return np.asarray(basis.reshape(-1, basis.shape[-1]))
 
 
 def _by_shapes(effect: Effect, q: Floats, c: Calibration) -> Floats:
-    """(3,) what the standard errors of its shapes make of it."""
+    """(18,) what the standard errors of its shapes make of it."""
     parts: Sequence[Floats] = [
         (_basis(reshaped(effect, name, value * (1 + STEP)), c) - _basis(effect, c)) @ q / (STEP * value) * error
         for name, (value, _) in effect.shape.items()
         if value and (error := c.shape_errors.get(f"{effect.name}.{name}"))
     ]
-    return np.asarray(np.linalg.norm(np.array(parts).reshape(-1, 3), axis=0))
+    return np.asarray(np.linalg.norm(np.array(parts).reshape(-1, len(FACES) * 3), axis=0))

@@ -7,14 +7,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Effect
-from triaxcal.effects.part import mix_of, whole
 from triaxcal.errors import Refused
 
 SOLVE_TOLERANCE = 1e-13
@@ -62,11 +61,6 @@ class Sensor:
     def centre(self) -> Floats:
         """c = K b (3,), output units."""
         return self.scale_factor * self.bias
-
-    @property
-    def whole(self) -> Sensor:
-        """The same sensor with every effect in full; coefficients that its parts leave out are zero."""
-        return replace(self, effects=tuple((whole(e), mix_of(e) @ q) for e, q in self.effects))
 
     def moved(self, by: Floats) -> Sensor:
         """With ``by`` (9+p,) added to scale factors, misalignments, biases and the effects' coefficients."""

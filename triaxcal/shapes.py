@@ -8,7 +8,6 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.effects.contract import HELD, SINCE_START, Effect, reshaped
-from triaxcal.effects.part import whole
 from triaxcal.problem import Problem, State, everything
 from triaxcal.trends import left_of
 
@@ -71,7 +70,7 @@ def edges_of(problem: Problem) -> Floats:
 
 def _by_likelihood(problem: Problem, state: State, i: int, name: str, inflation: float) -> float | None:
     effect = state.effects[i]
-    tried = [v.shape[name][0] for v in whole(effect).variants(problem.conditions) if name in v.shape]
+    tried = [v.shape[name][0] for v in effect.variants(problem.conditions) if name in v.shape]
 
     def chi2_at(value: float) -> float:
         return _left(problem, state, i, name, value) / inflation**2

@@ -23,7 +23,6 @@ from triaxcal.calibration_document import Document, budget_document, holds_of
 from triaxcal.conditions import channels_of, with_scale
 from triaxcal.effects import Effect
 from triaxcal.effects.in_run import of_clocks
-from triaxcal.effects.part import whole
 from triaxcal.figures import micro_g
 from triaxcal.loop import Loop, diagnose
 from triaxcal.poses.pose import Pose
@@ -166,7 +165,7 @@ def held_by_device(
         return None
 
     def has(effect: Effect) -> bool:
-        return all(profile.by_role(f"{effect.name}.{c.name}") for c in whole(effect).coefficients)
+        return all(profile.by_role(f"{effect.name}.{c.name}") for c in effect.coefficients)
 
     beside = reduced(full, lambda effect: has(effect) or is_passing(effect), logged).calibration
     return HeldByDevice(reduced(full, has, logged), beside)
@@ -174,7 +173,7 @@ def held_by_device(
 
 def image_of(profile: Profile, registers: Calibration, date_days: int) -> RegisterImage:
     """Raises RegisterValueError where a value does not go into its register."""
-    wanted = roles(registers.sensor.whole, registers.channel_reference)
+    wanted = roles(registers.sensor, registers.channel_reference)
     return build_image(profile, {r: v for r, v in wanted.items() if profile.by_role(r)}, date_days=date_days)
 
 
@@ -223,7 +222,7 @@ def _steps(image: RegisterImage) -> dict[str, float]:
 def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) -> float:
     """rms change of |a| in the poses, in g, that rounding the coefficients to their registers makes."""
     rounded = {w.role: w.held for w in image.words}
-    sensor = held.sensor.whole
+    sensor = held.sensor
 
     def triple(name: str, values: Any) -> Any:
         return np.array([rounded.get(f"{name}.{axis}", float(values[i])) for i, axis in enumerate("xyz")])

@@ -15,7 +15,6 @@ from triaxcal.calibration_document import calibration_document, poses_document
 from triaxcal.calibration_reading import calibration_of, calibration_part, sensor_of
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.bias_step import BiasStep
-from triaxcal.effects.part import Part
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.loop import diagnose
@@ -183,18 +182,6 @@ def test_each_effect_of_an_average_has_its_weight_and_that_comes_back(poses: lis
     back = calibration_of(document, where="x")
     assert back.weights == weights
     assert [e for e, _ in back.sensor.effects] == [e for e, _ in loop.after.sensor.effects]
-
-
-def test_an_effect_stands_in_the_document_in_full_whatever_part_of_it_was_fitted(poses: list[Pose]) -> None:
-    fitted = fit(poses, signs=SIGNS, effects=[Part.of(SECOND, "y")])
-    document = calibration_document(fitted)
-    held = document["effects"]["second_order_nonlinearity"]
-    assert list(held) == ["x", "y", "z"]
-    assert (held["x"]["value"], held["x"]["standard_error"]) == (0.0, 0.0)
-    assert held["y"]["value"] == pytest.approx(fitted.values[9], rel=1e-9)
-    assert document["parameters"][9:] == [f"second_order_nonlinearity.{axis}" for axis in "xyz"]
-    assert np.array(document["correlation"]).shape == (12, 12)
-    assert np.isfinite(document["correlation"]).all()
 
 
 SHAPED = [(WarmUp(75.0), "time_constant", 75.0), (BiasStep(127.0), "at", 127.0), (BiasStep(130.0), "at", 130.0)]

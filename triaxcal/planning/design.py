@@ -25,11 +25,6 @@ def needs_time(effects: Sequence[Effect]) -> bool:
     return any(TIME in e.needs for e in effects)
 
 
-def count_of(effects: Sequence[Effect]) -> int:
-    """How many coefficients the effects have together."""
-    return sum(len(e.coefficients) for e in effects)
-
-
 def profile_times(n: int) -> Floats:
     """(n,) time of the poses of a plan, from −1, the first, to 1, the last."""
     return np.linspace(-1, 1, n) if n > 1 else np.zeros(n)

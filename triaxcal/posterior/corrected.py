@@ -9,6 +9,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.calibration import Calibration, HoldsAt, Residual
 from triaxcal.caution import BirgeRatio, ExcessVariance
+from triaxcal.extrapolation import extrapolated
 from triaxcal.posterior.average import Average, average, linear_alone, refusal
 from triaxcal.posterior.posterior import Posterior
 from triaxcal.posterior.rows import Rows
@@ -46,7 +47,11 @@ def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
         holds_at=at,
         linear_only=before if made.sensor.effects else None,
     )
-    return _with_residuals(after, rows, made) if made.sensor.effects else after
+    if not made.sensor.effects:
+        return after
+    beyond = extrapolated(after)
+    told = after if beyond is None else replace(after, cautions=(*after.cautions, beyond))
+    return _with_residuals(told, rows, made)
 
 
 def _shape_errors(seen: Posterior, made: Average) -> dict[str, float]:

@@ -99,8 +99,8 @@ def _(_: of_fit.ResidualsTooSmall) -> str:
 @caution.register
 def _(c: extrapolation.Extrapolated) -> str:
     return (
-        f"the calibration is to hold {c.beyond_s:.0f} s after the last pose: what effects of time make of the bias "
-        f"there has a standard uncertainty of {micro_g(c.uncertainty_g)}"
+        f"the calibration is to hold {c.beyond_s:.0f} s after the last pose: what effects of time make of the "
+        f"readings there has a standard uncertainty of {micro_g(c.uncertainty_g)}"
     )
 
 

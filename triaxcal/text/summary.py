@@ -77,8 +77,8 @@ def _all(c: Calibration, output_unit: str, reference_unit: str) -> list[tuple[st
         (name, float(value), _error(float(error)), unit)
         for name, value, error, unit in zip(c.parameters[:9], c.values[:9], c.standard_errors[:9], units, strict=True)
     ]
-    for effect, _ in c.whole.sensor.effects:
-        for name, (value, error, unit) in c.whole.coefficients_of(effect.name).items():
+    for effect, _ in c.sensor.effects:
+        for name, (value, error, unit) in c.coefficients_of(effect.name).items():
             found.append((f"{effect.name}.{name}", value, _error(error), in_units_of(unit, reference_unit)))
     return found
 

@@ -71,7 +71,7 @@ def test_in_metres_per_second_squared_it_is_the_same_with_a_knee_in_that_unit(
     poses = noisy_poses(sensor, g * twenty_six, 1.5e-5 * g, np.random.default_rng(0))
     c = fit(poses, signs=MINUS, reference=g, effects=[Compression("odd", 0.7 * g)])
     assert np.all(np.abs(c.values[9:] - TRUTH) < 4.5 * c.standard_errors[9:])
-    assert c.whole.coefficients_of("compression")["knee"][0] == 0.7 * g
+    assert c.coefficients_of("compression")["knee"][0] == 0.7 * g
 
 
 def test_the_knee_is_where_least_is_left_and_has_an_error(

@@ -13,7 +13,6 @@ from triaxcal.conditions import behind, channels_of, conditions_elsewhere, lags_
 from triaxcal.creep import with_creep_left
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.contract import LAGS_S, RUN, SINCE_START, lag_in, lag_of
-from triaxcal.effects.part import Part
 from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.errors import InvalidData
 from triaxcal.loop import diagnose
@@ -92,7 +91,7 @@ def test_the_posterior_sums_over_time_constants_from_a_few_poses_to_twice_the_re
 def test_lags_are_derived_for_those_who_ask_and_for_nobody_else(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     poses = swinging(paper_unit, twenty_six, np.random.default_rng(0))
     assert not [n for n in channels_of(poses) if lag_in(n)]
-    wanted = lags_for([TemperatureLag(200.0), Part.of(TemperatureLag(33.0), "x"), effect_named("temperature_bias")])
+    wanted = lags_for([TemperatureLag(200.0), TemperatureLag(33.0), effect_named("temperature_bias")])
     assert wanted == tuple(lag_of("temp_c", c) for c in LAGS_S)
     assert lags_for([effect_named("thermal_gradient")]) == ()
     found = channels_of(poses, [*wanted, "other.lag:33", "temp_c.rate"])

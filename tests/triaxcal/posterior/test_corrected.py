@@ -10,6 +10,8 @@ import pytest
 from tests.triaxcal.posterior.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.calibration import Calibration, HoldsAt
+from triaxcal.conditions import at_moment
+from triaxcal.extrapolation import Extrapolated
 from triaxcal.moment import Moment
 from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
@@ -82,3 +84,27 @@ def test_the_linear_calibration_is_kept_beside_the_effects(poses_with: Poses) ->
     before, after = of(poses_with(4, hysteresis=[8e-4, -7e-4, 9e-4]))
     assert after.linear_only is before
     assert after.weights == pytest.approx({"hysteresis": 1.0})
+
+
+def test_beyond_the_last_pose_the_error_of_the_extrapolation_is_told(
+    poses_with: Poses, with_effects: Callable[..., Sensor]
+) -> None:
+    """As large as it is, over several units; within the recording nothing is told."""
+    drift = {"bias_drift": [8e-4, -6e-4, 7e-4]}
+    off = []
+    for seed in range(6):
+        poses = poses_with(seed, **drift)
+        before = fit(poses, signs=MINUS)
+        seen = posterior(poses, before, signs=MINUS, catalogue=FEW)
+        inside, after = (
+            corrected(before, seen, HoldsAt(Moment.SECONDS, t_s, t_s))
+            for t_s in (poses[-1].end_s, 2 * poses[-1].end_s)
+        )
+        assert not [c for c in inside.cautions if isinstance(c, Extrapolated)]
+        (told,) = (c for c in after.cautions if isinstance(c, Extrapolated))
+        assert told.beyond_s == pytest.approx(poses[-1].end_s)
+        ups = np.concatenate([np.eye(3), -np.eye(3)])
+        at = at_moment(after.channel_reference, len(ups), after.moment)
+        truth = with_effects(**drift).departure(ups, at)
+        off.append((after.sensor.departure(ups, at) - truth) / told.uncertainty_g)
+    assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.5

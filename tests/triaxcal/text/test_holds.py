@@ -13,7 +13,6 @@ from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_
 from triaxcal.effects.cross_coupling import CrossCoupling
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.in_run import InRuns
-from triaxcal.effects.part import Part
 from triaxcal.effects.run_bias import RunBias
 from triaxcal.effects.temperature_bias import TemperatureBias
 from triaxcal.effects.temperature_lag import TemperatureLag
@@ -70,7 +69,7 @@ def test_every_recording_of_several_has_its_own_middle() -> None:
 
 
 def test_each_condition_is_told_once_and_effects_of_directions_have_none() -> None:
-    effects = [CrossCoupling(), TemperatureBias(), TemperatureScaleFactor(), Part.of(WarmUp(60.0), "x")]
+    effects = [CrossCoupling(), TemperatureBias(), TemperatureScaleFactor(), WarmUp(60.0)]
     assert holds(effects, REFERENCE) == ("at temp_c = 24.5 °C", "long after the start")
 
 
