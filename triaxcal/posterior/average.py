@@ -185,7 +185,7 @@ def _likeliest(seen: Posterior) -> list[Effect]:
     effects: dict[int, Effect] = {}
     corrects: dict[str, float] = defaultdict(float)
     for w, found in zip(seen.weight, seen.sets, strict=True):
-        scaled = np.einsum("ps,psq->q", np.exp(found.log - found.total), found.mean)
+        scaled = np.exp(found.by_part - found.total) @ found.mean
         ends = np.cumsum([0, *(seen.evidence.terms[i].rank for i in found.members)])
         for i, first, last in zip(found.members, ends, ends[1:], strict=False):
             term = seen.evidence.terms[i]
@@ -239,11 +239,11 @@ def _mean(seen: Posterior, carried: _Carried) -> tuple[Floats, dict[int, Floats]
     for found, weight in zip(seen.sets, seen.weight, strict=True):
         if weight < NEGLIGIBLE:
             continue
-        share = np.exp(found.log - found.total) * weight
-        mean = np.einsum("ps,psq->pq", share, found.mean)
+        share = np.exp(found.by_part - found.total) * weight
+        mean = share[:, None] * found.mean
         places = evidence.places(found.members)
         scaled[places] += mean.sum(axis=0)
-        for part, of_part, q in zip(found.parts, share.sum(axis=1), mean, strict=True):
+        for part, of_part, q in zip(found.parts, share, mean, strict=True):
             by_part[part] += of_part * rows.y - evidence.columns[:, places] @ q
     deviation = carried.by_term @ scaled
     left: dict[int, Floats] = {}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -43,7 +44,7 @@ class _Turned:
 @dataclass(frozen=True, eq=False)
 class SetEvidence:
     """Of one set, by the ``parts`` (P,) reckoned and sizes (S,k) of its k terms: ``log`` (P,S) joint with the priors of
-    part, sizes and members, ``mean`` (P,S,q) of the scaled coefficients of all members."""
+    part, sizes and members, ``mean`` (P,q) of the scaled coefficients of all members, over the sizes."""
 
     members: tuple[int, ...]
     parts: tuple[int, ...]
@@ -69,11 +70,7 @@ class Evidence:
         """Sizes begin at ``smallest_g``, by default at that share of the noise of a pose which the odds have."""
         self.rows, self.terms, self.odds = rows, terms, odds
         self.parts = _parts(rows, odds)
-        least = odds.smallest * rows.of_a_pose if smallest_g is None else smallest_g
-        reference = rows.problem.reference
-        self.sizes = np.geomspace(least, odds.largest_g * reference, odds.sizes)
-        gross = np.geomspace(least, odds.largest_outlier * reference, odds.sizes)
-        self._sizes_of = np.array([gross if term.effect is None else self.sizes for term in terms])
+        self._begin_sizes(odds.smallest * rows.of_a_pose if smallest_g is None else smallest_g)
         self.log_prior = np.array([term.log_prior for term in terms])
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
         self.columns = np.concatenate([np.empty((len(rows.y), 0)), *(term.columns for term in terms)], axis=1)
@@ -88,6 +85,18 @@ class Evidence:
         for rank in np.unique(ranks):
             index = np.flatnonzero(ranks == rank)
             self._by_rank.append((index, self._ends[index][:, None] + np.arange(rank)))
+
+    def _begin_sizes(self, smallest_g: float) -> None:
+        odds, reference = self.odds, self.rows.problem.reference
+        self.sizes = np.geomspace(smallest_g, odds.largest_g * reference, odds.sizes)
+        gross = np.geomspace(smallest_g, odds.largest_outlier * reference, odds.sizes)
+        self._sizes_of = np.array([gross if term.effect is None else self.sizes for term in self.terms])
+
+    def resized(self, smallest_g: float) -> Evidence:
+        """The same, with sizes that begin elsewhere."""
+        other = copy(self)
+        other._begin_sizes(smallest_g)
+        return other
 
     def covariance(self, part: int) -> Floats:
         """(N,N) of the rows over their errors: noise and unmodelled part."""
@@ -131,13 +140,18 @@ class Evidence:
         return np.maximum(information, 0.0), np.einsum("tqr,tq->tr", axes, score[places]) ** 2
 
     def normal_equations(
-        self, part: int, members: Sequence[int], sizes: Sequence[float]
-    ) -> tuple[Floats, Floats, float]:
-        """Information (C,C) and score (C,) of the scaled coefficients of all terms beside ``members`` of these sizes,
-        and the sum of squares that these leave."""
+        self, part: int, members: Sequence[int], sizes: Sequence[float], each: Sequence[int]
+    ) -> tuple[dict[int, tuple[Floats, Floats]], float]:
+        """Of ``each`` term the information (q,q) and score (q,) of its scaled coefficients beside ``members`` of these
+        sizes, and the sum of squares that these leave."""
         turned, weight = self._turned[self._which[part]], self._weight[part]
         score, chi2, shared, _ = self._beside(part, members, sizes)
-        return turned.columns.T @ (weight[:, None] * turned.columns) - shared.T @ shared, score, chi2
+        out = {}
+        for i in each:
+            own = slice(self._ends[i], self._ends[i + 1])
+            columns, taken = turned.columns[:, own], shared[:, own]
+            out[i] = columns.T @ (weight[:, None] * columns) - taken.T @ taken, score[own]
+        return out, chi2
 
     def _beside(self, part: int, members: Sequence[int], sizes: Sequence[float]) -> tuple[Floats, float, Floats, float]:
         """What ``members`` of these sizes leave: the score (C,) of all terms and the sum of squares; (k,C) whose square
@@ -183,7 +197,8 @@ class Evidence:
             base[row] = self.parts[part].log_prior + 0.5 * np.log(weight).sum() + prior
         gain, log_det, mean = _absorbed(information, score, [self.terms[i].rank for i in members], grids)
         log = self.rows.log_likelihood(chi2 - gain) - 0.5 * log_det + base
-        return SetEvidence(members, tuple(parts), sizes, log, mean)
+        share = np.exp(log - log_sum_exp(log, axis=1)[:, None])
+        return SetEvidence(members, tuple(parts), sizes, log, np.einsum("ps,psq->pq", share, mean))
 
 
 def _squared(columns: Floats) -> Floats:

@@ -61,7 +61,7 @@ class Posterior:
 
     def resized(self, smallest_g: float) -> Posterior:
         """The same sets with sizes that begin elsewhere, as `posterior` has them."""
-        evidence = Evidence(self.evidence.rows, self.evidence.terms, self.evidence.odds, smallest_g)
+        evidence = self.evidence.resized(smallest_g)
         sets = [evidence.of_set(found.members, found.parts) for found in self.sets]
         return Posterior(evidence, sorted(sets, key=lambda found: -found.total))
 
@@ -291,7 +291,7 @@ def _point_of(seen: Posterior) -> State | None:
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
     if any(term.another >= 0 for term in terms) or not seen.names_of(best):
         return None
-    scaled = np.einsum("ps,psq->q", np.exp(best.log - best.total), best.mean)
+    scaled = np.exp(best.by_part - best.total) @ best.mean
     inverse = np.linalg.inv(evidence.covariance(best.parts[int(np.argmax(best.by_part))]))
     left = inverse @ (rows.y - evidence.columns[:, evidence.places(best.members)] @ scaled)
     linear = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ left)

@@ -234,12 +234,11 @@ def _log_without(unit: Posterior, bases: Sequence[_Base], name: str) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """``information`` (C,C) and ``score`` (C,) of the scaled coefficients of all terms, in standard errors, beside one
-    set with one part and one choice of sizes that leave ``chi2``. Its share of the unit by itself is ``log_share``;
-    ``variance`` is that of the noise where one more term explains what it can."""
+    """Of each term of a name the information (q,q) and score (q,) of its scaled coefficients, in standard errors,
+    beside one set with one part and one choice of sizes that leave ``chi2``. Its share of the unit by itself is
+    ``log_share``; ``variance`` is that of the noise where one more term explains what it can."""
 
-    information: Floats
-    score: Floats
+    of_terms: Mapping[int, tuple[Floats, Floats]]
     chi2: float
     variance: float
     log_share: float
@@ -255,15 +254,14 @@ def _equations(unit: Posterior, bases: Sequence[_Base], name: str, none: bool) -
     cell = int(np.argmax(found.log[row]))
     without = float(log_sum_exp([base.found.total for base in others]))
     share = float(found.by_part[row]) - without + _log_without(unit, bases, name)
-    information, score, chi2 = evidence.normal_equations(found.parts[row], found.members, found.sizes[cell])
-    explained = max(_explained(evidence, information, score, i) for i in mine)
-    return _Equations(information, score, chi2, evidence.rows.noise_given(chi2 - explained), share)
+    of_terms, chi2 = evidence.normal_equations(found.parts[row], found.members, found.sizes[cell], mine)
+    explained = max(_explained(*equations) for equations in of_terms.values())
+    return _Equations(of_terms, chi2, evidence.rows.noise_given(chi2 - explained), share)
 
 
-def _explained(evidence: Evidence, information: Floats, score: Floats, term: int) -> float:
+def _explained(information: Floats, score: Floats) -> float:
     """By how much a term lowers the sum of squares, at most."""
-    places = evidence.places([term])
-    return float(score[places] @ np.linalg.pinv(information[np.ix_(places, places)]) @ score[places])
+    return float(score @ np.linalg.pinv(information) @ score)
 
 
 def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations], index: Sequence[int]) -> Floats:
@@ -271,13 +269,16 @@ def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations
     that explain most, as the noise of no unit is known beforehand. Two such points are looked for, since a unit may as
     well lack the effect and be noisy."""
     first = units[0].evidence.terms[index[0]]
-    information, score = [], []
+    scaled = []
     for unit, of_unit, i in zip(units, equations, index, strict=True):
         scale = first.mix / unit.evidence.terms[i].mix
-        places = unit.evidence.places([i])
-        information.append(scale[:, None] * of_unit.information[np.ix_(places, places)] * scale)
-        score.append(scale * of_unit.score[places])
-    shared = np.array(information), np.array(score), np.array([of_unit.chi2 for of_unit in equations])
+        information, score = of_unit.of_terms[i]
+        scaled.append((scale[:, None] * information * scale, scale * score))
+    shared = (
+        np.array([of[0] for of in scaled]),
+        np.array([of[1] for of in scaled]),
+        np.array([of_unit.chi2 for of_unit in equations]),
+    )
     explained = np.array([of_unit.variance for of_unit in equations])
     noisy = np.array([u.evidence.rows.noise_given(e.chi2) for u, e in zip(units, equations, strict=True)])
     found = [_about(units, *shared, start) for start in (explained, noisy)]

@@ -97,8 +97,7 @@ def test_beyond_the_last_pose_the_error_of_the_extrapolation_is_told(
         before = fit(poses, signs=MINUS)
         seen = posterior(poses, before, signs=MINUS, catalogue=FEW)
         inside, after = (
-            corrected(before, seen, HoldsAt(Moment.SECONDS, t_s, t_s))
-            for t_s in (poses[-1].end_s, 2 * poses[-1].end_s)
+            corrected(before, seen, HoldsAt(Moment.SECONDS, t_s, t_s)) for t_s in (poses[-1].end_s, 2 * poses[-1].end_s)
         )
         assert not [c for c in inside.cautions if isinstance(c, Extrapolated)]
         (told,) = (c for c in after.cautions if isinstance(c, Extrapolated))

@@ -78,10 +78,12 @@ def test_each_term_beside_others_has_the_evidence_of_the_set_of_both(evidence: E
             assert with_each[other] == pytest.approx(expected, abs=1e-6)
 
 
-def test_coefficients_are_those_of_ridge_regression(evidence: Evidence) -> None:
+def test_coefficients_are_those_of_ridge_regression_over_all_sizes(evidence: Evidence) -> None:
     cubic = of(evidence, "third_order_nonlinearity", 3)
     found = evidence.of_set((cubic,), [0])
     columns = evidence.rows.beside.T @ evidence.terms[cubic].columns
-    for size, mean in zip(found.sizes[:, 0], found.mean[0], strict=True):
+    expected = np.zeros(3)
+    for size, log in zip(found.sizes[:, 0], found.log[0], strict=True):
         ridge = np.concatenate([columns, np.eye(3) / size]), np.concatenate([evidence.rows.z, np.zeros(3)])
-        assert mean == pytest.approx(np.linalg.lstsq(*ridge)[0], rel=1e-6, abs=1e-12)
+        expected += np.exp(log - found.total) * np.linalg.lstsq(*ridge)[0]
+    assert found.mean[0] == pytest.approx(expected, rel=1e-6, abs=1e-12)

@@ -71,7 +71,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
     found = evidence.of_set(members, [part])
     cell = int(np.argmax(found.log[0]))
     ahead = rows.to_come(poses_with(8)[:5])
-    one = replace(found, sizes=found.sizes[[cell]], log=found.log[:, [cell]], mean=found.mean[:, [cell]])
+    one = replace(found, sizes=found.sizes[[cell]], log=found.log[:, [cell]])
     mean, covariance = Cells.likeliest(Posterior(evidence, [one]), 1.0).predicted(ahead)
 
     def design(of_rows: Rows) -> np.ndarray:
