@@ -13,6 +13,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from matplotlib.transforms import blended_transform_factory
 from PIL import Image
 
@@ -88,6 +89,10 @@ def draw_pairs(path: Path, labels: tuple[str, str], before: Floats, after: Float
     ax.loglog(ends, ends, color="#888888", lw=0.7)
     ax.set_xlabel(labels[0], fontsize=7)
     ax.set_ylabel(labels[1], fontsize=7)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     ax.tick_params(labelsize=7)
     ax.legend(fontsize=6, frameon=False)
     _save(path, figure)
@@ -97,7 +102,7 @@ def _save(path: Path, figure: Figure) -> None:
     held = io.BytesIO()
     figure.savefig(held, format="png", dpi=110)
     plt.close(figure)
-    Image.open(held).convert("RGB").quantize(32).save(path, optimize=True)
+    Image.open(held).convert("RGB").quantize(64).save(path, optimize=True)
 
 
 def _envelope(axes: Axes, t_s: Floats, values: Floats, colour: str, name: str) -> None:

@@ -80,7 +80,7 @@ def _poses(loop: Loop) -> Floats:
     c = loop.after
     poses = [p.pose for p in c.poses]
     held = c.conditions_of(poses)
-    moved = c.sensor.departure(c.sensor.along_axes(np.array([p.mean for p in poses]), held), held)
+    moved = c.sensor.departure(np.zeros((len(poses), 3)), held)
     run = np.array([p.run.index for p in poses])
     end = np.array([moved[run == k][-1] for k in run])
     residual = [(b.residual_g, a.residual_g) for b, a in zip(loop.before.poses, c.poses, strict=True)]
@@ -148,7 +148,8 @@ def draw_session(found: Sequence[Told]) -> None:
 
     left = panels([SHOWN], [(2, "linear model", "."), (3, "with what was found", ".")])
     draw_by_run(PICTURES / "session-residuals.png", "|a| − 1 g, mg", left)
-    moved = panels(list(SENSORS), [(4, "sensor {}", "-")])
+    corrected = [sensor for sensor in SENSORS if whole[sensor][:, 4].any()]
+    moved = panels(corrected, [(4, "sensor {}", "-")])
     draw_by_run(PICTURES / "session-biases.png", "bias, from its end, mg", moved)
     following = [one for one in found if np.isfinite(one.next_before_g)]
     before, after = (

@@ -146,7 +146,7 @@ class Evidence:
         sizes, and the sum of squares that these leave."""
         turned, weight = self._turned[self._which[part]], self._weight[part]
         score, chi2, shared, _ = self._beside(part, members, sizes)
-        out = {}
+        out: dict[int, tuple[Floats, Floats]] = {}
         for i in each:
             own = slice(self._ends[i], self._ends[i + 1])
             columns, taken = turned.columns[:, own], shared[:, own]
