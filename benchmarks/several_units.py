@@ -13,7 +13,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -26,7 +26,7 @@ from triaxcal.pose_fit import fit
 from triaxcal.poses.pose import Pose
 from triaxcal.posterior import posterior
 from triaxcal.posterior.rows import Rows
-from triaxcal.posterior.together import Together, together
+from triaxcal.posterior.together import together
 from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
@@ -62,7 +62,18 @@ def poses_of(rng: np.random.Generator, name: str, along: np.ndarray | None) -> l
     return made(along * STRENGTH / float(np.linalg.norm(shown)))
 
 
-def session(kind: str, seed: int) -> Together:
+@dataclass(frozen=True)
+class Told:
+    """That something ``acts``, in some unit, for certain; ``groups`` of names of which one acts in all for certain; and
+    whether the values of the ``true`` effect are ``common``."""
+
+    true: str
+    acts: bool
+    groups: tuple[tuple[str, ...], ...]
+    common: bool
+
+
+def session(kind: str, seed: int) -> Told:
     rng = np.random.default_rng((seed, ("own", "common", "nothing").index(kind)))
     name = EFFECTS[seed % len(EFFECTS)]
     common = rng.standard_normal(3)
@@ -71,7 +82,8 @@ def session(kind: str, seed: int) -> Together:
         along = {"own": rng.standard_normal(3), "common": common, "nothing": None}[kind]
         poses = poses_of(rng, name, along)
         units.append(posterior(poses, fit(poses, signs=SIGNS), signs=SIGNS, smallest_g=0.1 * NOISE_G))
-    return together(units)
+    found = together(units)
+    return Told(name, found.nothing <= 1 - CERTAIN, found.certain(CERTAIN), found.common.get(name, 0.0) > 0.5)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -84,15 +96,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with ProcessPoolExecutor(options.jobs, initializer=one_thread) as pool:
         for kind, count in (("own", options.sessions), ("common", options.sessions), ("nothing", options.nothing)):
             found = list(pool.map(partial(session, kind), range(count)))
-            acts = sum(f.nothing <= 1 - CERTAIN for f in found)
-            truth = [EFFECTS[i % len(EFFECTS)] for i in range(count)]
-            listed = sum(any(t in group for group in f.certain(CERTAIN)) for f, t in zip(found, truth, strict=True))
-            alone = sum(f.certain(CERTAIN) == ((t,),) for f, t in zip(found, truth, strict=True))
-            common = [f.common[t] > 0.5 for f, t in zip(found, truth, strict=True) if t in f.common]
-            rows.append([kind, str(count), str(acts), str(listed), str(alone), str(sum(common))])
-            print(
-                Table("So far", ["values", "sessions", "certain", "listed", "named", "called common"], rows), flush=True
-            )
+            acts = sum(f.acts for f in found)
+            listed = sum(any(f.true in group for group in f.groups) for f in found)
+            alone = sum(f.groups == ((f.true,),) for f in found)
+            wrong = sum(bool(f.groups) and not any(f.true in group for group in f.groups) for f in found)
+            named = [listed, alone, wrong] if kind != "nothing" else [0, 0, sum(bool(f.groups) for f in found)]
+            rows.append([kind, str(count), str(acts), *map(str, named), str(sum(f.common for f in found))])
+            head = ["values", "sessions", "something acts", "listed", "named alone", "wrong", "called common"]
+            print(Table("So far", head, rows), flush=True)
     return 0
 
 
