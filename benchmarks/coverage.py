@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.table import Table, run
 from benchmarks.truth import PAPER_UNIT, Condition, plan
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
 from triaxcal.poses.pose import Pose
 
 SEEDS, QUICK = 600, 60

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.table import Table, run
 from benchmarks.truth import PARAMETERS, Condition, bound_and_best, conditions
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
 
 SEEDS, QUICK = 1000, 100
 

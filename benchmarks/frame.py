@@ -12,15 +12,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from triaxcal.arrays import Floats
-from triaxcal.frame.faces import AXES, LABELS, nearest_rotation, recognise
-from triaxcal.frame.frames import frames
-from triaxcal.frame.orientations import Assumed
-from triaxcal.frame.standing import stand
-from triaxcal.frame.synthetic_fixture import SyntheticFixture
-from triaxcal.frame.verticals import verticals
-from triaxcal.planning.directions import directions
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.frames.faces import AXES, LABELS, nearest_rotation, recognise
+from triaxcal.frames.frames import frames
+from triaxcal.frames.orientations import Assumed
+from triaxcal.frames.standing import stand
+from triaxcal.frames.synthetic_fixture import SyntheticFixture
+from triaxcal.frames.verticals import verticals
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
 SENSOR = Sensor(

@@ -33,9 +33,9 @@ from tests.undeclared import invented, invented_later, physics, uncatalogued
 from tests.undeclared.examine import Case, still_poses
 from tests.undeclared.generator import CannotShow, Recording
 from tests.undeclared.told import rms_g
-from triaxcal.calibration import Calibration
-from triaxcal.held_out import magnitude_errors
-from triaxcal.loop import diagnose
+from triaxcal.diagnosis import diagnose
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.held_out import magnitude_errors
 from triaxcal.poses.pose import Pose
 
 RANGES = {"development": 0, "test": 500_000}

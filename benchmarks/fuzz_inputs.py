@@ -19,7 +19,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from benchmarks.fuzz_spoil import spoil, spoil_packed
-from triaxcal.planning.directions import directions
+from triaxcal.model.directions import directions
 from triaxcal_drivers.can.decode import CanDecoder
 from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.model import CanProfile, CanStream, PdoStream

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from benchmarks.pages import DOCS, PICTURES, write
 from benchmarks.pictures import draw
-from triaxcal.caution import HighLeverage, PoorSpread
+from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
-from triaxcal.loop import Loop, diagnose
+from triaxcal.estimate.caution import HighLeverage, PoorSpread
 from triaxcal.text import caution
 from triaxcal.text.diagnosis import chance
 from triaxcald.inputs import Measured, measure

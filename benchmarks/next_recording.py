@@ -20,8 +20,8 @@ import numpy as np
 from benchmarks.frozen import WORSE, judged
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
-from triaxcal.calibration import Calibration
-from triaxcal.held_out import magnitude_errors
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.held_out import magnitude_errors
 from triaxcal.poses.pose import Pose
 from triaxcald.inputs import measure
 

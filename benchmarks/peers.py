@@ -15,10 +15,10 @@ from scipy.optimize import least_squares
 
 from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, bound_and_best, hard, plan
-from triaxcal.ellipsoid import closed_form, coefficients
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.ellipsoid import closed_form, coefficients
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.sensor import Sensor
 
 SEEDS, QUICK = 200, 20
 SIGMA = 1.5e-5

@@ -18,8 +18,8 @@ from matplotlib.transforms import blended_transform_factory
 from PIL import Image
 
 from triaxcal.arrays import Floats
+from triaxcal.model.samples import Samples
 from triaxcal.poses.pose import Pose
-from triaxcal.samples import Samples
 
 Line = tuple[str, str, Floats, Floats]
 """Name, style, moments in s, values."""

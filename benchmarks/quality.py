@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.streams import CONDITIONS, Condition, Stream, made
 from triaxcal.arrays import Floats, Ints
-from triaxcal.quality import Finding, QualityDetector
-from triaxcal.stillness.detector import StillnessDetector
+from triaxcal.poses.quality import Finding, QualityDetector
+from triaxcal.poses.stillness.detector import StillnessDetector
 
 Fault = Callable[[Ints, Floats, Stream, np.random.Generator], tuple[Ints, Floats]]
 SCALE = 2.4  # volts per g

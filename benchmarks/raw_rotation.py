@@ -13,9 +13,9 @@ from scipy.optimize import least_squares
 
 from benchmarks.table import Table, run
 from benchmarks.truth import information
-from triaxcal.ellipsoid import closed_form, coefficients
-from triaxcal.sensor import Sensor
-from triaxcal.turning.rotation import Moments, fit_rotation
+from triaxcal.estimate.ellipsoid import closed_form, coefficients
+from triaxcal.inputs.turning.rotation import Moments, fit_rotation
+from triaxcal.model.sensor import Sensor
 
 SEEDS, QUICK = 12, 3
 UNIT = Sensor(np.array([2.41, 2.0, 3.1]), np.array([6e-3, 4e-2, -6e-3]), np.array([0.05, -0.03, 0.04]))

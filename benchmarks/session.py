@@ -24,12 +24,12 @@ from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from triaxcal.agreement import Common, agreement
 from triaxcal.arrays import Floats
-from triaxcal.loop import Loop, diagnose
-from triaxcal.next_recording import next_recording
-from triaxcal.runs import together
+from triaxcal.diagnosis import Loop, diagnose
+from triaxcal.estimate.runs import together
 from triaxcal.text.agreement import verdict
 from triaxcal.text.diagnosis import chance
 from triaxcal.uncertainty import budget
+from triaxcal.uncertainty.next_recording import next_recording
 
 SHOWN = 6
 """The sensor whose residuals are drawn: that with the largest warm-up."""

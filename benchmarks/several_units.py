@@ -21,13 +21,13 @@ import numpy as np
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from triaxcal.effects import effect_named
-from triaxcal.planning.directions import directions
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence import posterior
+from triaxcal.evidence.rows import Rows
+from triaxcal.evidence.together import together
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.posterior import posterior
-from triaxcal.posterior.rows import Rows
-from triaxcal.posterior.together import together
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
 UNITS, NOISE_G, STRENGTH = 8, 2e-5, 3.0

@@ -12,7 +12,7 @@ from benchmarks.peers import scipy_magnitude
 from benchmarks.raw_rotation import adjusted, paper, turning
 from benchmarks.table import Table, chosen
 from benchmarks.truth import PAPER_UNIT, Condition, plan
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
 
 
 def seconds(work: Callable[[], object], budget_s: float) -> float:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.sensor import Sensor
 
 PAPER_UNIT = Sensor(
     np.array([-2.410618, -2.403823, -2.371761]),

@@ -9,13 +9,13 @@ import numpy as np
 
 from benchmarks.table import Table, chosen
 from benchmarks.truth import information, plan
-from triaxcal.attitude import fit_attitudes
-from triaxcal.passport import Passport, refine
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.inputs.attitude import fit_attitudes
+from triaxcal.inputs.passport import Passport, refine
+from triaxcal.inputs.turning.moments import Moments
+from triaxcal.inputs.turning.rotation import fit_rotation
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
-from triaxcal.turning.moments import Moments
-from triaxcal.turning.rotation import fit_rotation
 
 UNIT = Sensor(np.array([-2.41, 2.0, 3.1]), np.array([6e-3, 4e-2, -6e-3]), np.array([0.05, -0.03, 0.04]))
 SIGNS = (-1, 1, 1)

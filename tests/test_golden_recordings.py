@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.loop import diagnose
+from triaxcal.diagnosis import diagnose
 from triaxcald.audit import audit
 from triaxcald.inputs import measure
 

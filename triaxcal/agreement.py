@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from triaxcal.diagnosis import Loop
 from triaxcal.errors import InvalidData
-from triaxcal.loop import Loop
-from triaxcal.posterior.shapes import Shape, shapes_of
-from triaxcal.posterior.together import Together, together
+from triaxcal.evidence.shapes import Shape, shapes_of
+from triaxcal.evidence.together import Together, together
 
 
 class Answer(StrEnum):

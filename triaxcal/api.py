@@ -8,24 +8,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from triaxcal import loop, pose_fit, tables, text, uncertainty
+from triaxcal import tables, text, uncertainty
 from triaxcal.arrays import Floats
-from triaxcal.creep import with_creep_left
+from triaxcal.diagnosis import Call, Candidate, Finding
+from triaxcal.diagnosis import diagnose as diagnosed
 from triaxcal.documents import Calibration
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.held_out import HeldOut, magnitude_errors
-from triaxcal.loop import Call, Candidate, Finding
-from triaxcal.means import poses_of_means
-from triaxcal.moment import Moment
-from triaxcal.next_recording import NextRecording, next_recording
-from triaxcal.planning.directions import FULL, closed, directions
+from triaxcal.estimate import pose_fit
+from triaxcal.estimate.creep import with_creep_left
+from triaxcal.estimate.held_out import HeldOut, magnitude_errors
+from triaxcal.estimate.means import poses_of_means
+from triaxcal.evidence.findings import Unexplained
+from triaxcal.model.directions import FULL, closed, directions
+from triaxcal.model.moment import Moment
+from triaxcal.model.samples import Samples
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.posterior.findings import Unexplained
-from triaxcal.quality import QualityDetector, untrusted_poses
-from triaxcal.samples import Samples
-from triaxcal.stillness.detector import StillnessDetector
+from triaxcal.poses.quality import QualityDetector, untrusted_poses
+from triaxcal.poses.stillness.detector import StillnessDetector
 from triaxcal.text import diagnosis
+from triaxcal.uncertainty.next_recording import NextRecording, next_recording
 from triaxcal.units import ErrorUnit
 
 
@@ -225,7 +227,7 @@ def diagnose(
         raise InvalidData("at: expected 'end', 'mean' or a number of seconds")
     others = None if check is None else _poses(check)
     output_unit = output_unit or _unit_of(poses)
-    closed_loop = loop.diagnose(found, signs=_signs(signs), reference=_positive(reference), check=others, at=moment)
+    closed_loop = diagnosed(found, signs=_signs(signs), reference=_positive(reference), check=others, at=moment)
     before, after = (
         Calibration(c, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
         for c in (closed_loop.before, closed_loop.after)

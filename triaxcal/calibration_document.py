@@ -7,8 +7,7 @@ from typing import Any
 
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration, Exclusion, HoldsAt, Residual
-from triaxcal.next_recording import NextRecording, next_recording
+from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt, Residual
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import (
     UNCERTAINTY_DIGITS,
@@ -23,6 +22,7 @@ from triaxcal.rounding import (
 )
 from triaxcal.uncertainty import Budget, Stated, budget
 from triaxcal.uncertainty.basis import Basis, UnmodelledTemperature
+from triaxcal.uncertainty.next_recording import NextRecording, next_recording
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 Document = dict[str, Any]

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration, HoldsAt, Residual
 from triaxcal.calibration_document import WEIGHT
 from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.contract import condition_of
 from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.errors import InvalidData
-from triaxcal.moment import Moment
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
+from triaxcal.model.moment import Moment
+from triaxcal.model.sensor import Sensor
 from triaxcal.units import reference_unit_of
 
 

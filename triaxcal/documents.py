@@ -18,13 +18,13 @@ import numpy as np
 
 from triaxcal import tables, text
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration as Fitted
-from triaxcal.calibration import HoldsAt, PoseResult, Residual
 from triaxcal.calibration_document import LINEAR, Document, calibration_document
 from triaxcal.calibration_reading import calibration_of, calibration_part
-from triaxcal.conditions import conditions_elsewhere
 from triaxcal.effects.contract import TIME, channel_of, condition_of, is_derived
 from triaxcal.errors import InvalidData, MissingChannel, Refused
+from triaxcal.estimate.calibration import Calibration as Fitted
+from triaxcal.estimate.calibration import HoldsAt, PoseResult, Residual
+from triaxcal.poses.conditions import conditions_elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Stated
 

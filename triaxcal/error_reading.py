@@ -10,7 +10,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.calibration_document import LINEAR
 from triaxcal.errors import InvalidData
-from triaxcal.sensor import Sensor
+from triaxcal.model.sensor import Sensor
 
 ROUNDED = 1e-4
 """Documents round correlations to a millionth, so that the smallest eigenvalue may come out below zero."""

@@ -16,7 +16,7 @@ class InvalidData(TriaxcalError):
 class Refused(TriaxcalError):
     """The data cannot carry the answer.
 
-    ``wanted`` names the poses that would mend it (labels of `triaxcal.planning.directions`), best first.
+    ``wanted`` names the poses that would mend it (labels of `triaxcal.model.directions`), best first.
     """
 
     def __init__(self, message: str, *, wanted: Sequence[str] = ()) -> None:

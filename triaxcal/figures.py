@@ -1,10 +1,6 @@
-"""How numbers, and poses, are written in sentences: without an exponent where one can do without."""
+"""How numbers are written in sentences: without an exponent where one can do without."""
 
 from __future__ import annotations
-
-from collections.abc import Iterable
-
-from triaxcal.poses.pose import Began
 
 P_LEAST = 1e-12
 """Below this a probability says how well the noise is known, and no more."""
@@ -29,14 +25,3 @@ def probability(p: float | None) -> str:
     if p is None:
         return "—"
     return f"< {P_LEAST:.0e}" if p < P_LEAST else f"{p:.2g}"
-
-
-def moment(began: Began) -> str:
-    """When a pose began, and in which of several recordings, counted from 1."""
-    of = "" if began.recording is None else f" of recording {began.recording + 1}"
-    return f"{began.start_s:.1f} s{of}"
-
-
-def the_poses(began: Iterable[Began], joined: str = " and ") -> str:
-    """By when they began."""
-    return joined.join(f"the pose at {moment(b)}" for b in began)

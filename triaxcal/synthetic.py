@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.conditions import behind
 from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, LAGS_S, SINCE_START, TIME, lag_in, lag_of, rate_of
-from triaxcal.gravity import STANDARD_GRAVITY
+from triaxcal.model.gravity import STANDARD_GRAVITY
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.conditions import behind
 from triaxcal.poses.pose import Pose
-from triaxcal.sensor import Sensor
 
 LAGS = {lag_of(TEMPERATURE, constant_s): constant_s for constant_s in LAGS_S}
 CONDITIONS = frozenset({TEMPERATURE, rate_of(TEMPERATURE), *LAGS, TIME, SINCE_START, HELD, *BEFORE, *CHANGE})

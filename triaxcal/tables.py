@@ -11,7 +11,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import InvalidData, MissingChannel
-from triaxcal.samples import Samples
+from triaxcal.model.samples import Samples
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000, "ns": 1}
 TIME_COLUMN, OUTPUTS = "t_s", ("ux", "uy", "uz")

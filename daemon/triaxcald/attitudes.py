@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.planning.directions import cube_directions
+from triaxcal.model.directions import cube_directions
 from triaxcal.poses.pose import Pose
 from triaxcal_drivers.files import read_whole
 from triaxcald.errors import InputError

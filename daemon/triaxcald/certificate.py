@@ -18,17 +18,17 @@ import numpy as np
 
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
 from triaxcal.calibration_document import Document, budget_document, holds_of
-from triaxcal.conditions import channels_of, with_scale
+from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.in_run import of_clocks
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.evidence.reduced import Reduced, reduced
 from triaxcal.figures import micro_g
-from triaxcal.loop import Loop, diagnose
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.conditions import channels_of, with_scale
 from triaxcal.poses.pose import Pose
-from triaxcal.reduced import Reduced, reduced
 from triaxcal.rounding import error, number
-from triaxcal.sensor import Sensor
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
 from triaxcald.choices import is_passing
@@ -160,7 +160,8 @@ class HeldByDevice:
 def held_by_device(
     profile: Profile, full: Calibration, logged: Mapping[str, Floats] | None = None
 ) -> HeldByDevice | None:
-    """None where the device cannot take a calibration at all. ``logged`` as `triaxcal.reduced.reduced` has it."""
+    """None where the device cannot take a calibration at all. ``logged`` as `triaxcal.evidence.reduced.reduced` has
+    it."""
     if why_not_written(profile):
         return None
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from triaxcal.calibration import Calibration, Residual
+from triaxcal.diagnosis import Loop
 from triaxcal.effects import Effect
 from triaxcal.effects.contract import DERIVED, rate_of
-from triaxcal.loop import Loop
+from triaxcal.estimate.calibration import Calibration, Residual
 
 REGISTERS, HOST, PROCESS = "registers", "host", "process"
 

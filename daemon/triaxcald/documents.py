@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from triaxcal.calibration import Calibration
 from triaxcal.calibration_document import (
     WEIGHT,
     Document,
@@ -14,14 +13,15 @@ from triaxcal.calibration_document import (
     coefficients_document,
     residual_document,
 )
-from triaxcal.held_out import HeldOut
-from triaxcal.loop import Finding, Loop, Verdict
-from triaxcal.next_recording import next_recording
-from triaxcal.posterior.average import Refusal
-from triaxcal.posterior.findings import Unexplained
+from triaxcal.diagnosis import Finding, Loop, Verdict
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.held_out import HeldOut
+from triaxcal.evidence.average import Refusal
+from triaxcal.evidence.findings import Unexplained
 from triaxcal.rounding import chance, error, number
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty import Stated, budget
+from triaxcal.uncertainty.next_recording import next_recording
 from triaxcal.units import ErrorUnit
 from triaxcald.choices import choices_of
 from triaxcald.doubts import UNIT

@@ -10,16 +10,16 @@ import numpy as np
 
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
 from triaxcal.calibration_document import Document
 from triaxcal.calibration_reading import calibration_part, holds_at_of, sensor_of
 from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
-from triaxcal.frame.faces import LABELS, TURNS, axis_of, opposite
-from triaxcal.frame.fixture import Fixture, Quantity
-from triaxcal.frame.frames import Frames, UnitFrame
-from triaxcal.frame.verticals import Verticals, verticals, verticals_under
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.frames.faces import LABELS, TURNS, axis_of, opposite
+from triaxcal.frames.fixture import Fixture, Quantity
+from triaxcal.frames.frames import Frames, UnitFrame
+from triaxcal.frames.verticals import Verticals, verticals, verticals_under
+from triaxcal.model.sensor import Sensor
 from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
-from triaxcal.sensor import Sensor
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
 

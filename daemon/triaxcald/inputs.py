@@ -13,12 +13,12 @@ import numpy as np
 
 from triaxcal.documents import Calibration
 from triaxcal.errors import InvalidData
-from triaxcal.means import poses_of_means
-from triaxcal.moment import Moment
+from triaxcal.estimate.means import poses_of_means
+from triaxcal.inputs.turning.moments import Moments
+from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.quality import QualityDetector, untrusted_poses
-from triaxcal.stillness.detector import StillnessDetector, Windows
-from triaxcal.turning.moments import Moments
+from triaxcal.poses.quality import QualityDetector, untrusted_poses
+from triaxcal.poses.stillness.detector import StillnessDetector, Windows
 from triaxcal.uncertainty import Stated
 from triaxcal.units import same_unit
 from triaxcal_drivers.files import read_whole

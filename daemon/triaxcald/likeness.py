@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
-from triaxcal.conditions import conditions_elsewhere
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.pose_fit import fit
 from triaxcal.figures import plain
-from triaxcal.pose_fit import fit
+from triaxcal.poses.conditions import conditions_elsewhere
 from triaxcal.poses.pose import Pose
 
 MISALIGNMENT_RAD, SCALE_FACTOR = 1e-3, 6e-3

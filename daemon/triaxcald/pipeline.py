@@ -11,8 +11,8 @@ import numpy as np
 from triaxcal import text
 from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Held, Pose, held_of, poses_of
-from triaxcal.quality import Finding, QualityDetector, untrusted_poses
-from triaxcal.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
+from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import READINGS, Bundle

@@ -7,10 +7,10 @@ from typing import Any
 
 from triaxcal.agreement import Agreement, Answer, Common, SharedShape
 from triaxcal.calibration_document import Document
-from triaxcal.loop import Loop
-from triaxcal.posterior.shapes import Shape
+from triaxcal.diagnosis import Loop
+from triaxcal.estimate.runs import residuals_by_run
+from triaxcal.evidence.shapes import Shape
 from triaxcal.rounding import chance, error, number, uncertainty
-from triaxcal.runs import residuals_by_run
 from triaxcal.text.agreement import verdict
 from triaxcal.units import in_units_of
 

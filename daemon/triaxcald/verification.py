@@ -1,7 +1,7 @@
 """Verification by physics: |a| in check poses, from the device's own corrected output or under a calibration.
 
-Poses in which the outputs do not follow the acceleration (`triaxcal.quality`) stay in the documents, marked, and count
-for nothing.
+Poses in which the outputs do not follow the acceleration (`triaxcal.poses.quality`) stay in the documents, marked, and
+count for nothing.
 """
 
 from __future__ import annotations

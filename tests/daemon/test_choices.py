@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 
+from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects import effect_of
-from triaxcal.loop import Loop, diagnose
-from triaxcal.planning.directions import directions
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.choices import choices_of
 

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.calibration import Exclusion
 from triaxcal.calibration_document import calibration_document, poses_document
 from triaxcal.calibration_reading import calibration_of, calibration_part, sensor_of
+from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
-from triaxcal.loop import diagnose
-from triaxcal.planning.directions import directions
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.calibration import Exclusion
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import error, number, numbers, probability, uncertainty
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated
 from triaxcald.documents import loop_document, to_text

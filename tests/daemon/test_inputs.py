@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from triaxcal.arrays import Floats
-from triaxcal.planning.directions import FULL, directions, spiral
-from triaxcal.sensor import Sensor
+from triaxcal.model.directions import FULL, directions, spiral
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import SyntheticUnit, Tumble
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.inputs import VERIFICATION, bundle_of, measure, parse_document, read_document

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import effect_named
-from triaxcal.planning.directions import directions
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.likeness import Shape, shape_beside, shape_by_poses, shape_in, shape_of, unlike_shapes
 

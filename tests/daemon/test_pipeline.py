@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from triaxcal.poses.pose import Pose
-from triaxcal.quality import Finding, QualityDetector
-from triaxcal.quality.finding import MissingSamples, StuckOutput
+from triaxcal.poses.quality import Finding, QualityDetector
+from triaxcal.poses.quality.finding import MissingSamples, StuckOutput
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, load_bundle
 from triaxcald.pipeline import Pipeline, together

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import effect_named
-from triaxcal.planning.directions import directions
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.sensor import Sensor
-from triaxcal.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
 from triaxcal.synthetic import noisy_poses
 
 POSE_NOISE_G = 2e-5

@@ -9,13 +9,13 @@ import pytest
 
 from triaxcal.agreement import Agreement, Answer, Common, agreement
 from triaxcal.arrays import Floats
+from triaxcal.diagnosis import Loop, Verdict, diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
-from triaxcal.loop import Loop, Verdict, diagnose
-from triaxcal.planning.directions import directions
+from triaxcal.model.directions import directions
 from triaxcal.poses.pose import Pose
 
 SIGMA_G, HOLD_S, COUNT = 1e-5, 10.0, 26

@@ -12,9 +12,9 @@ import pytest
 
 import triaxcal as tc
 from triaxcal.effects import effect_of
-from triaxcal.planning.directions import directions
-from triaxcal.quality.finding import UNTRUSTED
-from triaxcal.sensor import Sensor
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.quality.finding import UNTRUSTED
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 
 MINUS = (-1, -1, -1)

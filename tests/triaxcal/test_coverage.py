@@ -9,9 +9,9 @@ from scipy import stats
 from benchmarks.coverage import Knowledge, covered, known, own, pooled, unknown
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.errors import InvalidData
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
 from triaxcal.poses.pose import Pose
-from triaxcal.pure_error import pure_error_dof, raised_dof
+from triaxcal.poses.pure_error import pure_error_dof, raised_dof
 
 SEEDS = 220
 CERTAIN = stats.norm.isf(1e-4)

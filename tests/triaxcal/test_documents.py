@@ -14,16 +14,16 @@ import polars as pl
 import pytest
 
 import triaxcal as tc
-from triaxcal.calibration import Calibration as Fitted
-from triaxcal.calibration import HoldsAt, Residual
 from triaxcal.effects import CATALOGUE, Effect
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
 from triaxcal.effects.contract import HELD, SINCE_START, TIME, is_derived
-from triaxcal.moment import Moment
+from triaxcal.estimate.calibration import Calibration as Fitted
+from triaxcal.estimate.calibration import HoldsAt, Residual
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.moment import Moment
+from triaxcal.model.sensor import Sensor
 from triaxcal.pictures import residuals_figure
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
 KNOWN: list[Effect] = [*CATALOGUE, ChannelBias("supply_v"), ChannelScaleFactor("supply_v")]

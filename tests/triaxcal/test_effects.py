@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import triaxcal.effects
+from triaxcal.diagnosis import diagnose
 from triaxcal.effects import CATALOGUE, TIME, Effect, catalogue_for, effect_named, effect_of
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.bias_step import BiasStep
@@ -41,9 +42,8 @@ from triaxcal.effects.plugins import plugins
 from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
-from triaxcal.loop import diagnose
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.text.advice import advice
 from triaxcal.units import ErrorUnit

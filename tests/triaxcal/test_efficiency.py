@@ -8,8 +8,8 @@ from scipy import stats
 
 from benchmarks.efficiency import measure
 from benchmarks.truth import Condition, bound_and_best, conditions, hard, information
-from triaxcal.problem import linearise, solve
-from triaxcal.start import problem_of, start
+from triaxcal.estimate.problem import linearise, solve
+from triaxcal.estimate.start import problem_of, start
 
 FAMILYWISE = 1e-4
 CONDITIONS = {c.name: c for c in conditions()}

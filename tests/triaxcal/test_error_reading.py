@@ -11,9 +11,9 @@ from triaxcal.calibration_document import calibration_document
 from triaxcal.effects import effect_named
 from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.errors import InvalidData
-from triaxcal.planning.directions import cube_directions
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.directions import cube_directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.framing import covariance_of
 

@@ -37,10 +37,10 @@ import triaxcal
 for module in pkgutil.walk_packages(triaxcal.__path__, "triaxcal."):
     __import__(module.name)
 
-from triaxcal.pose_fit import fit
-from triaxcal.loop import diagnose
-from triaxcal.planning.directions import directions
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.diagnosis import diagnose
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
 sensor = Sensor(np.full(3, 2.0), np.zeros(3), np.full(3, 0.01))

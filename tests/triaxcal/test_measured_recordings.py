@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
-from triaxcal.loop import Loop, diagnose
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence import Refusal
+from triaxcal.evidence.unmodelled import What
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.posterior import Refusal
-from triaxcal.posterior.unmodelled import What
-from triaxcal.stillness.detector import StillnessDetector
+from triaxcal.poses.stillness.detector import StillnessDetector
 
 FOLDER = Path(__file__).parents[3] / "shared" / "datasets"
 pytestmark = [

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from triaxcal.calibration import Calibration
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
 SEEDS = 200

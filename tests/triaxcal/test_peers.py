@@ -7,8 +7,8 @@ import pytest
 
 from benchmarks.peers import FACES, cases, ferraris, orthogonal_distance, ours
 from benchmarks.truth import Condition, bound_and_best, plan
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import Sensor
 
 CASES = {c.name: c for c in cases()}
 

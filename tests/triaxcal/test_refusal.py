@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from triaxcal.caution import FewPoses, PoorSpread
 from triaxcal.errors import Refused
-from triaxcal.planning.directions import cube_directions, dilution
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.caution import FewPoses, PoorSpread
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.estimate.start import problem_of, start
+from triaxcal.model.directions import cube_directions, dilution
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.sensor import Sensor
-from triaxcal.start import problem_of, start
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)

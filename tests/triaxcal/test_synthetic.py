@@ -16,7 +16,7 @@ from triaxcal.effects.scale_factor_drift import ScaleFactorDrift
 from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.effects.thermal_gradient import ThermalGradient
 from triaxcal.effects.warm_up import WarmUp
-from triaxcal.sensor import Sensor
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import STANDARD_GRAVITY, Environment, SyntheticUnit, Tumble, noisy_poses
 
 

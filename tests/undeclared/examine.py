@@ -12,12 +12,12 @@ from tests.undeclared.generator import CannotShow, Recording, misses, recording
 from tests.undeclared.imitation import best_imitation
 from tests.undeclared.told import rms_g, told_errors_g
 from tests.undeclared.visible import Linear, told_power
-from triaxcal.held_out import magnitude_errors
-from triaxcal.loop import Loop, diagnose
-from triaxcal.pose_fit import fit
+from triaxcal.diagnosis import Loop, diagnose
+from triaxcal.estimate.held_out import magnitude_errors
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.samples import Samples
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.samples import Samples
-from triaxcal.stillness.detector import StillnessDetector
+from triaxcal.poses.stillness.detector import StillnessDetector
 
 IN_MOTION_S = 0.2
 

@@ -29,7 +29,7 @@ from tests.undeclared.scene import (
     wandering,
 )
 from tests.undeclared.visible import Linear, magnitude, nine_of, standard_errors
-from triaxcal.samples import Samples
+from triaxcal.model.samples import Samples
 
 KINDS = (*physics.KINDS, *uncatalogued.KINDS, *invented.KINDS, *invented_later.KINDS)
 LARGEST_G = 0.05

@@ -26,8 +26,8 @@ class Remanence(Effect):
     offset in proportion to p_i, and one by the way on which the pose was reached.
 
     In the first pose p_i is that of the pose itself, as if the unit had rested there before, and the fit may leave it
-    out (`triaxcal.conditions.of_unknown_history`). A pose with next to no force along the axis leaves next to nothing,
-    though what was before that one may still be there.
+    out (`triaxcal.poses.conditions.of_unknown_history`). A pose with next to no force along the axis leaves next to
+    nothing, though what was before that one may still be there.
     """
 
     name: str = "remanence"

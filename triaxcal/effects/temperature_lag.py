@@ -34,10 +34,10 @@ class TemperatureLag(Effect):
     To the first order θ = T − τ dT/dt, which is a bias by temperature beside one by its rate (`ThermalGradient`); once
     the temperature changes within τ, θ depends on what it was before. A pose does not know that by itself, so θ − T is
     a condition of the poses, derived from all of a recording for certain time constants
-    (`triaxcal.effects.contract.lag_of`, `triaxcal.conditions.behind`): the temperature goes straight from the middle of
-    one pose to that of the next, and stood still before the first. What it did there, nobody knows; that goes out by
-    exp(−t/τ), as a `WarmUp` of the same time constant would. In use, where no lag is given, the temperature counts as
-    settled: θ = T.
+    (`triaxcal.effects.contract.lag_of`, `triaxcal.poses.conditions.behind`): the temperature goes straight from the
+    middle of one pose to that of the next, and stood still before the first. What it did there, nobody knows; that goes
+    out by exp(−t/τ), as a `WarmUp` of the same time constant would. In use, where no lag is given, the temperature
+    counts as settled: θ = T.
 
     A time constant between two of those known has the mean of theirs, weighted by its logarithm, which is right within
     three per cent of the lag; beyond them it counts as the nearest.

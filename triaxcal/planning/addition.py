@@ -10,8 +10,8 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME
+from triaxcal.model.directions import FULL, Direction, cube_directions, dilution, directions, linear_design
 from triaxcal.planning.design import LINEAR, Asked, channels_needed, profile_times
-from triaxcal.planning.directions import FULL, Direction, cube_directions, dilution, directions, linear_design
 from triaxcal.planning.optimal import profile
 
 ENOUGH = 1.25

@@ -9,7 +9,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME, Effect
-from triaxcal.planning.directions import linear_design
+from triaxcal.model.directions import linear_design
 
 SHOWS = 1e-6
 """A combination of coefficients shows at all where this share of it is left beside the nine parameters."""

@@ -18,9 +18,9 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
+from triaxcal.model.directions import Direction, cube_directions, dilution, directions, linear_design
+from triaxcal.model.order import in_order
 from triaxcal.planning.design import LINEAR, Asked, ask, channels_needed, needs_time, profile_times
-from triaxcal.planning.directions import Direction, cube_directions, dilution, directions, linear_design
-from triaxcal.planning.order import in_order
 
 DILUTION_RATIO = 1.5
 """The nine parameters may come out so many times worse than by the plain plan of as many poses."""

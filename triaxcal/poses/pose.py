@@ -13,9 +13,9 @@ from triaxcal.errors import InvalidData
 from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose_noise import PoseNoise, pose_noise
-from triaxcal.stillness.detector import Span
-from triaxcal.stillness.rounded import left_in_means, resolution
-from triaxcal.stillness.windows import Windows
+from triaxcal.poses.stillness.detector import Span
+from triaxcal.poses.stillness.rounded import left_in_means, resolution
+from triaxcal.poses.stillness.windows import Windows
 
 SHAKEN, QUIET = 2.0, 0.1
 """Poses are shaken in which the outputs scatter with so many times the variance of the quietest tenth of them."""
@@ -55,8 +55,8 @@ class Pose:
     either side; ``channel_errors``, ``rate_errors`` and ``bend_errors`` the standard errors of mean, slope and bend
     from the scatter that these leave.
     ``before`` (3,) is the mean of the pose before, None in the first; ``scatter`` (3,) the variance of a sample inside
-    the span, output units squared. ``fault`` is what its samples are to be blamed for (`triaxcal.quality`), if at all:
-    no fit uses such a pose.
+    the span, output units squared. ``fault`` is what its samples are to be blamed for (`triaxcal.poses.quality`), if at
+    all: no fit uses such a pose.
     """
 
     start_s: float

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from triaxcal.diagnosis import Call, Loop, Verdict
 from triaxcal.effects.plugins import package_of
-from triaxcal.figures import moment, plain, the_poses
-from triaxcal.loop import Call, Loop, Verdict
-from triaxcal.posterior.actions import Action, Do
-from triaxcal.posterior.average import Refusal
-from triaxcal.posterior.blind import Blind, Why
-from triaxcal.posterior.unmodelled import What
+from triaxcal.evidence.actions import Action, Do
+from triaxcal.evidence.average import Refusal
+from triaxcal.evidence.blind import Blind, Why
+from triaxcal.evidence.unmodelled import What
+from triaxcal.figures import plain
+from triaxcal.poses.when import moment, the_poses
 from triaxcal.units import ErrorUnit
 
 ALMOST = 0.999

@@ -7,11 +7,13 @@ from functools import singledispatch
 
 import numpy as np
 
-from triaxcal import attitude, extrapolation, passport
-from triaxcal import caution as of_fit
-from triaxcal.figures import micro_g, moment, the_poses
-from triaxcal.frame import faces, frames, orientations, standing
-from triaxcal.turning import rotation
+from triaxcal.estimate import caution as of_fit
+from triaxcal.figures import micro_g
+from triaxcal.frames import faces, frames, orientations, standing
+from triaxcal.inputs import attitude, passport
+from triaxcal.inputs.turning import rotation
+from triaxcal.poses.when import moment, the_poses
+from triaxcal.uncertainty import extrapolation
 
 RAISED = "the standard errors are raised by that"
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from triaxcal.figures import moment
-from triaxcal.loop import Call, Candidate, Finding, Loop, Verdict
-from triaxcal.next_recording import NextRecording, Source
+from triaxcal.diagnosis import Call, Candidate, Finding, Loop, Verdict
+from triaxcal.evidence.average import Refusal
+from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.poses.pose import Began
-from triaxcal.posterior.average import Refusal
-from triaxcal.posterior.findings import Findings, Unexplained
+from triaxcal.poses.when import moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
+from triaxcal.uncertainty.next_recording import NextRecording, Source
 from triaxcal.units import ErrorUnit
 
 __all__ = ["advice", "call", "cause", "chance", "errors", "lines", "reason", "unexplained"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from triaxcal.calibration import HoldsAt
 from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import (
     DERIVED,
@@ -18,8 +17,9 @@ from triaxcal.effects.contract import (
     lag_in,
     rate_of,
 )
+from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.figures import plain
-from triaxcal.moment import Moment
+from triaxcal.model.moment import Moment
 
 
 def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several: bool = False) -> tuple[str, ...]:

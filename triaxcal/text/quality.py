@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import singledispatch
 
-from triaxcal.quality import finding as of
+from triaxcal.poses.quality import finding as of
 
 POSES_NAMED = 8
 """So many poses are named by when they begin; the others are counted."""

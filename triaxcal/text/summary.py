@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from triaxcal.calibration import Calibration
 from triaxcal.effects.contract import SINCE_START, TIME
+from triaxcal.estimate.calibration import Calibration
 from triaxcal.poses.pose import Pose
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 

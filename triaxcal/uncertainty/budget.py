@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
 from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects import TEMPERATURE
-from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.poses.pure_error import LACK_OF_FIT
 from triaxcal.uncertainty.basis import (
     NotEvaluated,
     PosesWithoutScatter,
@@ -71,7 +71,7 @@ class Budget:
 
 
 def budget(calibration: Calibration, stated: Stated | None = None, level: float = LEVEL) -> Budget:
-    """The budget of a calibration fitted to still poses (`triaxcal.pose_fit.fit`)."""
+    """The budget of a calibration fitted to still poses (`triaxcal.estimate.pose_fit.fit`)."""
     stated = stated or Stated()
     linearised = Linearised(calibration)
     thermal, beyond = temperature(calibration, linearised, stated)

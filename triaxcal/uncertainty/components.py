@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
+from triaxcal.estimate.calibration import Calibration
 from triaxcal.poses.pose import Pose
-from triaxcal.pure_error import pure_error_dof
+from triaxcal.poses.pure_error import pure_error_dof
 from triaxcal.uncertainty.basis import (
     AveragedModels,
     Basis,

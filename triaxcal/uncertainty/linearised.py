@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.beyond import Beyond
-from triaxcal.calibration import Calibration
-from triaxcal.conditions import at_moment
-from triaxcal.planning.directions import spiral
-from triaxcal.problem import Problem, State, by_shape, everything, linearise, parameters_by_theta
-from triaxcal.start import problem_of, with_history
-from triaxcal.trends import with_trends
+from triaxcal.estimate.beyond import Beyond
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.problem import Problem, State, by_shape, everything, linearise, parameters_by_theta
+from triaxcal.estimate.start import problem_of, with_history
+from triaxcal.estimate.trends import with_trends
+from triaxcal.model.directions import spiral
+from triaxcal.poses.conditions import at_moment
 
 SPHERE = 200
 
@@ -46,7 +46,7 @@ class Linearised:
         self.gain = held_gain(self.weighted, calibration.spread)
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
-        """(p,n): shift of the parameters for an error of each residual (`triaxcal.problem.everything`)."""
+        """(p,n): shift of the parameters for an error of each residual (`triaxcal.estimate.problem.everything`)."""
         self.up = spiral(SPHERE) * calibration.reference
         """(m,3) specific force all over the sphere."""
         self.sphere = self._sphere(calibration, {})

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.errors import InvalidData
-from triaxcal.gravity import local_gravity_g
+from triaxcal.model.gravity import local_gravity_g
 from triaxcal.uncertainty.basis import StatedReference
 
 
@@ -40,8 +40,8 @@ class Stated:
         thermometer_k: float | None = None,
         thermal_sensitivity: float | None = None,
     ) -> Stated:
-        """Where the reference is gravity by `triaxcal.gravity`: a stated uncertainty, in g, comes before that of the
-        formula. Without a place, what is stated."""
+        """Where the reference is gravity by `triaxcal.model.gravity`: a stated uncertainty, in g, comes before that of
+        the formula. Without a place, what is stated."""
         if latitude_deg is None or height_m is None:
             return cls(reference, thermometer_k=thermometer_k, thermal_sensitivity=thermal_sensitivity)
         basis = StatedReference(latitude_deg, height_m, stated=reference is not None)

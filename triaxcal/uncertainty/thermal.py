@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
 from triaxcal.effects import CATALOGUE, TEMPERATURE, Effect
-from triaxcal.problem import everything
-from triaxcal.pure_error import LACK_OF_FIT
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.problem import everything
+from triaxcal.poses.pure_error import LACK_OF_FIT
 from triaxcal.uncertainty.basis import (
     PosesAtOtherTemperatures,
     ProbableTemperature,

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from triaxcal.gravity import HEIGHTS_M
-from triaxcal.moment import Moment
+from triaxcal.model.gravity import HEIGHTS_M
+from triaxcal.model.moment import Moment
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.tables.naming import TIME_UNITS, parse_columns

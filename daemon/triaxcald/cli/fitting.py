@@ -10,10 +10,10 @@ from pathlib import Path
 from triaxcal import text
 from triaxcal.agreement import agreement
 from triaxcal.calibration_document import Document, calibration_document
+from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
-from triaxcal.loop import Loop, diagnose
-from triaxcal.moment import Moment
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import writable

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration import Calibration
-from triaxcal.conditions import channels_of
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.estimate.start import rough_directions, wanted_for
+from triaxcal.model.directions import FULL, cube_directions, most_wanted
 from triaxcal.planning.addition import ENOUGH, Addition, Had, additions
 from triaxcal.planning.design import ask, channels_needed, profile_times
-from triaxcal.planning.directions import FULL, cube_directions, most_wanted
-from triaxcal.pose_fit import fit
+from triaxcal.poses.conditions import channels_of
 from triaxcal.poses.pose import Pose
-from triaxcal.start import rough_directions, wanted_for
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from triaxcal.calibration_document import Document
 from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
 from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER, lag_in
 from triaxcal.errors import InvalidData
+from triaxcal.model.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
 from triaxcal.planning.addition import Addition
 from triaxcal.planning.clock import in_plan
 from triaxcal.planning.design import Asked, ask, needs_time
-from triaxcal.planning.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
 from triaxcal.planning.optimal import OptimalPlan, optimal
+from triaxcal.planning.visibility import Sight, sight, unseen_effects
 from triaxcal.rounding import number, numbers, uncertainty
-from triaxcal.visibility import Sight, sight, unseen_effects
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.lacking import Lacking, lacking
 from triaxcald.cli.showing import chosen, counted, read_recording, telling_data_quality, warn

@@ -9,10 +9,10 @@ from itertools import combinations
 from pathlib import Path
 
 from triaxcal.agreement import Agreement, Answer
+from triaxcal.diagnosis import Loop
 from triaxcal.errors import Refused
+from triaxcal.estimate.runs import residuals_by_run, together
 from triaxcal.figures import plain
-from triaxcal.loop import Loop
-from triaxcal.runs import residuals_by_run, together
 from triaxcal.text import diagnosis
 from triaxcal.text.agreement import verdict
 from triaxcald.cli.console import table

@@ -11,9 +11,9 @@ from typing import Any
 from triaxcal.documents import Calibration
 from triaxcal.effects.contract import channel_of
 from triaxcal.errors import Refused
-from triaxcal.gravity import local_gravity_g
+from triaxcal.inputs.turning.moments import Moments
+from triaxcal.model.gravity import local_gravity_g
 from triaxcal.poses.pose import Pose
-from triaxcal.turning.moments import Moments
 from triaxcal.uncertainty import Stated
 from triaxcal.units import ErrorUnit, reference_unit_of
 from triaxcald.cli.console import say, table

@@ -9,14 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from triaxcal.attitude import AttitudeFit, fit_attitudes
-from triaxcal.calibration import Calibration
 from triaxcal.calibration_document import Document
 from triaxcal.errors import Refused
+from triaxcal.estimate.calibration import Calibration
 from triaxcal.figures import probability
-from triaxcal.passport import Refinement, refine
-from triaxcal.turning.moments import Moments
-from triaxcal.turning.rotation import RotationFit, fit_rotation
+from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
+from triaxcal.inputs.passport import Refinement, refine
+from triaxcal.inputs.turning.moments import Moments
+from triaxcal.inputs.turning.rotation import RotationFit, fit_rotation
 from triaxcald import ways_in
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import micro, table

@@ -9,7 +9,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects import effect_of
 from triaxcal.errors import Refused
-from triaxcal.sensor import Sensor
+from triaxcal.model.sensor import Sensor
 from triaxcal_drivers.profile import Profile
 from triaxcald.provision.image import REFERENCE_ROLE
 from triaxcald.provision.plausible import Doubt

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from triaxcal.calibration import Exclusion
 from triaxcal.calibration_document import WEIGHT
+from triaxcal.estimate.calibration import Exclusion
 from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names
@@ -152,7 +152,7 @@ class Outcome:
 
 def read_document(document: Mapping[str, object]) -> Outcome:
     """The outcome that `document` describes; whatever is missing or of the wrong kind counts as missing."""
-    looped = str(document.get("format", "")).startswith("triaxcal.loop/")
+    looped = str(document.get("format", "")).startswith("triaxcal.diagnosis/")
     calibration = mapping(document.get("calibration")) if looped else document
     matrix, centre = _matrix(calibration.get("matrix")), vector(calibration.get("centre"))
     names = file_names(texts(document.get("recordings")))

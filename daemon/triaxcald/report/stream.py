@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from triaxcal.poses.pose import Pose
-from triaxcal.stillness.detector import Windows
+from triaxcal.poses.stillness.detector import Windows
 
 
 @dataclass(frozen=True)

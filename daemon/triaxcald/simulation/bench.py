@@ -15,8 +15,8 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import effect_named, effect_of
 from triaxcal.effects.contract import Effect, channel_of
 from triaxcal.errors import InvalidData
-from triaxcal.planning.directions import directions, elsewhere
-from triaxcal.sensor import Sensor
+from triaxcal.model.directions import directions, elsewhere
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import CONDITIONS, Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.catalogue import driver_named

@@ -10,7 +10,7 @@ from typing import Any, Protocol, cast
 
 from triaxcal.arrays import Floats
 from triaxcal.errors import Refused
-from triaxcal.planning.directions import directions
+from triaxcal.model.directions import directions
 from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Device, RawBatch

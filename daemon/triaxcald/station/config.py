@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, FailFast, Field, model_validator
 
 from triaxcal.effects import CATALOGUE
-from triaxcal.gravity import local_gravity_g
-from triaxcal.moment import Moment
+from triaxcal.model.gravity import local_gravity_g
+from triaxcal.model.moment import Moment
 from triaxcal.uncertainty import Stated
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.claim import claim_of
@@ -123,7 +123,7 @@ class StationFile(Strict):
 
     @property
     def moment(self) -> Moment | float:
-        """As `triaxcal.loop.diagnose` has it."""
+        """As `triaxcal.diagnosis.diagnose` has it."""
         return Moment(self.holds_at) if isinstance(self.holds_at, str) else self.holds_at
 
     def stated(self, profile: Profile) -> Stated:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.planning.directions import Direction, directions, elsewhere
+from triaxcal.model.directions import Direction, directions, elsewhere
 from triaxcal.poses.pose import Held
 
 COVERED_DEG = 25.0

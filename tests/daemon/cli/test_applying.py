@@ -12,8 +12,8 @@ import pytest
 
 import triaxcal as tc
 from triaxcal.effects import effect_of
-from triaxcal.planning.directions import directions
-from triaxcal.sensor import Sensor
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.calibration import Residual
-from triaxcal.planning.directions import spiral
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.calibration import Residual
+from triaxcal.model.directions import spiral
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcal.units import ErrorUnit
 from triaxcald.cli.results import cross_validated

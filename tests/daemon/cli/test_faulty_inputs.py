@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.planning.directions import directions
+from triaxcal.model.directions import directions
 from triaxcald.recording.frames import MAGIC
 
 Run = Callable[..., Any]

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.planning.directions import cube_directions
-from triaxcal.sensor import Sensor
+from triaxcal.model.directions import cube_directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Tumble
 from triaxcald.recording.reader import Recording
 

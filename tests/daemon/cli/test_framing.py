@@ -15,10 +15,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from triaxcal.effects import effect_named
-from triaxcal.frame.faces import LABELS, axis_of
-from triaxcal.frame.synthetic_fixture import SyntheticFixture
-from triaxcal.planning.directions import directions
-from triaxcal.sensor import Sensor
+from triaxcal.frames.faces import LABELS, axis_of
+from triaxcal.frames.synthetic_fixture import SyntheticFixture
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcald.cli.commands import main
 
 Run = Callable[..., Any]

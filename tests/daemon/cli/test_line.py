@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects.third_order_nonlinearity import ThirdOrderNonlinearity
-from triaxcal.loop import Loop, diagnose
+from triaxcal.model.sensor import Sensor
 from triaxcal.planning import directions
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcald.certificate import Certified
 from triaxcald.cli.line import show_outcome

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.planning.directions import directions
-from triaxcal.sensor import Sensor
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
 from triaxcald.cli.arguments import parsed
 from triaxcald.cli.commands import parser

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.planning.directions import directions
+from triaxcal.model.directions import directions
 
 Run = Callable[..., Any]
 HZ, HOLD = 50, 200

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.planning.directions import directions, elsewhere
+from triaxcal.model.directions import directions, elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcald.station.guidance import Guide, guide
 

@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from triaxcal.effects import Effect
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
 SIGMA_G = 1.5e-5

@@ -8,16 +8,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.compression import KINDS, KNEES, Compression
 from triaxcal.effects.contract import BEFORE
-from triaxcal.loop import diagnose
-from triaxcal.planning.directions import directions
-from triaxcal.pose_fit import fit
-from triaxcal.posterior.blind import Blind, Why
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.blind import Blind, Why
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
+from triaxcal.planning.visibility import sight
 from triaxcal.synthetic import noisy_poses
-from triaxcal.visibility import sight
 
 MINUS = (-1, -1, -1)
 TRUTH = [3e-3, -2e-3, 4e-3]

@@ -7,16 +7,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.fifth_order_nonlinearity import FifthOrderNonlinearity
-from triaxcal.loop import diagnose
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.blind import Blind, Why
+from triaxcal.model.directions import directions, linear_design
+from triaxcal.model.sensor import Sensor
 from triaxcal.planning.design import combinations, radial
-from triaxcal.planning.directions import directions, linear_design
-from triaxcal.pose_fit import fit
-from triaxcal.posterior.blind import Blind, Why
-from triaxcal.sensor import Sensor
+from triaxcal.planning.visibility import sight
 from triaxcal.synthetic import noisy_poses
-from triaxcal.visibility import sight
 
 MINUS = (-1, -1, -1)
 TRUTH = [4e-4, -3e-4, 6e-4]

@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from triaxcal.calibration import Exclusion
-from triaxcal.conditions import of_unknown_history
+from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.contract import BEFORE
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.remanence import Remanence
-from triaxcal.loop import diagnose
-from triaxcal.pose_fit import fit
-from triaxcal.posterior.blind import Blind, Why
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.calibration import Exclusion
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.blind import Blind, Why
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.conditions import of_unknown_history
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.scale_factor_drift import ScaleFactorDrift
-from triaxcal.loop import diagnose
-from triaxcal.pose_fit import fit
-from triaxcal.posterior.blind import Blind, Why
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.blind import Blind, Why
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)

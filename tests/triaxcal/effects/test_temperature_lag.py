@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from triaxcal.conditions import behind, channels_of, conditions_elsewhere, lags_for
-from triaxcal.creep import with_creep_left
+from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.contract import LAGS_S, RUN, SINCE_START, lag_in, lag_of
 from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.errors import InvalidData
-from triaxcal.loop import diagnose
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.creep import with_creep_left
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.blind import Blind, Why
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.conditions import behind, channels_of, conditions_elsewhere, lags_for
 from triaxcal.poses.pose import Pose, Run
-from triaxcal.posterior.blind import Blind, Why
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble, noisy_poses
 
 MINUS = (-1, -1, -1)

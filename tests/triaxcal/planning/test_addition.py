@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import Effect, effect_named
+from triaxcal.model.directions import cube_directions, dilution, directions, linear_design, most_wanted
 from triaxcal.planning.addition import ENOUGH, Addition, Had, additions
 from triaxcal.planning.design import ask
-from triaxcal.planning.directions import cube_directions, dilution, directions, linear_design, most_wanted
 
 SECOND, THIRD = effect_named("second_order_nonlinearity"), effect_named("third_order_nonlinearity")
 WARM, DRIFT = effect_named("temperature_bias"), effect_named("bias_drift")

@@ -13,12 +13,12 @@ from scipy import stats
 from triaxcal.effects import CATALOGUE, Coefficient, Effect, effect_named
 from triaxcal.effects.contract import per_axis, per_axis_slope
 from triaxcal.errors import Refused
+from triaxcal.estimate.problem import solve
+from triaxcal.estimate.start import problem_of, start
+from triaxcal.model.directions import cube_directions, dilution, directions, distinct
+from triaxcal.model.sensor import Sensor
 from triaxcal.planning.design import ask
-from triaxcal.planning.directions import cube_directions, dilution, directions, distinct
 from triaxcal.planning.optimal import OptimalPlan, bound, optimal
-from triaxcal.problem import solve
-from triaxcal.sensor import Sensor
-from triaxcal.start import problem_of, start
 from triaxcal.synthetic import noisy_poses
 
 SECOND, THIRD = effect_named("second_order_nonlinearity"), effect_named("third_order_nonlinearity")

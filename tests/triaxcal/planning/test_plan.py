@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from triaxcal.errors import InvalidData
-from triaxcal.planning.directions import (
+from triaxcal.model.directions import (
     closed,
     cube_directions,
     dilution,

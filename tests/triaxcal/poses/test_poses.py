@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from triaxcal.errors import InvalidData
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose, poses_of
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import Tumble
 
 Detect = Callable[..., tuple[object, object, list[Pose]]]

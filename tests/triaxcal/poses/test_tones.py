@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from triaxcal.coloured_noise import first_order, white
+from triaxcal.poses.coloured_noise import first_order, white
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose import poses_of
+from triaxcal.poses.stillness.detector import Span
+from triaxcal.poses.stillness.windows import WindowCutter
 from triaxcal.poses.tones import without_tones
-from triaxcal.stillness.detector import Span
-from triaxcal.stillness.windows import WindowCutter
 
 NOISES = [(white, ()), (first_order, (5.0,))]
 

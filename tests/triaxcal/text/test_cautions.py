@@ -8,8 +8,7 @@ import pkgutil
 import pytest
 
 import triaxcal
-from triaxcal.attitude import AttitudeExcluded, AttitudesTied, MagnitudeContradicts, Row
-from triaxcal.caution import (
+from triaxcal.estimate.caution import (
     BirgeRatio,
     Caution,
     ExcessVariance,
@@ -23,12 +22,13 @@ from triaxcal.caution import (
     PosesExcludedByCaller,
     UnknownHistoryExcluded,
 )
-from triaxcal.frame.orientations import NotFlush
-from triaxcal.frame.standing import SingleOrientation
-from triaxcal.passport import DatasheetContradicted, StillOfDatasheet
+from triaxcal.frames.orientations import NotFlush
+from triaxcal.frames.standing import SingleOrientation
+from triaxcal.inputs.attitude import AttitudeExcluded, AttitudesTied, MagnitudeContradicts, Row
+from triaxcal.inputs.passport import DatasheetContradicted, StillOfDatasheet
+from triaxcal.inputs.turning.rotation import StretchesDiffer
 from triaxcal.poses.pose import Began
 from triaxcal.text import caution
-from triaxcal.turning.rotation import StretchesDiffer
 
 FIRST, SECOND = Began(10.0), Began(70.04, recording=1)
 SENTENCES: list[tuple[Caution, str]] = [

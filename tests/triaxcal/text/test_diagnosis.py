@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from triaxcal.loop import Call, Candidate, Finding, Verdict
-from triaxcal.next_recording import NextRecording, Source
+from triaxcal.diagnosis import Call, Candidate, Finding, Verdict
+from triaxcal.evidence.average import Refusal
+from triaxcal.evidence.findings import Another, Findings, Unexplained
+from triaxcal.evidence.unmodelled import What
 from triaxcal.poses.pose import Began
-from triaxcal.posterior.average import Refusal
-from triaxcal.posterior.findings import Another, Findings, Unexplained
-from triaxcal.posterior.unmodelled import What
 from triaxcal.text import diagnosis
+from triaxcal.uncertainty.next_recording import NextRecording, Source
 from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)

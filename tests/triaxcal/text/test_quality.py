@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcal.quality.finding import (
+from triaxcal.poses.quality.finding import (
     AtRail,
     CoarseQuantization,
     DuplicateSamples,

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from triaxcal.calibration import Calibration
 from triaxcal.effects import effect_named
-from triaxcal.planning.directions import directions
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.directions import directions
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import SENSITIVITY_PER_K, Stated, budget
 from triaxcal.uncertainty.basis import ReferenceTakenAsExact, SingleReading, TemperatureNotLogged

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.truth import PAPER_UNIT, Condition, plan
-from triaxcal.loop import diagnose
-from triaxcal.moment import Moment
+from triaxcal.diagnosis import diagnose
+from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.basis import AveragedModels

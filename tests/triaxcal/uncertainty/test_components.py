@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from triaxcal.effects import effect_named
-from triaxcal.pose_fit import fit
-from triaxcal.sensor import Sensor
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Stated, budget
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import effect_named
-from triaxcal.pose_fit import fit
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Component, Stated, budget
 from triaxcal.uncertainty.basis import (

@@ -1,0 +1,18 @@
+"""The table of constants in the documentation is the one in the code."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+from triaxcal.evidence import Odds
+
+PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "what-acts.md"
+
+
+def test_the_documentation_has_every_constant_with_its_value() -> None:
+    told = {}
+    for names, values in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", PAGE.read_text(), re.MULTILINE):
+        told |= dict(zip(re.findall(r"`(\w+)`", names), map(float, values.split(", ")), strict=True))
+    assert told == {field.name: float(getattr(Odds(), field.name)) for field in fields(Odds)}

@@ -1,0 +1,227 @@
+"""Close the loop: what acts beyond the linear model, with which probability, and what the error becomes with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+
+from triaxcal.effects.contract import Effect
+from triaxcal.effects.plugins import plugins
+from triaxcal.errors import Refused
+from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
+from triaxcal.estimate.held_out import HeldOut, held_out
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.evidence.advice import Advice, advice, decided
+from triaxcal.evidence.average import Refusal, average, refusal
+from triaxcal.evidence.blind import Blind, blind_to
+from triaxcal.evidence.corrected import corrected
+from triaxcal.evidence.findings import Findings, Named, findings
+from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.posterior import Posterior, looked_for, posterior
+from triaxcal.evidence.terms import faults_of
+from triaxcal.model.moment import Moment
+from triaxcal.poses.pose import Pose
+from triaxcal.uncertainty import budget
+from triaxcal.uncertainty.next_recording import START_TO_START, NextRecording, next_recording
+
+Coefficients = Mapping[str, tuple[float, float | None, str]]
+"""Name → value, standard error, unit."""
+
+
+class Verdict(StrEnum):
+    ADOPTED = "adopted"
+    """Known, and corrected."""
+    CONFOUNDED = "confounded"
+    """One of several acts; or it is known, and no effect is corrected (`Loop.refusal`)."""
+
+
+class Call(StrEnum):
+    """What to do with the calibration."""
+
+    USABLE = "usable"
+    """What acts is known and corrected, or nothing does."""
+    RECORD_MORE = "record_more"
+    """What acts is not known for certain, and poses could tell; or the calibration is less certain than the unit comes
+    back after a start."""
+    INVESTIGATE = "investigate"
+    """Something acts that no effect describes, or this is not one unit in one mounting."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that acts for certain, alone or as the likeliest of ``alternatives``, each with its probability;
+    ``together`` is that of at least one of them. The ``coefficients`` are those that are corrected, or else those if it
+    is this effect that acts; ``remedy`` is how to be rid of it."""
+
+    effect: str
+    verdict: Verdict
+    probability: float
+    alternatives: Mapping[str, float]
+    coefficients: Coefficients
+    remedy: str
+    together: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that acts more likely than not, and not for certain: with the ``coefficients`` if it acts."""
+
+    effect: str
+    probability: float
+    coefficients: Coefficients
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The closed loop. ``before`` is the linear calibration, ``after`` the one that is handed on; ``found`` all that is
+    read off the posterior. ``blind`` are effects that these poses cannot show in full, ``faulty`` those of other
+    packages that cannot be used, each with the reason."""
+
+    before: Calibration
+    after: Calibration
+    found: Findings
+    findings: tuple[Finding, ...]
+    candidates: tuple[Candidate, ...]
+    refusal: Refusal | None
+    held_out: HeldOut | None
+    blind: Mapping[str, Blind]
+    faulty: Mapping[str, str]
+    seen: Posterior = field(repr=False, compare=False)
+
+    @property
+    def probabilities(self) -> Mapping[str, float]:
+        """That each effect acts, whatever else does, the likeliest first."""
+        return self.seen.of_names
+
+    @cached_property
+    def advice(self) -> Advice:
+        """What to record next; nothing where that cannot be told."""
+        try:
+            return advice(self.seen)
+        except Refused:  # the model has no inverse in poses to come
+            return Advice((), 0.0, 0.0, {})
+
+    @cached_property
+    def next_recording(self) -> NextRecording:
+        """As the recording tells by itself, without what a station knows of its reference."""
+        return next_recording(self.after, budget(self.after))
+
+    @cached_property
+    def too_uncertain(self) -> bool:
+        """Whether more poses would make the next recording better, whatever acts: the calibration's own uncertainty is
+        more than half of what is expected there of a usual unit."""
+        known = max(self.next_recording.start_to_start, START_TO_START * self.after.reference)
+        return bool(self.next_recording.standard > np.sqrt(2) * known)
+
+    @cached_property
+    def call(self) -> Call:
+        if self.refusal in (Refusal.UNMODELLED, Refusal.ANOTHER):
+            return Call.INVESTIGATE
+        known = decided(self.seen) and not self.candidates
+        more = self.too_uncertain or self.found.outliers or (not known and self.advice.actions)
+        return Call.RECORD_MORE if more else Call.USABLE
+
+
+def diagnose(
+    poses: Sequence[Pose],
+    *,
+    signs: Sequence[float] = (1, 1, 1),
+    reference: float = 1.0,
+    check: Sequence[Pose] | None = None,
+    catalogue: Sequence[Effect] | None = None,
+    at: Moment | float = Moment.END,
+    odds: Odds | None = None,
+) -> Loop:
+    """Find and correct the effects that still poses show beyond the linear model.
+
+    ``catalogue`` are the effects to look for: all that are known for these poses' channels where it is None. ``check``
+    are poses of another recording, for the held-out error. ``at`` is the moment of the recording for which the
+    calibration holds elsewhere: a number in seconds from the first sample. Raises as `triaxcal.estimate.pose_fit.fit`
+    does.
+    """
+    linear = fit(poses, signs=signs, reference=reference)
+    sound = [p for p in poses if not p.fault]
+    moment = HoldsAt.of(sound, at)
+    if moment is None:
+        raise Refused("no pose without a fault")
+    seen = posterior(poses, linear, signs=signs, catalogue=catalogue, odds=odds)
+    before = replace(_without_outliers(poses, linear, signs, seen), holds_at=moment)
+    effects = looked_for(poses, catalogue)
+    faulty = faults_of(seen.evidence.rows, effects)
+    blind = blind_to(seen.evidence, [e for e in effects if e.name not in faulty])
+    before, after = (c.with_blind_to(tuple(blind)) for c in (before, corrected(before, seen, moment)))
+    found, refused = findings(seen), refusal(seen)
+    told = _Told(seen, moment, after)
+    sound_check = None if check is None else [p for p in check if not p.fault]
+    return Loop(
+        before=before,
+        after=after,
+        found=found,
+        findings=tuple(told.finding(named, refused) for named in found.named),
+        candidates=tuple(Candidate(name, p, told.given(name)[0]) for name, p in found.candidates.items()),
+        refusal=refused,
+        held_out=None if sound_check is None else held_out(before, after, sound_check),
+        blind=blind,
+        faulty=(dict(plugins()[1]) if catalogue is None else {}) | faulty,
+        seen=seen,
+    )
+
+
+def _without_outliers(
+    poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], seen: Posterior
+) -> Calibration:
+    """The linear calibration without the poses that are outliers whatever else acts, and with all others."""
+    likely = {int(i): float(p) for i, p in zip(seen.evidence.rows.places, seen.of_outliers, strict=True)}
+    outliers = [i for i, p in likely.items() if p >= seen.evidence.odds.reported]
+    if outliers != [i for i, p in enumerate(linear.poses) if p.excluded == Exclusion.OUTLIER]:
+        with suppress(Refused):  # the others may not carry a fit
+            linear = fit(poses, signs=signs, reference=linear.reference, aside=outliers, why=Exclusion.OUTLIER)
+    return replace(
+        linear, poses=tuple(replace(p, outlier_probability=likely.get(i)) for i, p in enumerate(linear.poses))
+    )
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What is told of an effect of this name: as it is in ``after``, or as it would be if it acted."""
+
+    seen: Posterior
+    moment: HoldsAt
+    after: Calibration
+
+    def finding(self, named: Named, refused: Refusal | None) -> Finding:
+        probabilities = named.probabilities
+        name, *others = probabilities
+        adopted = not others and refused is None
+        coefficients, remedy = self._corrected(name) if adopted else self.given(name)
+        return Finding(
+            effect=name,
+            verdict=Verdict.ADOPTED if adopted else Verdict.CONFOUNDED,
+            probability=probabilities[name],
+            alternatives={other: probabilities[other] for other in others},
+            coefficients=coefficients,
+            remedy=remedy,
+            together=named.together,
+        )
+
+    def given(self, name: str) -> tuple[Coefficients, str]:
+        """If it acts."""
+        made = average(self.seen.given(name), self.moment)
+        reference = self.seen.evidence.rows.problem.channel_reference
+        c = replace(self.after, sensor=made.sensor, covariance=made.covariance, channel_reference=reference)
+        return self._of(c, name)
+
+    def _corrected(self, name: str) -> tuple[Coefficients, str]:
+        return self._of(self.after, name)
+
+    def _of(self, c: Calibration, name: str) -> tuple[Coefficients, str]:
+        effect, q = next((e, q) for e, q in c.sensor.effects if e.name == name)
+        floor = self.after.residual.noise_floor_g
+        if not effect.coefficients[0].unit.startswith("g"):
+            floor /= c.reference  # the effect is a share of the magnitude
+        return c.coefficients_of(name), effect.advice(float(abs(q).max()), floor)

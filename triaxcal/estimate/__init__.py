@@ -1,0 +1,1 @@
+"""From poses to a calibration: closed form, maximum likelihood, outliers, cross-validation."""

@@ -1,0 +1,122 @@
+"""The poses that a fit leaves out: which these are, and what the calibration of the others says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from triaxcal.arrays import Ints
+from triaxcal.estimate.beyond import Beyond
+from triaxcal.estimate.calibration import Calibration, Exclusion, PoseResult
+from triaxcal.estimate.caution import (
+    Caution,
+    FaultyPosesExcluded,
+    Outlier,
+    OutlierSetsTied,
+    OutliersExcluded,
+    PosesExcludedByCaller,
+    UnknownHistoryExcluded,
+)
+from triaxcal.estimate.outliers import Spoiled, not_as_foretold, spoiled
+from triaxcal.estimate.problem import Problem, State, linearise, solve
+from triaxcal.poses.conditions import of_unknown_history
+from triaxcal.poses.pose import Pose
+from triaxcal.poses.pure_error import of_both, pose_dof, pure_error_dof
+
+SPOILED_ROUNDS = 4
+
+
+def spoiled_among(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
+    """Indices of spoiled poses, from the fit to all. Sought anew without those found, until the same are found again:
+    a pose spoiled by a thousand times its noise bends the fit so far that linear reckoning is off.
+
+    What the others show beside their noise, all are taken to have: by the noise alone the quietest would look spoiled.
+    """
+    own, together = pose_dof(poses), pure_error_dof(poses)
+    dof, pure, judged, found = own, together, problem, Spoiled()
+    for _ in range(SPOILED_ROUNDS):
+        r, J, s = linearise(judged, state)
+        again = spoiled(r / s, J / s[:, None], dof, pure)
+        if again.rows == found.rows:
+            return again
+        found = again
+        rest: Ints = np.delete(np.arange(len(poses)), found.rows)
+        others, left = problem.only(rest), len(rest) - len(state.theta)
+        state = solve(others, state, state.effects)
+        judged = replace(problem, excess=Beyond.shown(linearise(others, state), len(rest), left, together).excess_g)
+        share = judged.excess**2 / linearise(judged, state)[2] ** 2
+        dof, pure = of_both(share, left, own), float(of_both(share.mean(), left, together))
+    return found
+
+
+def of_another_history(
+    problem: Problem, state: State, poses: Sequence[Pose], aside: tuple[int, ...]
+) -> tuple[int, ...]:
+    """Poses, besides those ``aside``, that are not as if the unit had rested there before; what was is not known."""
+    if not (unknown := set(of_unknown_history(poses, state.effects)) - set(aside)):
+        return ()
+    rest: Ints = np.delete(np.arange(len(poses)), aside)
+    problem = problem.only(rest)
+    r, J, s = linearise(problem, solve(problem, state, state.effects))
+    rows = [k for k, i in enumerate(rest) if i in unknown]
+    found = not_as_foretold(r / s, J / s[:, None], pure_error_dof([poses[i] for i in rest]), rows)
+    return tuple(int(rest[k]) for k in found)
+
+
+def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
+    """A calibration from the sound ones of ``poses`` with the faulty ones among its results, and a caution."""
+    faulty = [i for i, p in enumerate(poses) if p.fault]
+    if not faulty:
+        return calibration
+    caution = FaultyPosesExcluded(tuple((poses[i].began, poses[i].fault) for i in faulty))
+    results, _ = _among(calibration, poses, dict.fromkeys(faulty, Exclusion.FAULT))
+    return replace(calibration, poses=results, cautions=(caution, *calibration.cautions))
+
+
+def _among(
+    calibration: Calibration, poses: Sequence[Pose], reasons: Mapping[int, Exclusion]
+) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
+    """The results of a calibration with those of further poses left out among them, by rows of all; and these."""
+    u = np.array([p.mean for p in poses])
+    conditioned = calibration.conditions_of(poses)
+    length, by_u = calibration.sensor.magnitude(u, conditioned)
+    a = calibration.sensor.specific_force(u, conditioned)
+    results, added = list(calibration.poses), []
+    for i, reason in sorted(reasons.items()):
+        noise = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
+        error = float(np.hypot(noise, calibration.excess_g))
+        miss = float(length[i] - calibration.reference)
+        added.append(PoseResult(poses[i], a[i] / np.linalg.norm(a[i]), miss, noise, miss / error, 0.0, reason, error))
+        results.insert(i, added[-1])
+    return tuple(results), added
+
+
+def with_aside(
+    calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: Spoiled, why: Exclusion
+) -> Calibration:
+    """The calibration with the poses left out among its results, in order of time, and cautions that name them: those
+    that an effect knows no history of, and else as ``why`` says."""
+    unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects]) if why != Exclusion.CALLER else ()
+    results, added = _among(calibration, poses, {i: Exclusion.UNKNOWN_HISTORY if i in unknown else why for i in rows})
+
+    def those(reason: Exclusion) -> tuple[Outlier, ...]:
+        return tuple(Outlier(p.pose.began, p.studentized) for p in added if p.excluded == reason)
+
+    cautions: list[Caution] = []
+    if excused := those(Exclusion.UNKNOWN_HISTORY):
+        cautions.append(UnknownHistoryExcluded(excused))
+    if wanted := those(Exclusion.CALLER):
+        cautions.append(PosesExcludedByCaller(wanted))
+    if outliers := those(Exclusion.OUTLIER):
+        cautions.append(OutliersExcluded(outliers, verdict.doubtful, calibration.excess_g / calibration.reference))
+    return replace(calibration, poses=results, cautions=(*cautions, *calibration.cautions))
+
+
+def with_rivals(calibration: Calibration, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
+    """The calibration with a caution of sets of poses one of which may be spoiled, where nobody can tell which."""
+    if not verdict.rivals:
+        return calibration
+    tied = OutlierSetsTied(tuple(tuple(poses[i].began for i in rows) for rows in verdict.rivals))
+    return replace(calibration, cautions=(tied, *calibration.cautions))

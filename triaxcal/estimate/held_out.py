@@ -1,0 +1,76 @@
+"""Errors of the magnitude in poses of another recording, which no fit saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.errors import InvalidData
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.creep import with_creep_left
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.conditions import conditions_elsewhere
+from triaxcal.poses.pose import Pose
+
+CLEARLY = 2.0
+"""Standard errors of the mean difference of the squares, pose by pose: by chance in one recording of forty."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """In the unit of the reference."""
+
+    before_rms_g: float
+    after_rms_g: float
+    noise_floor_g: float
+    """What the noise of these poses leaves, with so much of their creep as the extended model does not explain."""
+    poses: int
+    worse: bool = False
+    """Whether the linear calibration is clearly better in these poses."""
+
+
+def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HeldOut:
+    """Raises InvalidData where there is no check pose, or where these lack a channel that the effects need."""
+    if not check:
+        raise InvalidData("the check recording has no still pose")
+    try:
+        first, last = _errors(before, check), _errors(after, with_creep_left(check, after, elsewhere=True))
+    except InvalidData as e:
+        raise InvalidData(f"the check recording: {e}") from e
+    more = last[0] ** 2 - first[0] ** 2
+    worse = len(more) > 1 and float(more.mean()) > CLEARLY * float(more.std(ddof=1)) / np.sqrt(len(more))
+    return HeldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), bool(worse))
+
+
+def magnitude_errors(
+    sensor: Sensor,
+    poses: Sequence[Pose],
+    *,
+    channel_reference: Mapping[str, float],
+    reference: float,
+    moment: tuple[float, float] | None = None,
+) -> tuple[Floats, Floats]:
+    """|a| − reference (n,) of poses under a sensor's model, and its standard error (n,) from their noise.
+
+    The poses are of another recording than the model's, whose clock is its own: effects of time count as at one
+    ``moment`` (`triaxcal.poses.conditions.of_moment`). Raises InvalidData where a channel that the effects need is
+    missing.
+    """
+    u = np.array([p.mean for p in poses])
+    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
+    length, by_u = sensor.magnitude(u, held)
+    covariance = np.array([p.covariance for p in poses])
+    return length - reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))
+
+
+def _errors(c: Calibration, poses: Sequence[Pose]) -> tuple[Floats, Floats]:
+    return magnitude_errors(
+        c.sensor, poses, channel_reference=c.channel_reference, reference=c.reference, moment=c.moment
+    )
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))

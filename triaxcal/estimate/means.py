@@ -1,0 +1,76 @@
+"""Poses of which only the means are known, as others publish them and old test benches keep them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.errors import InvalidData, Refused
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.poses.pose import Pose
+
+PARAMETERS = 9
+NOISE_FIRST = 1e-4
+"""Of the outputs' size: a noise to begin with, far below what turning changes."""
+ROUNDS, SETTLED = 10, 0.05
+"""The noise is estimated until it changes by less than so much; two or three rounds do."""
+
+
+def poses_of_means(
+    u: Floats,
+    t_s: Floats | None = None,
+    standard_errors: Floats | None = None,
+    channels: Mapping[str, Floats] | None = None,
+) -> list[Pose]:
+    """One pose a row: ``u`` (n,3) means in output units, ``t_s`` (n,) s when it was held, one a second where that is
+    not known, ``standard_errors`` (n,3) of the means, output units.
+
+    Without standard errors the noise is the residual of the linear model, alike on all axes, with the degrees of
+    freedom that the fit leaves: then no lack of fit can show, and an effect only against all the others. Raises Refused
+    where nothing is left to tell it by, InvalidData.
+    """
+    n = len(u)
+    if standard_errors is not None and not (np.isfinite(standard_errors).all() and (standard_errors > 0).all()):
+        raise InvalidData("standard errors of pose means have to be positive")
+    size = float(np.sqrt(np.mean(u**2))) if n else 0.0
+    variances = np.full((n, 3), (NOISE_FIRST * size) ** 2) if standard_errors is None else standard_errors**2
+    times = np.arange(n, dtype=float) if t_s is None else t_s - t_s[:1]
+    poses = [
+        Pose(
+            float(times[i]),
+            float(times[i]),
+            1,
+            u[i],
+            np.diag(variances[i]),
+            float("inf"),
+            channels={name: float(values[i]) for name, values in (channels or {}).items()},
+            before=None if i == 0 else u[i - 1],
+        )
+        for i in range(n)
+    ]
+    return poses if standard_errors is not None else _with_noise_of_residuals(poses)
+
+
+def _with_noise_of_residuals(poses: Sequence[Pose]) -> list[Pose]:
+    if len(poses) <= PARAMETERS:
+        raise Refused(
+            f"{len(poses)} pose means without standard errors: nine parameters leave nothing to tell the noise by; "
+            f"{PARAMETERS + 1} or more are needed"
+        )
+    before = 0.0
+    for _ in range(ROUNDS):
+        found = fit(poses)
+        used = sum(p.excluded is None for p in found.poses)
+        if used <= PARAMETERS:
+            raise Refused(f"{used} pose means that agree leave nothing to tell the noise by")
+        gain = float(np.sqrt(np.mean(found.sensor.scale_factor**2)))
+        variance = (found.residual.rms_g * gain) ** 2 * used / (used - PARAMETERS)
+        left = float(used - PARAMETERS)
+        poses = [replace(p, covariance=variance * np.eye(3), dof=left, shared_dof=left) for p in poses]
+        if abs(np.sqrt(variance) - before) < SETTLED * before:
+            break
+        before = float(np.sqrt(variance))
+    return list(poses)

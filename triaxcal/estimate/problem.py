@@ -1,0 +1,225 @@
+"""The likelihood of still poses under a model, its derivatives, and the search for its maximum.
+
+Every pose says that ``|a| = reference``; its attitude is a nuisance. With the attitude profiled out, the likelihood
+of a pose is that of ``r = |a(u)| − reference`` with the variance that the noise of its mean has along the gradient
+of r. What this neglects is of the order of the noise squared.
+
+The parameters of the search are ``v = D x − w`` (x the outputs scaled to the range of the data), the three angles
+and the effects' coefficients; all derivatives are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol, Self
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.effects.contract import Effect, reshaped
+from triaxcal.errors import NotStill, Refused
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.conditions import conditions, references
+
+Linearised = tuple[Floats, Floats, Floats]
+"""Residuals (n,), their derivatives by theta (n, 9+p), their standard errors (n,)."""
+STEPS_MOST = 60
+FAR = 1e6
+"""Times the reference vector: what no unit has as bias, nor as the half of its range."""
+HALVES = 0.5 ** np.arange(13)
+"""Shares of a step that are tried, until one is no worse."""
+NEARBY = 1e-6
+"""Share of a shape by which it is moved to find the derivative."""
+CONVERGED = 1e-12
+"""Relative step at which the search ends; the noise of any real pose is a million times larger."""
+
+
+class Further(Protocol):
+    """What poses tell beside their means: a residual of each, which the model should make zero."""
+
+    @property
+    def inside(self) -> Problem:
+        """The poses at all places that are asked, one after the other."""
+        ...
+
+    def along(self, values: Floats) -> Floats:
+        """(n,…) of each pose, from ``values`` (k·n,…) `inside`."""
+        ...
+
+    def linearise(self, state: State, jacobian: bool = True) -> Linearised:
+        """As `linearise` has it for the means."""
+        ...
+
+    def only(self, rows: Ints | slice) -> Self: ...
+
+    def widened(self, factor: Floats) -> Self:
+        """With errors so many times (n,) as large."""
+        ...
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each. ``further`` is
+    fitted along with the means. ``excess`` is a standard deviation of |a| that all have beside their covariance."""
+
+    u: Floats
+    covariance: Floats
+    channels: Mapping[str, Floats]
+    channel_reference: Mapping[str, float]
+    middle: Floats
+    half: Floats
+    signs: Floats
+    reference: float
+    further: Further | None = None
+    excess: float = 0.0
+
+    @cached_property
+    def conditions(self) -> dict[str, Floats]:
+        return conditions(self.channels, self.channel_reference)
+
+    def with_channels(self, channels: Mapping[str, Floats]) -> Problem:
+        """The same problem with more conditions."""
+        return replace(self, channels=channels, channel_reference=references(channels) | dict(self.channel_reference))
+
+    def only(self, rows: Ints | slice) -> Problem:
+        """The same problem with some of its poses."""
+        channels = {n: v[rows] for n, v in self.channels.items()}
+        further = self.further and self.further.only(rows)
+        return replace(self, u=self.u[rows], covariance=self.covariance[rows], channels=channels, further=further)
+
+
+@dataclass(frozen=True)
+class State:
+    """A point of the search: ``theta`` (9 + p,) as D (3), w (3), angles (3), effects' coefficients."""
+
+    theta: Floats
+    effects: tuple[Effect, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, sensor: Sensor) -> State:
+        """The point at which a sensor stands: the inverse of `sensor`."""
+        k = sensor.scale_factor
+        coefficients = [c for _, c in sensor.effects]
+        theta = np.concatenate([problem.half / k, sensor.bias - problem.middle / k, sensor.misalignment, *coefficients])
+        return cls(theta, tuple(e for e, _ in sensor.effects))
+
+    def extended(self, effects: Sequence[Effect]) -> State:
+        """With further effects, whose coefficients are zero."""
+        zeros = np.zeros(sum(len(e.coefficients) for e in effects))
+        return State(np.concatenate([self.theta, zeros]), (*self.effects, *effects))
+
+    def sensor(self, problem: Problem) -> Sensor:
+        D, w, angles = self.theta[:3], self.theta[3:6], self.theta[6:9]
+        pairs = []
+        at = 9
+        for effect in self.effects:
+            pairs.append((effect, self.theta[at : at + len(effect.coefficients)]))
+            at += len(effect.coefficients)
+        return Sensor(problem.half / D, angles, w + problem.middle * D / problem.half, tuple(pairs))
+
+
+def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: int = STEPS_MOST) -> State:
+    """Gauss–Newton with halved steps; the weights follow the gradient of r from step to step.
+
+    Raises Refused where it does not converge within the limit (with ``steps`` at its default).
+    """
+    extra = sum(len(e.coefficients) for e in effects) - (len(state.theta) - 9)
+    theta = np.concatenate([state.theta, np.zeros(max(extra, 0))])
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a step too far is taken back
+        return _solved(problem, theta, effects, steps)
+
+
+def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps: int) -> State:
+    here: Linearised | None = None
+    for left in reversed(range(steps)):
+        r, J, s = here or everything(problem, State(theta, effects))
+        if not (np.isfinite(J).all() and np.isfinite(r).all() and np.abs(theta[:6]).max() < FAR * problem.reference):
+            raise NotStill("the fit ran away")
+        norm = np.linalg.norm(J / s[:, None], axis=0)
+        norm[norm == 0] = 1.0
+        step = -np.linalg.lstsq(J / s[:, None] / norm, r / s, rcond=1e-14)[0] / norm
+        size = np.linalg.norm(step * norm) / max(float(np.linalg.norm((theta + step) * norm)), 1e-300)
+        if size < CONVERGED:
+            return State(theta + step, effects)
+        cost = float(np.sum((r / s) ** 2))
+        for scale in HALVES:
+            # Hardly any step is halved: a trial brings the derivatives along, unless none are wanted after it.
+            here = _tried(problem, State(theta + scale * step, effects), jacobian=left > 0)
+            if here is not None and float(np.sum((here[0] / s) ** 2)) <= cost * (1 + 1e-9) + 1e-12:
+                break
+        theta = theta + scale * step
+    if steps == STEPS_MOST and size > 1e-9:
+        raise NotStill(f"the fit did not converge in {STEPS_MOST} steps (last relative step {size:.1e})")
+    return State(theta, effects)
+
+
+def _tried(problem: Problem, state: State, jacobian: bool) -> Linearised | None:
+    """None where a step goes too far for the model."""
+    try:
+        return everything(problem, state, jacobian)
+    except Refused:
+        return None
+
+
+def everything(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
+    """`linearise`, and where the problem has something further the same of that, after the means of all poses."""
+    means = linearise(problem, state, jacobian)
+    if problem.further is None:
+        return means
+    r, J, s = (np.concatenate(both) for both in zip(means, problem.further.linearise(state, jacobian), strict=True))
+    return r, J, s
+
+
+def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
+    """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise, and what is
+    beside it (n,)."""
+    sensor = state.sensor(problem)
+    held = problem.conditions
+    if not jacobian:
+        length = np.linalg.norm(sensor.specific_force(problem.u, held), axis=1)
+        return length - problem.reference, np.empty((0, 0)), np.empty(0)
+    length, s, a, by_s, by_v = sensor.radius(problem.u, held)
+    x = (problem.u - problem.middle) / problem.half
+    angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
+    effects = [by_coefficients(by_v, e.basis(s, held)) for e in state.effects]
+    J = np.concatenate([by_v * x, -by_v, angles, *effects], axis=1)
+    by_u = by_v / sensor.scale_factor
+    variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
+    # Poses without any scatter (made up, or below the resolution) would otherwise weigh infinitely.
+    variance = np.maximum(variance, (1e-12 * problem.reference) ** 2) + problem.excess**2
+    return length - problem.reference, J, np.sqrt(variance)
+
+
+def by_coefficients(by_v: Floats, basis: Floats) -> Floats:
+    """(n,p) derivatives of |a| by an effect's coefficients."""
+    return np.asarray(-np.einsum("ni,nip->np", by_v, basis))
+
+
+def by_shape(problem: Problem, state: State) -> Floats:
+    """Derivatives of all residuals (`everything`) by the shapes of the effects (`Effect.shape`), (n,m), in thousandths
+    of each."""
+    columns = []
+    for i, effect in enumerate(state.effects):
+        for name, (value, _) in effect.shape.items():
+            sides = []
+            for sign in (1, -1):
+                other = reshaped(effect, name, value * (1 + sign * NEARBY))
+                effects = (*state.effects[:i], other, *state.effects[i + 1 :])
+                sides.append(everything(problem, State(state.theta, effects), jacobian=False)[0])
+            columns.append((sides[0] - sides[1]) / (2000 * NEARBY))
+    return np.array(columns).T if columns else np.empty((len(everything(problem, state, jacobian=False)[0]), 0))
+
+
+def parameters_by_theta(problem: Problem, state: State) -> Floats:
+    """(9+p, 9+p) derivative of scale factor, misalignment, bias and the effects' coefficients by theta."""
+    D = state.theta[:3]
+    G = np.eye(len(state.theta))
+    G[0:9, 0:9] = 0
+    for i in range(3):
+        G[i, i] = -problem.half[i] / D[i] ** 2  # k = h / D
+        G[3 + i, 6 + i] = 1  # angles
+        G[6 + i, 3 + i] = 1  # b = w + m D / h
+        G[6 + i, i] = problem.middle[i] / problem.half[i]
+    return G

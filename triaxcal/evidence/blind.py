@@ -1,0 +1,73 @@
+"""Which effects poses cannot show in full, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, rate_of
+from triaxcal.evidence.evidence import Evidence
+from triaxcal.planning.visibility import VISIBLE
+from triaxcal.poses.conditions import still_conditions
+
+
+class Why(StrEnum):
+    NOT_LOGGED = "not_logged"
+    SOMETIMES_LOGGED = "sometimes_logged"
+    """The channel is missing in some poses."""
+    RATE_UNKNOWN = "rate_unknown"
+    NOT_KNOWN = "not_known"
+    """A condition that follows from the poses does not here."""
+    STOOD_STILL = "stood_still"
+    EVEN_RATE = "even_rate"
+    """The channel changes no faster in one pose than in another."""
+    EVEN_SCATTER = "even_scatter"
+    MOVED_ALONG = "moved_along"
+    """Too few poses, or what the effect goes with moved along with their directions."""
+    FEW_DIRECTIONS = "few_directions"
+
+
+@dataclass(frozen=True)
+class Blind:
+    """``channel`` is empty where no channel is to blame."""
+
+    why: Why
+    channel: str = ""
+
+
+def blind_to(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping[str, Blind]:
+    """By name, in the order of the ``catalogue``."""
+    shown = {name for name in {term.name for term in evidence.terms} if name and _in_full(evidence, name)}
+    return {effect.name: _why(evidence, effect) for effect in catalogue if effect.name not in shown}
+
+
+def _in_full(evidence: Evidence, name: str) -> bool:
+    """Whether no combination of all the coefficients of some shape looks like the nine parameters."""
+    beside = evidence.rows.beside.T
+    for term in evidence.terms:
+        if term.name == name and term.effect is not None and len(term.kept) == len(term.effect.coefficients):
+            columns = term.columns / np.maximum(np.linalg.norm(term.columns, axis=0), 1e-300)
+            left = beside @ columns
+            if min(left.shape) == term.rank and np.linalg.svd(left, compute_uv=False)[-1] > VISIBLE:
+                return True
+    return False
+
+
+def _why(evidence: Evidence, effect: Effect) -> Blind:
+    rows = evidence.rows
+    known, still = rows.problem.channel_reference, still_conditions(rows.poses)
+    for name in effect.needs:
+        rate, channel = name.endswith(rate_of("")), channel_of(name.removesuffix(rate_of("")))
+        logged = any(channel in p.channels for p in rows.poses)
+        if name not in known and (rate or not is_derived(name)) and not (rate and logged):
+            return Blind(Why.SOMETIMES_LOGGED if logged else Why.NOT_LOGGED, channel)
+        if name not in known:
+            return Blind(Why.RATE_UNKNOWN, channel) if rate else Blind(Why.NOT_KNOWN, name)
+        if name in still:
+            if name in SCATTER:
+                return Blind(Why.EVEN_SCATTER)
+            return Blind(Why.EVEN_RATE if rate else Why.STOOD_STILL, channel)
+    return Blind(Why.MOVED_ALONG if effect.needs else Why.FEW_DIRECTIONS)

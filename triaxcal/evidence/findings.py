@@ -1,0 +1,97 @@
+"""What is read off the posterior: names that are known, names that are likely, outliers, and what has no name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.unmodelled import What
+
+
+@dataclass(frozen=True)
+class Named:
+    """One of these effects acts for certain, each with its probability, the likeliest first; ``together`` is that of at
+    least one. A name alone is known."""
+
+    probabilities: Mapping[str, float]
+    together: float
+
+    @property
+    def effect(self) -> str:
+        return next(iter(self.probabilities))
+
+    @property
+    def unique(self) -> bool:
+        return len(self.probabilities) == 1
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Something acts that no name describes: with which ``probability``, of which ``kind`` it is most likely, and how
+    large it then is, as an rms of |a| over the poses, in the unit of the reference."""
+
+    probability: float
+    kind: What | None
+    rms_g: float
+    significant: bool
+    """Whether it is likelier than not."""
+
+
+@dataclass(frozen=True)
+class Another:
+    """From this pose on there is another unit, or another mounting."""
+
+    pose: int
+    probability: float
+
+
+@dataclass(frozen=True)
+class Findings:
+    """``candidates`` are likely names that are not certain, with their probability; ``nothing`` is the probability that
+    no effect, no outlier and nothing unmodelled acts. ``outliers`` are poses, each with its probability, counted among
+    all that were given."""
+
+    named: tuple[Named, ...]
+    candidates: Mapping[str, float]
+    outliers: Mapping[int, float]
+    unexplained: Unexplained
+    another: Another | None
+    nothing: float
+
+
+def findings(seen: Posterior) -> Findings:
+    odds = seen.evidence.odds
+    certain = {name for group in seen.certain for name in group}
+    places = seen.evidence.rows.places
+    outliers = {int(places[i]): float(p) for i, p in enumerate(seen.of_outliers) if p >= odds.reported}
+    another = int(places[int(np.argmax(seen.of_another))])
+    from_there_on = float(seen.of_another.sum())
+    return Findings(
+        named=tuple(Named({name: seen.of_names[name] for name in group}, seen.any_of(group)) for group in seen.certain),
+        candidates={n: p for n, p in seen.of_names.items() if p >= odds.reported and n not in certain},
+        outliers=dict(sorted(outliers.items(), key=lambda item: -item[1])),
+        unexplained=_unexplained(seen),
+        another=Another(another, from_there_on) if from_there_on >= odds.reported else None,
+        nothing=_nothing(seen),
+    )
+
+
+def _unexplained(seen: Posterior) -> Unexplained:
+    rows, total = seen.evidence.rows, seen.of_unmodelled
+    variance = 0.0
+    for p, part in zip(seen.of_parts, seen.evidence.parts, strict=True):
+        if part.kind is not None and part.kind.what is not What.INSIDE:
+            squares = np.diag(part.kind.covariance)[: rows.n] * rows.error[: rows.n] ** 2
+            variance += float(p) * part.tau**2 * float(np.mean(squares))
+    likeliest = next((what for what in seen.of_kinds if what is not What.INSIDE), None)
+    rms = float(np.sqrt(variance / total)) if total > 0 else 0.0
+    return Unexplained(total, likeliest, rms, total >= seen.evidence.odds.reported)
+
+
+def _nothing(seen: Posterior) -> float:
+    """The empty set is always among the sets, and no unmodelled part always among its parts (`likely_sets`)."""
+    weight, empty = next(pair for pair in zip(seen.weight, seen.sets, strict=True) if not pair[1].members)
+    return float(weight * np.exp(empty.by_part[empty.parts.index(0)] - empty.total))

@@ -1,0 +1,141 @@
+"""What the likely sets say of poses that nobody has taken: of each a normal distribution, given all rows seen.
+
+Universal kriging: the nine parameters are flat, what no term describes is predicted through its covariance with the
+rows seen, and the coefficients of the terms have the distribution that these leave them.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.effects.plugins import EffectFault
+from triaxcal.evidence.evidence import Evidence, SetEvidence
+from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.rows import Rows
+from triaxcal.evidence.solved import Solved, solved_cells
+from triaxcal.evidence.terms import Term
+from triaxcal.evidence.unmodelled import Held, Kind, What
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What a reader wants to know: which effects act, which poses are outliers, from which pose on there is another
+    unit (−1: from none), and with what something goes that no name describes (None: with nothing)."""
+
+    names: frozenset[str]
+    outliers: frozenset[int]
+    another: int
+    unmodelled: What | None
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The likeliest sets, each with one part of the evidence and one choice of sizes: C of them, of H hypotheses.
+    ``weight`` (C,) adds up to one and gives each hypothesis its share of the probability of all that have a cell here;
+    ``of`` (C,) is the place of each cell's hypothesis among the ``hypotheses``."""
+
+    seen: Posterior
+    solved: Sequence[Solved]
+    weight: Floats
+    hypotheses: Sequence[Hypothesis]
+    of: Ints
+
+    @classmethod
+    def likeliest(cls, seen: Posterior, share: float) -> Cells:
+        """Those that hold this share of the probability, or as many as there are."""
+        solved = solved_cells(seen, share)
+        each = [_hypothesis(seen, cells.found, cells.part) for cells in solved]
+        hypotheses = list(dict.fromkeys(each))
+        of = np.repeat([hypotheses.index(h) for h in each], [len(cells.share) for cells in solved])
+        weight = np.concatenate([cells.share for cells in solved])
+        whole = probabilities(seen)
+        wanted = np.array([whole[h] for h in hypotheses])
+        weight = weight * (wanted / np.bincount(of, weight))[of]
+        return cls(seen, solved, weight / weight.sum(), hypotheses, of)
+
+    def with_name(self, name: str) -> Floats:
+        """(C,) one where the effect acts, else zero."""
+        return np.array([float(name in h.names) for h in self.hypotheses])[self.of]
+
+    def predicted(self, rows: Rows) -> tuple[Floats, Floats]:
+        """Mean (C,M) and covariance (C,M,M) of M rows to come, over their errors."""
+        evidence = self.seen.evidence
+        columns = _columns(evidence, sorted({i for cells in self.solved for i in cells.found.members}), rows)
+        here, there = Held.of(evidence.rows), Held.of(rows)
+        of_parts: dict[int, tuple[Floats, Floats]] = {}
+        mean, covariance = [], []
+        for cells in self.solved:
+            kind, tau = evidence.parts[cells.part].kind, evidence.parts[cells.part].tau
+            if cells.part not in of_parts:
+                of_parts[cells.part] = _unmodelled(kind, tau, here, there, cells.inverse)
+            to, error = of_parts[cells.part]
+            design = np.concatenate([rows.linear, columns[:, cells.places]], axis=1) - to @ cells.design
+            mean.append(to @ evidence.rows.y + cells.here @ design.T)
+            covariance.append(cells.noise[:, None, None] * (error + design @ cells.within @ design.T))
+        return np.concatenate(mean), np.concatenate(covariance)
+
+
+def _unmodelled(kind: Kind | None, tau: float, here: Held, there: Held, inverse: Floats) -> tuple[Floats, Floats]:
+    """Of the rows to come, noise and what no term describes: the best linear prediction (M,N) by the rows seen, of
+    whose covariance this is the ``inverse``, and the covariance (M,M) of its error."""
+    k, n = len(there.error), len(here.error)
+    if kind is None:
+        return np.zeros((k, n)), np.eye(k)
+    crossed = tau**2 * kind.covariance_of(there, here)
+    to = crossed @ inverse
+    return to, np.eye(k) + tau**2 * kind.covariance_of(there, there) - to @ crossed.T
+
+
+def probabilities(seen: Posterior) -> Mapping[Hypothesis, float]:
+    """Of every hypothesis."""
+    out: dict[Hypothesis, float] = defaultdict(float)
+    for weight, found in zip(seen.weight, seen.sets, strict=True):
+        share = weight * np.exp(found.by_part - found.total)
+        by_what: dict[What | None, float] = defaultdict(float)
+        for part, p in zip(found.parts, share, strict=True):
+            by_what[_what(seen, part)] += float(p)
+        any_of = _hypothesis(seen, found, 0)
+        for what, p in by_what.items():
+            out[replace(any_of, unmodelled=what)] += p
+    return out
+
+
+def _hypothesis(seen: Posterior, found: SetEvidence, part: int) -> Hypothesis:
+    terms = (seen.evidence.terms[i] for i in found.members)
+    another = max((term.another for term in terms), default=-1)
+    return Hypothesis(seen.names_of(found), seen.poses_of(found), another, _what(seen, part))
+
+
+def _what(seen: Posterior, part: int) -> What | None:
+    kind = seen.evidence.parts[part].kind
+    return None if kind is None or kind.what is What.INSIDE else kind.what
+
+
+def _columns(evidence: Evidence, members: Sequence[int], rows: Rows) -> Floats:
+    """(M,C) of all terms in the rows to come; zero of those that are no ``members``, of outliers, and where an effect
+    of another package does not say what it adds."""
+    out = np.zeros((len(rows.y), evidence.columns.shape[1]))
+    known: dict[int, Floats] = {}
+    for i in members:
+        term = evidence.terms[i]
+        out[:, evidence.places([i])] = _of_term(term, rows, known)
+    return out
+
+
+def _of_term(term: Term, rows: Rows, known: dict[int, Floats]) -> Floats:
+    if term.another >= 0:
+        return np.asarray(rows.linear * term.mix)
+    if term.effect is None:
+        return np.zeros((len(rows.y), term.rank))
+    if id(term.effect) not in known:
+        try:
+            columns = rows.by_coefficients(term.effect)
+        except EffectFault:
+            columns = np.full((len(rows.y), len(term.effect.coefficients)), np.nan)
+        known[id(term.effect)] = np.where(np.isfinite(columns), columns, 0.0)
+    return np.asarray(known[id(term.effect)][:, list(term.kept)] * term.mix)

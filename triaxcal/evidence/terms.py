@@ -1,0 +1,190 @@
+"""What a hypothesis is made of: effects, each in one form, on some axes, with one shape; poses that are outliers."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects.contract import SINCE_START, TIME, Effect
+from triaxcal.effects.plugins import EffectFault, is_foreign
+from triaxcal.errors import Refused
+from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.rows import Rows
+from triaxcal.model.directions import spiral
+from triaxcal.poses.conditions import still_conditions
+
+FEWEST = 4
+"""Poses that another unit or mounting has at least: fewer are outliers."""
+SPHERE = 48
+"""Directions over which the size of an effect is reckoned."""
+NOTHING_G = 1e-12
+ABSORBED = 1e-6
+"""Of a term's columns: what the nine parameters leave no more of is theirs, to rounding."""
+AXES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """``columns`` (N,q) are those of coefficients of size one, so that ρ times them has the rms ρ; ``mix`` (q,) what
+    they were multiplied by. ``kind`` is the same for terms that exclude each other; ``pose`` is the outlier's, or −1;
+    ``another`` is the pose from which on there is another unit or mounting, or −1; ``kept`` are those coefficients of
+    the ``effect`` that are free."""
+
+    name: str
+    kind: str
+    columns: Floats
+    mix: Floats
+    log_prior: float
+    effect: Effect | None = None
+    kept: tuple[int, ...] = ()
+    pose: int = -1
+    another: int = -1
+
+    @property
+    def rank(self) -> int:
+        return int(self.columns.shape[1])
+
+
+Variant = tuple[str, tuple[str, ...], tuple[float, ...]]
+"""An effect's name, coefficients and shape: foreign effects need not be equal to themselves."""
+Finer = Mapping[Variant, Sequence[Effect]]
+"""Variants that share the prior of the one whose place they take, among which it stands itself."""
+
+
+def variant_of(effect: Effect) -> Variant:
+    return effect.name, tuple(c.name for c in effect.coefficients), tuple(v for v, _ in effect.shape.values())
+
+
+def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = ()) -> list[Term]:
+    """Every form, shape and choice of axes of every effect that can act in these poses, every pose as an outlier, and
+    every pose as the first of another unit or mounting. ``finer`` are divisions of shapes, one after the other."""
+    still = still_conditions(rows.poses)
+    known = rows.problem.channel_reference
+    if not np.ptp(rows.t_s) > 0:  # means whose times nobody knows
+        still = still | {TIME, SINCE_START}
+    able = [e for e in catalogue if all(name in known and name not in still for name in e.needs)]
+    share = np.log(odds.effect / max(len(able), 1))
+    terms = [term for effect in able for term in _of_effect(rows, effect, share, odds, finer)]
+    return [*terms, *(_outlier(rows, i, odds) for i in range(rows.n)), *_another(rows, odds)]
+
+
+def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
+    """Effects of other packages that cannot be used in these poses, though they could be loaded: name → reason."""
+    found = {}
+    known, held = rows.problem.channel_reference, rows.problem.conditions
+    s = rows.state.sensor(rows.problem).along_axes(rows.problem.u, held)
+    for effect in catalogue:
+        if is_foreign(effect) and all(n in known for n in effect.needs):
+            try:
+                for variant in effect.variants(held):
+                    variant.basis(s, held)
+                    variant.slope(s, held)
+                    rows.by_coefficients(variant)
+            except EffectFault as e:
+                found[effect.name] = e.reason
+    return found
+
+
+def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds, finer: Sequence[Finer]) -> Iterator[Term]:
+    try:
+        variants = effect.variants(rows.problem.conditions)
+    except (EffectFault, Refused):
+        return
+    forms: dict[tuple[str, ...], list[Effect]] = defaultdict(list)
+    for variant in variants:
+        forms[tuple(c.name for c in variant.coefficients)].append(variant)
+    for shapes in forms.values():
+        chosen = list(_axes([c.part for c in shapes[0].coefficients], odds))
+        for shape, of_shape in _divided(shapes, finer):
+            made = _columns(rows, shape)
+            if made is None:
+                continue
+            columns, size = made
+            for kept, of_axes in chosen:
+                index = list(kept)
+                if (size[index] < NOTHING_G).any():
+                    continue
+                mix = 1 / (size[index] * np.sqrt(len(index)))
+                own = columns[:, index] * mix
+                if np.linalg.norm(rows.beside.T @ own) < ABSORBED * np.linalg.norm(own):
+                    continue
+                prior = share + np.log(of_axes * of_shape / len(forms))
+                yield Term(effect.name, effect.name, own, mix, prior, shape, kept)
+
+
+def _divided(shapes: Sequence[Effect], finer: Sequence[Finer]) -> list[tuple[Effect, float]]:
+    """The variants, and with which share of the prior."""
+    out = [(shape, 1 / len(shapes)) for shape in shapes]
+    for division in finer:
+        each = [(division.get(variant_of(shape), (shape,)), share) for shape, share in out]
+        out = [(shape, share / len(ones)) for ones, share in each for shape in ones]
+    return out
+
+
+def _axes(parts: Sequence[str], odds: Odds) -> Iterator[tuple[tuple[int, ...], float]]:
+    """Which coefficients are free, and with which share of the prior."""
+    labels = list(dict.fromkeys(parts))
+    whole = tuple(range(len(parts)))
+    if len(labels) == 1:
+        yield whole, 1.0
+        return
+    two = odds.on_two_axes if len(labels) == AXES else 0.0
+    yield whole, 1 - odds.on_one_axis - two
+
+    def of(some: Sequence[str]) -> tuple[int, ...]:
+        return tuple(i for i, part in enumerate(parts) if part in some)
+
+    for label in labels:
+        yield of([label]), odds.on_one_axis / len(labels)
+    if two:
+        for pair in itertools.combinations(labels, 2):
+            yield of(pair), two / AXES
+
+
+def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
+    """Derivatives of the rows by the coefficients (N,p), and the size of each (p,): the rms of what a coefficient of
+    one adds over the sphere and over the poses' conditions, about its mean over these. None where it cannot be told."""
+    try:
+        columns = rows.by_coefficients(effect)
+        held = rows.problem.conditions
+        if is_foreign(effect):  # it may not know its slope
+            effect.slope(rows.state.sensor(rows.problem).along_axes(rows.problem.u, held), held)
+        up = spiral(SPHERE) * rows.problem.reference
+        every: Mapping[str, Floats] = {name: np.repeat(values, len(up)) for name, values in held.items()}
+        basis = effect.basis(np.tile(up, (rows.n, 1)), every).reshape(rows.n, len(up), AXES, -1)
+    except (EffectFault, Refused):
+        return None
+    if not (np.isfinite(columns).all() and np.isfinite(basis).all()):
+        return None
+    if effect.needs:
+        basis = basis - basis.mean(axis=0, keepdims=True)
+    return columns, np.sqrt(np.mean(np.sum(basis**2, axis=2), axis=(0, 1)))
+
+
+def _outlier(rows: Rows, pose: int, odds: Odds) -> Term:
+    """Its mean is off, and its slope with it."""
+    columns = np.zeros((len(rows.y), 2 if rows.slopes else 1))
+    columns[pose, 0] = 1 / rows.error[pose]
+    if rows.slopes:
+        columns[rows.n + pose, 1] = 1 / rows.error[rows.n + pose]
+    mix = np.full(columns.shape[1], 1 / np.sqrt(columns.shape[1]))
+    return Term("", f"outlier {pose}", columns * mix, mix, float(np.log(odds.outlier)), pose=pose)
+
+
+def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
+    """From a pose on all nine parameters are others: another unit, channels that were exchanged."""
+    order = np.lexsort((rows.t_s, rows.run))
+    cuts = range(FEWEST, rows.n - FEWEST + 1)
+    size = np.sqrt(np.mean((rows.linear[: rows.n] * rows.error[: rows.n, None]) ** 2, axis=0))
+    mix = 1 / (np.maximum(size, NOTHING_G) * np.sqrt(len(size)))
+    for cut in cuts:
+        late = np.zeros(rows.n, dtype=bool)
+        late[order[cut:]] = True
+        columns = rows.linear * np.resize(late, len(rows.y))[:, None] * mix
+        prior = float(np.log(odds.another / len(cuts)))
+        yield Term("", "another", columns, mix, prior, another=int(order[cut]))

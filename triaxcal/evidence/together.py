@@ -1,0 +1,309 @@
+"""What several units, or recordings, show together: whether an effect acts in all, then whether its values are common.
+
+An effect that no unit shows for certain may be certain in all of them together. So existence is asked of the product
+of their evidences: one name, form, shape and size for all, and coefficients of its own for each unit, or the same. Its
+competitor is that each unit is for itself, with its own posterior.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.distributions import log_sum_exp
+from triaxcal.evidence.evidence import Evidence, SetEvidence
+from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.shapes import Shape, shapes_by
+from triaxcal.evidence.terms import Term
+
+LIKELY = 3
+"""Sets of a unit, the likeliest, beside which an effect is asked about."""
+NEGLIGIBLE = 14.0
+"""In the logarithm: parts that are less likely by more add nothing."""
+STEPS = 6
+"""Towards coefficients that units share: each weighs the units by the noise that is left in them."""
+Form = tuple[str, tuple[str, ...], tuple[int, ...]]
+"""A name, the coefficients of a form, and those of them that are free."""
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Hypotheses are that one effect acts in every unit, of one form, shape and size, or that each unit is for itself.
+
+    ``shared`` is the probability of the first by name, ``apart`` that of the second. ``probability`` is that each
+    effect acts in every unit, whatever else does, the likeliest first; ``common`` that its values then are one for all,
+    and ``shapes`` has what its shape is. ``nothing`` is the probability that no effect acts in any unit.
+    """
+
+    units: Sequence[Posterior]
+    shared: Mapping[str, float]
+    apart: float
+    probability: Mapping[str, float]
+    common: Mapping[str, float]
+    shapes: Mapping[str, Mapping[str, Shape]]
+    nothing: float
+
+    def one_of(self, names: Sequence[str]) -> float:
+        """The probability that one of these effects, the same, acts in every unit; at least, where units that share
+        nothing may have several of them."""
+        total = self.apart * max(_product(unit.of_names.get(name, 0.0) for unit in self.units) for name in names)
+        for other, p in self.shared.items():
+            if other in names:
+                total += p
+            elif p > np.exp(-NEGLIGIBLE):
+                total += p * max(_product(_acts_beside(unit, name, other) for unit in self.units) for name in names)
+        return total
+
+    def certain(self, level: float) -> tuple[tuple[str, ...], ...]:
+        """Groups of names, in each of which one acts in every unit with this probability: names alone, and the fewest
+        of the others, the likeliest first. Names that hold each other's columns, as temperature and its square, stand
+        together."""
+        alone = [name for name, p in self.probability.items() if p >= level]
+        out = [(name,) for name in alone]
+        rest = [name for name, p in self.probability.items() if 1 - level <= p < level]
+        for k in range(2, len(rest) + 1):
+            if self.one_of(rest[:k]) >= level:
+                return (*out, tuple(rest[:k]))
+        return tuple(out)
+
+
+def together(units: Sequence[Posterior]) -> Together:
+    """Of units whose posteriors are of one catalogue and one grid of sizes (`Posterior.resized`). Names that some unit
+    cannot show are left out. Where an effect acts in all, another is asked about beside it."""
+    found, given = _asked(units, frozenset()), units
+    odds, acting = units[0].evidence.odds, list[str]()
+    while len(acting) < odds.together - 1:
+        name = next((n for n, p in found.probability.items() if p >= odds.certain and n not in acting), None)
+        if name is None:
+            break
+        given, acting = [unit.given(name) for unit in given], [*acting, name]
+        if not all(unit.sets for unit in given):
+            break
+        found = _beside(found, _asked(given, frozenset(acting)), found.probability[name])
+    return found
+
+
+def _beside(found: Together, more: Together, p: float) -> Together:
+    """With what was asked beside an effect that acts in all with probability ``p``."""
+    better = {n: p * q for n, q in more.probability.items() if p * q > found.probability[n]}
+    of_names = dict(found.probability) | better
+    return replace(
+        found,
+        probability=dict(sorted(of_names.items(), key=lambda item: -item[1])),
+        common=dict(found.common) | {n: more.common[n] for n in better},
+        shapes=dict(found.shapes) | {n: more.shapes[n] for n in better},
+    )
+
+
+def _asked(units: Sequence[Posterior], acting: frozenset[str]) -> Together:
+    """Beside effects that are ``acting`` in all sets of every unit."""
+    first = units[0].evidence
+    terms = [_terms(unit.evidence) for unit in units]
+    forms = [form for form in terms[0] if form[0] not in acting and all(form in of_unit for of_unit in terms)]
+    bases = [_bases(unit, acting) for unit in units]
+    own: dict[str, list[float]] = defaultdict(list)
+    one: dict[str, list[float]] = defaultdict(list)
+    index: dict[str, list[int]] = defaultdict(list)
+    for name in sorted({form[0] for form in forms}):
+        ratios = [_ratio(unit, of_unit, name) for unit, of_unit in zip(units, bases, strict=True)]
+        # All without an unmodelled part, or each with its likeliest: the coefficients are one for all.
+        settings = [
+            [_equations(unit, of_unit, name, none) for unit, of_unit in zip(units, bases, strict=True)]
+            for none in (True, False)
+        ]
+        for alike in _alike(units, terms, [form for form in forms if form[0] == name]):
+            prior = float(first.log_prior[alike[0]]) - np.log(2)  # common values, or each its own
+            of_own = np.sum([ratio[i] for ratio, i in zip(ratios, alike, strict=True)], axis=0)
+            of_one = [_mean(_of_common_values(units, equations, alike)) for equations in settings]
+            own[name].append(prior + _mean(of_own))
+            one[name].append(prior + float(log_sum_exp(of_one)) - np.log(len(settings)))
+            index[name].append(alike[0])
+    apart = float(np.log1p(-first.odds.effect))
+    weight = {name: float(log_sum_exp([*own[name], *one[name]])) for name in own}
+    total = float(log_sum_exp([apart, *weight.values()]))
+    shared = {name: float(np.exp(w - total)) for name, w in weight.items()}
+    of_values = {name: float(np.exp(log_sum_exp(one[name]) - weight[name])) for name in own}
+    shapes = {
+        name: shapes_by(
+            [first.terms[i] for i in index[name]], np.exp(np.logaddexp(own[name], one[name]) - weight[name])
+        )
+        for name in own
+    }
+    alone = float(np.exp(apart - total))
+    none = _product(unit.of_sets_of_names.get(frozenset(), 0.0) for unit in units)
+    found = Together(units, shared, alone, {}, of_values, shapes, alone * none)
+    acts = {name: found.one_of((name,)) for name in shared}
+    return replace(found, probability=dict(sorted(acts.items(), key=lambda item: -item[1])))
+
+
+def _product(probabilities: Iterable[float]) -> float:
+    return float(np.prod([*probabilities]))
+
+
+def _acts_beside(unit: Posterior, name: str, other: str) -> float:
+    """The probability that an effect acts in a unit in which the other does."""
+    with_other = {names: p for names, p in unit.of_sets_of_names.items() if other in names}
+    total = sum(with_other.values())
+    return sum(p for names, p in with_other.items() if name in names) / total if total > 0 else 0.0
+
+
+def _mean(by_size: Floats) -> float:
+    return float(log_sum_exp(by_size) - np.log(len(by_size)))
+
+
+def _terms(evidence: Evidence) -> dict[Form, list[int]]:
+    """The terms of each form, one for each shape that it is asked about with."""
+    out: dict[Form, list[int]] = defaultdict(list)
+    for i, term in enumerate(evidence.terms):
+        if term.effect is not None:
+            out[term.name, tuple(c.name for c in term.effect.coefficients), term.kept].append(i)
+    return out
+
+
+def _alike(
+    units: Sequence[Posterior], terms: Sequence[Mapping[Form, list[int]]], forms: Sequence[Form]
+) -> Iterator[list[int]]:
+    """Of every form and shape of the first unit the term in each unit whose shape comes nearest: units that were held
+    still at other times have other grids of shapes."""
+    for form in forms:
+        shapes = [
+            np.array([_shape_of(unit.evidence.terms[i]) for i in of_unit[form]])
+            for unit, of_unit in zip(units, terms, strict=True)
+        ]
+        for shape in shapes[0]:
+            yield [
+                of_unit[form][int(np.argmin(np.sum((of_shapes - shape) ** 2, axis=1)))]
+                for of_shapes, of_unit in zip(shapes, terms, strict=True)
+            ]
+
+
+def _shape_of(term: Term) -> list[float]:
+    return [] if term.effect is None else [value for value, _ in term.effect.shape.values()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Base:
+    """A set that a further term may stand beside: ``found``, the ``names`` in it, and ``with_each`` (T,R), the
+    logarithm of its evidence with each term at each size, of the sizes one by one."""
+
+    found: SetEvidence
+    names: frozenset[str]
+    with_each: Floats
+
+
+def _bases(unit: Posterior, acting: frozenset[str]) -> list[_Base]:
+    """The likeliest sets, and what is left of the likeliest without some of its terms, but for effects that are
+    ``acting``; where none is, the empty set too."""
+    evidence = unit.evidence
+    best = unit.sets[0].members
+    less = [kept for k in range(len(best) + 1) for kept in itertools.combinations(best, k)]
+    some = [*less, *(found.members for found in unit.sets[:LIKELY])]
+    sets = [m for m in dict.fromkeys(some) if acting <= {evidence.terms[i].name for i in m}]
+    known = {found.members: found for found in unit.sets}
+    # Whatever part is likely beside some set: an effect may take the place of a part.
+    likely = [row for row, part in enumerate(unit.sets[0].parts) if unit.of_parts[part] > np.exp(-NEGLIGIBLE)]
+    out = []
+    for members in sets:
+        found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
+        rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE).tolist()}
+        whole = log_sum_exp([evidence.with_further(found, row, cells=1) for row in sorted(rows)], axis=0)
+        whole = whole + np.log(len(evidence.sizes))
+        out.append(_Base(found, unit.names_of(found), np.asarray(whole)))
+    return out
+
+
+def _ratio(unit: Posterior, bases: Sequence[_Base], name: str) -> Floats:
+    """(T,R) the logarithm of the evidence of the unit with each term at each size, over that of the unit by itself."""
+    others = [base for base in bases if name not in base.names]
+    with_each = log_sum_exp([base.with_each for base in others], axis=0)
+    without = log_sum_exp([base.found.total for base in others])
+    return np.asarray(with_each - without + _log_without(unit, bases, name))
+
+
+def _log_without(unit: Posterior, bases: Sequence[_Base], name: str) -> float:
+    """The logarithm of the evidence of the unit without that name, over that of the unit by itself."""
+    every = {found.members: found for found in (*(base.found for base in bases), *unit.sets)}.values()
+    others = [found.total for found in every if name not in unit.names_of(found)]
+    return float(log_sum_exp(others) - log_sum_exp([found.total for found in every]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Of each term of a name the information (q,q) and score (q,) of its scaled coefficients, in standard errors,
+    beside one set with one part and one choice of sizes that leave ``chi2``. Its share of the unit by itself is
+    ``log_share``; ``variance`` is that of the noise where one more term explains what it can."""
+
+    of_terms: Mapping[int, tuple[Floats, Floats]]
+    chi2: float
+    variance: float
+    log_share: float
+
+
+def _equations(unit: Posterior, bases: Sequence[_Base], name: str, none: bool) -> _Equations:
+    """Beside what explains most with one more term of this name; without an unmodelled part, where ``none``."""
+    evidence = unit.evidence
+    mine = [i for i, term in enumerate(evidence.terms) if term.name == name]
+    others = [base for base in bases if name not in base.names]
+    found = max(others, key=lambda base: base.with_each[mine].max()).found
+    row = found.parts.index(0) if none and 0 in found.parts else int(np.argmax(found.by_part))
+    cell = int(np.argmax(found.log[row]))
+    without = float(log_sum_exp([base.found.total for base in others]))
+    share = float(found.by_part[row]) - without + _log_without(unit, bases, name)
+    of_terms, chi2 = evidence.normal_equations(found.parts[row], found.members, found.sizes[cell], mine)
+    explained = max(_explained(*equations) for equations in of_terms.values())
+    return _Equations(of_terms, chi2, evidence.rows.noise_given(chi2 - explained), share)
+
+
+def _explained(information: Floats, score: Floats) -> float:
+    """By how much a term lowers the sum of squares, at most."""
+    return float(score @ np.linalg.pinv(information) @ score)
+
+
+def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations], index: Sequence[int]) -> Floats:
+    """(R,) the same ratio, where all have the coefficients of the first: by Laplace's method about the coefficients
+    that explain most, as the noise of no unit is known beforehand. Two such points are looked for, since a unit may as
+    well lack the effect and be noisy."""
+    first = units[0].evidence.terms[index[0]]
+    scaled = []
+    for unit, of_unit, i in zip(units, equations, index, strict=True):
+        scale = first.mix / unit.evidence.terms[i].mix
+        information, score = of_unit.of_terms[i]
+        scaled.append((scale[:, None] * information * scale, scale * score))
+    shared = (
+        np.array([of[0] for of in scaled]),
+        np.array([of[1] for of in scaled]),
+        np.array([of_unit.chi2 for of_unit in equations]),
+    )
+    explained = np.array([of_unit.variance for of_unit in equations])
+    noisy = np.array([u.evidence.rows.noise_given(e.chi2) for u, e in zip(units, equations, strict=True)])
+    found = [_about(units, *shared, start) for start in (explained, noisy)]
+    return np.asarray(np.max(found, axis=0) + sum(of_unit.log_share for of_unit in equations))
+
+
+def _about(units: Sequence[Posterior], information: Floats, score: Floats, chi2: Floats, start: Floats) -> Floats:
+    """(R,) the logarithm of the evidence of coefficients that U units share over that of none, for each size. Of each
+    unit ``information`` (U,q,q), ``score`` (U,q) and ``chi2`` (U,) without them; ``start`` (U,) are variances of the
+    noise."""
+    size = units[0].evidence.sizes
+    prior = np.eye(score.shape[1]) / size[:, None, None] ** 2
+    variance = np.broadcast_to(start, (len(size), len(units)))
+    for _ in range(STEPS):
+        precision = prior + np.einsum("ru,uqp->rqp", 1 / variance, information)
+        values = np.linalg.solve(precision, ((1 / variance) @ score)[:, :, None])[:, :, 0]
+        squares = np.einsum("rq,uqp,rp->ru", values, information, values)
+        left = np.maximum(chi2 - 2 * values @ score.T + squares, 0.0)
+        variance = np.array(
+            [[u.evidence.rows.noise_given(float(x)) for u, x in zip(units, row, strict=True)] for row in left]
+        )
+    gain = np.zeros(len(size))
+    for k, unit in enumerate(units):
+        rows = unit.evidence.rows
+        gain += rows.log_likelihood(left[:, k]) - rows.log_likelihood(chi2[k])
+    precision = prior + np.einsum("ru,uqp->rqp", 1 / variance, information)
+    log_det = np.linalg.slogdet(precision * size[:, None, None] ** 2)[1]
+    return np.asarray(gain - 0.5 * np.sum((values / size[:, None]) ** 2, axis=1) - 0.5 * log_det)

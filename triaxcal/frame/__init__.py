@@ -1,5 +1,0 @@
-"""The frame of the mounting faces: from faces in two orientations each to a rotation, with the fixture's own errors."""
-
-from triaxcal.frame.frames import Frames, UnitFrame
-
-__all__ = ["Frames", "UnitFrame"]

@@ -1,0 +1,5 @@
+"""The frame of the mounting faces: from faces in two orientations each to a rotation, with the fixture's own errors."""
+
+from triaxcal.frames.frames import Frames, UnitFrame
+
+__all__ = ["Frames", "UnitFrame"]

@@ -1,0 +1,96 @@
+"""The errors of a fixture's own faces, and which of them do not depend on the frame they are told in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.frames.faces import axis_of
+
+
+@dataclass(frozen=True)
+class Quantity:
+    value: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class Fixture:
+    """Faces by the label of what is up on them. ``up`` (f,3) their inward normals in the body's frame.
+
+    ``error`` (f,3) how far these are from the axes, rad, along the body's axes; ``covariance`` (3f,3f) of all of them.
+    ``squareness`` by pair of axes (XY, YZ, ZX): how far the mean normals of their faces are from a right angle,
+    positive where the angle is smaller. ``parallelism`` by axis: half of what its two faces lack to be parallel, as the
+    mean of both inward normals, along the two other axes in cyclic order. Both do not depend on the datum.
+    ``offset`` (3,) rad: standard error, about the body's axes, of the datum against the frame that faces with
+    independent errors of this size were made to; None where nothing shows that size.
+    """
+
+    faces: tuple[str, ...]
+    up: Floats
+    error: Floats
+    covariance: Floats
+    squareness: dict[str, Quantity]
+    parallelism: dict[str, tuple[Quantity, Quantity]]
+    offset: Floats | None
+
+    @property
+    def standard_error(self) -> Floats:
+        """(f,3) rad."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(-1, 3)
+
+
+def fixture_of(faces: tuple[str, ...], up: Floats, covariance: Floats, axes: Floats, datum: Floats) -> Fixture:
+    """``covariance`` (2f,2f) of the normals in ``axes`` (f,3,2); ``datum`` (3,2f): what of their errors there it makes
+    zero."""
+    nominal = np.array([axis_of(label) for label in faces])
+    spread = np.zeros((3 * len(faces), 2 * len(faces)))
+    for k in range(len(faces)):
+        # What a normal loses along its own axis is of second order, and no error of the face.
+        spread[3 * k : 3 * k + 3, 2 * k : 2 * k + 2] = axes[k] - np.outer(nominal[k], nominal[k] @ axes[k])
+    error = up - nominal * np.sum(nominal * up, axis=1, keepdims=True)
+    V = spread @ covariance @ spread.T
+    flat = error.ravel()
+
+    def quantity(weight: Floats) -> Quantity:
+        return Quantity(float(weight @ flat), float(np.sqrt(max(float(weight @ V @ weight), 0.0))))
+
+    def component(label: str, axis: int) -> Floats:
+        weight = np.zeros(len(flat))
+        weight[3 * faces.index(label) + axis] = 1.0
+        return weight
+
+    both = [a for a in range(3) if f"+{'XYZ'[a]}" in faces and f"-{'XYZ'[a]}" in faces]
+    mean, half = {}, {}
+    for a in range(3):
+        here = [label for label in faces if label[1] == "XYZ"[a]]
+        for b in range(3):
+            if here and a != b:
+                # The mean normal of an axis, the face of the minus side turned round.
+                mean[a, b] = np.sum([component(x, b) * axis_of(x)[a] for x in here], axis=0) / len(here)
+            if a in both and a != b:
+                half[a, b] = np.sum([component(x, b) for x in here], axis=0) / 2
+    squareness = {
+        "XYZ"[a] + "XYZ"[b]: quantity(mean[a, b] + mean[b, a])
+        for a, b in ((0, 1), (1, 2), (2, 0))
+        if (a, b) in mean and (b, a) in mean
+    }
+    parallelism = {"XYZ"[a]: (quantity(half[a, (a + 1) % 3]), quantity(half[a, (a + 2) % 3])) for a in both}
+    return Fixture(faces, up, error, V, squareness, parallelism, _offset(nominal, axes, error, V, datum))
+
+
+def _offset(nominal: Floats, axes: Floats, error: Floats, V: Floats, datum: Floats) -> Floats | None:
+    left = 2 * len(nominal) - 3
+    if left < 1:
+        return None
+    turns = np.cross(np.eye(3), nominal[:, None]).transpose(0, 2, 1)  # (f,3,3) errors by a rotation of all faces
+    B = turns.reshape(-1, 3)
+    shape = np.eye(len(B)) - B @ np.linalg.pinv(B)  # errors as the least-squares frame has them, whatever the datum
+    rest = shape @ error.ravel()
+    variance = max(float(rest @ rest) - float(np.trace(shape @ V @ shape)), 0.0) / left
+    # The datum turns by what makes its share of the faces' errors zero.
+    across = (axes.transpose(0, 2, 1) @ turns).reshape(-1, 3)
+    turned = np.linalg.solve(datum @ across, datum)
+    return np.asarray(np.sqrt(variance * np.sum(turned**2, axis=1)))

@@ -1,0 +1,296 @@
+"""The frame of a unit's mounting faces: what an ellipsoid leaves open, from poses on the faces of a fixture.
+
+Each unit gives the inward normals of the faces it stood on, in its sensor's frame (`triaxcal.frames.standing`). The
+fixture's faces are the same for all units on it, so all their normals together give the faces, up to a rotation of the
+whole, and each unit's rotation against them. That last rotation is a convention, the datum: which three of the
+fixture's errors are zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from triaxcal.arrays import Floats
+from triaxcal.distributions import chi2_sf, t_ppf
+from triaxcal.errors import InvalidData, Refused
+from triaxcal.estimate.caution import Caution
+from triaxcal.frames.faces import LABELS, axis_of, nearest_rotation, opposite
+from triaxcal.frames.fixture import Fixture, fixture_of
+from triaxcal.frames.orientations import LARGE_RAD
+from triaxcal.frames.standing import Standing, basis_of
+from triaxcal.poses.pure_error import LACK_OF_FIT
+
+ROUNDS = 8
+SINGULAR = 0.05
+"""Faces that connect units give singular values near 1; ones that do not, those of the faces' own errors."""
+
+
+@dataclass(frozen=True)
+class Datum:
+    """Which frame the body's is. ``faces``: none for the least-squares frame, else primary and secondary face.
+
+    Faces are named by their outward normal: ``-Z`` is the one that the fixture stands on with +Z up. The least-squares
+    frame is the one in which the sum of the squared errors of the faces that there are is smallest, all weighing the
+    same. With faces, the primary's normal is the axis of its name, and the secondary's lies in the plane of the two.
+    """
+
+    faces: tuple[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.faces is None:
+            return
+        primary, secondary = self.faces
+        if not {primary, secondary} <= set(LABELS) or primary[1] == secondary[1]:
+            raise InvalidData(f"a datum is two faces at right angles, as -Z,-X, not {primary},{secondary}")
+
+    @property
+    def name(self) -> str:
+        return "least_squares" if self.faces is None else ",".join(self.faces)
+
+
+@dataclass(frozen=True)
+class UnitFrame:
+    """``rotation`` (3,3) takes vectors of the sensor's frame to the body's.
+
+    ``covariance`` (3,3) rad²: of the small rotation about the body's axes that would take it to the truth; ``dof``
+    (3,) the effective degrees of freedom behind its diagonal.
+    """
+
+    standing: Standing
+    rotation: Floats
+    covariance: Floats
+    dof: Floats
+
+    @property
+    def rotation_vector(self) -> Floats:
+        """(3,) rad."""
+        return np.asarray(Rotation.from_matrix(self.rotation).as_rotvec())
+
+    @property
+    def standard_error(self) -> Floats:
+        """(3,) rad, about the body's axes."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def coverage_factor(self, level: float = 0.95) -> Floats:
+        """(3,): Student's t for ``dof``."""
+        return np.asarray(t_ppf((1 + level) / 2, self.dof))
+
+
+@dataclass(frozen=True)
+class UnitsDisagree(Caution):
+    """On the fixture's faces, by ``ratio`` times what noise and seating explain (probability ``p``)."""
+
+    ratio: float
+    p: float
+
+
+@dataclass(frozen=True)
+class FacesMissing(Caution):
+    """Nothing stood with these ``faces`` up, and the least-squares frame is that of the others."""
+
+    faces: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FaceFarOff(Caution):
+    """A face is ``angle_rad`` off its axis."""
+
+    angle_rad: float
+
+
+@dataclass(frozen=True)
+class Frames:
+    """``units`` in the order given, in one frame. ``covariance`` (3u,3u) of all their rotations.
+
+    ``chi2`` in ``left`` degrees of freedom: by how much the units disagree on the faces; ``inflation`` ≥ 1 by how much
+    the standard errors were raised for it.
+    """
+
+    datum: Datum
+    units: tuple[UnitFrame, ...]
+    fixture: Fixture
+    covariance: Floats
+    chi2: float
+    left: int
+    inflation: float
+    cautions: tuple[Caution, ...]
+
+    @property
+    def lack_of_fit_p(self) -> float | None:
+        return float(chi2_sf(self.chi2, self.left)) if self.left else None
+
+    def between(self, i: int, j: int) -> tuple[Floats, Floats]:
+        """Rotation vector (3,) rad from the sensor's frame of unit i to that of j, and its covariance (3,3).
+
+        The covariance is of a small rotation about the body's axes.
+        """
+        turn = Rotation.from_matrix(self.units[j].rotation.T @ self.units[i].rotation).as_rotvec()
+        a, b = slice(3 * i, 3 * i + 3), slice(3 * j, 3 * j + 3)
+        V = self.covariance
+        return np.asarray(turn), V[a, a] + V[b, b] - V[a, b] - V[b, a]
+
+
+def frames(standings: Sequence[Standing], *, datum: Datum | None = None) -> Frames:
+    """One frame for units that stood on the faces of one fixture.
+
+    Raises Refused where the faces do not connect the units, or the datum's are not among those stood on.
+    """
+    if not standings:
+        raise InvalidData("no unit")
+    datum = datum or Datum()
+    faces = tuple(label for label in LABELS if any(label in s.faces for s in standings))
+    _datum_is_there(datum, faces)
+    joint = _Joint(standings, faces, datum).connected().solved()
+    n = 3 * len(standings)
+    left = sum(2 * len(s.faces) for s in standings) - n - 2 * len(faces) + 3
+    p = float(chi2_sf(joint.chi2, left)) if left else 1.0
+    inflation = float(np.sqrt(joint.chi2 / left)) if p < LACK_OF_FIT else 1.0
+    covariance = joint.covariance * inflation**2
+    dofs = _dof(joint, standings) if inflation == 1 else [np.full(3, float(left))] * len(standings)
+    found = tuple(
+        UnitFrame(s, joint.rotations[i], covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], dofs[i])
+        for i, s in enumerate(standings)
+    )
+    fixture = fixture_of(faces, joint.up, covariance[n:, n:], joint.axes, joint.constraints()[0])
+    cautions = [*_cautions(fixture, datum), *([UnitsDisagree(inflation, p)] if inflation > 1 else [])]
+    return Frames(datum, found, fixture, covariance[:n, :n], joint.chi2, left, inflation, tuple(cautions))
+
+
+def _datum_is_there(datum: Datum, faces: Sequence[str]) -> None:
+    lost = [face for face in datum.faces or () if opposite(face) not in faces]
+    if lost:
+        raise Refused(
+            f"no unit stood on the face {', '.join(lost)}, which the datum needs", wanted=[opposite(f) for f in lost]
+        )
+
+
+@dataclass
+class _Joint:
+    """Rotations of the units and normals of the faces that fit all observed normals best, under the datum.
+
+    Unknowns of a step: a small rotation about the body's axes for each unit (3u,), shifts of the normals in two axes
+    each (2f,). The three constraints of the datum take the place of the rotation of the whole, which nothing shows.
+    """
+
+    standings: Sequence[Standing]
+    faces: tuple[str, ...]
+    datum: Datum
+
+    def __post_init__(self) -> None:
+        self.nominal = np.array([axis_of(label) for label in self.faces])
+        self.up = self.nominal.copy()
+        self.rotations = [
+            nearest_rotation(s.up, np.array([axis_of(label) for label in s.faces])) for s in self.standings
+        ]
+
+    def connected(self) -> _Joint:
+        """Itself; raises Refused where the faces in common leave units free to turn against each other."""
+        n = 3 * len(self.standings)
+        self._prepare()
+        G = np.concatenate([np.zeros((3, n)), self.constraints()[0]], axis=1)
+        rows = np.concatenate([*(self._observed(i, s)[0] for i, s in enumerate(self.standings)), G])
+        if np.linalg.matrix_rank(rows, tol=SINGULAR) < rows.shape[1]:
+            raise Refused(
+                "the units stood on faces that do not connect them: any two at right angles that one has in common "
+                "with the others would",
+                wanted=[label for label in LABELS if not all(label in s.faces for s in self.standings)],
+            )
+        return self
+
+    def solved(self) -> _Joint:
+        for _ in range(ROUNDS):
+            step = self._step()
+            for i in range(len(self.standings)):
+                turn = Rotation.from_rotvec(step[3 * i : 3 * i + 3]).as_matrix()
+                self.rotations[i] = turn @ self.rotations[i]
+            shift = step[3 * len(self.standings) :].reshape(-1, 2)
+            self.up = self.up + np.einsum("kij,kj->ki", self.axes, shift)
+            self.up /= np.linalg.norm(self.up, axis=1, keepdims=True)
+        self._step()
+        return self
+
+    def _prepare(self) -> None:
+        self.axes = np.array([basis_of(label, self.up[k], np.eye(3)) for k, label in enumerate(self.faces)])
+
+    def _step(self) -> Floats:
+        self._prepare()
+        n, m = 3 * len(self.standings), 2 * len(self.faces)
+        information, right = np.zeros((n + m, n + m)), np.zeros(n + m)
+        self.chi2 = 0.0
+        self.gains = []
+        for i, standing in enumerate(self.standings):
+            J, y, V = self._observed(i, standing)
+            weight = np.linalg.inv(V)
+            information += J.T @ weight @ J
+            right += J.T @ weight @ y
+            self.chi2 += float(y @ weight @ y)
+            self.gains.append(J.T @ weight)
+        G, miss = self.constraints()
+        G = np.concatenate([np.zeros((3, n)), G], axis=1)
+        scale = float(np.trace(information)) / (n + m)
+        bordered = np.block([[information / scale, G.T], [G, np.zeros((3, 3))]])
+        inverse = np.linalg.inv(bordered)
+        self.covariance = inverse[: n + m, : n + m] / scale
+        self.gains = [self.covariance @ gain for gain in self.gains]
+        step: Floats = self.covariance @ right + inverse[: n + m, n + m :] @ -miss
+        return step
+
+    def _observed(self, i: int, standing: Standing) -> tuple[Floats, Floats, Floats]:
+        """Derivatives (2k, 3u+2f), misses (2k,) and their covariance of one unit's normals, in the body's axes."""
+        n = 3 * len(self.standings)
+        k = len(standing.faces)
+        J, y, turn = np.zeros((2 * k, n + 2 * len(self.faces))), np.zeros(2 * k), np.zeros((2 * k, 2 * k))
+        for row, label in enumerate(standing.faces):
+            face = self.faces.index(label)
+            T, seen = self.axes[face], self.rotations[i] @ standing.up[row]
+            at = slice(2 * row, 2 * row + 2)
+            y[at] = -(T.T @ seen)
+            J[at, 3 * i : 3 * i + 3] = -T.T @ np.cross(seen, np.eye(3), axisb=0).T
+            J[at, n + 2 * face : n + 2 * face + 2] = -np.eye(2)
+            turn[at, at] = T.T @ self.rotations[i] @ standing.basis[row]
+        return J, y, turn @ standing.covariance @ turn.T
+
+    def constraints(self) -> tuple[Floats, Floats]:
+        """(3,2f) derivatives, and misses (3,), of what the datum wants to be zero."""
+        G = np.zeros((3, 2 * len(self.faces)))
+        if self.datum.faces is None:
+            for k in range(len(self.faces)):
+                G[:, 2 * k : 2 * k + 2] = np.cross(self.nominal[k], self.axes[k], axisb=0).T
+            return G, np.sum(np.cross(self.nominal, self.up), axis=0)
+        first, second = (self.faces.index(opposite(face)) for face in self.datum.faces)
+        rows = [*(np.delete(np.eye(3), np.argmax(np.abs(self.nominal[first])), axis=0))]
+        third = np.cross(self.nominal[first], self.nominal[second])
+        for row, v in enumerate(rows):
+            G[row, 2 * first : 2 * first + 2] = v @ self.axes[first]
+        G[2, 2 * second : 2 * second + 2] = third @ self.axes[second]
+        return G, np.array([*(v @ self.up[first] for v in rows), third @ self.up[second]])
+
+
+def _dof(joint: _Joint, standings: Sequence[Standing]) -> list[Floats]:
+    """(3,) for each unit by Welch and Satterthwaite's formula (JCGM 100, G.4.1)."""
+    out: list[Floats] = []
+    for i in range(len(standings)):
+        whole = np.diag(joint.covariance)[3 * i : 3 * i + 3]
+        parts = np.zeros(3)
+        for standing, gain in zip(standings, joint.gains, strict=True):
+            rows = gain[3 * i : 3 * i + 3]
+            seated = np.diag(rows @ standing.seating_part @ rows.T)
+            other = np.diag(rows @ standing.covariance @ rows.T) - seated
+            parts += np.maximum(other, 0.0) ** 2 / standing.dof
+            if standing.seating_dof:
+                parts += seated**2 / standing.seating_dof
+        out.append(np.asarray(np.clip(whole**2 / np.maximum(parts, 1e-300), 1.0, 1e9)))
+    return out
+
+
+def _cautions(fixture: Fixture, datum: Datum) -> Iterator[Caution]:
+    missing = tuple(label for label in LABELS if label not in fixture.faces)
+    if missing and datum.faces is None:
+        yield FacesMissing(missing)
+    worst = float(np.abs(fixture.error).max())
+    if worst > LARGE_RAD:
+        yield FaceFarOff(worst)

@@ -1,0 +1,204 @@
+"""In which orientations a fixture stood on each of its faces, and what these tell of the table's tilt.
+
+Headings that nobody gave are found as far as they matter: the poses on a face are split in two, half a turn apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from triaxcal.arrays import Bools, Floats
+from triaxcal.distributions import chi2_isf, chi2_sf, t_isf
+from triaxcal.errors import InvalidData, Refused
+from triaxcal.estimate.caution import Caution
+from triaxcal.frames.faces import Labelling
+from triaxcal.frames.verticals import Verticals
+from triaxcal.poses.pose import Began
+
+FLOOR_RAD = 1e-12
+SHOWS = 1e-4
+"""Probability below which a tilt, or a face that was not turned, is more than noise."""
+PAIRS_LEAST = 3
+"""So many faces that agree on the tilt are needed to conclude it for a face that stood one way only."""
+SHORT = 0.95
+"""The share of the tilt that a turn by 143° shows."""
+SPLIT_MOST = 12
+APART_RAD = 0.2
+LARGE_RAD = 0.01
+
+
+@dataclass(frozen=True)
+class NotTurned(Caution):
+    """The poses with a face up differ less than half a turn makes them on the others: taken as not turned by that."""
+
+    face: str
+    began: Began
+
+
+@dataclass(frozen=True)
+class NotFlush(Caution):
+    """The poses with a face up differ by ``angle_rad``, far more than on the other faces."""
+
+    face: str
+    began: Began
+    angle_rad: float
+
+
+@dataclass(frozen=True)
+class Assumed:
+    """What the user knows: standard errors of one seating of the fixture and of a turn, and the table's tilt [rad].
+
+    None where it is to be found from the poses. ``turn`` is that of a half turn, or of a heading that is given.
+    """
+
+    seating: float | None = None
+    tilt: float | None = None
+    turn: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("seating error", self.seating), ("tilt", self.tilt), ("turn error", self.turn)):
+            if value is not None and not 0 <= value < 1:
+                raise InvalidData(f"the {name} must be between 0 and 1 rad, not {value}")
+
+
+@dataclass(frozen=True)
+class Face:
+    """``rows`` of the poses on it, ``turn`` (n,) rad: headings where ``headed``, else counted from the first pose."""
+
+    label: str
+    rows: tuple[int, ...]
+    turn: Floats
+    headed: bool
+
+    @classmethod
+    def of(cls, found: Verticals, labelling: Labelling, label: str) -> Face:
+        rows = tuple(i for i, here in enumerate(labelling.labels) if here == label)
+        headings = [labelling.headings[i] for i in rows]
+        known = [h for h in headings if h is not None]
+        if len(known) == len(rows):
+            return cls(label, rows, np.array(known), True)
+        return cls(label, rows, _turns(found, rows), False)
+
+    @property
+    def resolved(self) -> bool:
+        """Whether orientations differ."""
+        return bool(np.any(1 - np.cos(self.turn[:, None] - self.turn[None, :]) > 1 - np.cos(APART_RAD)))
+
+
+def felt(turn: float) -> Floats:
+    """(2,2): the table's tilt in the axes of a face (`standing.basis_of`) that has turned by ``turn``."""
+    c, s = np.cos(turn), np.sin(turn)
+    return np.array([[c, s], [-s, c]])
+
+
+def _turns(found: Verticals, rows: Sequence[int]) -> Floats:
+    """(n,): half turns from the first pose, by the split in two whose means are farthest apart; or quarter turns.
+
+    Quarter turns where half turns leave far more than noise and quarter turns a small part of that.
+    """
+    up = found.direction[list(rows)]
+    second = _farthest_halves(up)
+    turn = np.where(second, np.pi, 0.0)
+    y, noise = _flat(found, rows)
+    left = 2 * len(rows) - 4
+    if left <= 0:
+        return turn
+    xy = y.reshape(-1, 2) - (y.reshape(-1, 2)[second].mean(axis=0) + y.reshape(-1, 2)[~second].mean(axis=0)) / 2
+    angle = -np.arctan2(xy[:, 1], xy[:, 0])  # the tilt turns the other way
+    quarter = np.round((angle - angle[0]) / (np.pi / 2)) % 4 * (np.pi / 2)
+    designs = [_felt_by(turn), _felt_by(quarter)]
+    half_left, quarter_left = (float(np.sum((y - H @ (np.linalg.pinv(H) @ y)) ** 2)) for H in designs)
+    beyond = chi2_sf(half_left * len(noise) / float(np.trace(noise)), left) < SHOWS
+    return quarter if beyond and quarter_left < half_left / 4 else turn
+
+
+def _farthest_halves(up: Floats) -> Bools:
+    """(n,): not with the first pose."""
+    n = len(up)
+    if n > SPLIT_MOST:  # the direction of most scatter divides them
+        centred = up - up.mean(axis=0)
+        along = centred @ np.linalg.svd(centred)[2][0]
+        return np.asarray((along > 0) != (along[0] > 0))
+    best, farthest = np.zeros(n, dtype=bool), -1.0
+    for code in range(1, 2 ** (n - 1)):
+        second = np.array([False, *(bool(code >> i & 1) for i in range(n - 1))])
+        gap = up[second].mean(axis=0) - up[~second].mean(axis=0)
+        spread = float(gap @ gap) * float(second.sum() * (~second).sum())
+        if spread > farthest:
+            best, farthest = second, spread
+    return np.asarray(best)
+
+
+def _felt_by(turn: Floats) -> Floats:
+    """(2n,4): poses by the face's normal and the table's tilt."""
+    return np.concatenate([np.hstack([np.eye(2), felt(t)]) for t in turn])
+
+
+def _flat(found: Verticals, rows: Sequence[int]) -> tuple[Floats, Floats]:
+    """(2n,) up in the poses of one face, in axes square to its mean, x × y along it; and its covariance."""
+    up = found.direction[list(rows)]
+    m = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
+    x = np.linalg.svd(m[None])[2][1]
+    across = np.kron(np.eye(len(rows)), np.stack([x, np.cross(m, x)]))
+    index = np.concatenate([3 * r + np.arange(3) for r in rows])
+    return across @ up.ravel(), across @ found.covariance[np.ix_(index, index)] @ across.T
+
+
+def _tilt_on(face: Face, found: Verticals) -> tuple[float, float]:
+    """Magnitude of the table's tilt as one face alone shows it, and its standard error."""
+    y, covariance = _flat(found, face.rows)
+    gain = np.linalg.pinv(_felt_by(face.turn))[2:]
+    d = gain @ y
+    size = float(np.linalg.norm(d))
+    along = d @ gain / max(size, 1e-300)
+    return size, float(np.sqrt(max(float(along @ covariance @ along), FLOOR_RAD**2)))
+
+
+def pairs_of(faces: Sequence[Face], found: Verticals) -> list[tuple[Face, float, float]]:
+    """Faces in more than one orientation at unknown headings: the tilt's magnitude there and its standard error."""
+    return [(f, *_tilt_on(f, found)) for f in faces if not f.headed and f.resolved]
+
+
+def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[Caution]]:
+    """The faces, those that were seemingly not turned between their poses as in one orientation; and cautions."""
+    cautions: list[Caution] = []
+    pairs = pairs_of(faces, found)
+    size = np.array([m for _, m, _ in pairs])
+    still = set()
+    for k, (face, m, error) in enumerate(pairs):
+        rest = np.delete(size, k)
+        if len(rest) < PAIRS_LEAST - 1:
+            continue
+        middle = float(np.median(rest))
+        scatter = float(np.hypot(error, np.std(rest, ddof=1) * np.sqrt(1 + 1 / len(rest))))
+        far = abs(m - middle) > float(t_isf(SHOWS, len(rest) - 1)) * scatter
+        began = found.poses[face.rows[0]].began
+        if far and m < SHORT * middle:
+            still.add(face.label)
+            cautions.append(NotTurned(face.label, began))
+        elif far and m > max(3 * middle, LARGE_RAD / 10):
+            cautions.append(NotFlush(face.label, began, 2 * m))
+    single = [f for f in faces if not f.headed and (not f.resolved or f.label in still)]
+    if single and len(pairs) - len(still) < PAIRS_LEAST:
+        # One or two pairs among faces that stood one way may be poses repeated, without a turn.
+        still |= {f.label for f, m, error in pairs if m**2 < chi2_isf(SHOWS, 2) * error**2}
+    return [replace(f, turn=np.zeros(len(f.rows))) if f.label in still else f for f in faces], cautions
+
+
+def tilt_of_others(faces: Sequence[Face], found: Verticals) -> float:
+    """rms tilt where it is resolved. Raises Refused where too few faces show one."""
+    pairs = pairs_of(faces, found)
+    chi2 = sum((m / error) ** 2 for _, m, error in pairs)
+    if len(pairs) < PAIRS_LEAST or chi2_sf(chi2, 2 * len(pairs)) > SHOWS:
+        have = f"{len(pairs)} faces" if len(pairs) > 1 else "one face" if pairs else "no face"
+        raise Refused(
+            f"{have} of {len(faces)} stood in two orientations half a turn apart"
+            f"{', which show no tilt' if len(pairs) >= PAIRS_LEAST else ''}: on the others the table's tilt enters the "
+            "rotation and cannot be told from it: record the second orientations, or say by --table-tilt how large it "
+            "may be",
+            wanted=[f.label for f in faces if not f.resolved],
+        )
+    return float(np.sqrt(np.mean([m**2 for _, m, _ in pairs])))

@@ -1,0 +1,1 @@
+"""Other ways in: a turning unit, known attitudes, datasheet values."""

@@ -1,0 +1,276 @@
+"""Refinement of passport values: a calibration that is known from before, brought up to date by a few still poses.
+
+The paper's reference 3 adds increments to passport values until |a| is right in the poses. Here the passport's values
+are observations with standard errors of their own beside the poses (JCGM 102; Bayes with normal priors): fewer poses
+than parameters will do, each parameter is moved as far as the poses know better than the passport, and whether the two
+contradict each other can be tested.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.errors import InvalidData, Refused
+from triaxcal.estimate.calibration import Calibration, HoldsAt, PoseResult, Residual
+from triaxcal.estimate.caution import Caution
+from triaxcal.estimate.problem import Problem, State, linearise, parameters_by_theta
+from triaxcal.model.directions import dilution, linear_design
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.conditions import conditions_elsewhere
+from triaxcal.poses.pose import Pose
+from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof
+
+STEPS_MOST = 60
+CONVERGED = 1e-12
+CONFLICT = 0.01
+FROM_POSES, FROM_PASSPORT = 0.9, 0.1
+"""Share of the information on a parameter from which on it counts as the poses', or still as the passport's."""
+
+
+class FarFromPoses(Refused):
+    """The poses are too far from the passport's values."""
+
+    def __init__(self) -> None:
+        super().__init__("the refinement did not converge: the passport values are far from these poses")
+
+
+@dataclass(frozen=True)
+class Passport:
+    """Values known from before. ``standard_error`` (9+p,) in the order of `Calibration.parameters`: scale factors,
+    misalignments, biases, effects' coefficients; a zero holds a value fast. ``correlation`` (9+p,9+p) of their errors,
+    none where it is None."""
+
+    sensor: Sensor
+    standard_error: Floats
+    channel_reference: Mapping[str, float]
+    reference: float
+    correlation: Floats | None = None
+    holds_at: HoldsAt | None = None
+
+    @property
+    def moment(self) -> tuple[float, float] | None:
+        """As `Calibration.moment`."""
+        return None if self.holds_at is None else self.holds_at.clocks
+
+    def __post_init__(self) -> None:
+        n = 9 + sum(len(e.coefficients) for e, _ in self.sensor.effects)
+        error = self.standard_error
+        if error.shape != (n,) or not (np.isfinite(error).all() and np.all(error >= 0)):
+            raise InvalidData(f"a passport of {n} values needs as many standard errors of at least 0")
+        if not np.any(error > 0):
+            raise InvalidData("every passport value has a standard error of 0: nothing is left to refine")
+        if self.correlation is not None and self.correlation.shape != (n, n):
+            raise InvalidData(f"the correlation of a passport of {n} values is a matrix of as many rows")
+
+    @property
+    def values(self) -> Floats:
+        s = self.sensor
+        return np.concatenate([s.scale_factor, s.misalignment, s.bias, *(c for _, c in s.effects)])
+
+    @property
+    def root(self) -> Floats:
+        """(9+p,q): what independent errors of variance one make of the values that are free; its square is their
+        covariance."""
+        error = self.standard_error
+        free = np.flatnonzero(error > 0)
+        if self.correlation is None:
+            return np.asarray(np.diag(error)[:, free])
+        values, vectors = np.linalg.eigh(self.correlation[np.ix_(free, free)])
+        out = np.zeros((len(error), len(free)))
+        out[free] = error[free, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        return out
+
+
+@dataclass(frozen=True)
+class DatasheetContradicted(Caution):
+    """Poses and passport values contradict each other (probability ``p``), most in ``parameter``, which moved by
+    ``shift`` standard errors; standard errors are ``raised`` so many times."""
+
+    p: float
+    parameter: str
+    shift: float
+    raised: float
+
+
+@dataclass(frozen=True)
+class StillOfDatasheet(Caution):
+    """The poses say next to nothing of these ``parameters``."""
+
+    parameters: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """``share`` (9+p,) of the information on each parameter that came from the poses, 0…1: one less the ratio of its
+    variance after to that before. ``shift`` (9+p,) of the values in standard errors of a shift by chance, 0 where the
+    poses say nothing. ``conflict_p`` is the probability of residuals and shifts as large as these together.
+    """
+
+    calibration: Calibration
+    passport: Passport
+    share: Floats
+    shift: Floats
+    conflict_p: float | None
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """ "poses", "passport" or "both" for each parameter."""
+        return tuple("poses" if s > FROM_POSES else "passport" if s < FROM_PASSPORT else "both" for s in self.share)
+
+
+def refine(poses: Sequence[Pose], passport: Passport) -> Refinement:
+    """Refine passport values by still poses, however few.
+
+    Raises Refused where there is none, InvalidData where a channel that the passport's effects need is missing.
+    """
+    if not poses:
+        raise Refused("no still pose: there is nothing to refine the passport values by")
+    problem = _problem(poses, passport)
+    free = passport.standard_error > 0
+    root = passport.root
+    z, information = _solved(problem, passport, root)
+    p = passport.values + root @ z
+    prior = passport.standard_error**2
+    covariance = root @ np.linalg.inv(information) @ root.T
+    state = _state(problem, passport, p)
+    r, J, s = linearise(problem, state)
+    J = J @ _theta_by_parameters(problem, state)
+    moved = p - passport.values
+    chi2 = float(np.sum((r / s) ** 2) + z @ z)
+    pure = pure_error_dof(poses)
+    conflict_p = lack_of_fit_p(chi2, len(poses), pure if pure >= 1 else 1e6)
+    raised = max(1.0, float(np.sqrt(chi2 / len(poses)))) if conflict_p is not None and conflict_p < CONFLICT else 1.0
+    leverage = np.clip(np.einsum("ni,ij,nj->n", J, covariance, J) / s**2, 0.0, 1.0)
+    share = np.where(free, 1 - np.diag(covariance) / np.where(free, prior, 1.0), 0.0)
+    by_chance = np.sqrt(np.maximum(prior * share, 0.0))
+    shift = np.where(share > 1e-6, moved / np.where(share > 1e-6, by_chance, 1.0), 0.0)
+    calibration = Calibration(
+        sensor=state.sensor(problem),
+        covariance=covariance * raised**2,
+        reference=passport.reference,
+        channel_reference=dict(passport.channel_reference),
+        residual=_residual(r, s, leverage, conflict_p),
+        poses=_results(problem, state, poses, r, s, leverage),
+        condition=_condition(information),
+        dilution=_dilution(problem, state),
+        inflation=raised,
+        dof=float(max(len(poses), 1) if raised > 1 else max(pure, 1.0)),
+        holds_at=passport.holds_at,
+    )
+    found = Refinement(calibration, passport, share, shift, conflict_p)
+    return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found))))
+
+
+def _problem(poses: Sequence[Pose], passport: Passport) -> Problem:
+    """Scaled by what the passport expects, since few poses have no range of their own."""
+    sensor = passport.sensor
+    held = conditions_elsewhere(poses, passport.channel_reference, sensor.scale_factor, sensor.bias, passport.moment)
+    return Problem(
+        u=np.array([p.mean for p in poses]),
+        covariance=np.array([p.covariance for p in poses]),
+        channels={name: held[name] + value for name, value in passport.channel_reference.items()},
+        channel_reference=passport.channel_reference,
+        middle=sensor.centre,
+        half=np.abs(sensor.scale_factor) * passport.reference,
+        signs=np.sign(sensor.scale_factor),
+        reference=passport.reference,
+    )
+
+
+def _state(problem: Problem, passport: Passport, p: Floats) -> State:
+    k, angles, b = p[:3], p[3:6], p[6:9]
+    effects = tuple(e for e, _ in passport.sensor.effects)
+    return State(np.concatenate([problem.half / k, b - problem.middle / k, angles, p[9:]]), effects)
+
+
+def _theta_by_parameters(problem: Problem, state: State) -> Floats:
+    return np.linalg.inv(parameters_by_theta(problem, state))
+
+
+def _solved(problem: Problem, passport: Passport, root: Floats) -> tuple[Floats, Floats]:
+    """Shifts (q,) of the values along ``root`` (9+p,q) and the information (q,q) on them: Gauss–Newton with halved
+    steps."""
+    z = np.zeros(root.shape[1])
+    free = passport.standard_error > 0
+    size = max(float(np.linalg.norm(passport.values[free] / passport.standard_error[free])), 1.0)
+
+    def cost(z: Floats, s: Floats) -> float:
+        p = passport.values + root @ z
+        if np.any(p[:3] * passport.values[:3] <= 0):
+            return float("inf")
+        r, _, _ = linearise(problem, _state(problem, passport, p), jacobian=False)
+        return float(np.sum((r / s) ** 2) + z @ z)
+
+    for _ in range(STEPS_MOST):
+        state = _state(problem, passport, passport.values + root @ z)
+        r, J, s = linearise(problem, state)
+        if not (np.isfinite(J).all() and np.isfinite(r).all() and np.all(s > 0)):
+            raise FarFromPoses
+        J = J @ _theta_by_parameters(problem, state) @ root / s[:, None]
+        information = J.T @ J + np.eye(len(z))
+        if not np.isfinite(information).all():
+            raise FarFromPoses
+        step = -np.linalg.solve(information, J.T @ (r / s) + z)
+        now, scale = cost(z, s), 1.0  # the weights follow the gradient from step to step
+        for _ in range(20):
+            trial = z + scale * step
+            if cost(trial, s) <= now * (1 + 1e-9) + 1e-12:
+                break
+            scale /= 2
+        z = trial
+        if np.linalg.norm(step) <= CONVERGED * size:
+            return z, information
+    if np.linalg.norm(step) > 1e-6:
+        raise FarFromPoses
+    return z, information
+
+
+def _residual(r: Floats, s: Floats, leverage: Floats, p: float | None) -> Residual:
+    alone = r / np.maximum(1 - leverage, 1e-9)  # of each pose under passport and all other poses
+    return Residual(
+        rms_g=float(np.sqrt(np.mean(r**2))),
+        max_abs_g=float(np.max(np.abs(r))),
+        cross_validated_rms_g=float(np.sqrt(np.mean(alone**2))) if np.all(leverage < 1 - 1e-6) else None,
+        noise_floor_g=float(np.sqrt(np.mean(s**2))),
+        lack_of_fit_p=p,
+    )
+
+
+def _results(
+    problem: Problem, state: State, poses: Sequence[Pose], r: Floats, s: Floats, leverage: Floats
+) -> tuple[PoseResult, ...]:
+    a = state.sensor(problem).specific_force(problem.u, problem.conditions)
+    direction = a / np.linalg.norm(a, axis=1, keepdims=True)
+    free = np.sqrt(np.maximum(1 - leverage, 0.0))
+    studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
+    return tuple(
+        PoseResult(p, direction[i], float(r[i]), float(s[i]), float(studentized[i]), float(leverage[i]))
+        for i, p in enumerate(poses)
+    )
+
+
+def _condition(information: Floats) -> float:
+    norms = np.sqrt(np.diag(information))
+    return float(np.sqrt(np.linalg.cond(information / np.outer(norms, norms))))
+
+
+def _dilution(problem: Problem, state: State) -> float:
+    """Of the poses alone, without the passport."""
+    a = state.sensor(problem).specific_force(problem.u, problem.conditions)
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    return dilution(a, linear_design(a, (problem.u - problem.middle) / problem.half))
+
+
+def _cautions(found: Refinement) -> Iterator[Caution]:
+    names = found.calibration.parameters
+    if found.conflict_p is not None and found.conflict_p < CONFLICT:
+        worst = int(np.argmax(np.abs(found.shift)))
+        yield DatasheetContradicted(
+            found.conflict_p, names[worst], float(found.shift[worst]), found.calibration.inflation
+        )
+    if kept := tuple(n for n, s in zip(names, found.sources, strict=True) if s == "passport"):
+        yield StillOfDatasheet(kept)

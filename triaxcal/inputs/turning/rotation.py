@@ -1,0 +1,336 @@
+"""Calibration from a unit that turns slowly and never rests: adjusted least squares from streaming moments.
+
+Ordinary fits of an ellipsoid to raw samples are biased by the square of the noise, which more samples do not cure.
+Adjusted least squares (`triaxcal.inputs.turning.adjusted`) corrects the moments of the samples for the noise instead,
+and estimates it. All it needs of the samples are their moments up to the fourth degree
+(`triaxcal.inputs.turning.moments`).
+
+How the noise is shared between the axes the ellipsoid does not show; differences from sample to sample do, where the
+unit turns slowly. Whether noise is all there is, is judged by stretches of the recording: the mean magnitude of each
+differs from the reference by no more than the noise of one sample over the root of their number, if the noise is
+white, the model complete, and gravity alone was felt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from triaxcal.arrays import Bools, Floats
+from triaxcal.distributions import f_sf
+from triaxcal.errors import InvalidData, Refused
+from triaxcal.estimate.calibration import Calibration, Residual
+from triaxcal.estimate.caution import Caution
+from triaxcal.inputs.turning.adjusted import (
+    ARITHMETIC,
+    DirectionsLacking,
+    Ellipsoid,
+    NoEllipsoid,
+    as_monomials,
+    coefficients_by_entries,
+    corrected,
+    design,
+    fitted,
+    noise,
+)
+from triaxcal.inputs.turning.moments import MONOMIALS, Moments, Summary
+from triaxcal.model.directions import linear_design, most_wanted
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.pure_error import LACK_OF_FIT
+
+SAMPLES_LEAST = 100
+ROUNDS_MOST = 20
+DILUTION_MOST = 100.0
+"""Largest standard error of a combination of parameters, in noises of one sample over the root of their number."""
+DILUTION_WARNING = 10.0
+UNSEEN_WARNING = 0.2
+"""Share of a coefficient's variance from which on the unknown share of the noise is worth a word."""
+QUICK = 0.7
+"""Share of what differences from sample to sample show that the scatter about the ellipsoid must at least have; with
+less the unit turns too fast for its sample rate, and they are not noise."""
+UNEQUAL = 2.5
+"""Ratio of the axes' noises from which on weights, which this fit has not, would lower the errors by a tenth."""
+STRETCHES_LEAST = 30
+"""With fewer, the scatter between stretches says too little for nine parameters."""
+SPOILED_SIGMA = 6.0
+SPOILED_MOST = 0.05
+"""Stretches that stand out so far from the others are left out, if they are no more than this share."""
+SPOILED_ROUNDS = 4
+SPIKE = 10.0
+"""How many times farther than nine tenths of all others a stretch may reach."""
+STEPS = 0.5
+"""Noise, in steps of the output, below which rounding is no noise any more."""
+
+
+@dataclass(frozen=True)
+class StretchesExcluded(Caution):
+    """Stretches of the recording that stand out from the others."""
+
+    stretches: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class FewDirections(Caution):
+    dilution: float
+
+
+@dataclass(frozen=True)
+class StretchesDiffer(Caution):
+    """``ratio`` times as much as white noise explains; the standard errors are raised by up to ``raised``."""
+
+    ratio: float
+    raised: float
+
+
+@dataclass(frozen=True)
+class NoiseUnseen(Caution):
+    """A ``share`` of the noise does not show from sample to sample, and how the axes share it is not known."""
+
+    share: float
+
+
+@dataclass(frozen=True)
+class NoiseUnequal(Caution):
+    """The noise of one axis is ``ratio`` times that of another; the fit has no weights."""
+
+    ratio: float
+
+
+@dataclass(frozen=True)
+class CoarseSteps(Caution):
+    """The outputs are rounded to steps larger than their noise, which the standard errors do not contain."""
+
+
+@dataclass(frozen=True)
+class RotationFit:
+    """``calibration`` has no poses; its residual is that of ``stretches`` of the recording, and its dilution is in
+    noises of one sample over the root of ``samples``. ``noise_g`` (3,) of one sample along each sensitive axis.
+
+    ``unseen_share`` of the noise, 0…1, does not show from sample to sample: how the axes share it is not known.
+    """
+
+    calibration: Calibration
+    noise_g: Floats
+    unseen_share: float
+    samples: int
+    stretches: int
+
+
+def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), reference: float = 1.0) -> RotationFit:
+    """Fit the linear model to the moments of a turning unit.
+
+    ``signs`` (3,) of the scale factors, which |a| does not show. Raises Refused where the samples cannot carry nine
+    parameters, with the sides that were never up; InvalidData where they are no sensor's.
+    """
+    if moments.count < SAMPLES_LEAST:
+        raise Refused(f"{moments.count} samples of a turning unit; at least {SAMPLES_LEAST} are needed")
+    if not (np.isfinite(reference) and reference > 0):
+        raise InvalidData(f"the reference must be a positive number, not {reference}")
+    s = np.asarray(signs, dtype=float)
+    whole = moments.summary()
+    try:
+        held, e, unseen = _without_spoiled(whole)
+        judged = _Judged(held, e)
+        if not judged.dilution < DILUTION_MOST:
+            raise DirectionsLacking((judged.dilution, DILUTION_MOST))
+    except Refused as refusal:
+        refusal.wanted = _wanted(whole, s, refusal)
+        raise
+    p = judged.lack_of_fit_p
+    entries, inflation = judged.covariance(raised=p is not None and p < LACK_OF_FIT)
+    G = coefficients_by_entries(e, held, reference)
+    shares = _by_share(held, e, reference) * unseen
+    flip = np.r_[s, s[1] * s[2], s[0] * s[2], s[0] * s[1], s]
+    k, angles, b = e.coefficients(held, reference)
+    r = judged.error * reference
+    calibration = Calibration(
+        sensor=Sensor(s * k, flip[3:6] * angles, s * b),
+        covariance=np.outer(flip, flip) * (G @ entries @ G.T + shares @ shares.T),
+        reference=reference,
+        channel_reference={},
+        residual=Residual(
+            rms_g=float(np.sqrt(np.mean(r**2))),
+            max_abs_g=float(np.max(np.abs(r))),
+            cross_validated_rms_g=None,
+            noise_floor_g=float(np.sqrt(np.mean(judged.noise**2))) * reference,
+            lack_of_fit_p=p,
+        ),
+        poses=(),
+        condition=judged.condition,
+        dilution=judged.dilution,
+        inflation=inflation,
+        dof=float(max(len(held.counts) - 10, 1) if inflation > 1 else held.count - 9),
+    )
+    noise_g = np.sqrt(e.variance) * held.half / k
+    found = RotationFit(calibration, noise_g, unseen, held.count, len(held.counts))
+    raised = float(np.max(np.sum(shares**2, axis=1) / np.diag(calibration.covariance)))
+    return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found, whole, held, raised))))
+
+
+def _without_spoiled(held: Summary) -> tuple[Summary, Ellipsoid, float]:
+    """Without stretches that a knock or a lost word spoiled, which stand out from all the others."""
+    spikes = _spiky(held)
+    if spikes.any() and spikes.sum() <= max(SPOILED_MOST * len(spikes), 1):
+        held = held.only(~spikes)
+    e, unseen = _ellipsoid_and_noise(held)
+    for _ in range(SPOILED_ROUNDS):
+        judged = _Judged(held, e)
+        z = judged.error / judged.noise
+        z -= np.median(z)
+        bad: Bools = np.abs(z) > SPOILED_SIGMA * max(1.4826 * float(np.median(np.abs(z))), 1.0)
+        if not bad.any() or len(z) < STRETCHES_LEAST or bad.sum() > max(SPOILED_MOST * len(z), 1):
+            break
+        held = held.only(~bad)
+        e, unseen = _ellipsoid_and_noise(held)
+    return held, e, unseen
+
+
+def _spiky(held: Summary) -> Bools:
+    """Stretches that reach far beyond nearly all others: no fit could begin with them."""
+    reach = held.reach
+    return np.asarray((reach > SPIKE * np.quantile(reach, 0.9, axis=0)).any(axis=1))
+
+
+def _ellipsoid_and_noise(held: Summary) -> tuple[Ellipsoid, float]:
+    """And the share of the noise of which it is not known how the axes share it."""
+    mean = held.mean()
+    if np.all(held.quick > 0):
+        ratio = noise(mean, held.quick)
+        if ratio > QUICK:
+            by_chance = 1 + 4 * np.sqrt(8 / held.count)
+            return fitted(held, held.quick), max(0.0, 1 - by_chance / ratio)
+    k = held.half.copy()
+    for _ in range(ROUNDS_MOST):
+        e = fitted(held, (k / held.half) ** 2)  # taken to be alike in g, hence unlike in scaled units
+        before, (k, _, _) = k, e.coefficients(held, 1.0)
+        if np.max(np.abs(k / before - 1)) < 1e-12:
+            break
+    return e, 1.0
+
+
+def _by_share(held: Summary, e: Ellipsoid, reference: float) -> Floats:
+    """(9,3): change of the coefficients were the share of the noise in one axis twice as large as it was taken."""
+    step = 0.05
+    start = np.concatenate(e.coefficients(held, reference))
+    if not np.all(e.variance > 0):
+        return np.zeros((9, 3))
+    shifted = (fitted(held, e.variance * (1 + step * axis)) for axis in np.eye(3))
+    return np.stack([(np.concatenate(o.coefficients(held, reference)) - start) / step for o in shifted], axis=1)
+
+
+class _Judged:
+    """Stretches under a fit. ``error`` (m,): mean of |a| − 1 in each, ``noise`` (m,) its standard error."""
+
+    def __init__(self, held: Summary, e: Ellipsoid) -> None:
+        self.counts, self.count = held.counts, held.count
+        moments = corrected(held.moments, e.variance)
+        squares = np.concatenate([e.T, -e.o[:, None]], axis=1)  # a = squares @ (x, 1)
+        self.across = e.T * np.sqrt(e.variance + ARITHMETIC)
+        rows, ones = design(e), moments[:, MONOMIALS.index((0, 0, 0))]
+        miss = as_monomials(squares.T @ squares - np.diag([0.0, 0.0, 0.0, 1.0])) / 2
+        along = as_monomials(squares.T @ self.across @ self.across.T @ squares)
+        self.error = ones @ miss
+        self.variance = np.maximum(ones @ along, 1e-300)
+        self.noise = np.sqrt(self.variance / self.counts)
+        self.mean_row = ones @ rows.T
+        self.scores = (moments @ miss) @ rows.T
+        self.information = rows @ np.einsum("m,mij->ij", self.counts / self.count, moments) @ rows.T
+        a = ((held.sampled - held.middle) / held.half) @ e.T.T - e.o
+        self.directions = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300)
+
+    @property
+    def dilution(self) -> float:
+        weakest = float(np.linalg.eigvalsh(self.information)[0])
+        return float(1 / np.sqrt(weakest)) if weakest > 1e-12 else float("inf")
+
+    @property
+    def condition(self) -> float:
+        norms = np.sqrt(np.diag(self.information))
+        return float(np.sqrt(np.linalg.cond(self.information / np.outer(norms, norms))))
+
+    @property
+    def lack_of_fit_p(self) -> float | None:
+        if len(self.counts) < STRETCHES_LEAST:
+            return None
+        inverse = np.linalg.inv(self.information) / self.count
+        leverage = self.counts * np.einsum("mi,ij,mj->m", self.mean_row, inverse, self.mean_row)
+        left = float(np.sum(1 - np.clip(leverage, 0.0, 1.0)))
+        return float(f_sf(float(np.sum((self.error / self.noise) ** 2)) / left, left, self.count - 9))
+
+    def covariance(self, *, raised: bool) -> tuple[Floats, float]:
+        """(9,9) of the entries of T and o, and by how much its standard errors were raised at most.
+
+        From white noise; where that is not all, what the stretches scatter, wherever it is more.
+        """
+        inverse = np.linalg.inv(self.information)
+        white = inverse * float(self.variance @ self.counts) / self.count**2
+        factor = self._unequal()
+        white = white * np.outer(factor, factor)
+        if not raised:
+            return white, 1.0
+        score = self.scores * self.counts[:, None] / self.count
+        most = np.diag(white)
+        while len(score) >= STRETCHES_LEAST:  # neighbours put together, again and again: what drifts is no chance
+            m = len(score)
+            most = np.maximum(most, np.diag(inverse @ (score.T @ score) @ inverse) * m / (m - 10))
+            score = score[: m // 2 * 2].reshape(m // 2, 2, 9).sum(axis=1)
+        factor = np.sqrt(most / np.diag(white))
+        return white * np.outer(factor, factor), float(factor.max())
+
+    def _unequal(self) -> Floats:
+        """(9,) by what factor noise that differs from direction to direction changes the standard errors."""
+        # The moments end at the fourth degree, this needs the sixth; some of the samples tell it well enough.
+        J = linear_design(self.directions, self.directions)
+        variance = np.sum((self.directions @ self.across) ** 2, axis=1)
+        bread = np.linalg.pinv(J.T @ J)
+        ratio = np.diag(bread @ (J.T * variance) @ J @ bread) / (np.diag(bread) * variance.mean())
+        return np.asarray(np.sqrt(ratio))
+
+
+def _wanted(held: Summary, signs: Floats, refusal: Refused) -> tuple[str, ...]:
+    """Sides that were never up, as far as the directions can be told without a fit."""
+    # Without one scale for all, an axis that hardly moved would look like one that swung from end to end.
+    u = (held.sampled - np.median(held.sampled, axis=0)) / np.max(held.half) * signs
+    wanted = most_wanted(u + 1e-12)
+    if not wanted and not isinstance(refusal, NoEllipsoid):
+        wanted = most_wanted(np.zeros((0, 3)))
+    return tuple(dict.fromkeys(label for label, _ in wanted))
+
+
+def _cautions(found: RotationFit, whole: Summary, held: Summary, unseen: float) -> Iterator[Caution]:
+    """``unseen``: the largest share that the unknown share of the noise has in the variance of a coefficient."""
+    c = found.calibration
+    if gone := whole.count - held.count:
+        yield StretchesExcluded(len(whole.counts) - len(held.counts), gone)
+    if c.dilution > DILUTION_WARNING:
+        yield FewDirections(c.dilution)
+    if c.inflation > 1:
+        yield StretchesDiffer(c.residual.rms_g / c.residual.noise_floor_g, c.inflation)
+    if np.any(found.noise_g) and (found.unseen_share == 1 or unseen > UNSEEN_WARNING):
+        yield NoiseUnseen(found.unseen_share)
+    low, high = float(np.min(found.noise_g)), float(np.max(found.noise_g))
+    if high > UNEQUAL * low > 0:
+        yield NoiseUnequal(high / low)
+    if np.any(_step(held) * STEPS > np.sqrt(held.half**2 * _variance(found, held))):
+        yield CoarseSteps()
+
+
+def _variance(found: RotationFit, held: Summary) -> Floats:
+    """(3,) of the noise in scaled units."""
+    return np.asarray((found.noise_g * found.calibration.sensor.scale_factor / held.half) ** 2)
+
+
+def _step(held: Summary) -> Floats:
+    """(3,) of which all outputs are whole multiples; 0 where there is none."""
+    out = np.zeros(3)
+    for axis in range(3):
+        gaps = np.diff(np.unique(held.sampled[:, axis]))
+        gaps = gaps[gaps > 1e-9 * np.max(np.abs(held.sampled[:, axis]))]
+        if len(gaps):
+            parts = gaps / gaps.min()
+            if np.mean(np.abs(parts - np.round(parts)) < 0.05) > 0.95:
+                out[axis] = gaps.min()
+    return out

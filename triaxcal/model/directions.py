@@ -1,0 +1,202 @@
+"""Where to point the unit: sets of poses, and what a given set still lacks."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.errors import InvalidData
+from triaxcal.model.order import in_order
+
+PAPER, FULL = 14, 26
+LEAST = 9
+Direction = tuple[str, Floats]
+"""A label, and the unit vector (3,) of up in the unit's frame."""
+
+
+def cube_directions() -> list[Direction]:
+    """Six faces, eight vertices and twelve edges of a cube, in that order, as labels and unit vectors of up."""
+    out = []
+    for corner in sorted(itertools.product((1, 0, -1), repeat=3), key=_faces_vertices_edges):
+        if any(corner):
+            label = "".join("+-"[v < 0] + axis for v, axis in zip(corner, "XYZ", strict=True) if v)
+            v = np.array(corner, dtype=float)
+            out.append((label, v / np.linalg.norm(v)))
+    return out
+
+
+def _faces_vertices_edges(corner: tuple[int, ...]) -> int:
+    return {1: 0, 3: 1, 2: 2, 0: 3}[sum(map(abs, corner))]
+
+
+def directions(count: int = FULL) -> list[Direction]:
+    """A plan of ``count`` distinct poses, in the order to take them; the first is then taken once more.
+
+    14 is the paper's (faces and vertices of a cube), 26 adds its edges; any other number of nine or more is spread
+    evenly over the sphere on a spiral (golden angle), labelled by number. The order keeps drift apart from the
+    rest (`triaxcal.model.order`). Raises InvalidData where there are fewer than nine.
+    """
+    return list(_directions(count))
+
+
+@cache
+def _directions(count: int) -> tuple[Direction, ...]:
+    if count < LEAST:
+        raise InvalidData(f"a plan of {count} poses cannot carry nine parameters; at least {LEAST}")
+    if count in (PAPER, FULL):
+        cube = cube_directions()[:count]
+        return tuple(cube[i] for i in in_order(np.array([v for _, v in cube])))
+    points = spiral(count)
+    return tuple((f"N{k + 1}", points[i]) for k, i in enumerate(in_order(points)))
+
+
+def spiral(count: int) -> Floats:
+    """(count,3) unit vectors spread evenly over the sphere, from pole to pole."""
+    i = np.arange(count)
+    z = 1 - (2 * i + 1) / count
+    angle = i * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z**2)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+
+
+def elsewhere(taken: Floats, count: int) -> list[Direction]:
+    """``count`` directions that lie far from those ``taken`` (n,3) and from each other, the farthest first.
+
+    Labels are in parts of the axes: "+2X-Y" is two parts X to one of minus Y. Of 98 directions, so that a
+    ``count`` above that gives no more.
+    """
+    candidates = _lattice()
+    ups = np.array([v for _, v in candidates])
+    nearest = np.max(ups @ taken.T, axis=1, initial=-1.0)
+    chosen: list[Direction] = []
+    while len(chosen) < min(count, len(candidates)):
+        best = int(np.argmin(np.round(nearest, 9)))
+        chosen.append(candidates[best])
+        nearest = np.maximum(nearest, ups @ ups[best])
+    return chosen
+
+
+@cache
+def _lattice() -> tuple[Direction, ...]:
+    """Directions with up to two parts of each axis."""
+    out = []
+    for parts in itertools.product((1, 2, -1, -2, 0), repeat=3):
+        if np.gcd.reduce(parts) == 1:
+            label = "".join("+-"[p < 0] + "2" * (abs(p) == 2) + axis for p, axis in zip(parts, "XYZ", strict=True) if p)
+            v = np.array(parts, dtype=float)
+            out.append((label, v / np.linalg.norm(v)))
+    return tuple(out)
+
+
+def closed(plan: Sequence[Direction]) -> list[Direction]:
+    """The plan with its first pose repeated at the end: what differs between the two is time."""
+    return [*plan, plan[0]]
+
+
+def linear_design(a: Floats, x: Floats) -> Floats:
+    """(n,9): derivative of |a| by the nine linear parameters ``a = T x − o``, T upper triangular.
+
+    ``a`` (n,3) unit vectors, ``x`` (n,3) scaled outputs (or ``a`` itself, to judge a plan).
+    """
+    rows, columns = np.triu_indices(3)
+    return np.concatenate([a[:, rows] * x[:, columns], -a], axis=1)
+
+
+def dilution(a: Floats, design: Floats | None = None) -> float:
+    """The worst standard error of any direction of the nine parameters, in standard errors of one pose.
+
+    About 1 for the 14 poses; infinite where the set is singular.
+    """
+    J = linear_design(a, a) if design is None else design
+    if len(J) < 9:
+        return float("inf")
+    smallest = float(np.linalg.svd(J, compute_uv=False)[-1])
+    return 1 / smallest if smallest > 1e-12 else float("inf")
+
+
+def most_wanted(
+    a: Floats,
+    enough: float = 2.0,
+    most: int = 9,
+    *,
+    unsure_rad: float = 0.0,
+    weights: Floats | None = None,
+) -> list[Direction]:
+    """The poses of the 26 that mend a set best, each once, until its dilution is below ``enough``; at most ``most``.
+
+    ``a`` (n,3): the directions of up that the set has; where they are known to no better than ``unsure_rad``, the
+    dilution is that of the worst of some sets that are so far off. ``weights`` (n,) are 1/variance, of a pose to be
+    added 1. Empty where nothing is wanted.
+    """
+    have = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300)
+    root = np.ones(len(a)) if weights is None else np.sqrt(weights)
+    sets = [linear_design(v, v) * root[:, None] for v in _maybe(have, unsure_rad)]
+    candidates = cube_directions()
+    ups = np.array([v for _, v in candidates])
+    rows = linear_design(ups, ups)
+    information = np.array([J.T @ J for J in sets])
+    wanted: list[int] = []
+    while len(wanted) < min(most, len(rows)) and _worst(information, rows[wanted]) > enough:
+        wanted.append(_best_addition(information, rows, wanted))
+    wanted = _exchanged(information, rows, wanted, enough)
+    return [candidates[i] for i in wanted]
+
+
+def _maybe(have: Floats, unsure_rad: float) -> list[Floats]:
+    """The directions as they seem, and where unsure some sets that they may be."""
+    rng = np.random.default_rng(0)
+    out = [have]
+    for _ in range(8 if unsure_rad and len(have) else 0):
+        # Errors of scale and offset, which all directions have in common, and which matter most.
+        matrix = np.eye(3) + unsure_rad * rng.standard_normal((3, 3))
+        off = have @ matrix.T + unsure_rad * rng.standard_normal(3)
+        out.append(off / np.linalg.norm(off, axis=1, keepdims=True))
+    return out
+
+
+def _worst(information: Floats, more: Floats) -> float:
+    """Dilution of the worst of the sets (k,9,9) with further rows (m,9)."""
+    smallest = np.linalg.eigvalsh(information + more.T @ more)[:, 0].min()
+    return float(1 / np.sqrt(max(float(smallest), 1e-12)))
+
+
+def _best_addition(information: Floats, rows: Floats, wanted: list[int]) -> int:
+    """The row not yet wanted that adds most to the determinant, over all sets; the first of those that add as much."""
+    held = rows[wanted]
+    inverse = np.linalg.inv(information + held.T @ held + 1e-9 * np.eye(9))
+    gain = np.log1p(np.einsum("ci,kij,cj->kc", rows, inverse, rows)).sum(axis=0)
+    gain[wanted] = -np.inf
+    return int(np.argmax(gain >= gain.max() - 1e-6))
+
+
+def _exchanged(information: Floats, rows: Floats, wanted: list[int], enough: float) -> list[int]:
+    """As few as do, and of those the ones that lower the dilution most."""
+    wanted = list(wanted)
+    for i in reversed(range(len(wanted))):
+        fewer = wanted[:i] + wanted[i + 1 :]
+        if _worst(information, rows[fewer]) <= enough:
+            wanted = fewer
+    for _ in range(3):
+        before = list(wanted)
+        for i in range(len(wanted)):
+            others = {*wanted[:i], *wanted[i + 1 :]}
+            trials = [[*wanted[:i], c, *wanted[i + 1 :]] for c in range(len(rows)) if c not in others]
+            values = np.array([_worst(information, rows[t]) for t in trials])
+            if values.min() < _worst(information, rows[wanted]) - 1e-6:
+                wanted = trials[int(np.argmax(values <= values.min() + 1e-6))]
+        if wanted == before:
+            break
+    return wanted
+
+
+def distinct(a: Floats, apart_deg: float = 5.0) -> int:
+    """How many directions differ from all before them by more than ``apart_deg``."""
+    kept: list[Floats] = []
+    for v in a / np.linalg.norm(a, axis=1, keepdims=True):
+        if all(float(v @ k) < np.cos(np.radians(apart_deg)) for k in kept):
+            kept.append(v)
+    return len(kept)

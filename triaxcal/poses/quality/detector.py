@@ -1,0 +1,140 @@
+"""The detector: fed a stream in blocks of any size, it keeps what the judges of data quality need.
+
+The stream is cut anew into chunks that depend on the samples alone, so that live and replayed streams are judged alike.
+Memory grows with time, not with the sample rate: about a hundred bytes for each tenth of a second, and three thousand
+for a second of spectra.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.poses.quality import faults, mains
+from triaxcal.poses.quality.cells import CellKeeper, Steps
+from triaxcal.poses.quality.finding import Finding, Holds, MissingSamples
+from triaxcal.poses.quality.repeats import RunLengths
+from triaxcal.poses.quality.timing import Gaps
+from triaxcal.poses.stillness.detector import Span
+from triaxcal.poses.stillness.rounded import OTHERWISE, shown_step
+from triaxcal.poses.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, Windows
+
+CELL_S = 0.1
+CELL_LEAST = 3
+CHUNK_LEAST = 4096
+
+
+@dataclass
+class QualityDetector:
+    """Feed it blocks of any size, `finish`, then ask for `findings`.
+
+    Before `finish` the findings are those of the samples up to the last whole chunk.
+    """
+
+    samples: int = 0
+    _pending: list[tuple[Ints, Floats]] = field(default_factory=list)
+    _held: int = 0
+    _begin_ns: int | None = None
+    _period_ns: float = 0.0
+    _low: Floats = field(default_factory=lambda: np.full(3, np.inf))
+    _high: Floats = field(default_factory=lambda: np.full(3, -np.inf))
+
+    def feed(self, time_ns: Ints, readings: Floats, channels: Mapping[str, Floats] | None = None) -> None:
+        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3) finite, output units; ``channels`` are
+        not judged.
+        """
+        if not len(time_ns):
+            return
+        if self._begin_ns is None:
+            self._begin_ns = int(time_ns[0])
+        self._pending.append((np.asarray(time_ns, dtype=np.int64), np.asarray(readings, dtype=float)))
+        self._held += len(time_ns)
+        if not self._period_ns and self._held >= RATE_SAMPLES and time_ns[-1] - self._begin_ns >= RATE_S * 1e9:
+            self._learn_rate()
+        if self._period_ns and self._held >= self._chunk:
+            self._take_chunks()
+
+    def finish(self) -> None:
+        """No more samples come."""
+        if not self._period_ns and self._held >= RATE_LEAST:
+            self._learn_rate()
+        if self._period_ns:
+            self._take_chunks(last=True)
+
+    def _learn_rate(self) -> None:
+        """As that of the windows: over a quarter of the first samples at a time."""
+        time_ns = np.concatenate([p[0] for p in self._pending])
+        enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
+        time_ns = time_ns[:enough]
+        lag = len(time_ns) // 4
+        self._period_ns = max(float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag, 1.0)
+        size = max(CELL_LEAST, round(CELL_S * 1e9 / self._period_ns))
+        self._chunk = -(-CHUNK_LEAST // size) * size
+        self._cells, self._steps, self._runs = CellKeeper(size), Steps(), RunLengths()
+        self._gaps, self._spectra = Gaps(), mains.Spectra(self._period_ns)
+
+    def _take_chunks(self, *, last: bool = False) -> None:
+        time_ns = np.concatenate([p[0] for p in self._pending])
+        readings = np.concatenate([p[1] for p in self._pending])
+        at = 0
+        while len(time_ns) - at >= self._chunk or (last and at < len(time_ns)):
+            part = slice(at, min(at + self._chunk, len(time_ns)))
+            self._take(time_ns[part], np.ascontiguousarray(readings[part].T))
+            at = part.stop
+        if last:
+            self._gaps.feed(time_ns[:0], last=True)
+        self._pending, self._held = [(time_ns[at:], readings[at:])], len(time_ns) - at
+
+    def _take(self, time_ns: Ints, u: Floats) -> None:
+        """``u`` (3,n)."""
+        self.samples += len(time_ns)
+        self._low = np.minimum(self._low, u.min(axis=1))
+        self._high = np.maximum(self._high, u.max(axis=1))
+        whole = len(time_ns) // self._cells.size * self._cells.size
+        if whole:
+            self._cells.feed(time_ns[:whole], u[:, :whole])
+        self._steps.feed(u)
+        self._runs.feed(time_ns, u)
+        self._gaps.feed(time_ns)
+        self._spectra.feed(time_ns, u)
+
+    def findings(self, w: Windows | None, spans: Sequence[Span]) -> list[Finding]:
+        """One for each kind of fault, with the still ``spans`` that windows ``w`` of the same stream show."""
+        if not self.samples or self._begin_ns is None:
+            return []
+        holds = Holds.of(self._begin_ns, w, spans)
+        step, roughness = self._steps.step(), self._steps.roughness()
+        if w is not None:
+            # Printed decimals that are no multiples of the step hide it from single differences.
+            shown = shown_step(w)
+            step = np.where(shown > OTHERWISE * step, shown, step)
+        noisy = self._steps.scatters(step)
+        rate_hz = 1e9 / self._period_ns
+        cells = self._cells.cells()
+        rails, spoiled = faults.saturation(cells, self._runs, holds, step, roughness, noisy)
+        frozen = faults.frozen_runs(cells, self._runs, noisy)
+        for poses, runs in zip(spoiled, frozen, strict=False):
+            poses.update(i for r in (*runs, *frozen[-1]) for i in holds.touched(r.start_ns, r.end_ns))
+        slow, twice = faults.repeated_samples(self._runs, noisy, rate_hz)
+        flat = self._low == self._high
+        dead = [axis for i, axis in enumerate("xyz") if flat[i] and not flat.all()]
+        lines = self._spectra.lines(holds)
+        found = [
+            rails,
+            faults.stuck_output(frozen, slow, holds, dead),
+            self._missing(),
+            twice,
+            mains.pickup(lines, rate_hz) if lines else None,
+            faults.coarse_quantization(holds, spoiled, step),
+        ]
+        return [f for f in found if f is not None]
+
+    def _missing(self) -> Finding | None:
+        g = self._gaps
+        if not g.gaps or self._begin_ns is None:
+            return None
+        first_s = (g.first_ns - self._begin_ns) * 1e-9
+        return MissingSamples(g.missing, self.samples + g.missing, g.gaps, g.longest, first_s)

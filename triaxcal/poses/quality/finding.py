@@ -1,0 +1,195 @@
+"""One kind of fault of a raw stream, and the still spans as the judges of it need them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.poses.stillness.detector import Span
+from triaxcal.poses.stillness.windows import Windows
+
+AXES = "xyz"
+UNTRUSTED = ("saturation", "stuck_output")
+"""Faults for which a mean is not that of the acceleration."""
+
+
+@dataclass(frozen=True)
+class Touched:
+    """The still spans that a fault touches, by index, and where each begins, in seconds from the first sample."""
+
+    poses: tuple[int, ...] = ()
+    starts_s: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A kind of fault, ``name`` as in data-quality lines. `triaxcal.text` says what, which axis, how much and where."""
+
+    name: ClassVar[str]
+
+    @property
+    def poses(self) -> tuple[int, ...]:
+        """Indices of the spans that it touches, which have to be taken again."""
+        return ()
+
+
+@dataclass(frozen=True)
+class AtRail:
+    """So many ``samples`` of an axis read one extreme value, output units."""
+
+    axis: str
+    rail: float
+    samples: int
+    first_s: float
+    touched: Touched
+
+
+@dataclass(frozen=True)
+class Saturation(Finding):
+    name: ClassVar[str] = "saturation"
+    rails: tuple[AtRail, ...]
+
+    @property
+    def poses(self) -> tuple[int, ...]:
+        return tuple(sorted({i for r in self.rails for i in r.touched.poses}))
+
+
+@dataclass(frozen=True)
+class Freeze:
+    """An axis (None: all at once) repeats a reading, so many ``times``, for up to ``longest`` samples; ``value`` is
+    that of the longest, output units."""
+
+    axis: str | None
+    value: float
+    times: int
+    longest: int
+    first_s: float
+    touched: Touched
+
+
+@dataclass(frozen=True)
+class SlowUpdate:
+    """There are new values only ``every`` so many samples, of a stream of ``rate_hz``."""
+
+    every: float
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class StuckOutput(Finding):
+    """``dead`` are axes that never change."""
+
+    name: ClassVar[str] = "stuck_output"
+    dead: tuple[str, ...]
+    slow: SlowUpdate | None
+    freezes: tuple[Freeze, ...]
+
+    @property
+    def poses(self) -> tuple[int, ...]:
+        return tuple(sorted({i for f in self.freezes for i in f.touched.poses}))
+
+
+@dataclass(frozen=True)
+class MissingSamples(Finding):
+    """By the times, ``missing`` of ``of`` samples, in so many ``gaps``."""
+
+    name: ClassVar[str] = "missing_samples"
+    missing: int
+    of: int
+    gaps: int
+    longest: int
+    first_s: float
+
+
+@dataclass(frozen=True)
+class DuplicateSamples(Finding):
+    """So many of the samples repeat the one before on all axes."""
+
+    name: ClassVar[str] = "duplicate_samples"
+    repeated: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class Tone:
+    """``amplitude`` by axis, output units. ``alias_of_hz``: the frequency that it may be the alias of."""
+
+    frequency_hz: float
+    amplitude: tuple[float, float, float]
+    alias_of_hz: float | None
+
+
+@dataclass(frozen=True)
+class MainsPickup(Finding):
+    name: ClassVar[str] = "mains_pickup"
+    tones: tuple[Tone, ...]
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Of an axis, with the scatter in the poses and by how much pose means may be off, output units."""
+
+    axis: str
+    step: float
+    scatter: float
+    mean_error: float
+
+
+@dataclass(frozen=True)
+class CoarseQuantization(Finding):
+    name: ClassVar[str] = "coarse_quantization"
+    axes: tuple[Steps, ...]
+
+
+def untrusted_poses(findings: Iterable[Finding]) -> dict[int, str]:
+    """By index, the still spans in which the outputs do not follow the acceleration, with the name of the fault."""
+    return {i: f.name for f in findings if f.name in UNTRUSTED for i in f.poses}
+
+
+@dataclass(frozen=True)
+class Holds:
+    """The still spans of a stream: ``start_ns``, ``end_ns`` (k,); ``begin_ns`` is where its seconds begin. ``variance``
+    (k,3) of the readings in each, slow noise included.
+    """
+
+    begin_ns: int
+    start_ns: Ints
+    end_ns: Ints
+    variance: Floats
+
+    @classmethod
+    def of(cls, begin_ns: int, w: Windows | None, spans: Sequence[Span]) -> Holds:
+        if w is None or not spans:
+            none = np.zeros(0, dtype=np.int64)
+            return cls(begin_ns, none, none, np.zeros((0, 3)))
+        start = np.array([w.start_ns[s.first] for s in spans])
+        end = np.array([w.end_ns[s.last] for s in spans])
+        variance = [w.variance[s.used].mean(axis=0) + w.mean[s.used].var(axis=0) for s in spans]
+        return cls(int(w.start_ns[0]), start, end, np.array(variance))
+
+    def __len__(self) -> int:
+        return len(self.start_ns)
+
+    def seconds(self, time_ns: int) -> float:
+        return (time_ns - self.begin_ns) * 1e-9
+
+    def within(self, start_ns: Ints, end_ns: Ints) -> Ints:
+        """(n,) index of the span in which each stretch of time lies whole, else -1."""
+        if not len(self):
+            return np.full(len(start_ns), -1, dtype=np.int64)
+        at = np.searchsorted(self.start_ns, start_ns, side="right") - 1
+        whole = (at >= 0) & (end_ns <= self.end_ns[np.maximum(at, 0)])
+        return np.where(whole, at, -1)
+
+    def touched(self, start_ns: int, end_ns: int) -> tuple[int, ...]:
+        """Spans that share time with a stretch."""
+        shared: Bools = (self.start_ns <= end_ns) & (self.end_ns >= start_ns)
+        return tuple(int(i) for i in np.flatnonzero(shared))
+
+    def touching(self, poses: Sequence[int]) -> Touched:
+        return Touched(tuple(poses), tuple(self.seconds(int(self.start_ns[i])) for i in poses))

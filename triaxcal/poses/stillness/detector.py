@@ -1,0 +1,301 @@
+"""Where the unit stood still: a detector that learns the noise from the stream itself.
+
+It works on the windows of `triaxcal.poses.stillness.windows`, in three steps. What scatters inside a window as the
+quietest windows do is calm. Among calm windows a move shows in the difference of neighbouring averages over one window
+and more, judged by how such differences scatter in this very stream, whatever the colour of its noise. What is left are
+runs, trimmed where a move sets out or settles, and put together where only a bump parts them. Where a machine shakes
+the stand, `triaxcal.poses.stillness.shaken` looks for the poses that are left.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
+from triaxcal.poses.stillness.edges import SPAN_LEAST_WINDOWS, trimmed
+from triaxcal.poses.stillness.noise_scales import SCALES, NoiseScales, contrasts
+from triaxcal.poses.stillness.rounded import Rounding, resolution
+from triaxcal.poses.stillness.shaken import ALONE_S, runs, shaken_noise, shaken_runs
+from triaxcal.poses.stillness.windows import WindowCutter, Windows
+
+__all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
+
+SPAN_LEAST_S = 0.4
+REJOIN_S = 1.5
+"""A disturbance shorter than this, with the same mean before and after, is a bump inside one pose."""
+FALSE_ALARM = 1e-6
+MOVE_SIGMA = 5.0
+STEP_SIGMA = 7.0
+"""Of a single step, tested on noise that need not be Gaussian."""
+BESIDE = 6
+"""Windows beside a run in which a move shows."""
+MOTION = 2.0
+"""Of a random walk, the strongest colour that noise has, a quarter of the squared steps is below 0.4 of the scatter."""
+SLIGHT = 0.01
+"""Slow vibration moves the outputs from window to window by no more than this share of their range."""
+FROZEN_WINDOWS = 3
+"""An output is frozen that repeats one reading over so many windows, though noise is wider than its steps."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """A still span as indices of windows. ``used`` (k,) are the windows in it that no bump disturbs."""
+
+    used: Ints
+
+    @property
+    def first(self) -> int:
+        return int(self.used[0])
+
+    @property
+    def last(self) -> int:
+        return int(self.used[-1])
+
+
+@dataclass
+class StillnessDetector(WindowCutter):
+    """Feed it blocks of any size; ask for `windows` and `spans` at any time."""
+
+    def spans(self) -> list[Span]:
+        """The still spans so far, in order."""
+        return find_spans(self.windows())
+
+
+def find_spans(w: Windows) -> list[Span]:
+    """The still spans of a stream of windows, at least 0.4 s long."""
+    # Rounding of a digital output leaves windows without any scatter; a step of it is noise all the same.
+    raw, step = w.variance, resolution(w)
+    frozen = _frozen(w, step)
+    live, stuck = np.asarray(~frozen.any(axis=1)), np.asarray(frozen.all(axis=1))
+    w = replace(w, variance=np.maximum(raw, step**2 / 4))
+    calm = np.asarray((w.variance <= quiet_limit(w.variance[live], w.size - 1)).all(axis=1)) & ~stuck
+    if _only_moves(w, calm):
+        return []
+    found, noise = _still_runs(w, calm, live, _rounding(step, raw[calm & live]))
+    for _ in range(2):
+        inside = _inside(w, found) & live
+        if inside.sum() < 2 * SPAN_LEAST_WINDOWS:
+            break
+        calm = np.asarray((w.variance <= _limit_within(w.variance[inside], w.size - 1)).all(axis=1)) & ~stuck
+        found, noise = _still_runs(w, calm, live, _rounding(step, raw[inside & calm]))
+    taken, pieces = _quiet_pieces(w, found, noise)
+    shaken = shaken_runs(w, [*taken, *runs(stuck, w.joined)], noise)
+    disturbed = ~_steady(w, calm, noise)
+    spans = _rejoin(w, sorted([*pieces, *shaken], key=lambda p: int(p[0])), noise, disturbed)
+    quiet = np.zeros(len(w), dtype=bool)
+    quiet[np.concatenate([*pieces, np.zeros(0, dtype=np.int64)])] = True
+    return [s for s in spans if _long_enough(w, s.used, SPAN_LEAST_S if quiet[s.used].any() else ALONE_S)]
+
+
+def _rounding(step: Floats, quiet: Floats) -> Rounding:
+    """What the step adds, by the variances (k,3) of quiet windows: of their mean, since a median of windows with one
+    reading or two says little."""
+    return Rounding.of(step, quiet.mean(axis=0) if len(quiet) else np.zeros(3))
+
+
+def _quiet_pieces(w: Windows, found: list[Ints], noise: NoiseScales) -> tuple[list[Ints], list[Ints]]:
+    """Runs that are settled, one way or the other, and the still pieces of them."""
+    taken, pieces = [], []
+    for run in found:
+        if _under_way(w, run, noise):
+            taken.append(run)
+            continue
+        piece = trimmed(w, run, noise)
+        if len(piece) >= SPAN_LEAST_WINDOWS:
+            taken.append(run)
+            pieces.append(piece)
+    return taken, pieces
+
+
+def _frozen(w: Windows, step: Floats) -> Bools:
+    """(m,3) windows in which an axis is frozen: they show no noise, and nothing is learned from them. Nor is it a pose
+    where all axes are: what the unit does meanwhile, nobody knows.
+
+    An output whose ``step`` is as wide as its noise repeats readings too, but it does so again and again, or else
+    changes by a step or two.
+    """
+    frozen = np.zeros((len(w), 3), dtype=bool)
+    # One reading that differs by a step makes more of either.
+    repeats = w.variance < step**2 / (2 * w.size)
+    same = np.abs(np.diff(w.mean, axis=0, prepend=w.mean[:1])) < step / (2 * w.size)
+    for axis in range(3):
+        found = runs(repeats[:, axis], w.joined & same[:, axis])
+        live = w.variance[~repeats[:, axis], axis]
+        again = sum(map(len, found)) - max(map(len, found), default=0)
+        if again < len(live) and np.quantile(live, 0.01) > step[axis] ** 2:
+            for run in found:
+                frozen[run, axis] = len(run) >= FROZEN_WINDOWS
+    return frozen
+
+
+def _still_runs(w: Windows, calm: Bools, live: Bools, rounding: Rounding) -> tuple[list[Ints], NoiseScales]:
+    """Runs of windows that are calm and do not move, and the noise they were judged by, learned from the ``live``."""
+    noise = NoiseScales.learned(w, calm & live, rounding, first=True)
+    for _ in range(2):
+        noise = NoiseScales.learned(w, _steady(w, calm, noise) & live, rounding)
+    still = _steady(w, calm, noise)
+    return [run for run in runs(still, w.joined) if len(run) >= SPAN_LEAST_WINDOWS], noise
+
+
+def _under_way(w: Windows, run: Ints, noise: NoiseScales) -> bool:
+    """Whether a run that climbs steadily is the middle of a move: a pose that creeps lies between faster moves."""
+    x = run - run.mean()
+    pace = x @ w.mean[run] / max(float(x @ x), 1.0) / noise.step[1]
+    if np.abs(pace).max() < 1:
+        return False
+    for beside in (run[0] - np.arange(BESIDE), run[-1] + 1 + np.arange(BESIDE)):
+        if beside.min() < 1 or beside.max() >= len(w) or not w.joined[beside].all():
+            continue
+        speed = np.abs(w.mean[beside] - w.mean[beside - 1]).max(axis=0) / noise.step[1]
+        if speed.max() < 2 * np.abs(pace).max():
+            return True
+    return False
+
+
+def quiet_limit(variance: Floats, dof: int) -> Floats:
+    """(3,) the largest scatter that noise alone makes in a window, learned from the quietest windows.
+
+    Still windows crowd around one scatter while moving ones spread over decades above it: the mode of the logarithm
+    is the noise, and how far the windows below it reach tells its effective degrees of freedom, which are fewer than
+    the samples where the noise is coloured.
+    """
+    limit = np.zeros(3)
+    tried = np.unique(np.r_[np.geomspace(1, max(dof, 2), 40), dof])
+    reaches = -np.log(chi2_ppf(chi2_cdf(tried, tried) / 2, tried) / tried)
+    for axis in range(3):
+        log = np.sort(np.log(np.maximum(variance[:, axis], 1e-300)))
+        mode = _half_sample_mode(log)
+        below = log[log < mode]
+        reach = float(mode - np.median(below)) if len(below) else 0.0
+        effective = tried[int(np.argmin(np.abs(reaches - reach)))]
+        limit[axis] = np.exp(mode) * chi2_isf(FALSE_ALARM, effective) / effective
+    return limit
+
+
+def _half_sample_mode(ordered: Floats) -> float:
+    """The densest place of sorted values: the densest half, again and again (Robertson and Cryer 1974)."""
+    while len(ordered) > 8:
+        half = (len(ordered) + 1) // 2
+        widths = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
+        at = int(np.argmin(widths))
+        ordered = ordered[at : at + half]
+    return float(np.mean(ordered))
+
+
+def _limit_within(variance: Floats, most: int) -> Floats:
+    """(3,) the same limit from windows of which all but a few are known to be still: chi-square with the degrees of
+    freedom, ``most`` at most, that the spread between the quartiles of the logarithm shows.
+    """
+    log = np.log(np.maximum(variance, 1e-300))
+    low, middle, high = np.quantile(log, [0.25, 0.5, 0.75], axis=0)
+    tried = np.geomspace(0.5, most, 80)
+    spreads = np.log(chi2_ppf(0.75, tried) / chi2_ppf(0.25, tried))
+    dof = np.interp(-(high - low), -spreads, tried)
+    return np.asarray(np.exp(middle) * chi2_isf(FALSE_ALARM, dof) / chi2_ppf(0.5, dof))
+
+
+def _inside(w: Windows, pieces: list[Ints]) -> Bools:
+    """Windows from the first to the last of each span, those that were left out as well."""
+    inside = np.zeros(len(w), dtype=bool)
+    for piece in pieces:
+        inside[piece] = True
+    for here, there in itertools.pairwise(pieces):
+        if there[0] - here[-1] <= 4:
+            inside[here[-1] : there[0]] = True
+    return inside
+
+
+def _only_moves(w: Windows, calm: Bools) -> bool:
+    """Whether the quietest windows are those of a motion, and nothing in the stream stands still.
+
+    Steadily moving outputs step 12 times as far from window to window, squared, as they scatter inside one. Slow
+    vibration does so too, but it is small beside the differences of poses, and leads nowhere.
+    """
+    at, step = contrasts(w.mean, calm, w.joined, 1, 1)
+    if not len(at):
+        return False
+    share = step**2 / np.maximum((w.variance[at] + w.variance[at - 1]) / 2, 1e-300)
+    if not (np.quantile(share, 0.25, axis=0) > MOTION).any():
+        return False
+    _, far = contrasts(w.mean, calm, w.joined, SCALES[-1], SCALES[-1])
+    pace = np.median(np.abs(step), axis=0)
+    leads = len(far) > 0 and (np.median(np.abs(far), axis=0) > 3 * pace).any()
+    return bool(leads or pace.max() > SLIGHT * np.ptp(w.mean, axis=0).max())
+
+
+def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
+    """The calm windows at which no difference of neighbouring averages, short or long, is more than noise."""
+    steady = calm.copy()
+    for scale in SCALES:
+        at, difference = contrasts(w.mean, steady, w.joined, scale, scale)
+        if not len(at):
+            break
+        sigma = noise.step[scale]
+        if scale == 1:
+            moved = at[(np.abs(difference) > STEP_SIGMA * sigma).any(axis=1)]
+        else:
+            difference = difference - _common_climb(at, difference / sigma) * sigma
+            moved = at[(np.abs(difference) > MOVE_SIGMA * sigma).any(axis=1)]
+        half = max(scale // 2, 1)
+        for shift in range(-half, half):
+            steady[moved + shift] = False
+        steady[_bumped(w, steady, noise, scale)] = False
+    return steady
+
+
+def _common_climb(at: Ints, z: Floats) -> Floats:
+    """(len, 3) what the quietest quarter of the differences of each run have in common: the pace of a steady creep."""
+    out = np.zeros_like(z)
+    for part in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) > 1) + 1):
+        quiet = part[np.argsort(np.abs(z[part]).max(axis=1), kind="stable")[: max(len(part) // 4, 1)]]
+        climb = z[quiet].mean(axis=0)
+        out[part] = np.where(np.abs(climb) > 1, climb, 0.0)
+    return out
+
+
+def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
+    """Windows of short bumps: averages that differ from those before and from those after alike."""
+    if scale not in noise.edge:
+        return np.zeros(0, dtype=np.int64)
+    limit = MOVE_SIGMA * noise.edge[scale]
+    at, before = contrasts(w.mean, steady, w.joined, 4 * scale, scale)
+    to, after = contrasts(w.mean, steady, w.joined, scale, 4 * scale)
+    _, i, j = np.intersect1d(at, to - scale, return_indices=True)
+    out = ((np.abs(before[i]) > limit) & (np.abs(after[j]) > limit) & (before[i] * after[j] < 0)).any(axis=1)
+    hit = at[i[out]]
+    return np.asarray(np.unique(hit[:, None] + np.arange(scale)), dtype=np.int64)
+
+
+def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools) -> list[Span]:
+    """Pieces of one pose on either side of a bump, put together."""
+    period_s = w.period_ns * 1e-9
+    spans: list[Span] = []
+    for piece in pieces:
+        here = spans[-1].last if spans else 0
+        silent_s = (w.start_ns[piece[0]] - w.start_ns[here]) * 1e-9 - (piece[0] - here) * period_s
+        between = np.flatnonzero(disturbed[here : piece[0]])
+        bump_s = float(np.ptp(between) + 1 if len(between) else 0) * period_s + max(silent_s, 0.0)
+        if spans and bump_s < REJOIN_S and _same_pose(w, spans[-1].used, piece, noise):
+            spans[-1] = Span(np.concatenate([spans[-1].used, piece]))
+        else:
+            spans.append(Span(piece))
+    return spans
+
+
+def _same_pose(w: Windows, before: Ints, after: Ints, noise: NoiseScales) -> bool:
+    """Whether the means on either side of a disturbance agree."""
+    scale = max(s for s in SCALES if s <= min(len(before), len(after)))
+    here, there = before[-scale:], after[:scale]
+    apart = np.abs(w.mean[here].mean(axis=0) - w.mean[there].mean(axis=0))
+    level = w.variance[np.concatenate([here, there])].mean(axis=0)
+    return bool((apart <= MOVE_SIGMA * shaken_noise(noise, level, w.size).step[scale]).all())
+
+
+def _long_enough(w: Windows, used: Ints, least_s: float) -> bool:
+    if len(used) < SPAN_LEAST_WINDOWS:
+        return False
+    return bool((w.end_ns[used[-1]] - w.start_ns[used[0]]) * 1e-9 >= least_s)

@@ -1,0 +1,111 @@
+"""Poses during which a machine shakes the stand: the outputs scatter as much as in a move, but their mean stays put.
+
+A move carries the means of the windows away; shaking leaves them where they are, but for what of it a window does not
+average out. That is bounded. Shaking without a rhythm adds a random part, the variance of a sample over the samples. A
+tone of frequency f adds to an average over T at most its amplitude over πfT, also where the windows fall in step with
+it and the means wander slowly; from 5 Hz on two neighbouring averages over s windows of 0.1 s so differ by at most 2.3
+times the scatter inside a window, over s. Neither grows with s as the way of a move does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import scipy
+
+from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.poses.stillness.edges import trimmed
+from triaxcal.poses.stillness.noise_scales import SCALES, NoiseScales, contrasts
+from triaxcal.poses.stillness.windows import Windows
+
+LEAST_S = 1.0
+ALONE_S = 1.5
+"""A span that is shaken throughout lasts longer than a hand hesitates; a part of one need not."""
+MOVE_SIGMA = 5.0
+TONE = 0.5
+"""The bound for tones over `MOVE_SIGMA`, about: a standard deviation to judge by."""
+LONGEST = 16
+"""Windows in the longest averages compared: jitter of a hand hides a slow turn from shorter ones."""
+ABOUT = 7
+"""Windows over which the usual scatter is taken."""
+UNEVEN = 5.0
+"""Where the usual variance is so many times that of the run, or a window's its square, is a move, or a knock."""
+SHARE = 0.03
+"""Shaking makes the outputs scatter by no more than this share of the range of the poses."""
+
+
+def shaken_noise(noise: NoiseScales, variance: Floats, size: int) -> NoiseScales:
+    """Of averages over windows of ``size`` samples that scatter with ``variance`` (3,), where that is more than the
+    quiet noise makes.
+    """
+    excess = np.maximum(variance - noise.scatter**2, 0.0)
+    return replace(
+        noise,
+        step={s: np.sqrt(v**2 + excess * _share(s, size)) for s, v in noise.step.items()},
+        edge={s: np.sqrt(v**2 + excess * _share(s, size) / 1.6) for s, v in noise.edge.items()},
+    )
+
+
+def _share(scale: int, size: int) -> float:
+    """Of the variance inside windows that remains in the difference of averages over ``scale`` of them."""
+    return 2 / (size * scale) + (TONE / scale) ** 2
+
+
+def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]:
+    """Runs, trimmed, among the windows outside the quiet runs ``taken``, in which the mean stands still.
+
+    Only what is small beside the differences of poses can be told from a hand that shakes the unit.
+    """
+    if len(taken) < 2:
+        return []
+    levels = np.array([w.mean[run].mean(axis=0) for run in taken])
+    most = (SHARE * float(np.linalg.norm(np.ptp(levels, axis=0)))) ** 2
+    rest = np.asarray((w.variance <= most).all(axis=1))
+    for quiet in taken:
+        rest[max(quiet[0] - 1, 0) : quiet[-1] + 2] = False
+    level = _level(w)
+    found = []
+    # What scatters otherwise is something else: the end of a move, which is slow, is no part of what comes after it.
+    total = np.maximum(level.sum(axis=1), 1e-300)
+    alike = w.joined & (np.abs(np.diff(np.log(total), prepend=np.log(total[0]))) < np.log(UNEVEN))
+    for run in runs(_staying(w, rest, alike, level, noise), alike):
+        usual = np.median(w.variance[run], axis=0)
+        even = np.asarray(((level[run] < UNEVEN * usual) & (w.variance[run] < UNEVEN**2 * usual)).all(axis=1))
+        for part in runs(even, np.ones(len(run), dtype=bool)):
+            part = run[part]
+            piece = trimmed(w, part, shaken_noise(noise, w.variance[part].mean(axis=0), w.size))
+            if len(piece) and (w.end_ns[piece[-1]] - w.start_ns[piece[0]]) * 1e-9 >= LEAST_S:
+                found.append(piece)
+    return found
+
+
+def _level(w: Windows) -> Floats:
+    """(m,3) the usual variance about each window: a window that is shorter than a swing shows now more, now less."""
+    return np.asarray(scipy.ndimage.median_filter(w.variance, size=(ABOUT, 1), mode="nearest"))
+
+
+def _staying(w: Windows, rest: Bools, alike: Bools, level: Floats, noise: NoiseScales) -> Bools:
+    """Those of the windows at which no difference of neighbouring averages is more than shaking explains."""
+    staying = rest.copy()
+    excess = np.maximum(level - noise.scatter**2, 0.0)
+    for scale in (*SCALES, LONGEST):
+        at, difference = contrasts(w.mean, staying, alike, scale, scale)
+        _, after = contrasts(excess, staying, alike, 0, scale, at)
+        _, before = contrasts(excess, staying, alike, scale, 0, at)
+        quiet = noise.step[min(scale, SCALES[-1])]
+        sigma = quiet**2 + (after - before) / 2 * _share(scale, w.size)
+        moved = at[(difference**2 > MOVE_SIGMA**2 * sigma).any(axis=1)]
+        half = max(scale // 2, 1)
+        for shift in range(-half, half):
+            staying[moved + shift] = False
+    return staying
+
+
+def runs(still: Bools, joined: Bools) -> list[Ints]:
+    """Indices of unbroken runs of still windows."""
+    index = np.flatnonzero(still)
+    if not len(index):
+        return []
+    breaks = np.flatnonzero((np.diff(index) > 1) | ~joined[index[1:]]) + 1
+    return [np.asarray(run, dtype=np.int64) for run in np.split(index, breaks)]

@@ -1,6 +1,0 @@
-"""What the raw stream is to be blamed for, found before any fit: rails, frozen outputs, gaps, mains, coarse steps."""
-
-from triaxcal.quality.detector import QualityDetector
-from triaxcal.quality.finding import Finding, untrusted_poses
-
-__all__ = ["Finding", "QualityDetector", "untrusted_poses"]

@@ -1,6 +1,0 @@
-"""Where a unit stood still: windows of the stream, the noise at every scale, the detector, the ends of its spans."""
-
-from triaxcal.stillness.detector import Span, StillnessDetector, find_spans
-from triaxcal.stillness.windows import Windows
-
-__all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
