@@ -219,11 +219,11 @@ def parse_document(data: bytes, *, where: str) -> Mapping[str, Any]:
         if "\\u" in text:
             json.dumps(document, ensure_ascii=False).encode()
     except json.JSONDecodeError as e:
-        raise InputError(f"{where}, line {e.lineno}: not JSON: {e.msg}") from e
+        raise InputError(f"{where}, line {e.lineno}: not JSON: {e.msg}; expected a JSON document") from e
     except RecursionError as e:
         raise InputError(f"{where}: not JSON: nested too deeply") from e
     except UnicodeDecodeError as e:
-        raise InputError(f"{where}: not UTF-8 text (byte {e.start})") from e
+        raise InputError(f"{where}: not UTF-8 text (byte {e.start}), expected a JSON document") from e
     except UnicodeEncodeError as e:
         raise InputError(f"{where}: half of a surrogate pair, which is no character") from e
     except ValueError as e:  # a number of thousands of digits, a key given twice

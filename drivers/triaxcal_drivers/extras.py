@@ -20,16 +20,19 @@ CALLED = {"can": "python-can", "serial": "pyserial"}
 
 def absent(modules: Iterable[str]) -> str | None:
     """What to install, of modules by the names that are imported; None where all are there."""
-    missing = next((m for m in modules if importlib.util.find_spec(m) is None), None)
-    if missing is None:
+    missing = [m for m in modules if importlib.util.find_spec(m) is None]
+    if not missing:
         return None
-    return lacking(ModuleNotFoundError(name=missing)) or f"the package {missing} is not installed"
+    extras = {EXTRAS.get(m) for m in missing}
+    return _told(missing[0], extras.pop() if len(extras) == 1 else "station")
 
 
 def lacking(e: ModuleNotFoundError) -> str | None:
     """What to install; None where it is no package of ours."""
     module = (e.name or "").partition(".")[0]
-    if module not in EXTRAS:
-        return None
-    name = CALLED.get(module, module)
-    return f"the package {name} is not installed; pip install 'triaxcal[{EXTRAS[module]}]' brings it"
+    return _told(module, EXTRAS[module]) if module in EXTRAS else None
+
+
+def _told(module: str, extra: str | None) -> str:
+    brings = f"; pip install 'triaxcal[{extra}]' brings it" if extra else ""
+    return f"the package {CALLED.get(module, module)} is not installed{brings}"

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from triaxcal.diagnosis import Call, Candidate, Finding, Loop, Verdict
 from triaxcal.evidence.average import Refusal
 from triaxcal.evidence.findings import Findings, Unexplained
+from triaxcal.evidence.odds import Odds
 from triaxcal.poses.pose import Began
 from triaxcal.poses.when import moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
@@ -78,7 +79,8 @@ def _causes(
     for finding in findings:
         yield f"{_named(finding)} acts"
     for candidate in candidates:
-        yield f"{candidate.effect} probably acts ({chance(candidate.probability)})"
+        one_pose = ", but less so without some one pose" if candidate.probability >= Odds().certain else ""
+        yield f"{candidate.effect} probably acts ({chance(candidate.probability)}{one_pose})"
     if found.unexplained.significant:
         yield unexplained(found.unexplained, small)
     if found.outliers:

@@ -16,6 +16,7 @@ from triaxcal import text as of_metrology
 from triaxcal.evidence.odds import Odds
 from triaxcal.rounding import number
 from triaxcal.text import diagnosis as of_diagnosis
+from triaxcal_drivers.extras import absent
 from triaxcal_drivers.profile import READINGS
 from triaxcald import text
 from triaxcald.cli.arguments import writable
@@ -23,6 +24,7 @@ from triaxcald.cli.console import Bars, emit, micro, say, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.journals import warn_of_a_journal
 from triaxcald.cli.showing import counted
+from triaxcald.errors import InputError
 from triaxcald.exit_codes import SEVEREST
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
@@ -146,6 +148,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
 
 
 def demo_command(a: argparse.Namespace) -> int:
+    if fault := absent(("can", "pymodbus")):
+        raise InputError(f"demo: {fault}")
     from triaxcald.demo import run_demo
 
     with Bars() as bars:

@@ -13,6 +13,7 @@ import numpy as np
 
 from triaxcal.calibration_document import WEIGHT
 from triaxcal.estimate.calibration import Exclusion
+from triaxcal.evidence.odds import Odds
 from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names
@@ -81,6 +82,12 @@ class Finding:
     def in_question(self) -> bool:
         """Whether it need not be this effect that acts."""
         return bool(self.alternatives) or self.verdict == CANDIDATE
+
+    @property
+    def hangs_on_a_pose(self) -> bool:
+        """Whether it is likely enough to be known, and is not since some one pose may be an outlier."""
+        likely = self.probability is not None and self.probability >= Odds().certain
+        return self.verdict == CANDIDATE and likely and not self.alternatives
 
     def shape(self, name: str) -> float | None:
         """The value of a coefficient, such as the moment of a step."""
@@ -152,7 +159,7 @@ class Outcome:
 
 def read_document(document: Mapping[str, object]) -> Outcome:
     """The outcome that `document` describes; whatever is missing or of the wrong kind counts as missing."""
-    looped = str(document.get("format", "")).startswith("triaxcal.diagnosis/")
+    looped = str(document.get("format", "")).startswith("triaxcal.loop/")
     calibration = mapping(document.get("calibration")) if looped else document
     matrix, centre = _matrix(calibration.get("matrix")), vector(calibration.get("centre"))
     names = file_names(texts(document.get("recordings")))

@@ -61,6 +61,8 @@ class Name:
 
     @property
     def is_time(self) -> bool:
+        if self.is_celsius and self.unit:
+            return False
         called = {w for w in self.words if len(w) > 2 or len(self.words) == 1} & known.TIMES
         return bool(called) or self.words == ("x", "value") or self.time_unit is not None
 
@@ -103,9 +105,14 @@ class Name:
         return "angular" not in self.words and bool(set(self.words) & (known.COMPUTED | known.TURNED | known.ERRORS))
 
     @property
+    def is_either(self) -> bool:
+        """T is a temperature as well as a time: it is a time only where no other column is, and where it rises."""
+        return self.words == ("t",) and self.text.startswith("T")
+
+    @property
     def is_celsius(self) -> bool:
         """A temperature whose unit is no other than the degree Celsius."""
-        called = set(self.words) & known.TEMPERATURE and not set(self.words) & known.NOT_CELSIUS
+        called = (set(self.words) & known.TEMPERATURE and not set(self.words) & known.NOT_CELSIUS) or self.is_either
         return bool(called) and self.unit.lower().lstrip("°º").removeprefix("deg").strip() in ("", "c", "celsius")
 
 
@@ -182,6 +189,7 @@ def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str]
         time: tuple[int, ...] = (given[TIME],)
     else:
         called = [i for i in others if named and parsed[i].is_time and i not in indices]
+        called = [i for i in called if not parsed[i].is_either] or called
         time = tuple(sorted(called, key=lambda i: parsed[i].is_of_another_sensor))
     channels = {role: i for role, i in given.items() if role not in (TIME, *OUTPUTS)}
     for i in others:  # standard errors by our own names

@@ -232,12 +232,12 @@ def _assembled(grid: _Grid, reading: Reading, beside: bool) -> Table:
     else:
         time_ns, by_index = _counted(grid, timing, rows, chosen)
         timing = timing if by_index else replace(timing, index=None)
-    channels, left_out = _channels(grid, roles, parsed, timing, rows, readings, reading.wanted)
+    channels, renamed, left_out = _channels(grid, roles, parsed, timing, rows, readings, reading.wanted)
     once = _rising(grid, timing, rows, time_ns, readings, channels)
     samples = CsvSamples(
         time_ns[once], readings[once], {n: v[once] for n, v in channels.items()}, int(len(once) - once.sum())
     )
-    remarks = [_read_as(grid, roles, timing, reading)]
+    remarks = [_read_as(grid, roles, timing, renamed, reading)]
     remarks += [f"left out: {'; '.join(left_out)}"] if left_out else []
     if len({*(units := [parsed[i].unit for i in roles.outputs])}) > 1:
         raise Unclear(f"outputs in {', '.join(unit or 'no unit' for unit in units)}; expected one unit for all three")
@@ -360,6 +360,7 @@ def _timing(grid: _Grid, roles: Roles, names: Sequence[Name], reading: Reading, 
     if reading.time_unit not in (None, INDEX) and rate is not None:
         raise Unclear(f"--rate, --time-unit {reading.time_unit}: give one or the other")
     by_index = reading.time_unit == INDEX
+    roles = replace(roles, time=tuple(i for i in roles.time if not _is_no_time(grid.columns[i], names[i], chosen)))
     candidates = [i for i in roles.time if _rises_at_all(grid.columns[i], chosen)]
     if not roles.time and grid.named:
         moments = [i for i, c in enumerate(grid.columns) if c.moments_ns is not None and _rises_at_all(c, chosen)]
@@ -407,6 +408,12 @@ def _rises_at_all(column: Column, chosen: NDArray[np.bool_]) -> bool:
     values = column.moments_ns if column.moments_ns is not None else column.numbers
     held = values[rows]
     return len(held) < 2 or held[-1] > held[0]
+
+
+def _is_no_time(column: Column, name: Name, chosen: NDArray[np.bool_]) -> bool:
+    """Of a column that may be either: a temperature falls as well."""
+    held = column.numbers[chosen & column.usable]
+    return name.is_either and column.moments_ns is None and bool((np.diff(held) < 0).any())
 
 
 def _timed(
@@ -520,11 +527,15 @@ def _channels(
     rows: NDArray[np.intp],
     readings: NDArray[np.float64],
     wanted: frozenset[str],
-) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
-    """All other columns of numbers without gaps, and why the others are not among them."""
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, int], list[str]]:
+    """All other columns of numbers without gaps, which of them have another name than their column, and why the others
+    are not among them."""
     channels = {role: grid.columns[i].numbers[rows] for role, i in roles.channels.items()}
+    renamed: dict[str, int] = {}
     left_out: list[str] = []
     used = {*roles.outputs, *roles.channels.values(), timing.column, timing.index}
+    kept = np.zeros(len(grid.columns[0].numbers), bool)
+    kept[rows] = True
     celsius = [i for i, n in enumerate(names) if n.is_celsius and i not in used]
     magnitude = np.linalg.norm(readings, axis=1)
     for i, column in enumerate(grid.columns):
@@ -536,7 +547,7 @@ def _channels(
         if name in wanted and name not in channels and not (column.strange | column.gaps)[rows].any():
             channels[name] = values
             continue
-        if i in roles.time or column.moments_ns is not None:
+        if (i in roles.time and not _is_no_time(column, names[i], kept)) or column.moments_ns is not None:
             reason = "another time"
         elif i in roles.indices or _counts(column, rows):
             reason = "an index"
@@ -550,11 +561,12 @@ def _channels(
             reason = "its name is taken" if name else "it has no name"
         if reason is None and [i] == celsius and "temp_c" not in channels and _as_celsius(values):
             name = "temp_c"
+            renamed[name] = i
         if reason is None:
             channels[name] = values
         else:
             left_out.append(f"{name or f'column {i + 1}'} ({reason})")
-    return channels, left_out
+    return channels, renamed, left_out
 
 
 def _unfit(column: Column, rows: NDArray[np.intp], magnitude: NDArray[np.float64]) -> str | None:
@@ -606,7 +618,7 @@ def _rising(
     return np.concatenate(([True], ~repeated))
 
 
-def _read_as(grid: _Grid, roles: Roles, timing: _Timing, reading: Reading) -> str:
+def _read_as(grid: _Grid, roles: Roles, timing: _Timing, renamed: Mapping[str, int], reading: Reading) -> str:
     parts = []
     if timing.column is not None:
         parts.append(f"t = {_shown(grid, timing.column)} [{timing.said}]")
@@ -615,6 +627,7 @@ def _read_as(grid: _Grid, roles: Roles, timing: _Timing, reading: Reading) -> st
     else:
         parts.append(f"t = rows, {timing.said}")
     parts += [f"{axis} = {_shown(grid, i)}" for axis, i in zip(OUTPUTS, roles.outputs, strict=True)]
+    parts += [f"{channel} = {_shown(grid, i)}" for channel, i in renamed.items() if channel != _shown(grid, i)]
     return f"read as {', '.join(parts)}" + ("" if set(reading.columns) >= {*OUTPUTS} else " (else: --columns)")
 
 

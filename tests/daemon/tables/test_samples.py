@@ -308,6 +308,23 @@ def test_an_index_that_counts_no_samples_is_not_said_to(tmp_path: Path) -> None:
     assert read(tmp_path, content, Reading(rate=100.0)).remarks[0].startswith("read as t = rows, 100 Hz")
 
 
+@pytest.mark.parametrize("header", ["time_ms,ax,ay,az,T", "t [ms],ax,ay,az,T [°C]", "Zeit [ms],ax,ay,az,T"])
+def test_t_is_a_temperature_beside_a_time(tmp_path: Path, header: str) -> None:
+    table = read(tmp_path, lines([f"{10 * i},1,2,{i % 3},{20 + i % 7}" for i in range(40)], header))
+    assert set(np.diff(table.samples.time_ns)) == {10_000_000}
+    assert table.samples.channels["temp_c"][6] == 26
+    assert ", temp_c = T" in table.remarks[0]
+
+
+def test_t_alone_is_a_time_where_it_rises_and_else_a_temperature(tmp_path: Path) -> None:
+    rising = lines([f"{i / 100},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az")
+    assert set(np.diff(read(tmp_path, rising).samples.time_ns)) == {10_000_000}
+    falling = lines([f"{20 + i % 7},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az")
+    with pytest.raises(InputError, match="no column of time"):
+        read(tmp_path, falling)
+    assert "temp_c" in read(tmp_path, falling, Reading(rate=100.0)).samples.channels
+
+
 @pytest.mark.parametrize("name", ["temp_f", "Temp [°F]", "temp_raw", "temp_mv"])
 def test_a_temperature_in_another_unit_keeps_its_name(tmp_path: Path, name: str) -> None:
     channels = read(tmp_path, lines([f"{row},{70 + i % 7}" for i, row in enumerate(EVERY)], f"time,ax,ay,az,{name}"))
