@@ -146,7 +146,8 @@ def find_poses(
 
     ``t`` (n,) floats in seconds, datetimes, or integers with ``time_unit`` (s, ms, us, ns); ``u`` (n,3) output units;
     ``channels`` (n,) each by name. Or ``t`` a DataFrame with the columns t_s, ux, uy, uz and any further channels;
-    ``columns`` says how they are called where that is otherwise: {"t": "time", "ux": "ax", …}. Raises InvalidData.
+    ``columns`` says how they are called where that is otherwise, channels too: {"t": "time", "ux": "ax", …, "temp_c":
+    "Temperatur"}. A file is first read into a DataFrame, by whatever reads it. Raises InvalidData.
     """
     samples = _samples(t, u, channels, time_unit, columns)
     detector, judge = StillnessDetector(), QualityDetector()

@@ -374,8 +374,8 @@ class Calibration:
         return text.summary(self._fitted, self.output_unit, self.reference_unit, self.warnings)
 
     def plot(self) -> Figure:
-        """The residuals of the poses, and where these lie on the sphere. Raises InvalidData where there are none;
-        ModuleNotFoundError without matplotlib."""
+        """The residuals of the poses, and where these lie on the sphere: also of a loaded document, which holds them.
+        Raises InvalidData where there are none; ModuleNotFoundError without matplotlib."""
         from triaxcal.pictures import residuals_figure  # matplotlib, which nothing else needs
 
         return residuals_figure(calibration_part(self.to_dict(), where="document"))
