@@ -23,8 +23,9 @@ def absent(modules: Iterable[str]) -> str | None:
     missing = [m for m in modules if importlib.util.find_spec(m) is None]
     if not missing:
         return None
-    extras = {EXTRAS.get(m) for m in missing}
-    return _told(missing[0], extras.pop() if len(extras) == 1 else "station")
+    ours = [m for m in missing if m in EXTRAS]
+    extras = {EXTRAS[m] for m in ours}
+    return _told((ours or missing)[0], extras.pop() if len(extras) == 1 else "station" if extras else None)
 
 
 def lacking(e: ModuleNotFoundError) -> str | None:

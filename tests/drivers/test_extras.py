@@ -25,6 +25,9 @@ def test_one_extra_brings_all_that_is_missing(modules: tuple[str, ...], extra: s
 @pytest.mark.usefixtures("without")
 def test_of_a_package_that_no_extra_brings_the_name_is_all_that_is_said() -> None:
     assert absent(("elsewhere",)) == "the package elsewhere is not installed"
+    assert (
+        absent(("elsewhere", "can")) == "the package python-can is not installed; pip install 'triaxcal[can]' brings it"
+    )
 
 
 def test_where_all_are_there_nothing_is_absent() -> None:

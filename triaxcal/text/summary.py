@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from triaxcal.effects.contract import SINCE_START, TIME, channel_of
+from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose
+from triaxcal.text.holds import holds
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 
 
@@ -94,10 +94,10 @@ def _quality(c: Calibration, reference_unit: str) -> list[str]:
     if c.poses:
         excluded = sum(not p.used for p in c.poses)
         lines.append(f"{len(c.poses)} poses" + (f", {excluded} of them excluded" if excluded else ""))
-    needed = {channel_of(need) for e, _ in c.sensor.effects for need in e.needs}
-    held = [f"{name} = {plain(value, 4)}" for name, value in c.channel_reference.items() if name in needed]
-    if held:
-        lines.append(f"scale factors, misalignments and biases hold at {', '.join(held)}")
+    effects = [effect for effect, _ in c.sensor.effects]
+    several = any(p.pose.run.of > 1 for p in c.poses)
+    if held := holds(effects, c.channel_reference, several=several):
+        lines.append(f"the linear parameters hold {', '.join(held)}")
     if c.holds_at is not None and any({TIME, SINCE_START} & set(e.needs) for e, _ in c.sensor.effects):
         lines.append(f"effects of time hold at {c.holds_at.t_s:.1f} s of its recording ({c.holds_at.moment.value})")
     return lines

@@ -107,7 +107,7 @@ class Name:
     @property
     def is_either(self) -> bool:
         """T is a temperature as well as a time: it is a time only where no other column is, and where it rises."""
-        return self.words == ("t",) and self.text.startswith("T")
+        return self.words == ("t",) and self.text.startswith("T") and self.time_unit is None
 
     @property
     def is_celsius(self) -> bool:

@@ -35,6 +35,8 @@ VALUES_MOST, IN_TURN = 50, 0.2
 SECONDS_MOST = 2**63 // 10**9
 FAR = 1e4
 """Times what nine in ten samples reach: more is no reading, as a knock reaches the end of the range."""
+RESTARTS = 10
+"""A clock rises so many times as often as it starts again, at least."""
 COMPUTED_LEAST = 0.999
 """Correlation with the magnitude of the outputs above which a column is computed from them; a temperature that is
 measured has not a thousandth of it."""
@@ -360,7 +362,8 @@ def _timing(grid: _Grid, roles: Roles, names: Sequence[Name], reading: Reading, 
     if reading.time_unit not in (None, INDEX) and rate is not None:
         raise Unclear(f"--rate, --time-unit {reading.time_unit}: give one or the other")
     by_index = reading.time_unit == INDEX
-    roles = replace(roles, time=tuple(i for i in roles.time if not _is_no_time(grid.columns[i], names[i], chosen)))
+    time = tuple(i for i in roles.time if not _is_no_time(grid.columns[i], names[i], chosen))
+    roles = roles if TIME in roles.said else replace(roles, time=time)
     candidates = [i for i in roles.time if _rises_at_all(grid.columns[i], chosen)]
     if not roles.time and grid.named:
         moments = [i for i, c in enumerate(grid.columns) if c.moments_ns is not None and _rises_at_all(c, chosen)]
@@ -375,7 +378,8 @@ def _timing(grid: _Grid, roles: Roles, names: Sequence[Name], reading: Reading, 
             raise Unclear(_no_time(grid, roles, by_index))
         rate, where = stated[0], f"'{clipped(stated[1])}'"
     if rate is not None:
-        index = next(iter([*([roles.time[0]] if by_index or TIME in roles.said else []), *roles.indices][:1]), None)
+        counted = [*(roles.time[:1] if by_index or TIME in roles.said else ()), *roles.indices]
+        index = next(iter(counted), None)
         return _Timing(None, None, f"{plain(rate, 6)} Hz by {where}", rate, index)
     return _timed(grid, candidates, names, reading.time_unit, chosen)
 
@@ -411,9 +415,9 @@ def _rises_at_all(column: Column, chosen: NDArray[np.bool_]) -> bool:
 
 
 def _is_no_time(column: Column, name: Name, chosen: NDArray[np.bool_]) -> bool:
-    """Of a column that may be either: a temperature falls as well."""
-    held = column.numbers[chosen & column.usable]
-    return name.is_either and column.moments_ns is None and bool((np.diff(held) < 0).any())
+    """Of a column that may be either: a temperature falls as it rises, a clock at most where it starts again."""
+    steps = np.diff(column.numbers[chosen & column.usable])
+    return name.is_either and column.moments_ns is None and bool((steps < 0).sum() * RESTARTS > (steps > 0).sum())
 
 
 def _timed(
@@ -537,6 +541,7 @@ def _channels(
     kept = np.zeros(len(grid.columns[0].numbers), bool)
     kept[rows] = True
     celsius = [i for i, n in enumerate(names) if n.is_celsius and i not in used]
+    celsius = [i for i in celsius if names[i].unit or not names[i].is_either] or celsius
     magnitude = np.linalg.norm(readings, axis=1)
     for i, column in enumerate(grid.columns):
         if i in used:
@@ -547,7 +552,9 @@ def _channels(
         if name in wanted and name not in channels and not (column.strange | column.gaps)[rows].any():
             channels[name] = values
             continue
-        if (i in roles.time and not _is_no_time(column, names[i], kept)) or column.moments_ns is not None:
+        clock_of_its_own = names[i].is_either and len(values) > 1 and bool((np.diff(values) > 0).all())
+        time = i in roles.time and not _is_no_time(column, names[i], kept)
+        if time or clock_of_its_own or column.moments_ns is not None:
             reason = "another time"
         elif i in roles.indices or _counts(column, rows):
             reason = "an index"

@@ -325,6 +325,32 @@ def test_t_alone_is_a_time_where_it_rises_and_else_a_temperature(tmp_path: Path)
     assert "temp_c" in read(tmp_path, falling, Reading(rate=100.0)).samples.channels
 
 
+def test_t_is_the_time_that_the_user_says_it_is_whatever_it_does(tmp_path: Path) -> None:
+    once_back = lines([f"{(i % 30) / 100},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az")
+    with pytest.raises(InputError, match="column T: the time is before that of the line before"):
+        read(tmp_path, once_back, Reading(columns={"t": "T"}))
+    with pytest.raises(InputError, match="column T: the time falls back"):
+        read(tmp_path, lines([f"{(i % 39) / 100},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az"))
+    assert len(read(tmp_path, once_back, Reading(columns={"t": "T"}, rate=100.0)).samples.time_ns) == 40
+
+
+def test_a_column_that_says_temperature_comes_before_t(tmp_path: Path) -> None:
+    rows = [f"{10 * i},1,2,{i % 3},{i % 5},{20 + i % 7}" for i in range(40)]
+    channels = read(tmp_path, lines(rows, "t_ms,ax,ay,az,T,temp")).samples.channels
+    assert channels["temp_c"][6] == 26
+    assert channels["T"][6] == 1
+
+
+def test_a_t_that_always_rises_beside_a_time_is_another_time(tmp_path: Path) -> None:
+    rows = [f"{10 * i},1,2,{i % 3},{i / 100}" for i in range(40)]
+    assert not read(tmp_path, lines(rows, "t_ms,ax,ay,az,T")).samples.channels
+
+
+def test_without_a_column_that_counts_the_rows_are_counted(tmp_path: Path) -> None:
+    content = lines([f"{i % 5},1,2,{i % 3}" for i in range(40)], "q,ax,ay,az")
+    assert set(np.diff(read(tmp_path, content, Reading(time_unit="index", rate=100.0)).samples.time_ns)) == {10**7}
+
+
 @pytest.mark.parametrize("name", ["temp_f", "Temp [°F]", "temp_raw", "temp_mv"])
 def test_a_temperature_in_another_unit_keeps_its_name(tmp_path: Path, name: str) -> None:
     channels = read(tmp_path, lines([f"{row},{70 + i % 7}" for i, row in enumerate(EVERY)], f"time,ax,ay,az,{name}"))

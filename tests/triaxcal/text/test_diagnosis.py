@@ -45,6 +45,10 @@ def test_the_cause_is_told_with_its_probability() -> None:
     assert cause(NOTHING, (GROUP,)) == "one of warm_up (0.72), bias_drift (0.28) acts"
     likely = Candidate("third_order_nonlinearity", 0.63, {})
     assert cause(NOTHING, (KNOWN,), (likely,)).endswith("third_order_nonlinearity probably acts (0.63)")
+    hangs = Candidate("hysteresis", 0.9995, {})
+    assert (
+        cause(NOTHING, (), (hangs,)) == "hysteresis probably acts (more than 0.999, but less so without some one pose)"
+    )
 
 
 def test_what_has_no_name_is_told_with_its_size_and_what_it_goes_with() -> None:
