@@ -12,6 +12,7 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.errors import InvalidData, MissingChannel
 from triaxcal.model.samples import Samples
+from triaxcal.poses.stillness.windows import RATE_SAMPLES
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000, "ns": 1}
 TIME_COLUMN, OUTPUTS = "t_s", ("ux", "uy", "uz")
@@ -67,6 +68,10 @@ def called(columns: Mapping[str, str] | None) -> dict[str, str]:
     }
 
 
+SLOW_S = 1.0
+"""Nobody looks for still poses in so few samples: such times are milliseconds of a fast logger, if nothing says so."""
+
+
 def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_unit: str | None = None) -> Samples:
     """Of a table with the columns t_s, ux, uy, uz; ``columns`` says how they are called where that is otherwise. All
     other columns of finite numbers are channels, by their own names, but for those that number the rows. Raises
@@ -103,7 +108,8 @@ def samples_of(
     t: Any, u: Any, channels: Mapping[str, Any] | None = None, time_unit: str | None = None, name: str = "t"
 ) -> Samples:
     """``t`` (n,): floats are seconds, unless ``time_unit`` names another unit, datetimes are what they are, and of
-    integers the unit is asked for; ``u`` (n,3) output units; ``channels`` (n,) each. Raises InvalidData."""
+    integers the unit is asked for, as it is where seconds would be `SLOW_S` apart; ``u`` (n,3) output units;
+    ``channels`` (n,) each. Raises InvalidData."""
     readings = readings_of(u)
     if readings.ndim != 2:
         raise InvalidData(f"u: expected shape (n, 3), one row a sample, not {readings.shape}")
@@ -117,6 +123,12 @@ def samples_of(
         if not np.isfinite(values).all():
             row = int(np.flatnonzero(~np.isfinite(values))[0])
             raise InvalidData(f"channel {channel}: value {row} is not a finite number")
+    step_s = float(np.median(np.diff(time_ns))) * 1e-9 if len(time_ns) > 1 else 0.0
+    if time_unit is None and np.asarray(t).dtype.kind == "f" and step_s >= SLOW_S and len(time_ns) >= RATE_SAMPLES:
+        raise InvalidData(
+            f"{name}: floats count as seconds, and these are {step_s:g} apart: say their unit by time_unit, one of s, "
+            "ms, us, ns"
+        )
     return Samples(time_ns, readings, found)
 
 

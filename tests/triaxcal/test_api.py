@@ -344,3 +344,10 @@ def test_a_gap_in_a_channel_is_a_gap_in_what_is_calibrated(recorded: Recorded, d
     a = diagnosed.calibration.apply(recorded.u, channels={"temp_c": temp_c})
     assert np.isnan(a[3]).any()
     assert np.isfinite(np.delete(a, 3, axis=0)).all()
+
+
+def test_floats_that_are_no_seconds_of_a_logger_are_asked_about() -> None:
+    times_ms, u = np.arange(500) * 10.0, np.tile([0.0, 0.0, 1.0], (500, 1))
+    with pytest.raises(tc.InvalidData, match="10 apart: say their unit by time_unit"):
+        tc.find_poses(times_ms, u)
+    assert len(tc.find_poses(times_ms, u, time_unit="ms")) <= 1
