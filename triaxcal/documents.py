@@ -25,6 +25,7 @@ from triaxcal.errors import InvalidData, MissingChannel, Refused
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.calibration import HoldsAt, PoseResult, Residual
 from triaxcal.poses.conditions import conditions_elsewhere
+from triaxcal.poses.in_streams import InStream, averages, followed
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Stated
 
@@ -37,6 +38,8 @@ BESIDE, BESIDE_S = 1.2, 60.0
 """A recording ends after its last pose: by a fifth of its length and a minute at most."""
 HOLD_S = 1.0
 """By so much a recording may end before its last pose seemed to."""
+HELD_S = 5.0
+"""As long as a person holds a pose, where a document does not say."""
 OUT = ("ax", "ay", "az")
 UNCERTAINTY = ("u_ax", "u_ay", "u_az")
 
@@ -177,7 +180,8 @@ class Calibration:
 
         ``u`` (3,) or (n,3) in output units, or a DataFrame with the columns ux, uy, uz: then a DataFrame of the same
         library with ax, ay, az, whose other columns serve as channels; ``columns`` says how it calls them where that is
-        otherwise, as in `find_poses`. ``channels`` are named as in
+        otherwise, as in `find_poses`. Where it has the times too, rates and lags of channels are those of the rows.
+        ``channels`` are named as in
         ``channel_reference`` of the document (temp_c, temp_c.rate, before_x, …), one number or (n,) each; one that an
         effect needs and that is not given counts as at its reference, with a `MissingChannel` warning. Effects of time
         hold at `holds_at`, or with ``own_recording`` at the times ``t`` (n,) from the first sample of the recording
@@ -190,7 +194,8 @@ class Calibration:
         if table is not None:
             by_ours = tables.called(columns)
             u = np.stack([tables.column(table, by_ours[name]) for name in tables.OUTPUTS], axis=1)
-            channels = self._channels_in(table, by_ours) | dict(channels or {})
+            known = self._channels_in(table, by_ours) | dict(channels or {})
+            channels = self._in_stream(table, by_ours, time_unit) | known
             if own_recording and t is None and by_ours[tables.TIME_COLUMN] in tables.names_of(table):
                 t = tables.seconds(tables.column(table, by_ours[tables.TIME_COLUMN]), time_unit)
                 t, time_unit = t - t[:1], None
@@ -210,11 +215,42 @@ class Calibration:
         out = dict(zip(OUT, a.T, strict=True))
         return tables.like(table, out if errors is None else out | dict(zip(UNCERTAINTY, errors.T, strict=True)))
 
+    def needs_recording(self) -> tuple[str, ...]:
+        """Rates and lags of channels that the effects need: what no single reading shows, and a recording does."""
+        needs = dict.fromkeys(name for effect, _ in self._fitted.sensor.effects for name in effect.needs)
+        return tuple(name for name in needs if followed(name))
+
+    @property
+    def held_s(self) -> float:
+        """How long the poses were held of which it is, in the median: over such a time rates of channels are taken."""
+        held = [p.pose.end_s - p.pose.start_s for p in self._fitted.poses]
+        return float(np.median(held)) if held else HELD_S
+
     def _channels_in(self, table: Any, by_ours: Mapping[str, str]) -> dict[str, Any]:
         """Of those that the model needs: under their own names, and under those that they are called by."""
         needed = self._needed()
         found = {name: tables.column(table, name) for name in tables.names_of(table) if name in needed}
         return found | {name: tables.column(table, theirs) for name, theirs in by_ours.items() if name in needed}
+
+    def _in_stream(self, table: Any, by_ours: Mapping[str, str], time_unit: str | None) -> dict[str, Floats]:
+        """Rates and lags that the effects need, where the rows have times that are known: those of a recording."""
+        needed, names, time = self.needs_recording(), tables.names_of(table), by_ours[tables.TIME_COLUMN]
+        if not needed or time not in names:
+            return {}
+        times = tables.column(table, time)
+        if times.dtype.kind in "iu" and time_unit is None:
+            return {}
+        t_s = tables.seconds(times, time_unit)
+        if len(t_s) < 2 or not (np.diff(t_s) > 0).all():
+            return {}
+        columns = {channel: by_ours.get(channel, channel) for channel in map(followed, needed)}
+        values = {
+            channel: tables.channel_of_samples(channel, tables.column(table, name), len(t_s))
+            for channel, name in columns.items()
+            if name in names
+        }
+        of = {c: averages(t_s, v, self.held_s) for c, v in values.items() if np.isfinite(v).all()}
+        return InStream(of, self.held_s).at(t_s, needed)
 
     def _needed(self) -> set[str]:
         return {name if is_derived(name) else channel_of(name) for name in self._fitted.channel_reference} - {TIME}

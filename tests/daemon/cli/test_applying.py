@@ -12,6 +12,7 @@ import pytest
 
 import triaxcal as tc
 from triaxcal.effects import effect_of
+from triaxcal.effects.contract import lag_in
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble
@@ -146,6 +147,55 @@ def test_a_channel_that_the_recording_lacks_is_said_once(folder: Path, triaxcal,
     done = triaxcal("apply", folder / "cal.json", folder / "bare.csv", "-o", tmp_path / "out.csv")
     assert done.code == 0
     assert done.err.count("warning: temp_c not given, which temperature_bias goes with: taken at the reference") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("thermal_gradient", {"x": 5e-3, "y": -4e-3, "z": 6e-3}),
+        ("temperature_lag", {"x": 2e-4, "y": -3e-4, "z": 4e-4, "time_constant": 30.0}),
+    ],
+)
+def test_rates_and_lags_are_those_of_the_recording(
+    name: str, values: dict[str, float], triaxcal, tmp_path: Path
+) -> None:
+    """A unit that warms up while it is turned: no reading by itself says how fast, and how late."""
+    t = np.arange(0.0, 200.0, 0.02)
+    warmed, rate = 12 * -np.expm1(-t / 60), 0.2 * np.exp(-t / 60)
+
+    def condition(need: str) -> np.ndarray:
+        if lag := lag_in(need):  # τ y′ = T − y, from rest
+            return -(rate - 0.2 * np.exp(-t / lag[1])) / (1 / lag[1] - 1 / 60)
+        return rate if need == "temp_c.rate" else warmed
+
+    effect, coefficients = effect_of(name, values)
+    unit = Sensor(
+        np.array([2.4, 2.41, 2.37]), np.array([6e-3, 4e-3, -6e-4]), np.array([5e-3, -3e-3, 4e-3]),
+        ((effect, coefficients),),
+    )  # fmt: skip
+    a = np.array([v for _, v in directions(26)])[(t // 8).astype(int)]
+    u = unit.output(a, {need: condition(need) for need in effect.needs})
+    table = pd.DataFrame({"t_s": t, "ux": u[:, 0], "uy": u[:, 1], "uz": u[:, 2], "temp_c": 25 + warmed})
+    table.to_csv(tmp_path / "rec.csv", index=False)
+    document = {
+        "format": "triaxcal.calibration/1",
+        "scale_factor": unit.scale_factor.tolist(), "misalignment": unit.misalignment.tolist(),
+        "bias": unit.bias.tolist(), "effects": {name: {n: {"value": v} for n, v in values.items()}},
+        "channel_reference": {need: 25.0 if need == "temp_c" else 0.0 for need in effect.needs},
+    }  # fmt: skip
+    (tmp_path / "cal.json").write_text(json.dumps(document))
+    done = triaxcal("apply", tmp_path / "cal.json", tmp_path / "rec.csv", "-o", tmp_path / "out.csv")
+    assert done.code == 0, done.err
+    assert "not given" not in done.err
+    assert "of the recording's own channels and times" in done.err
+    found = pd.read_csv(tmp_path / "out.csv")[["ax", "ay", "az"]].to_numpy()
+    assert tc.Calibration.load(tmp_path / "cal.json").apply(table)[["ax", "ay", "az"]].to_numpy() == pytest.approx(
+        found, abs=1e-7
+    )
+    off = found - a
+    whole = {need: (warmed if need == "temp_c" else 0 * t) for need in effect.needs}
+    without = unit.specific_force(u, whole) - a
+    assert np.sqrt(np.mean(off**2)) < 0.03 * np.sqrt(np.mean(without**2))
 
 
 def test_effects_of_time_hold_at_each_time_of_their_own_recording(triaxcal, tmp_path: Path, folder: Path) -> None:
