@@ -25,7 +25,7 @@ from triaxcal.errors import InvalidData, MissingChannel, Refused
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.calibration import HoldsAt, PoseResult, Residual
 from triaxcal.poses.conditions import conditions_elsewhere
-from triaxcal.poses.in_streams import InStream, averages, followed
+from triaxcal.poses.in_streams import InStream, followed
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Stated
 
@@ -249,8 +249,8 @@ class Calibration:
             for channel, name in columns.items()
             if name in names
         }
-        of = {c: averages(t_s, v, self.held_s) for c, v in values.items() if np.isfinite(v).all()}
-        return InStream(of, self.held_s).at(t_s, needed)
+        whole = {channel: v for channel, v in values.items() if np.isfinite(v).all()}
+        return InStream.of([(t_s, whole)], needed, self.held_s).at(t_s)
 
     def _needed(self) -> set[str]:
         return {name if is_derived(name) else channel_of(name) for name in self._fitted.channel_reference} - {TIME}

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.arrays import Floats
 from triaxcal.documents import OUT, UNCERTAINTY, Calibration
 from triaxcal.errors import MissingChannel
-from triaxcal.poses.in_streams import InStream, averages
+from triaxcal.poses.in_streams import InStream
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
@@ -58,11 +57,10 @@ def applied(
     """
     found = Applied(iter(()), None)
     beside: Mapping[str, Any] = {}
-    needed, followed = calibration.needs_recording(), InStream({}, calibration.held_s)
     if name.endswith(".mcap"):
         blocks = _of_recording(Path(name), phase)
-        if needed:
-            followed = _followed(_of_recording(Path(name), phase), calibration.held_s)
+        whole = _of_recording(Path(name), phase)
+        pieces: Iterator[tuple[Any, Mapping[str, Any]]] = ((b.time_ns * 1e-9, b.channels) for b in whole if len(b))
     else:
         table = read_table(name, reading, beside=True)
         require_same_outputs(calibration, name, output_unit or table.output_unit)
@@ -72,9 +70,7 @@ def applied(
         found.start_ns, found.remarks = 0, table.remarks
         if samples.duplicates:
             found.remarks += (f"{samples.duplicates} rows left out that repeat the one before them",)
-        if needed:
-            of_table = SampleBlock(samples.time_ns, np.arange(0), samples.readings, samples.channels)
-            followed = _followed(iter([of_table]), calibration.held_s)
+        pieces = iter([(samples.time_ns * 1e-9, samples.channels)])
         blocks = (
             SampleBlock(
                 samples.time_ns[at : at + BLOCK],
@@ -84,7 +80,8 @@ def applied(
             )
             for at in range(0, len(samples.time_ns), BLOCK)
         )
-    if derived := ", ".join(followed.at(np.zeros(1), needed)):
+    followed = InStream.of(pieces, calibration.needs_recording(), calibration.held_s)
+    if derived := ", ".join(followed.conditions):
         found.remarks += (f"{derived}: of the recording's own channels and times, where it logs none",)
     columns = OUT + UNCERTAINTY * uncertainty
 
@@ -100,7 +97,7 @@ def applied(
                 a = calibration.apply(
                     block.readings,
                     t=t_s if own_recording else None,
-                    channels=followed.at(block.time_ns * 1e-9, needed) | dict(block.channels),
+                    channels=followed.at(block.time_ns * 1e-9) | dict(block.channels),
                     own_recording=own_recording,
                     uncertainty=uncertainty,
                 )
@@ -116,18 +113,6 @@ def applied(
 
     found.blocks = calibrated()
     return found
-
-
-def _followed(blocks: Iterator[SampleBlock], over_s: float) -> InStream:
-    """The channels of a whole recording."""
-    found: dict[str, list[tuple[Floats, Floats]]] = {}
-    for block in blocks:
-        for name, values in block.channels.items():
-            if len(block):
-                found.setdefault(name, []).append(averages(block.time_ns * 1e-9, values, over_s))
-    return InStream(
-        {n: (np.concatenate([t for t, _ in of]), np.concatenate([v for _, v in of])) for n, of in found.items()}, over_s
-    )
 
 
 def _of_another_unit(calibration: Calibration, name: str, lengths: list[float]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,6 @@ PARTS = 8
 """Averages in the time over which a rate is taken."""
 
 
-def averages(t_s: Floats, values: Floats, over_s: float) -> tuple[Floats, Floats]:
-    """Times and values (m,) averaged over `PARTS` to ``over_s``, of ascending times (n,)."""
-    _, index, count = np.unique(np.floor(t_s * (PARTS / over_s)), return_inverse=True, return_counts=True)
-    return np.bincount(index, t_s) / count, np.bincount(index, values) / count
-
-
 def followed(condition: str) -> str:
     """The channel whose rate or lag this is; empty of any other condition."""
     lag = lag_in(condition)
@@ -29,36 +23,50 @@ def followed(condition: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class InStream:
-    """Of each channel the averages (m,) at their times (m,). ``over_s`` is the time over which rates are taken."""
+    """``conditions`` are those that a recording shows: times (m,) in s, and the values (m,) there."""
 
-    channels: Mapping[str, tuple[Floats, Floats]]
-    over_s: float
+    conditions: Mapping[str, tuple[Floats, Floats]]
 
-    def at(self, t_s: Floats, wanted: Iterable[str]) -> dict[str, Floats]:
-        """(n,) those of the ``wanted`` conditions that are rates or lags of a channel here, by name: the slope of a
-        straight line through the averages about each moment, and what `behind` gives. None where there is one average
-        alone."""
-        out: dict[str, Floats] = {}
+    @classmethod
+    def of(
+        cls, pieces: Iterable[tuple[Floats, Mapping[str, Floats]]], wanted: Sequence[str], over_s: float
+    ) -> InStream:
+        """Of the ``wanted`` conditions those that are rates or lags of a channel here. A recording comes in ``pieces``,
+        ascending times (n,) with the channels (n,) each; a rate is the slope of a straight line through ``over_s``."""
+        held: dict[str, list[tuple[Floats, Floats]]] = {followed(name): [] for name in wanted}
+        for t_s, channels in pieces if wanted else ():
+            for name in held.keys() & channels.keys():
+                held[name].append(_averages(t_s, channels[name], over_s))
+        found = {}
         for name in wanted:
-            times, values = self.channels.get(followed(name), (np.empty(0), np.empty(0)))
-            if len(times) < 2:
-                continue
-            lag = lag_in(name)
-            found = behind(times, values, lag[1]) if lag else _slopes(times, values, self.over_s)
-            out[name] = np.interp(t_s, times, found)
-        return out
+            pairs = held[followed(name)]
+            times, values = (np.concatenate([np.empty(0), *(pair[k] for pair in pairs)]) for k in (0, 1))
+            if len(times) > 1:
+                lag = lag_in(name)
+                found[name] = times, behind(times, values, lag[1]) if lag else _slopes(times, values, over_s)
+        return cls(found)
+
+    def at(self, t_s: Floats) -> dict[str, Floats]:
+        """(n,) of each condition at times (n,)."""
+        return {name: np.interp(t_s, times, values) for name, (times, values) in self.conditions.items()}
+
+
+def _averages(t_s: Floats, values: Floats, over_s: float) -> tuple[Floats, Floats]:
+    """Times and values (m,) averaged over `PARTS` to ``over_s``, of ascending times (n,)."""
+    _, index, count = np.unique(np.floor(t_s * (PARTS / over_s)), return_inverse=True, return_counts=True)
+    return np.bincount(index, t_s) / count, np.bincount(index, values) / count
 
 
 def _slopes(t_s: Floats, values: Floats, over_s: float) -> Floats:
-    """(m,) of the straight lines through all values within half of ``over_s``; zero where there is one
-    alone."""
-    first, last = np.searchsorted(t_s, t_s - over_s / 2), np.searchsorted(t_s, t_s + over_s / 2, side="right")
-    t, v, count = t_s - t_s[0], values - values[0], last - first
-
-    def summed(x: Floats) -> Floats:
-        total = np.concatenate([[0.0], np.cumsum(x)])
-        return np.asarray(total[last] - total[first])
-
-    spread = summed(t * t) - summed(t) ** 2 / count
-    along = summed(t * v) - summed(t) * summed(v) / count
-    return np.where((count > 1) & (spread > 0), along / np.where(spread > 0, spread, 1.0), 0.0)
+    """(m,) of the straight lines through all values within half of ``over_s``; zero where there is one alone. Sums are
+    about each moment: those from the start of a long recording lose their digits."""
+    count, t, v, tt, tv = np.zeros((5, len(t_s)))
+    here = np.arange(len(t_s))
+    for step in range(-PARTS, PARTS + 1):
+        there = np.clip(here + step, 0, len(t_s) - 1)
+        dt, dv = t_s[there] - t_s, values[there] - values
+        inside = (there == here + step) & (np.abs(dt) <= over_s * (0.5 + 0.5 / PARTS))  # no rounding decides the last
+        count, t, v = count + inside, t + inside * dt, v + inside * dv
+        tt, tv = tt + inside * dt * dt, tv + inside * dt * dv
+    spread = tt - t * t / count
+    return np.where(count > 1, (tv - t * v / count) / np.where(count > 1, spread, 1.0), 0.0)

@@ -218,6 +218,9 @@ def _assembled(grid: _Grid, reading: Reading, beside: bool) -> Table:
     for i in roles.outputs:
         _require_numbers(grid, i, chosen)
     parsed = [Name.of(n, u) for n, u in zip(grid.names, grid.units, strict=True)]
+    if TIME not in roles.said:
+        times = tuple(i for i in roles.time if not _is_no_time(grid.columns[i], parsed[i], chosen))
+        roles = replace(roles, time=times)
     timing = _timing(grid, roles, parsed, reading, chosen)
     needed = [*roles.outputs, *roles.channels.values(), *([] if timing.column is None else [timing.column])]
     keep, skipped = _kept(grid, needed, chosen, reading)
@@ -362,8 +365,6 @@ def _timing(grid: _Grid, roles: Roles, names: Sequence[Name], reading: Reading, 
     if reading.time_unit not in (None, INDEX) and rate is not None:
         raise Unclear(f"--rate, --time-unit {reading.time_unit}: give one or the other")
     by_index = reading.time_unit == INDEX
-    time = tuple(i for i in roles.time if not _is_no_time(grid.columns[i], names[i], chosen))
-    roles = roles if TIME in roles.said else replace(roles, time=time)
     candidates = [i for i in roles.time if _rises_at_all(grid.columns[i], chosen)]
     if not roles.time and grid.named:
         moments = [i for i, c in enumerate(grid.columns) if c.moments_ns is not None and _rises_at_all(c, chosen)]
@@ -538,8 +539,6 @@ def _channels(
     renamed: dict[str, int] = {}
     left_out: list[str] = []
     used = {*roles.outputs, *roles.channels.values(), timing.column, timing.index}
-    kept = np.zeros(len(grid.columns[0].numbers), bool)
-    kept[rows] = True
     celsius = [i for i, n in enumerate(names) if n.is_celsius and i not in used]
     celsius = [i for i in celsius if names[i].unit or not names[i].is_either] or celsius
     magnitude = np.linalg.norm(readings, axis=1)
@@ -553,8 +552,7 @@ def _channels(
             channels[name] = values
             continue
         clock_of_its_own = names[i].is_either and len(values) > 1 and bool((np.diff(values) > 0).all())
-        time = i in roles.time and not _is_no_time(column, names[i], kept)
-        if time or clock_of_its_own or column.moments_ns is not None:
+        if i in roles.time or clock_of_its_own or column.moments_ns is not None:
             reason = "another time"
         elif i in roles.indices or _counts(column, rows):
             reason = "an index"
