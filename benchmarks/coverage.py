@@ -74,7 +74,7 @@ def covered(
     for seed in range(seeds):
         rng = np.random.default_rng([seed, count, 21])
         poses = c.poses(excess * rng.standard_normal(c.ups.shape) * c.error)
-        low, high = fit(knowledge(poses, rng), signs=c.signs, aside=None if search else ()).interval(level)
+        low, high = fit(knowledge(poses, rng), signs=c.signs, excluded=None if search else ()).interval(level)
         out[seed] = (low <= c.truth) & (c.truth <= high)
     return out
 

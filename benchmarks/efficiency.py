@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.table import Table, run
-from benchmarks.truth import PARAMETERS, Condition, bound_and_best, conditions
+from benchmarks.truth import PARAMETERS, Condition, bound_and_best, covariates
 from triaxcal.estimate.pose_fit import fit
 
 SEEDS, QUICK = 1000, 100
@@ -37,7 +37,7 @@ def measure(c: Condition, seeds: int) -> Efficiency:
     errors, ideal = np.empty((seeds, 9)), np.empty((seeds, 9))
     for seed in range(seeds):
         poses, noise = c.draw(seed)
-        errors[seed] = fit(poses, signs=c.signs, aside=()).values - c.truth
+        errors[seed] = fit(poses, signs=c.signs, excluded=()).values - c.truth
         ideal[seed] = best @ noise.ravel()
     bound = np.sqrt(np.diag(covariance))
     excess = (errors**2 - ideal**2) / bound**2
@@ -51,7 +51,7 @@ def measure(c: Condition, seeds: int) -> Efficiency:
 
 def table(seeds: int) -> Table:
     rows = []
-    for c in conditions():
+    for c in covariates():
         e = measure(c, seeds)
         worst = int(np.argmax(np.abs(e.ratio - 1)))
         rows.append(

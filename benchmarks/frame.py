@@ -62,8 +62,8 @@ def one(
     datum = nearest_rotation(np.array([fixture.inward[label] for label in LABELS]), AXES)
     miss = Rotation.from_matrix(datum @ mount @ unit.rotation.T).as_rotvec()
     off = np.zeros(3) if result.fixture.offset is None else result.fixture.offset
-    inflation = calibration.inflation if calibration.residual.lack_of_fit_p < 0.05 else 1.0
-    return miss, known.standard_error / inflation, np.abs(miss) < unit.coverage_factor() * unit.standard_error, off
+    birge_ratio = calibration.birge_ratio if calibration.residual.lack_of_fit_p < 0.05 else 1.0
+    return miss, known.standard_error / birge_ratio, np.abs(miss) < unit.coverage_factor() * unit.standard_error, off
 
 
 def main(seeds: int) -> None:

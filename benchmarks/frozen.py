@@ -35,7 +35,7 @@ from tests.undeclared.generator import CannotShow, Recording
 from tests.undeclared.told import rms_g
 from triaxcal.diagnosis import diagnose
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.held_out import magnitude_errors
+from triaxcal.estimate.hold_out import magnitude_errors
 from triaxcal.poses.pose import Pose
 
 RANGES = {"development": 0, "test": 500_000}

@@ -59,7 +59,7 @@ def findings(loop: Loop) -> str:
 
 def warnings(loop: Loop, measured: Measured) -> str:
     """In few words: by how much residuals exceed the noise in the end, and what the raw stream is blamed for."""
-    found = [f"noise ×{loop.after.inflation:.1f}"] if loop.after.inflation >= 1.05 else []
+    found = [f"noise ×{loop.after.birge_ratio:.1f}"] if loop.after.birge_ratio >= 1.05 else []
     found += [f"{1e6 * loop.after.excess_g:.0f} µg beside the noise"] if loop.after.excess_g else []
     found += [line.split(",")[0].replace("_", " ") for line in measured.data_quality]
     cautions = loop.after.cautions

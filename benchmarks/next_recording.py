@@ -21,7 +21,7 @@ from benchmarks.frozen import WORSE, judged
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.held_out import magnitude_errors
+from triaxcal.estimate.hold_out import magnitude_errors
 from triaxcal.poses.pose import Pose
 from triaxcald.inputs import measure
 

@@ -29,7 +29,7 @@ def _means(poses: Sequence[Pose]) -> np.ndarray:
 
 
 def ours(c: Condition, poses: Sequence[Pose]) -> np.ndarray:
-    return fit(poses, signs=c.signs, aside=()).values
+    return fit(poses, signs=c.signs, excluded=()).values
 
 
 def paper(c: Condition, poses: Sequence[Pose]) -> np.ndarray:

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.streams import CONDITIONS, Condition, Stream, made
+from benchmarks.streams import COVARIATES, Condition, Stream, made
 from triaxcal.arrays import Floats, Ints
 from triaxcal.poses.quality import Finding, QualityDetector
 from triaxcal.poses.stillness.detector import StillnessDetector
@@ -38,7 +38,7 @@ def judged(time_ns: Ints, readings: Floats) -> list[Finding]:
 
 def clean() -> Iterator[tuple[Condition, str]]:
     """Conditions, and what may truly be said of them."""
-    for c in CONDITIONS:
+    for c in COVARIATES:
         if c.rate_hz <= 1000 and c.hold_s[1] <= 60:
             yield c, "coarse_quantization" if c.step_g > 2.5 * np.min(c.noise_g) else ""
     base = Condition("steps", noise_g=2e-4)

@@ -22,12 +22,12 @@ from benchmarks.pages import DOCS, PICTURES, write
 from benchmarks.pictures import Line, draw_by_run, draw_pairs
 from benchmarks.processes import one_thread
 from benchmarks.table import Table
-from triaxcal.agreement import Common, agreement
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.estimate.runs import together
-from triaxcal.text.agreement import verdict
+from triaxcal.pooling import Common, pooled_analysis
 from triaxcal.text.diagnosis import chance
+from triaxcal.text.pooling import verdict
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import next_recording
 
@@ -79,7 +79,7 @@ def told(asked: tuple[int, int]) -> Told:
 def _poses(loop: Loop) -> Floats:
     c = loop.after
     poses = [p.pose for p in c.poses]
-    held = c.conditions_of(poses)
+    held = c.covariates_of(poses)
     moved = c.sensor.departure(np.zeros((len(poses), 3)), held)
     run = np.array([p.run.index for p in poses])
     end = np.array([moved[run == k][-1] for k in run])
@@ -92,7 +92,7 @@ def _shape(shape: dict[str, tuple[float, str]]) -> str:
 
 
 def agree() -> Table:
-    found = agreement([diagnose(together([poses_of(run, s) for run in range(1, 6)])) for s in SENSORS])
+    found = pooled_analysis([diagnose(together([poses_of(run, s) for run in range(1, 6)])) for s in SENSORS])
     rows = [
         [c.effect, chance(c.probability), chance(c.common), " ".join(f"{p:.2f}" for p in c.units), _shared(c)]
         for c in found.effects

@@ -37,7 +37,7 @@ def fits(quick: bool) -> Table:
         c = Condition("", PAPER_UNIT, plan(count), np.array(1.5e-5))
         poses, _ = c.draw(0)
         ours = seconds(partial(fit, poses, signs=c.signs), budget)
-        bare = seconds(partial(fit, poses, signs=c.signs, aside=()), budget)
+        bare = seconds(partial(fit, poses, signs=c.signs, excluded=()), budget)
         plain = seconds(partial(scipy_magnitude, c, poses), budget)
         rows.append([f"{count} poses", _duration(ours), f"{bare / ours:.2g}", f"{plain / ours:.2g}"])
     for count in (10_000, 100_000) if quick else (10_000, 100_000, 1_000_000):

@@ -54,8 +54,8 @@ def told_the_number(c: Condition, poses: Sequence[Pose], miss: np.ndarray, numbe
     return min((sets[k] for k in near), key=lambda s: _chi2(c, poses, s))
 
 
-def _chi2(c: Condition, poses: Sequence[Pose], aside: tuple[int, ...]) -> float:
-    used = [p for p in fit(poses, signs=c.signs, aside=aside).poses if p.used]
+def _chi2(c: Condition, poses: Sequence[Pose], excluded: tuple[int, ...]) -> float:
+    used = [p for p in fit(poses, signs=c.signs, excluded=excluded).poses if p.used]
     return sum((p.residual_g / p.standard_error_g) ** 2 for p in used)
 
 
@@ -104,14 +104,14 @@ def measure(count: int, number: int, sigmas: float | None, seeds: int, *, peer: 
         sizes = sizes * rng.choice([-1, 1], number)
         poses = spoil(c, c.poses(noise), bad, sizes.tolist())
         found = fit(poses, signs=c.signs)
-        told = fit(poses, signs=c.signs, aside=bad)
+        told = fit(poses, signs=c.signs, excluded=bad)
         miss = np.einsum("ni,ni->n", noise / c.unit.scale_factor, c.ups) / SIGMA
         miss[list(bad)] += sizes
         named.append(left_out(found) == bad)
         ambiguous.append(any(isinstance(caution, OutlierSetsTied) for caution in found.cautions))
         wrong.append(not set(left_out(found)) <= set(bad))
         optimum.append(told_the_number(c, poses, miss, number) == bad)
-        error = told.standard_errors / told.inflation
+        error = told.standard_errors / told.birge_ratio
         squares[seed] = [
             np.mean(((v - c.truth) / error) ** 2)
             for v in (found.values, told.values, huber(c, poses) if peer else c.truth)

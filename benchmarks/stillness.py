@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.streams import CONDITIONS, PAPER_UNIT, Condition, Stream, made
+from benchmarks.streams import COVARIATES, PAPER_UNIT, Condition, Stream, made
 from triaxcal.arrays import Floats
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
@@ -129,7 +129,7 @@ def speed(rate_hz: float, seconds: float = 60.0) -> str:
 def report(*, quick: bool = False, only: str = "") -> str:
     """The table and the speeds, as text."""
     lines = [HEAD]
-    for c in CONDITIONS:
+    for c in COVARIATES:
         if only in c.name:
             lines.append(line(c, measured(c, range(2 if quick else 20))))
     lines += ["", *(speed(rate) for rate in (100.0, 1000.0, 10_000.0))]

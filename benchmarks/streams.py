@@ -198,7 +198,7 @@ def _average(n: int, length: float, rng: np.random.Generator) -> Floats:
 
 SOME_POSES: dict[str, Any] = {"vibration_g": 1e-2, "machine": "some poses", "hold_s": (3.0, 8.0)}
 SLOW_TURNS: dict[str, Any] = {"jitter_g": 0.01, "apart_deg": 10.0, "move_s": (6.0, 9.0)}
-CONDITIONS = [
+COVARIATES = [
     Condition("white, 100 Hz"),
     *(Condition(f"white, {r:g} Hz", r, poses=26 if r < 2000 else 14) for r in (20.0, 50.0, 1000.0)),
     Condition("white, 10 kHz", 10_000.0, poses=9, hold_s=(3.0, 3.0)),

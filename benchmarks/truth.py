@@ -124,7 +124,7 @@ def _unit(
 LEANING = tuple(np.tan(np.radians([25.0, -25.0, 25.0])).tolist())
 
 
-def conditions() -> Iterator[Condition]:
+def covariates() -> Iterator[Condition]:
     """Everything that the claim about the bound names, alone and together."""
     for sigma in (1e-6, 1e-5, 1e-4, 1e-3):
         for count in (14, 26, 20):

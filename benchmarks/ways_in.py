@@ -11,7 +11,7 @@ from benchmarks.table import Table, chosen
 from benchmarks.truth import information, plan
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.inputs.attitude import fit_attitudes
-from triaxcal.inputs.passport import Passport, refine
+from triaxcal.inputs.datasheet import Datasheet, refine
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.inputs.turning.rotation import fit_rotation
 from triaxcal.model.sensor import Sensor
@@ -76,7 +76,7 @@ def attitudes(seeds: int) -> Table:
                     c = fit_attitudes(poses, ups, signs=SIGNS, attitude_error_rad=declared).calibration
                     pulls.append((c.values - TRUTH) / c.standard_errors)
                     if count > 6:
-                        ratio.append(c.standard_errors / fit(poses, signs=SIGNS, aside=()).standard_errors)
+                        ratio.append(c.standard_errors / fit(poses, signs=SIGNS, excluded=()).standard_errors)
                 known = "declared" if declared is not None else "estimated"
                 rows.append([f"{count}", f"{error_rad:g}", known, rms(pulls), rms(ratio) if ratio else "—"])
     title = f"Poses of known attitude, noise 1e-5 g, {seeds} seeds"
@@ -94,7 +94,7 @@ def passports(seeds: int) -> Table:
                 v = TRUTH + rng.standard_normal(9) * error
                 found = refine(
                     noisy_poses(UNIT, plan(14)[:count], noise, rng),
-                    Passport(Sensor(v[:3], v[3:6], v[6:]), error, {}, 1.0),
+                    Datasheet(Sensor(v[:3], v[3:6], v[6:]), error, {}, 1.0),
                 )
                 pulls.append((found.calibration.values - TRUTH) / found.calibration.standard_errors)
                 shares.append(found.share)

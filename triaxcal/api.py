@@ -17,7 +17,7 @@ from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate import pose_fit
 from triaxcal.estimate.creep import with_creep_left
-from triaxcal.estimate.held_out import HeldOut, magnitude_errors
+from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
 from triaxcal.estimate.means import poses_of_means
 from triaxcal.evidence.findings import Unexplained
 from triaxcal.model.directions import FULL, closed, directions
@@ -89,7 +89,7 @@ class Diagnosis:
     probabilities: Mapping[str, float]
     unexplained: Unexplained
     next_recording: NextRecording
-    held_out: HeldOut | None
+    held_out: HoldOut | None
     advice: tuple[str, ...]
     _lines: tuple[str, ...] = field(repr=False, default=())
 

@@ -144,7 +144,7 @@ def calibration_document(
             }
             for p in c.poses
         ],
-        "trends": c.trends,
+        "trends": c.slopes,
         "condition": uncertainty(c.condition),
         "dilution": uncertainty(c.dilution),
         "blind_to": list(c.blind_to),

@@ -11,7 +11,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.calibration_document import WEIGHT
 from triaxcal.effects import Effect, effect_of
-from triaxcal.effects.contract import condition_of
+from triaxcal.effects.contract import covariate_of
 from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
@@ -39,14 +39,14 @@ def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: flo
 
 
 def logged_in(document: Mapping[str, Any], *, where: str) -> dict[str, Floats]:
-    """The channels of the poses of a calibration document that were used, (n,) each, as conditions are named; none that
+    """The channels of the poses of a calibration document that were used, (n,) each, as covariates are named; none that
     one of these lacks."""
     poses = calibration_part(document, where=where).get("poses")
     used = [p for p in poses if isinstance(p, Mapping) and p.get("used", True)] if isinstance(poses, list) else []
     found = [p.get("channels") for p in used]
     rows = [row if isinstance(row, Mapping) else {} for row in found]
     names = [str(n) for n in rows[0] if all(math.isfinite(_number(row.get(n))) for row in rows)] if rows else []
-    return {condition_of(n): np.array([_number(row[n]) for row in rows]) for n in names}
+    return {covariate_of(n): np.array([_number(row[n]) for row in rows]) for n in names}
 
 
 def expanded_uncertainty_in(document: Mapping[str, Any], *, where: str) -> float | None:
@@ -112,7 +112,7 @@ def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
         poses=(),
         condition=_number(part.get("condition")),
         dilution=_number(part.get("dilution")),
-        inflation=unknown,
+        birge_ratio=unknown,
         dof=unknown,
         weights={
             name: w for name, held in part.get("effects", {}).items() if math.isfinite(w := _number(held.get(WEIGHT)))

@@ -14,13 +14,13 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import plugins
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
-from triaxcal.estimate.held_out import HeldOut, held_out
+from triaxcal.estimate.hold_out import HoldOut, held_out
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.advice import Advice, advice, decided
 from triaxcal.evidence.average import Refusal, average, refusal
-from triaxcal.evidence.blind import Blind, blind_to
 from triaxcal.evidence.corrected import corrected
 from triaxcal.evidence.findings import Findings, Named, findings
+from triaxcal.evidence.identifiability import NotIdentifiable, blind_to
 from triaxcal.evidence.odds import Odds
 from triaxcal.evidence.posterior import Posterior, looked_for, posterior
 from triaxcal.evidence.terms import faults_of
@@ -88,8 +88,8 @@ class Loop:
     findings: tuple[Finding, ...]
     candidates: tuple[Candidate, ...]
     refusal: Refusal | None
-    held_out: HeldOut | None
-    blind: Mapping[str, Blind]
+    held_out: HoldOut | None
+    blind: Mapping[str, NotIdentifiable]
     faulty: Mapping[str, str]
     seen: Posterior = field(repr=False, compare=False)
 
@@ -180,7 +180,7 @@ def _without_outliers(
     outliers = [i for i, p in likely.items() if p >= seen.evidence.odds.reported]
     if outliers != [i for i, p in enumerate(linear.poses) if p.excluded == Exclusion.OUTLIER]:
         with suppress(Refused):  # the others may not carry a fit
-            linear = fit(poses, signs=signs, reference=linear.reference, aside=outliers, why=Exclusion.OUTLIER)
+            linear = fit(poses, signs=signs, reference=linear.reference, excluded=outliers, why=Exclusion.OUTLIER)
     return replace(
         linear, poses=tuple(replace(p, outlier_probability=likely.get(i)) for i, p in enumerate(linear.poses))
     )

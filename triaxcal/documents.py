@@ -20,11 +20,11 @@ from triaxcal import tables, text
 from triaxcal.arrays import Floats
 from triaxcal.calibration_document import LINEAR, Document, calibration_document
 from triaxcal.calibration_reading import calibration_of, calibration_part
-from triaxcal.effects.contract import TIME, channel_of, condition_of, is_derived
+from triaxcal.effects.contract import TIME, channel_of, covariate_of, is_derived
 from triaxcal.errors import InvalidData, MissingChannel, Refused
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.calibration import HoldsAt, PoseResult, Residual
-from triaxcal.poses.conditions import conditions_elsewhere
+from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.in_streams import InStream, followed
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import Stated
@@ -203,7 +203,7 @@ class Calibration:
         readings = tables.readings_of(u)
         rows = np.atleast_2d(readings)
         times = self._times(t, own_recording, time_unit, len(rows))
-        held = self._conditions(len(rows), channels or {}, times)
+        held = self._covariates(len(rows), channels or {}, times)
         sensor = self._fitted.sensor
         a = sensor.specific_force(rows, held) if sensor.effects else (rows - sensor.centre) @ sensor.matrix.T
         if sensor.effects:
@@ -302,15 +302,15 @@ class Calibration:
                 "effects hold for, or is in another unit"
             )
 
-    def _conditions(self, n: int, channels: Mapping[str, Any], times: Floats | None) -> dict[str, Floats]:
+    def _covariates(self, n: int, channels: Mapping[str, Any], times: Floats | None) -> dict[str, Floats]:
         if not isinstance(channels, Mapping):
             raise InvalidData("channels: expected values by name, as in {'temp_c': 25.0}")
         given = {name: tables.channel_of_samples(name, v, n) for name, v in channels.items()}
-        held, missing = self._fitted.conditions_of_readings(n, given, times)
+        held, missing = self._fitted.covariates_of_readings(n, given, times)
         missing = tuple(channel_of(name) if not is_derived(name) else name for name in missing)
         if missing:
             effects = [e.name for e, _ in self._fitted.sensor.effects if set(e.needs) & set(missing)]
-            known = {name: self._fitted.channel_reference.get(condition_of(name), 0.0) for name in missing}
+            known = {name: self._fitted.channel_reference.get(covariate_of(name), 0.0) for name in missing}
             at = ", ".join(f"{value:g}" for value in known.values()) if any(known.values()) else ""
             warnings.warn(
                 f"{', '.join(missing)} not given, which {', '.join(effects)} goes with: taken at the reference"
@@ -325,7 +325,7 @@ class Calibration:
         noise of these poses. Raises InvalidData where a channel that the effects need is missing."""
         c = self._fitted
         u = np.array([p.mean for p in poses])
-        held = conditions_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
+        held = covariates_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
         a = c.sensor.specific_force(u, held)
         up = a / np.linalg.norm(a, axis=1, keepdims=True)
         variance = np.zeros(len(u))
@@ -343,7 +343,7 @@ class Calibration:
     def _steps(self, u: Floats, held: Mapping[str, Floats]) -> Iterator[Floats]:
         """(n,3) each: one standard error along each principal axis of the parameters' covariance, and what it does."""
         c = self._fitted
-        covariance = c.covariance * np.outer(*[self._beyond_the_fit(c)] * 2)
+        covariance = c.covariance * np.outer(*[self._after_the_recording(c)] * 2)
         if not np.isfinite(covariance).all():
             yield np.full(u.shape, np.nan)
             return
@@ -352,7 +352,7 @@ class Calibration:
         for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
             yield sensor.moved(step).specific_force(u, held) - a
 
-    def _beyond_the_fit(self, c: Fitted) -> Floats:
+    def _after_the_recording(self, c: Fitted) -> Floats:
         """(p,) standard uncertainties over standard errors: what the budget has beside the fit."""
         budget = calibration_part(self.to_dict(), where="document").get("uncertainty") or {}
         out = []

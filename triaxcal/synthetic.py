@@ -12,11 +12,11 @@ from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, LAGS_S, SINCE_START, TIME, lag_in, lag_of, rate_of
 from triaxcal.model.gravity import STANDARD_GRAVITY
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import behind
+from triaxcal.poses.covariates import behind
 from triaxcal.poses.pose import Pose
 
 LAGS = {lag_of(TEMPERATURE, constant_s): constant_s for constant_s in LAGS_S}
-CONDITIONS = frozenset({TEMPERATURE, rate_of(TEMPERATURE), *LAGS, TIME, SINCE_START, HELD, *BEFORE, *CHANGE})
+COVARIATES = frozenset({TEMPERATURE, rate_of(TEMPERATURE), *LAGS, TIME, SINCE_START, HELD, *BEFORE, *CHANGE})
 """What an effect of a synthetic unit may go with."""
 
 
@@ -107,7 +107,7 @@ class Environment:
 @dataclass
 class SyntheticUnit:
     """A sensor on its path. ``noise_g`` (3,) is white, of one sample; effects count from ``channel_reference``, and
-    from zero what goes with the temperature's rate, the time since the start or the pose before (`CONDITIONS`)."""
+    from zero what goes with the temperature's rate, the time since the start or the pose before (`COVARIATES`)."""
 
     sensor: Sensor
     path: Tumble
@@ -125,16 +125,16 @@ class SyntheticUnit:
         temperature = self.environment.temperature(t_s)
         a = self.path.specific_force(t_s)
         held = {TEMPERATURE: temperature, TIME: t_s}
-        conditions = {n: v - self.channel_reference[n] for n, v in held.items() if n in self.channel_reference}
-        conditions |= {SINCE_START: t_s, HELD: np.zeros(len(t_s))}
-        conditions[rate_of(TEMPERATURE)] = self.environment.temperature_rate(t_s)
+        covariates = {n: v - self.channel_reference[n] for n, v in held.items() if n in self.channel_reference}
+        covariates |= {SINCE_START: t_s, HELD: np.zeros(len(t_s))}
+        covariates[rate_of(TEMPERATURE)] = self.environment.temperature_rate(t_s)
         needs = {name for effect, _ in self.sensor.effects for name in effect.needs}
-        conditions |= {n: self.environment.temperature_lag(t_s, LAGS[n]) for n in needs & LAGS.keys()}
+        covariates |= {n: self.environment.temperature_lag(t_s, LAGS[n]) for n in needs & LAGS.keys()}
         if needs & {*BEFORE, *CHANGE}:
             before = self.path.before(t_s) @ self.sensor.axes.T
             change = a @ self.sensor.axes.T - before
-            conditions |= dict(zip((*BEFORE, *CHANGE), (*before.T, *change.T), strict=True))
-        clean = self.sensor.output(a, conditions)
+            covariates |= dict(zip((*BEFORE, *CHANGE), (*before.T, *change.T), strict=True))
+        clean = self.sensor.output(a, covariates)
         noise = self._rng.standard_normal((len(t_s), 3)) * self.noise_g * self.sensor.scale_factor
         return clean + noise, temperature
 
@@ -151,7 +151,7 @@ def noisy_poses(
 ) -> list[Pose]:
     """Pose means as a perfect detector would give them, one after the other, ``hold_s`` apart.
 
-    ``standard_error_g`` of a mean: one number, (3,) by axis, or (n,3). Conditions count from ``channel_reference``
+    ``standard_error_g`` of a mean: one number, (3,) by axis, or (n,3). Covariates count from ``channel_reference``
     (0 where not given).
     """
     n = len(directions)
@@ -168,8 +168,8 @@ def noisy_poses(
     needs = {name for effect, _ in sensor.effects for name in effect.needs} - held.keys()
     lags = {name: lag for name in needs if (lag := lag_in(name)) and lag[0] in held}
     own |= {name: behind(t_s, held[channel], constant_s) for name, (channel, constant_s) in lags.items()}
-    conditions = {name: v - reference.get(name, 0.0) for name, v in {**held, **own}.items()}
-    u = sensor.output(directions, conditions) + rng.standard_normal((n, 3)) * error
+    covariates = {name: v - reference.get(name, 0.0) for name, v in {**held, **own}.items()}
+    u = sensor.output(directions, covariates) + rng.standard_normal((n, 3)) * error
     return [
         Pose(
             start_s=i * hold_s,

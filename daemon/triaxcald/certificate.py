@@ -26,7 +26,7 @@ from triaxcal.estimate.calibration import Calibration
 from triaxcal.evidence.reduced import Reduced, reduced
 from triaxcal.figures import micro_g
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import channels_of, with_scale
+from triaxcal.poses.covariates import channels_of, with_scale
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import error, number
 from triaxcal.uncertainty import Stated, budget
@@ -241,11 +241,11 @@ def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) ->
     u = np.array([p.mean for p in poses])
     channels = with_scale(channels_of(poses, held.channel_reference), poses, sensor.scale_factor, sensor.bias)
     reference = dict(held.channel_reference)
-    conditions = {n: channels[n] - v for n, v in reference.items()}
+    covariates = {n: channels[n] - v for n, v in reference.items()}
     if TEMPERATURE in reference and REFERENCE_TEMPERATURE in rounded:
         reference[TEMPERATURE] = rounded[REFERENCE_TEMPERATURE]
     shifted = {n: channels[n] - v for n, v in reference.items()}
-    exact = np.linalg.norm(sensor.specific_force(u, conditions), axis=1)
+    exact = np.linalg.norm(sensor.specific_force(u, covariates), axis=1)
     return float(np.sqrt(np.mean((np.linalg.norm(worse.specific_force(u, shifted), axis=1) - exact) ** 2)))
 
 

@@ -15,7 +15,7 @@ from triaxcal.calibration_document import (
 )
 from triaxcal.diagnosis import Finding, Loop, Verdict
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.held_out import HeldOut
+from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.evidence.average import Refusal
 from triaxcal.evidence.findings import Unexplained
 from triaxcal.rounding import chance, error, number
@@ -134,7 +134,7 @@ def _another(loop: Loop) -> Document | None:
     }
 
 
-def _held_out(held: HeldOut, reference: float) -> Document:
+def _held_out(held: HoldOut, reference: float) -> Document:
     return {
         "before_rms_g": error(held.before_rms_g, reference),
         "after_rms_g": error(held.after_rms_g, reference),

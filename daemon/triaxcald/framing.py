@@ -112,7 +112,7 @@ def frame_document(sources: Sequence[Source], frames: Frames) -> Document:
             "chi2": uncertainty(frames.chi2) if frames.left else None,
             "degrees_of_freedom": frames.left,
             "p_value": probability(frames.lack_of_fit_p),
-            "inflation": uncertainty(frames.inflation),
+            "inflation": uncertainty(frames.birge_ratio),
         },
         "warnings": [text.caution(caution) for caution in frames.cautions],
     }

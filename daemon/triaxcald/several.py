@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from triaxcal.agreement import Agreement, Answer, Common, SharedShape
 from triaxcal.calibration_document import Document
 from triaxcal.diagnosis import Loop
 from triaxcal.estimate.runs import residuals_by_run
 from triaxcal.evidence.shapes import Shape
+from triaxcal.pooling import Answer, Common, PooledAnalysis, SharedShape
 from triaxcal.rounding import chance, error, number, uncertainty
-from triaxcal.text.agreement import verdict
+from triaxcal.text.pooling import verdict
 from triaxcal.units import in_units_of
 
 NO_LONGER_OF_AN_EFFECT = ("worse", "gain", "units_gain", "shown_by")
@@ -36,7 +36,7 @@ def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Doc
 
 
 def agreement_document(
-    found: Agreement, names: Sequence[str], results: Sequence[Document], reference_unit: str = "g"
+    found: PooledAnalysis, names: Sequence[str], results: Sequence[Document], reference_unit: str = "g"
 ) -> Document:
     """``results`` are the units' own, `triaxcal.loop/1`, and ``names`` their recordings."""
     return {

@@ -92,7 +92,7 @@ def test_a_pose_that_was_left_out_says_why(poses: list[Pose]) -> None:
         ((), Exclusion.OUTLIER, "spoiled"),
         ((effect_named("hysteresis"),), Exclusion.OUTLIER, "unknown_history"),
     ):
-        c = fit(begun, effects=effects, aside=[0], why=why)
+        c = fit(begun, effects=effects, excluded=[0], why=why)
         poses_of_document = calibration_document(c, output_unit="V", reference_unit="g", stated=None)["poses"]
         assert poses_of_document[0]["excluded"] == ("unknown_history" if effects else why)
         assert poses_of_document[0]["left_out"] == before  # as documents of 0.1 have it
@@ -202,7 +202,7 @@ def test_the_shape_of_an_effect_stands_beside_its_coefficients_and_comes_back(
     sensor, reference, _ = sensor_of(document, where="cal.json")
     assert [e for e, _ in sensor.effects] == [SECOND, effect]
     u = np.array([p.mean for p in apart])
-    own = fitted.conditions_of(apart)
+    own = fitted.covariates_of(apart)
     assert set(reference) == set(own)
     assert sensor.specific_force(u, own) == pytest.approx(fitted.sensor.specific_force(u, own), abs=1e-8)
 

@@ -47,7 +47,7 @@ def test_normal_quantiles_would_not_cover_at_five_degrees_of_freedom() -> None:
     inside = []
     for seed in range(SEEDS):
         rng = np.random.default_rng([seed, 14, 21])
-        found = fit(unknown(c.poses(rng.standard_normal(c.ups.shape) * c.error), rng), signs=c.signs, aside=())
+        found = fit(unknown(c.poses(rng.standard_normal(c.ups.shape) * c.error), rng), signs=c.signs, excluded=())
         assert found.dof == 5
         inside.append(np.mean(np.abs(found.values - c.truth) < 1.96 * found.standard_errors))
     # METHOD's figure, and the exact one: P(|t₅| < 1.96) = 0.893.
@@ -70,7 +70,7 @@ def test_what_all_poses_have_in_common_does_not_average_out() -> None:
 def test_coverage_factors_are_those_of_the_gum_s_table() -> None:
     c = Condition("", PAPER_UNIT, plan(14), np.array(1.5e-5))
     rng = np.random.default_rng(0)
-    found = fit(unknown(c.poses(rng.standard_normal(c.ups.shape) * c.error), rng), signs=c.signs, aside=())
+    found = fit(unknown(c.poses(rng.standard_normal(c.ups.shape) * c.error), rng), signs=c.signs, excluded=())
     # JCGM 100, table G.2, ν = 5.
     expected = {0.6827: 1.11, 0.90: 2.02, 0.95: 2.57, 0.9545: 2.65, 0.99: 4.03, 0.9973: 5.51}
     for level, factor in expected.items():

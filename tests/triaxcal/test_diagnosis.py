@@ -14,7 +14,7 @@ from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.runs import together
 from triaxcal.evidence import Refusal, posterior
-from triaxcal.evidence.blind import Why
+from triaxcal.evidence.identifiability import Why
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
 

@@ -129,7 +129,7 @@ def test_uncertainties_are_those_that_the_errors_of_a_calibration_scatter_with(
     a = np.array([[0.0, 0.0, 1.0], [0.6, -0.64, 0.48], [2.0, 0.0, -1.0]])
     u, errors, stated = paper_unit.output(a, {}), [], []
     for _ in range(60):
-        c = tc.Calibration(fit(noisy_poses(paper_unit, twenty_six, 1e-4, rng), signs=(-1, -1, -1), aside=()))
+        c = tc.Calibration(fit(noisy_poses(paper_unit, twenty_six, 1e-4, rng), signs=(-1, -1, -1), excluded=()))
         value, uncertainty = c.apply(u, uncertainty=True)
         errors.append(value - a)
         stated.append(uncertainty)
@@ -243,13 +243,13 @@ def test_a_fit_with_a_further_effect_is_saved_and_loaded_without_loss(
     sensor = replace(paper_unit, effects=((effect, TRUTHS[effect.name] * np.array([1.0, -1.0, 1.0])),))
     temp_c = {"temp_c": 25 + 3 * np.sin(np.arange(26) / 2)}
     poses = noisy_poses(sensor, twenty_six[rng.permutation(26)], 1e-5, rng, channels=temp_c)
-    fitted = tc.Calibration(fit(poses, signs=(-1, -1, -1), effects=[effect], aside=()), output_unit="V")
+    fitted = tc.Calibration(fit(poses, signs=(-1, -1, -1), effects=[effect], excluded=()), output_unit="V")
     fitted.save(tmp_path / "cal.json")
     found = tc.Calibration.load(tmp_path / "cal.json")
     assert found.to_dict() == fitted.to_dict()
     assert found.fitted.sensor.effects[0][0] == effect
     u = np.array([p.mean for p in poses])
-    held = found.fitted.conditions_of(poses)
+    held = found.fitted.covariates_of(poses)
     assert found.fitted.sensor.specific_force(u, held) == pytest.approx(
         fitted.fitted.sensor.specific_force(u, held), abs=1e-8
     )

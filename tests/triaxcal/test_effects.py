@@ -31,7 +31,7 @@ from triaxcal.effects.contract import (
     SCATTER,
     SINCE_START,
     channel_of,
-    condition_of,
+    covariate_of,
     is_derived,
     lag_in,
     lag_of,
@@ -151,21 +151,21 @@ def test_a_unit_of_each_coefficient_adds_what_the_formula_says(effect: Effect) -
 @pytest.mark.parametrize("effect", EVERY, ids=each)
 def test_the_slope_is_the_finite_difference_of_the_basis(effect: Effect) -> None:
     rng = np.random.default_rng(0)
-    s, conditions = rng.uniform(-1.5, 1.5, (20, 3)), held(20, rng)
-    slope = effect.slope(s, conditions)
+    s, covariates = rng.uniform(-1.5, 1.5, (20, 3)), held(20, rng)
+    slope = effect.slope(s, covariates)
     assert slope.shape == (20, 3, 3, len(effect.coefficients))
     for by in range(3):
         h = 1e-6 * np.eye(3)[by]
-        difference = (effect.basis(s + h, conditions) - effect.basis(s - h, conditions)) / 2e-6
+        difference = (effect.basis(s + h, covariates) - effect.basis(s - h, covariates)) / 2e-6
         assert slope[:, :, by] == pytest.approx(difference, rel=1e-7, abs=1e-7)
 
 
 @pytest.mark.parametrize("effect", EVERY, ids=each)
 def test_no_more_conditions_are_used_than_are_declared(effect: Effect) -> None:
     rng = np.random.default_rng(0)
-    s, conditions = rng.standard_normal((5, 3)), held(5, rng)
-    declared = {n: conditions[n] for n in effect.needs}
-    assert np.array_equal(effect.basis(s, declared), effect.basis(s, conditions))
+    s, covariates = rng.standard_normal((5, 3)), held(5, rng)
+    declared = {n: covariates[n] for n in effect.needs}
+    assert np.array_equal(effect.basis(s, declared), effect.basis(s, covariates))
     for name in effect.needs:
         with pytest.raises(KeyError):
             effect.basis(s, {n: v for n, v in declared.items() if n != name})
@@ -257,8 +257,8 @@ def test_drift_comes_straight_curved_and_with_a_turn() -> None:
 @pytest.mark.parametrize("effect", EVERY, ids=each)
 def test_at_its_reference_an_effect_of_time_or_environment_adds_nothing(effect: Effect) -> None:
     """A unit in use started long ago, and nothing deviates: only what the input itself does is left."""
-    conditions = {n: np.array([np.inf if n == SINCE_START else 0.0]) for n in HERE}
-    basis = effect.basis(S, conditions)
+    covariates = {n: np.array([np.inf if n == SINCE_START else 0.0]) for n in HERE}
+    basis = effect.basis(S, covariates)
     if effect.needs:
         assert np.all(basis == 0)
     else:
@@ -343,7 +343,7 @@ def test_every_logged_channel_gets_a_bias_and_a_scale_factor_effect_of_its_own()
     "channel", ["flow.rate", "temp_c.rate", "temp_c.lag:33", TIME, HELD, "before_x", f"{HELD}.logged", "x.logged"]
 )
 def test_a_logged_channel_may_have_any_name(channel: str) -> None:
-    condition = condition_of(channel)
+    condition = covariate_of(channel)
     assert not is_derived(condition)
     assert channel_of(condition) == channel
     effects = catalogue_for([*DERIVED, rate_of("flow"), rate_of("temp_c"), condition, rate_of(condition)])
@@ -360,9 +360,9 @@ def test_no_two_logged_channels_are_one_condition() -> None:
         "supply_v.logged",
         *(f"{n}{'.logged' * k}" for n in (HELD, "a.rate") for k in range(4)),
     ]
-    assert len({condition_of(c) for c in channels}) == len(channels)
+    assert len({covariate_of(c) for c in channels}) == len(channels)
     # Names that collide with nothing stay as documents have them.
-    assert [condition_of(c) for c in ("temp_c", "supply_v", "supply_v.logged")] == [
+    assert [covariate_of(c) for c in ("temp_c", "supply_v", "supply_v.logged")] == [
         "temp_c",
         "supply_v",
         "supply_v.logged",
@@ -583,7 +583,7 @@ class Failing(Radiation):
     # Who asks for it all the same gets one line that names it.
     asked = partial(fit, poses, signs=(-1, -1, -1), effects=[radiation])
     if method == "variants":
-        asked = partial(radiation.variants, loop.seen.evidence.rows.problem.conditions)
+        asked = partial(radiation.variants, loop.seen.evidence.rows.problem.covariates)
     with pytest.raises(InvalidData, match="the effect radiation of the package dosimetry-effects: "):
         asked()
 

@@ -7,19 +7,19 @@ import pytest
 from scipy import stats
 
 from benchmarks.efficiency import measure
-from benchmarks.truth import Condition, bound_and_best, conditions, hard, information
+from benchmarks.truth import Condition, bound_and_best, covariates, hard, information
 from triaxcal.estimate.problem import linearise, solve
 from triaxcal.estimate.start import problem_of, start
 
 FAMILYWISE = 1e-4
-CONDITIONS = {c.name: c for c in conditions()}
+COVARIATES = {c.name: c for c in covariates()}
 
 
 def named(name: str) -> Condition:
-    return CONDITIONS[name]
+    return COVARIATES[name]
 
 
-@pytest.mark.parametrize("name", CONDITIONS)
+@pytest.mark.parametrize("name", COVARIATES)
 def test_the_bound_by_the_whole_likelihood_is_the_bound_by_the_ellipsoid_s_normals(name: str) -> None:
     c = named(name)
     whole, best = bound_and_best(c)
@@ -58,7 +58,7 @@ def test_the_errors_are_within_three_percent_of_the_bound(name: str) -> None:
     assert np.all(np.abs(found.ratio - 1) + 4 * found.uncertainty < 0.03), found.ratio
 
 
-@pytest.mark.parametrize("name", CONDITIONS)
+@pytest.mark.parametrize("name", COVARIATES)
 def test_the_search_ends_far_below_the_noise(name: str) -> None:
     c = named(name)
     poses, _ = c.draw(7)

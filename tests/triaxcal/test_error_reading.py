@@ -28,7 +28,7 @@ def made() -> tuple[dict[str, Any], Sensor, np.ndarray]:
     """A document, its sensor and covariance, with an effect of a logged channel."""
     warm = {"temp_c": 20 + 5 * np.sin(np.arange(26) * 1.7)}
     poses = noisy_poses(UNIT, UPS, 1e-5, np.random.default_rng(1), channels=warm)
-    c = fit(poses, signs=(-1, -1, -1), effects=[EFFECT], aside=())
+    c = fit(poses, signs=(-1, -1, -1), effects=[EFFECT], excluded=())
     return calibration_document(c, budgeted=False), c.sensor, c.covariance
 
 

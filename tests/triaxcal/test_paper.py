@@ -33,7 +33,7 @@ class Trials:
     errors: np.ndarray
     standard_errors: np.ndarray
     half_widths: np.ndarray
-    inflation: np.ndarray
+    birge_ratio: np.ndarray
     lack_of_fit_p: np.ndarray
     check_g: np.ndarray
 
@@ -59,20 +59,20 @@ def trials(paper_unit: Sensor, fourteen: np.ndarray) -> Trials:
         errors=np.array([c.values for c in fits]) - truth_of(paper_unit),
         standard_errors=np.array([c.standard_errors for c in fits]),
         half_widths=np.array([c.coverage_factor(0.95) * c.standard_errors for c in fits]),
-        inflation=np.array([c.inflation for c in fits]),
+        birge_ratio=np.array([c.birge_ratio for c in fits]),
         lack_of_fit_p=np.array([c.residual.lack_of_fit_p for c in fits]),
         check_g=np.array(checks),
     )
 
 
 def test_pulls_of_all_nine_coefficients_have_mean_zero(trials: Trials) -> None:
-    pulls = trials.errors / (trials.standard_errors / trials.inflation[:, None])
+    pulls = trials.errors / (trials.standard_errors / trials.birge_ratio[:, None])
     limit = stats.norm.isf(EACH / 2) / np.sqrt(SEEDS)
     assert np.all(np.abs(pulls.mean(axis=0)) < limit), pulls.mean(axis=0)
 
 
 def test_pulls_of_all_nine_coefficients_have_variance_one(trials: Trials) -> None:
-    pulls = trials.errors / (trials.standard_errors / trials.inflation[:, None])
+    pulls = trials.errors / (trials.standard_errors / trials.birge_ratio[:, None])
     low, high = stats.chi2.ppf([EACH / 2, 1 - EACH / 2], SEEDS - 1) / (SEEDS - 1)
     variance = pulls.var(axis=0, ddof=1)
     assert np.all((low < variance) & (variance < high)), variance
@@ -138,12 +138,12 @@ def test_the_stated_covariance_is_the_cramer_rao_bound(
     c = stated(paper_unit, directions)
     expected = bound(paper_unit, directions) * SIGMA_G**2
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert (c.covariance / c.inflation**2 - expected) / scale == pytest.approx(np.zeros((9, 9)), abs=2e-3)
+    assert (c.covariance / c.birge_ratio**2 - expected) / scale == pytest.approx(np.zeros((9, 9)), abs=2e-3)
 
 
 def test_the_known_figures_for_the_fourteen_poses_come_out(paper_unit: Sensor, fourteen: np.ndarray) -> None:
     c = stated(paper_unit, fourteen)
-    sigma = c.standard_errors / c.inflation / SIGMA_G
+    sigma = c.standard_errors / c.birge_ratio / SIGMA_G
     assert sigma[:3] / np.abs(paper_unit.scale_factor) == pytest.approx(np.full(3, 0.66), rel=0.05)
     assert sigma[3:6] == pytest.approx(np.full(3, 1.04), rel=0.05)
     assert sigma[6:] == pytest.approx(np.full(3, 0.46), rel=0.05)
@@ -157,7 +157,7 @@ def test_the_known_error_of_held_out_magnitudes_comes_out(paper_unit: Sensor, fo
         return np.linalg.norm(Sensor(theta[:3], theta[3:6], theta[6:9]).specific_force(u, {}), axis=1)
 
     J = np.stack([(magnitude(c.values + h) - magnitude(c.values - h)) / 2e-6 for h in 1e-6 * np.eye(9)], axis=1)
-    variance = np.einsum("ni,ij,nj->n", J, c.covariance / c.inflation**2, J)
+    variance = np.einsum("ni,ij,nj->n", J, c.covariance / c.birge_ratio**2, J)
     assert np.sqrt(variance.mean()) / SIGMA_G == pytest.approx(0.80, rel=0.02)
 
 

@@ -134,9 +134,9 @@ def test_the_poses_wanted_mend_a_deficient_set_in_one_round(kind: str, alike: bo
             assert 0 < len(wanted) <= 9
             more = np.array([where[label] for label in wanted])
             more = unit(more + np.radians(2) * rng.standard_normal(more.shape))
-            everything = np.concatenate([there, more])
-            assert dilution(everything) < 5, (kind, wanted)
-            assert wanted_by(noisy_poses(sensor, everything, error, rng), signs) is None
+            linearise_all = np.concatenate([there, more])
+            assert dilution(linearise_all) < 5, (kind, wanted)
+            assert wanted_by(noisy_poses(sensor, linearise_all, error, rng), signs) is None
     assert refused > 5
 
 
@@ -189,10 +189,10 @@ def test_a_set_that_is_nearly_singular_is_warned_of_and_its_errors_are_true(
     truth = np.concatenate([paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias])
     squares = []
     for _ in range(25):
-        found = fit(noisy_poses(paper_unit, there, noise_g, rng), signs=MINUS, aside=())
+        found = fit(noisy_poses(paper_unit, there, noise_g, rng), signs=MINUS, excluded=())
         assert any(isinstance(c, PoorSpread) and c.wanted for c in found.cautions)
-        missed = (found.values - truth) / found.inflation
-        covariance = found.covariance / found.inflation**2
+        missed = (found.values - truth) / found.birge_ratio
+        covariance = found.covariance / found.birge_ratio**2
         scale = np.sqrt(np.diag(covariance))
         missed, correlation = missed / scale, covariance / np.outer(scale, scale)
         values, vectors = np.linalg.eigh(correlation)

@@ -13,7 +13,7 @@ from tests.undeclared.imitation import best_imitation
 from tests.undeclared.told import rms_g, told_errors_g
 from tests.undeclared.visible import Linear, told_power
 from triaxcal.diagnosis import Loop, diagnose
-from triaxcal.estimate.held_out import magnitude_errors
+from triaxcal.estimate.hold_out import magnitude_errors
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.samples import Samples
 from triaxcal.poses.pose import Pose, poses_of
@@ -125,11 +125,11 @@ class Outcome:
         poses = "" if self.poses_found == self.poses_made else f", poses {self.poses_found}/{self.poses_made}"
         poses += f", moving in {self.moving}" if self.moving else ""
         poses += f", errors overstated {self.overstated:.1f}" if self.overstated > 1.3 else ""
-        aside = f", set aside {self.set_aside}" if self.set_aside else ""
+        excluded = f", set aside {self.set_aside}" if self.set_aside else ""
         name, rest = self.imitation
         like = f", {name} leaves s = {rest:.1f}" if name else ""
         ratio = f", held out {self.after_ratio:.2f} (told {self.told_ratio:.2f})" if self.case.held_out else ""
-        return f"{self.case} | {self.text} | {self.error or found + left + poses + aside + like + ratio}"
+        return f"{self.case} | {self.text} | {self.error or found + left + poses + excluded + like + ratio}"
 
 
 def still_poses(samples: Samples) -> list[Pose]:

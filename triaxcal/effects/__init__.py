@@ -18,13 +18,13 @@ from triaxcal.effects.run_bias import BETWEEN_RUNS
 TEMPERATURE = "temp_c"
 
 
-def catalogue_for(conditions: Collection[str]) -> tuple[Effect, ...]:
-    """All effects that a recording with these conditions might show: the catalogue, the plugins, and bias and scale
+def catalogue_for(covariates: Collection[str]) -> tuple[Effect, ...]:
+    """All effects that a recording with these covariates might show: the catalogue, the plugins, and bias and scale
     factor by every other channel.
     """
     effects = (*CATALOGUE, *plugins()[0])
     # A channel that an effect of somebody else needs is that effect's business, and may be any other's too.
-    others = sorted(channel_of(c) for c in conditions if c != TEMPERATURE and not is_derived(c))
+    others = sorted(channel_of(c) for c in covariates if c != TEMPERATURE and not is_derived(c))
     return (*effects, *(made(c) for c in others for made in (ChannelBias, ChannelScaleFactor)))
 
 

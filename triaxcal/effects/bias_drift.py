@@ -27,11 +27,11 @@ class BiasDrift(Effect):
         higher = (c for d in range(2, self.degree + 1) for c in xyz(f"g/s{'²³'[d - 2]}", f"{{}}{d}"))
         return (*xyz("g/s"), *higher)
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        powers = [on_each_axis(conditions[TIME] ** d) for d in range(1, self.degree + 1)]
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        powers = [on_each_axis(covariates[TIME] ** d) for d in range(1, self.degree + 1)]
         return np.concatenate(powers, axis=2)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s, 3 * self.degree)
 
     @property

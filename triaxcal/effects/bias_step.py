@@ -26,12 +26,12 @@ class BiasStep(Effect):
     lasting: bool = True
     remedy: str = "Look for what happened then (a knock, a supply, a loose part) and record again."
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        held = np.maximum(conditions[HELD], 1e-9)
-        begin = conditions[SINCE_START] - held / 2
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        held = np.maximum(covariates[HELD], 1e-9)
+        begin = covariates[SINCE_START] - held / 2
         return on_each_axis(-np.clip((self.at_s - begin) / held, 0.0, 1.0))
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
 
     @property
@@ -42,9 +42,9 @@ class BiasStep(Effect):
     def shape(self) -> Mapping[str, tuple[float, str]]:
         return {"at": (self.at_s, "s")}
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         """Between any two poses, and in the middle of any but the first and the last."""
-        t, held = conditions[SINCE_START], conditions[HELD]
+        t, held = covariates[SINCE_START], covariates[HELD]
         order = np.argsort(t)
         begin, end = (t - held / 2)[order], (t + held / 2)[order]
         moments = [*(end[:-1] + begin[1:]) / 2, *t[order][1:-1]]

@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import (
     Coefficient,
     Effect,
-    condition_of,
+    covariate_of,
     held_within,
     no_slope,
     on_each_axis,
@@ -39,7 +39,7 @@ class ChannelBias(Effect):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (condition_of(self.channel),)
+        return (covariate_of(self.channel),)
 
     @property
     def remedy(self) -> str:
@@ -48,10 +48,10 @@ class ChannelBias(Effect):
     def advice(self, largest: float, floor: float) -> str:
         return held_within(self.remedy, largest, floor, f"[{self.channel}]")
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return on_each_axis(conditions[condition_of(self.channel)])
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return on_each_axis(covariates[covariate_of(self.channel)])
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
 
 
@@ -71,7 +71,7 @@ class ChannelScaleFactor(Effect):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (condition_of(self.channel),)
+        return (covariate_of(self.channel),)
 
     @property
     def remedy(self) -> str:
@@ -80,8 +80,8 @@ class ChannelScaleFactor(Effect):
     def advice(self, largest: float, floor: float) -> str:
         return held_within(self.remedy, largest, floor, f"[{self.channel}]")
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis(s * conditions[condition_of(self.channel)][:, None])
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return per_axis(s * covariates[covariate_of(self.channel)][:, None])
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis_slope(np.repeat(conditions[condition_of(self.channel)][:, None], 3, axis=1))
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return per_axis_slope(np.repeat(covariates[covariate_of(self.channel)][:, None], 3, axis=1))

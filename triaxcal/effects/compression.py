@@ -46,11 +46,11 @@ class Compression(Effect):
     def coefficients(self) -> tuple[Coefficient, ...]:
         return xyz("1", KINDS[self.kind] + "{}")
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         upper, lower = self._hinge(s), self._hinge(-s)
         return per_axis(lower - upper if self.kind == "odd" else -upper - lower)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         upper, lower = self._share_beyond(s), self._share_beyond(-s)
         return per_axis_slope(-upper - lower if self.kind == "odd" else lower - upper)
 
@@ -70,9 +70,9 @@ class Compression(Effect):
     def forms(self) -> tuple[Effect, ...]:
         return tuple(Compression(kind, self.knee) for kind in KINDS)
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         """Both forms with every knee. How long the reference vector is, the poses before tell."""
-        before = [conditions[n] for n in BEFORE if n in conditions]
+        before = [covariates[n] for n in BEFORE if n in covariates]
         reference = float(np.median(np.linalg.norm(before, axis=0))) if len(before) == len(BEFORE) else 1.0
         return tuple(Compression(kind, float(f"{k * reference:.4g}")) for kind in KINDS for k in KNEES)
 

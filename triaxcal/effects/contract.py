@@ -1,6 +1,6 @@
 """What every effect states about itself.
 
-An effect adds ``e`` to the reading: ``u = K (s + b + e(s, conditions))`` with ``s = R a`` the specific force
+An effect adds ``e`` to the reading: ``u = K (s + b + e(s, covariates))`` with ``s = R a`` the specific force
 along each sensitive axis, in g. ``e`` is linear in the effect's coefficients: ``e = basis @ coefficients``. What is not
 linear (a time constant, the moment of a step) is the effect's shape: the search tries `Effect.variants` of it.
 """
@@ -18,7 +18,7 @@ from triaxcal.arrays import Floats
 from triaxcal.figures import plain
 
 TIME = "t_s"
-"""The name under which time stands among the conditions, in seconds."""
+"""The name under which time stands among the covariates, in seconds."""
 SINCE_START = "since_start_s"
 """Seconds since the first sample of the recording; infinite for a unit in use, which started long ago."""
 HELD = "held_s"
@@ -32,9 +32,9 @@ SCATTER = ("scatter_x", "scatter_y", "scatter_z")
 RUN = "run_index"
 """Which of several recordings of the unit, from 0; infinite for a unit in use, which is in none of them."""
 CLOCKS = (TIME, SINCE_START, HELD)
-"""Conditions that follow from when and for how long the unit was held."""
+"""Covariates that follow from when and for how long the unit was held."""
 DERIVED = (*CLOCKS, *BEFORE, *CHANGE, *SCATTER, RUN)
-"""Conditions that no channel has to be logged for, beside the rates of those that are."""
+"""Covariates that no channel has to be logged for, beside the rates of those that are."""
 LOGGED = ".logged"
 LAGS_S = (10, 15, 22, 33, 47, 68, 100, 150, 220, 330, 470, 680, 1000, 1500, 2200, 3300, 4700, 6800, 10000)
 """Time constants for which it is known how far a channel's lag is behind it: preferred numbers (IEC 60063, E6)."""
@@ -42,39 +42,39 @@ _LAG = re.compile(r"(.+)\.lag:([1-9]\d{0,5})")
 
 
 def rate_of(channel: str) -> str:
-    """The name of the condition that is a channel's rate of change, per second."""
+    """The name of the covariate that is a channel's rate of change, per second."""
     return f"{channel}.rate"
 
 
 def lag_of(channel: str, constant_s: int) -> str:
-    """The name of the condition that is a channel after a first-order lag of this time constant, less the channel
+    """The name of the covariate that is a channel after a first-order lag of this time constant, less the channel
     itself: zero while the channel stands still, −τ times its rate where that has long been the same."""
     return f"{channel}.lag:{constant_s}"
 
 
-def lag_in(condition: str) -> tuple[str, int] | None:
-    """The channel and the time constant of `lag_of`; None of any other condition."""
-    found = _LAG.fullmatch(condition)
+def lag_in(covariate: str) -> tuple[str, int] | None:
+    """The channel and the time constant of `lag_of`; None of any other covariate."""
+    found = _LAG.fullmatch(covariate)
     return (found[1], int(found[2])) if found else None
 
 
-def is_derived(condition: str) -> bool:
-    """Whether a condition follows from the poses, whatever is logged."""
-    return condition in DERIVED or condition.endswith(rate_of("")) or lag_in(condition) is not None
+def is_derived(covariate: str) -> bool:
+    """Whether a covariate follows from the poses, whatever is logged."""
+    return covariate in DERIVED or covariate.endswith(rate_of("")) or lag_in(covariate) is not None
 
 
-def condition_of(channel: str) -> str:
-    """The name of the condition that a logged channel is: its own, with `LOGGED` where a derived condition has that."""
+def covariate_of(channel: str) -> str:
+    """The name of the covariate that a logged channel is: its own, with `LOGGED` where a derived covariate has that."""
     bare = channel
     while bare.endswith(LOGGED):
         bare = bare.removesuffix(LOGGED)
     return channel + LOGGED if is_derived(bare) else channel
 
 
-def channel_of(condition: str) -> str:
-    """The logged channel that a condition is: the inverse of `condition_of`."""
-    bare = condition.removesuffix(LOGGED)
-    return bare if condition_of(bare) == condition else condition
+def channel_of(covariate: str) -> str:
+    """The logged channel that a covariate is: the inverse of `covariate_of`."""
+    bare = covariate.removesuffix(LOGGED)
+    return bare if covariate_of(bare) == covariate else covariate
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Coefficient:
 class Effect(Protocol):
     """One way in which a sensor departs from the linear model.
 
-    ``needs`` names the conditions it depends on; each is given as the deviation from its reference, (n,).
+    ``needs`` names the covariates it depends on; each is given as the deviation from its reference, (n,).
     """
 
     @property
@@ -102,17 +102,17 @@ class Effect(Protocol):
     @property
     def remedy(self) -> str: ...
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         """(n,3,p): what a unit of each coefficient adds to each axis, in g."""
         ...
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         """(n,3,3,p): derivative of `basis` by s, as [n, axis, by axis, coefficient]."""
         ...
 
     def advice(self, largest: float, floor: float) -> str:
         """Its remedy, with numbers where it can: for the ``largest`` of its coefficients, where what it makes up to
-        ``floor``, in the same unit but for the conditions, does not matter. `remedy`, unless said otherwise."""
+        ``floor``, in the same unit but for the covariates, does not matter. `remedy`, unless said otherwise."""
         return self.remedy
 
     @property
@@ -136,8 +136,8 @@ class Effect(Protocol):
         """The forms that it comes in, which differ in their coefficients: one, unless said otherwise."""
         return (self,)
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
-        """What the search should try under these conditions: its forms, unless said otherwise."""
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
+        """What the search should try under these covariates: its forms, unless said otherwise."""
         return self.forms
 
     def shaped(self, values: Mapping[str, float]) -> Self:
@@ -159,9 +159,9 @@ def per_axis_slope(values: Floats) -> Floats:
     return out
 
 
-def on_each_axis(condition: Floats) -> Floats:
-    """(n,) → (n,3,3): a condition that acts on every axis by a coefficient of its own, whatever the specific force."""
-    return per_axis(np.repeat(condition[:, None], 3, axis=1))
+def on_each_axis(covariate: Floats) -> Floats:
+    """(n,) → (n,3,3): a covariate that acts on every axis by a coefficient of its own, whatever the specific force."""
+    return per_axis(np.repeat(covariate[:, None], 3, axis=1))
 
 
 def signs(values: Floats, s: Floats, certain: float) -> Floats:
@@ -189,7 +189,7 @@ def span_of(t_s: Floats) -> tuple[float, float]:
 
 
 def held_within(remedy: str, largest: float, floor: float, unit: str) -> str:
-    """A remedy that says how steady is steady enough, for an effect that goes with a condition in ``unit``."""
+    """A remedy that says how steady is steady enough, for an effect that goes with a covariate in ``unit``."""
     if not 0 < floor < np.inf or not largest:
         return remedy
     return f"{remedy} Within ±{plain(floor / abs(largest), 2)} {unit} what it does is below the noise floor."

@@ -30,7 +30,7 @@ class CrossCoupling(Effect):
     needs: tuple[str, ...] = ()
     remedy: str = "Correct it with the cross-coupling coefficients, in the host."
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         out = np.zeros((len(s), 3, 7))
         for k, (i, j) in enumerate(PAIRS):
             out[:, i, k] = s[:, i] * s[:, j]
@@ -38,7 +38,7 @@ class CrossCoupling(Effect):
             out[:, i, 6] = s[:, (i + 1) % 3] * s[:, (i + 2) % 3]
         return out
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         out = np.zeros((len(s), 3, 3, 7))
         for k, (i, j) in enumerate(PAIRS):
             out[:, i, i, k] = s[:, j]

@@ -44,16 +44,16 @@ class Empirical(Effect):
     def forms(self) -> tuple[Effect, ...]:
         return tuple(Empirical(kind) for kind in KINDS)
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         if self.kind == "time":
-            powers = (conditions[TIME][:, None] / 1000) ** np.arange(1, 5)
+            powers = (covariates[TIME][:, None] / 1000) ** np.arange(1, 5)
             return np.asarray(s[:, :, None] * powers[:, None, :])
         values, _ = self._on_sphere(s)
         return np.asarray(s[:, :, None] * values[:, None, :])
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         if self.kind == "time":
-            powers = (conditions[TIME][:, None] / 1000) ** np.arange(1, 5)
+            powers = (covariates[TIME][:, None] / 1000) ** np.arange(1, 5)
             return np.asarray(np.eye(3)[None, :, :, None] * powers[:, None, None, :])
         values, gradient = self._on_sphere(s)
         return np.asarray(

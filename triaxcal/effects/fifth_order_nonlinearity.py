@@ -25,8 +25,8 @@ class FifthOrderNonlinearity(Effect):
     needs: tuple[str, ...] = ()
     remedy: str = "Correct it with the fifth-order coefficients, in the host."
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis(s**5)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis_slope(5 * s**4)

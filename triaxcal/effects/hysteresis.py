@@ -40,13 +40,13 @@ class Hysteresis(Effect):
             return "after a pose with no specific force along the axis"
         return "with no change along the axis since the pose before"
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        values = np.stack([conditions[n] for n in self.needs], axis=1)
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        values = np.stack([covariates[n] for n in self.needs], axis=1)
         if self.kind == "memory":
             return per_axis(values)
         return per_axis(signs(values, s, REVERSAL))
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
 
     @property

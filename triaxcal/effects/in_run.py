@@ -42,37 +42,37 @@ class InRuns(Wrapped):
         # What lasts begins in one run, by whose clock its moment is told.
         return self.whole.absent + (f" of recording {self.runs[0] + 1}" if self.whole.lasting else "")
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        parts = [np.where(there[:, None, None], self.whole.basis(s, c), 0.0) for there, c in self._by_run(conditions)]
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        parts = [np.where(there[:, None, None], self.whole.basis(s, c), 0.0) for there, c in self._by_run(covariates)]
         return np.concatenate(parts, axis=-1)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         parts = [
-            np.where(there[:, None, None, None], self.whole.slope(s, c), 0.0) for there, c in self._by_run(conditions)
+            np.where(there[:, None, None, None], self.whole.slope(s, c), 0.0) for there, c in self._by_run(covariates)
         ]
         return np.concatenate(parts, axis=-1)
 
-    def _by_run(self, conditions: Mapping[str, Floats]) -> Iterator[tuple[Bools, Mapping[str, Floats]]]:
-        """For each run: where it acts (n,), and conditions whose clocks stand outside the run as they do in use."""
-        index = conditions[RUN]
+    def _by_run(self, covariates: Mapping[str, Floats]) -> Iterator[tuple[Bools, Mapping[str, Floats]]]:
+        """For each run: where it acts (n,), and covariates whose clocks stand outside the run as they do in use."""
+        index = covariates[RUN]
         for run in self.runs:
             outside = np.where((index < run) & self.whole.lasting, -np.inf, np.inf)
-            held = dict(conditions)
+            held = dict(covariates)
             if TIME in held:
                 held[TIME] = np.where(index == run, held[TIME], 0.0)
             if SINCE_START in held:
                 held[SINCE_START] = np.where(index == run, held[SINCE_START], outside)
             yield (index == run) | (self.whole.lasting & (index < run)), held
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
-        return tuple(InRuns(v, self.runs) for v in self.whole.variants(longest(conditions, self.runs)))
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
+        return tuple(InRuns(v, self.runs) for v in self.whole.variants(longest(covariates, self.runs)))
 
 
-def longest(conditions: Mapping[str, Floats], runs: Iterable[int]) -> dict[str, Floats]:
-    """The conditions in that of the runs which has the most poses."""
-    index = conditions[RUN]
+def longest(covariates: Mapping[str, Floats], runs: Iterable[int]) -> dict[str, Floats]:
+    """The covariates in that of the runs which has the most poses."""
+    index = covariates[RUN]
     rows = max((index == run for run in runs), key=lambda there: int(there.sum()))
-    return {name: values[rows] for name, values in conditions.items()}
+    return {name: values[rows] for name, values in covariates.items()}
 
 
 def runs_named(coefficients: Iterable[str]) -> tuple[int, ...]:

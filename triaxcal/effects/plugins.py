@@ -46,11 +46,11 @@ class Foreign(Wrapped):
 
     package: str = UNKNOWN
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return self._array(lambda: self.whole.basis(s, conditions), (len(s), 3, len(self.coefficients)))
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return self._array(lambda: self.whole.basis(s, covariates), (len(s), 3, len(self.coefficients)))
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return self._array(lambda: self.whole.slope(s, conditions), (len(s), 3, 3, len(self.coefficients)))
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return self._array(lambda: self.whole.slope(s, covariates), (len(s), 3, 3, len(self.coefficients)))
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -77,8 +77,8 @@ class Foreign(Wrapped):
     def forms(self) -> tuple[Effect, ...]:
         return tuple(Foreign(e, self.package) for e in self._asked(lambda: tuple(self.whole.forms)))
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
-        return tuple(Foreign(e, self.package) for e in self._asked(lambda: tuple(self.whole.variants(conditions))))
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
+        return tuple(Foreign(e, self.package) for e in self._asked(lambda: tuple(self.whole.variants(covariates))))
 
     def shaped(self, values: Mapping[str, float]) -> Self:
         return replace(self, whole=self._asked(lambda: self.whole.shaped(values)))
@@ -169,9 +169,9 @@ def _try(effect: Foreign) -> None:
     recorded = {name: np.linspace(0.5, 1.5, n) for name in names}
     in_use = {name: np.full(n, np.inf if name in (SINCE_START, RUN) else 0.0) for name in names}
     s = np.linspace(-0.5, 0.5, 3 * n).reshape(n, 3)
-    for conditions in (recorded, in_use):
-        effect.basis(s, conditions)
-        effect.slope(s, conditions)
+    for covariates in (recorded, in_use):
+        effect.basis(s, covariates)
+        effect.slope(s, covariates)
     effect.variants(recorded)
 
 

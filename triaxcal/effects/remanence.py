@@ -26,7 +26,7 @@ class Remanence(Effect):
     offset in proportion to p_i, and one by the way on which the pose was reached.
 
     In the first pose p_i is that of the pose itself, as if the unit had rested there before, and the fit may leave it
-    out (`triaxcal.poses.conditions.of_unknown_history`). A pose with next to no force along the axis leaves next to
+    out (`triaxcal.poses.covariates.of_unknown_history`). A pose with next to no force along the axis leaves next to
     nothing, though what was before that one may still be there.
     """
 
@@ -39,8 +39,8 @@ class Remanence(Effect):
     def absent(self) -> str:
         return "after a pose with no specific force along the axis"
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis(signs(np.stack([conditions[n] for n in BEFORE], axis=1), s, DRIVEN))
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return per_axis(signs(np.stack([covariates[n] for n in BEFORE], axis=1), s, DRIVEN))
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)

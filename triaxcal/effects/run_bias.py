@@ -58,20 +58,20 @@ class RunBias(Effect):
             return f"in all recordings but recording {self.alone + 1}"
         return "in the mean over the recordings"
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return np.concatenate([c[:, None, None] * np.eye(3) for c in self._contrasts(conditions)], axis=2)
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return np.concatenate([c[:, None, None] * np.eye(3) for c in self._contrasts(covariates)], axis=2)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s, len(self.coefficients))
 
-    def _contrasts(self, conditions: Mapping[str, Floats]) -> list[Floats]:
+    def _contrasts(self, covariates: Mapping[str, Floats]) -> list[Floats]:
         """(n,) each: the share that a pose has in the coefficients of each run."""
-        index = conditions[RUN]
+        index = covariates[RUN]
         if self.alone is not None:
             return [(index == self.alone).astype(float)]
         return [(index == k).astype(float) - (index == 0) for k in range(1, self.runs)]
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         """In every run another, and in one run alone where there are more than two."""
         single = range(self.runs) if self.runs > 2 else ()
         return (self, *(replace(self, alone=run) for run in single))
@@ -88,14 +88,14 @@ class RunScaleFactor(RunBias):
         "allow for its spread."
     )
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        shares = self._contrasts(conditions)
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        shares = self._contrasts(covariates)
         return np.concatenate([(c[:, None] * s)[:, :, None] * np.eye(3) for c in shares], axis=2)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         diagonal = np.zeros((3, 3, 3))
         diagonal[range(3), range(3), range(3)] = 1.0
-        return np.concatenate([c[:, None, None, None] * diagonal for c in self._contrasts(conditions)], axis=3)
+        return np.concatenate([c[:, None, None, None] * diagonal for c in self._contrasts(covariates)], axis=3)
 
 
 BETWEEN_RUNS: tuple[RunBias, ...] = (RunBias(), RunScaleFactor())

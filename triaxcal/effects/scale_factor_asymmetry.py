@@ -20,8 +20,8 @@ class ScaleFactorAsymmetry(Effect):
     needs: tuple[str, ...] = ()
     remedy: str = "Correct it with one scale factor for positive and one for negative outputs, in the host."
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis(np.abs(s))
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis_slope(np.sign(s))

@@ -21,8 +21,8 @@ class ScaleFactorDrift(Effect):
     needs: tuple[str, ...] = (TIME,)
     remedy: str = "Let the unit settle before the first pose, and repeat the first poses at the end."
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis(s * conditions[TIME][:, None])
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return per_axis(s * covariates[TIME][:, None])
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis_slope(np.repeat(conditions[TIME][:, None], 3, axis=1))
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return per_axis_slope(np.repeat(covariates[TIME][:, None], 3, axis=1))

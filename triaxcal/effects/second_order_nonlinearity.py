@@ -18,8 +18,8 @@ class SecondOrderNonlinearity(Effect):
     needs: tuple[str, ...] = ()
     remedy: str = "Correct it with the second-order coefficients, in the device or in the host."
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis(s**2)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis_slope(2 * s)

@@ -21,8 +21,8 @@ class TemperatureBias(Effect):
     def advice(self, largest: float, floor: float) -> str:
         return held_within(self.remedy, largest, floor, "K")
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return on_each_axis(conditions["temp_c"])
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return on_each_axis(covariates["temp_c"])
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)

@@ -23,9 +23,9 @@ class TemperatureBiasQuadratic(Effect):
     needs: tuple[str, ...] = ("temp_c",)
     remedy: str = "Correct the bias by a parabola in the logged temperature, or hold the temperature steadier."
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        deviation = conditions["temp_c"]
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        deviation = covariates["temp_c"]
         return np.concatenate([on_each_axis(deviation), on_each_axis(deviation**2)], axis=2)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s, 6)

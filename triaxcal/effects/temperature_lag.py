@@ -33,8 +33,8 @@ class TemperatureLag(Effect):
 
     To the first order θ = T − τ dT/dt, which is a bias by temperature beside one by its rate (`ThermalGradient`); once
     the temperature changes within τ, θ depends on what it was before. A pose does not know that by itself, so θ − T is
-    a condition of the poses, derived from all of a recording for certain time constants
-    (`triaxcal.effects.contract.lag_of`, `triaxcal.poses.conditions.behind`): the temperature goes straight from the
+    a covariate of the poses, derived from all of a recording for certain time constants
+    (`triaxcal.effects.contract.lag_of`, `triaxcal.poses.covariates.behind`): the temperature goes straight from the
     middle of one pose to that of the next, and stood still before the first. What it did there, nobody knows; that goes
     out by exp(−t/τ), as a `WarmUp` of the same time constant would. In use, where no lag is given, the temperature
     counts as settled: θ = T.
@@ -57,11 +57,11 @@ class TemperatureLag(Effect):
     def advice(self, largest: float, floor: float) -> str:
         return held_within(self.remedy, largest, floor, "K")
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        behind = sum(weight * conditions[lag_of(CHANNEL, c)] for c, weight in self._weights().items())
-        return on_each_axis(conditions[CHANNEL] + behind)
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        behind = sum(weight * covariates[lag_of(CHANNEL, c)] for c, weight in self._weights().items())
+        return on_each_axis(covariates[CHANNEL] + behind)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
 
     def _weights(self) -> dict[int, float]:
@@ -75,9 +75,9 @@ class TemperatureLag(Effect):
     def shape(self) -> Mapping[str, tuple[float, str]]:
         return {"time_constant": (self.time_constant_s, "s")}
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         """Those known, from what a few poses show to where the lag has hardly begun to follow at the end."""
-        shortest, whole = span_of(conditions[SINCE_START])
+        shortest, whole = span_of(covariates[SINCE_START])
         tried = [c for c in LAGS_S if shortest <= c <= SLOWEST * whole]
         return tuple(self.shaped({"time_constant": float(c)}) for c in tried) or (self,)
 

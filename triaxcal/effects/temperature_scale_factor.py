@@ -23,8 +23,8 @@ class TemperatureScaleFactor(Effect):
     def advice(self, largest: float, floor: float) -> str:
         return held_within(self.remedy, largest, floor, "K")
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis(s * conditions["temp_c"][:, None])
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return per_axis(s * covariates["temp_c"][:, None])
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis_slope(np.repeat(conditions["temp_c"][:, None], 3, axis=1))
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return per_axis_slope(np.repeat(covariates["temp_c"][:, None], 3, axis=1))

@@ -23,8 +23,8 @@ class ThermalGradient(Effect):
     def advice(self, largest: float, floor: float) -> str:
         return held_within(self.remedy, largest, floor, "K/s")
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return on_each_axis(conditions[RATE])
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return on_each_axis(covariates[RATE])
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)

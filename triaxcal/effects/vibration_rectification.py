@@ -24,8 +24,8 @@ class VibrationRectification(Effect):
     def absent(self) -> str:
         return "with readings that do not scatter"
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return per_axis(np.stack([conditions[n] for n in SCATTER], axis=1))
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return per_axis(np.stack([covariates[n] for n in SCATTER], axis=1))
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)

@@ -26,10 +26,10 @@ class WarmUp(Effect):
     needs: tuple[str, ...] = (SINCE_START,)
     remedy: str = "Switch the unit on and wait before the first pose, until the bias has settled."
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return on_each_axis(np.exp(-conditions[SINCE_START] / self.time_constant_s))
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return on_each_axis(np.exp(-covariates[SINCE_START] / self.time_constant_s))
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return no_slope(s)
 
     def advice(self, largest: float, floor: float) -> str:
@@ -45,9 +45,9 @@ class WarmUp(Effect):
     def shape(self) -> Mapping[str, tuple[float, str]]:
         return {"time_constant": (self.time_constant_s, "s")}
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         """From what three poses show to what is straight over the recording but for a few per cent."""
-        shortest, whole = span_of(conditions[SINCE_START])
+        shortest, whole = span_of(covariates[SINCE_START])
         return tuple(
             self.shaped({"time_constant": float(c)}) for c in np.geomspace(shortest, SLOWEST * whole, CONSTANTS)
         )

@@ -32,11 +32,11 @@ class Wrapped(Effect):
     def remedy(self) -> str:
         return self.whole.remedy
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return self.whole.basis(s, conditions)
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return self.whole.basis(s, covariates)
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return self.whole.slope(s, conditions)
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return self.whole.slope(s, covariates)
 
     def advice(self, largest: float, floor: float) -> str:
         return self.whole.advice(largest, floor)

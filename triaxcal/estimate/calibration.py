@@ -15,7 +15,7 @@ from triaxcal.errors import InvalidData
 from triaxcal.estimate.caution import Caution
 from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import channels_of, conditions, of_moment, of_readings, with_scale
+from triaxcal.poses.covariates import channels_of, covariates, of_moment, of_readings, with_scale
 from triaxcal.poses.pose import Pose
 
 
@@ -40,7 +40,7 @@ class HoldsAt:
     """The moment for which effects of time are evaluated in another recording, whose clock is its own.
 
     ``t_s`` in seconds from the first sample of the recording that was fitted, of the last one where these are several;
-    ``time_s`` the same as the condition `TIME` counts it, which of several recordings is from the middle of each.
+    ``time_s`` the same as the covariate `TIME` counts it, which of several recordings is from the middle of each.
     """
 
     moment: Moment
@@ -67,7 +67,7 @@ class HoldsAt:
 
     @property
     def clocks(self) -> tuple[float, float]:
-        """As `triaxcal.poses.conditions.of_moment` has it."""
+        """As `triaxcal.poses.covariates.of_moment` has it."""
         return self.t_s, self.time_s
 
 
@@ -97,8 +97,8 @@ class PoseResult:
     leverage: float
     excluded: Exclusion | None = None
     raised_g: float | None = None
-    carries: float = 0.0
-    """0…1: how much of some combination of its mean and its trend the pose determines by itself."""
+    largest_leverage: float = 0.0
+    """0…1: how much of some combination of its mean and its slope the pose determines by itself."""
     outlier_probability: float | None = None
     """None where nobody asked."""
 
@@ -117,11 +117,11 @@ class Calibration:
     """A fitted sensor. ``covariance`` is of `parameters`, in that order.
 
     ``reference`` is the magnitude of the reference vector; ``channel_reference`` the values from which the effects'
-    conditions are counted. Residuals that exceed the noise raise the standard errors: by a factor on all errors,
-    ``inflation``, at least 1 unless no pose knows its noise (then the residuals alone set it); or by ``excess_g``, a
-    standard deviation of |a| that every pose has beside its noise (`triaxcal.estimate.beyond`). ``dof`` are the
+    covariates are counted. Residuals that exceed the noise raise the standard errors: by a factor on all errors,
+    ``birge_ratio``, at least 1 unless no pose knows its noise (then the residuals alone set it); or by ``excess_g``, a
+    standard deviation of |a| that every pose has beside its noise (`triaxcal.estimate.excess`). ``dof`` are the
     effective degrees of freedom behind the standard errors. ``shape_errors`` are standard errors of the effects'
-    shapes, by "effect.name". ``trends``: how |a| goes inside the poses was fitted along with their means.
+    shapes, by "effect.name". ``slopes``: how |a| goes inside the poses was fitted along with their means.
     ``weights`` is the probability of each effect where the coefficients are means over all that may act. Then
     ``spread`` (p,) are the standard deviations of the coefficients before the poses were seen, and ``thermal``
     (9+p,9+p) is the part of the covariance that thermal effects make which the model has not.
@@ -137,11 +137,11 @@ class Calibration:
     poses: tuple[PoseResult, ...]
     condition: float
     dilution: float
-    inflation: float
+    birge_ratio: float
     dof: float
     excess_g: float = 0.0
     shape_errors: Mapping[str, float] = field(default_factory=dict)
-    trends: bool = False
+    slopes: bool = False
     blind_to: tuple[str, ...] = ()
     cautions: tuple[Caution, ...] = ()
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -152,7 +152,7 @@ class Calibration:
 
     @property
     def moment(self) -> tuple[float, float] | None:
-        """`holds_at` as `triaxcal.poses.conditions.of_moment` has it."""
+        """`holds_at` as `triaxcal.poses.covariates.of_moment` has it."""
         return None if self.holds_at is None else self.holds_at.clocks
 
     @property
@@ -209,13 +209,13 @@ class Calibration:
     def specific_force(self, readings: Floats, channels: Mapping[str, Floats]) -> Floats:
         """a (n,3) of single readings (n,3) in output units, with the ``channels`` (n,) that are known of them. Raises
         Refused where the model has no inverse there."""
-        held, _ = self.conditions_of_readings(len(readings), channels)
+        held, _ = self.covariates_of_readings(len(readings), channels)
         return self.sensor.specific_force(readings, held)
 
-    def conditions_of_readings(
+    def covariates_of_readings(
         self, n: int, channels: Mapping[str, Floats], t_s: Floats | None = None
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
-        """Of n single readings with the ``channels`` (n,) that are known of them: and the conditions that are needed
+        """Of n single readings with the ``channels`` (n,) that are known of them: and the covariates that are needed
         and not known, which count as at their reference. Effects of time at the times ``t_s`` (n,) of the recording
         that was fitted, at `holds_at` where that is None."""
         if t_s is None:
@@ -225,11 +225,11 @@ class Calibration:
             clocks = {SINCE_START: t_s, TIME: t_s - offset}
         return of_readings(channels, self.channel_reference, n, clocks)
 
-    def conditions_of(self, poses: Sequence[Pose]) -> dict[str, Floats]:
+    def covariates_of(self, poses: Sequence[Pose]) -> dict[str, Floats]:
         """Of poses of the recording that it was fitted to."""
         known = channels_of(poses, self.channel_reference)
         channels = with_scale(known, poses, self.sensor.scale_factor, self.sensor.bias)
-        return conditions(channels, self.channel_reference)
+        return covariates(channels, self.channel_reference)
 
     def with_blind_to(self, effects: tuple[str, ...]) -> Calibration:
         return replace(self, blind_to=effects)

@@ -15,7 +15,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import HELD, SINCE_START, TIME, channel_of, is_derived, lag_in
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.poses.conditions import conditions_elsewhere, rate_of_lag
+from triaxcal.poses.covariates import covariates_elsewhere, rate_of_lag
 from triaxcal.poses.pose import Pose
 
 ASLANT = 0.05
@@ -62,8 +62,8 @@ def _outward(poses: Sequence[Pose], model: Calibration, held: Mapping[str, Float
 def _held(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> dict[str, Floats]:
     sensor = model.sensor
     if elsewhere:
-        return conditions_elsewhere(poses, model.channel_reference, sensor.scale_factor, sensor.bias, model.moment)
-    return dict(model.conditions_of(poses))
+        return covariates_elsewhere(poses, model.channel_reference, sensor.scale_factor, sensor.bias, model.moment)
+    return dict(model.covariates_of(poses))
 
 
 def _change(poses: Sequence[Pose], model: Calibration, held: Mapping[str, Floats], elsewhere: bool) -> Floats:

@@ -1,11 +1,11 @@
-"""How well a fit foretells the poses that it did not see."""
+"""How well a fit predicts the poses that it did not see."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from triaxcal.arrays import Ints
-from triaxcal.estimate.problem import Problem, State, everything, linearise, solve
+from triaxcal.estimate.problem import Problem, State, linearise, linearise_all, solve
 
 STRAIGHT = 1e-4
 """Steps of the scaled parameters up to which the fit is straight, to about this share of the step."""
@@ -17,7 +17,7 @@ def cross_validated(problem: Problem, state: State) -> float | None:
     ``state`` is at the minimum. What leaving a pose out moves is exact for a linear problem; where that is so far that
     the curvature could show, the rest is fitted again from there.
     """
-    r, J, s = everything(problem, state)
+    r, J, s = linearise_all(problem, state)
     n = len(problem.u)
     if len(r) <= len(state.theta):
         return None

@@ -21,7 +21,7 @@ ALARM = 0.005
 """Probability that a clean set loses a pose, or a pair."""
 LEFT_LEAST = 3
 """So many degrees of freedom must be left, or there is nothing to judge a pose by."""
-RIVAL = 2.2
+TIED = 2.2
 """Sums of squares that differ by less than this for each pose of a set (a likelihood ratio of 3) do not tell one set
 from another."""
 LEAST = 6.0
@@ -32,20 +32,20 @@ DOUBT = 0.01
 """Probability above which a pose does not stand out from the others' residuals."""
 PAIRED_MOST = 300
 """So many poses are tried in pairs; where there are more, hardly any hides another."""
-CARRIES = 1e-6
+FREE_LEAST = 1e-6
 """Poses whose share of (1 − H) is below this alone carry a parameter, and cannot be judged."""
 
 
 @dataclass(frozen=True)
-class Spoiled:
-    """``rows`` were spoiled. Besides, one of ``rivals`` was: sets of rows that explain it as well as each other.
+class OutlierSet:
+    """``rows`` were spoiled. Besides, one of ``tied`` was: sets of rows that explain it as well as each other.
 
     Where only the noise inside the poses says so, because the rows do not stand out from the other residuals, it is
     ``doubtful``: it may be that the poses come back less well than that.
     """
 
     rows: tuple[int, ...] = ()
-    rivals: tuple[tuple[int, ...], ...] = ()
+    tied: tuple[tuple[int, ...], ...] = ()
     doubtful: bool = False
 
 
@@ -70,7 +70,7 @@ class _Judge:
     def singles(self) -> tuple[Ints, Floats]:
         """Rows (n,1), and what each takes out of the sum of squares."""
         share = 1 - (self.q**2).sum(axis=1)
-        taken = np.where(share > CARRIES, self.rest**2 / np.maximum(share, CARRIES), 0.0)
+        taken = np.where(share > FREE_LEAST, self.rest**2 / np.maximum(share, FREE_LEAST), 0.0)
         return np.arange(len(self.rest))[:, None], taken
 
     def pairs(self) -> tuple[Ints, Floats]:
@@ -82,7 +82,7 @@ class _Judge:
         i, j = rows[first], rows[second]
         r, s = self.rest[i], self.rest[j]
         determinant = a * b - c**2
-        sound = determinant > CARRIES * np.maximum(a, b)
+        sound = determinant > FREE_LEAST * np.maximum(a, b)
         taken = (b * r**2 - 2 * c * r * s + a * s**2) / np.where(sound, determinant, 1.0)
         return np.stack([i, j], axis=1), np.where(sound, taken, 0.0)
 
@@ -116,7 +116,7 @@ class _Judge:
         return max(p, 1e-300) * (1 + 1e-9 * after)  # of two that are beyond doubt, the one that leaves less
 
 
-def spoiled(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> Spoiled:
+def outlier_set(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> OutlierSet:
     """Rows that were spoiled, at most two; often none.
 
     ``r`` (n,) residuals and ``J`` (n,p) their derivatives, both in units of each pose's standard error; ``dof`` (n,)
@@ -126,20 +126,20 @@ def spoiled(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> Spoiled:
     left = n - parameters
     q, _ = np.linalg.qr(J)
     judge = _Judge(r - q @ (q.T @ r), q, left, dof, pure_dof)
-    best, best_p = Spoiled(), ALARM
+    best, best_p = OutlierSet(), ALARM
     for size, (rows, taken) in enumerate((judge.singles(), judge.pairs()), 1):
         if left - size < LEFT_LEAST:
             break
         most = int(np.argmax(taken))
         p = min(1.0, judge.p(float(taken[most]), rows[most], judge.chi2, left) * len(rows))
         if p < best_p and _each_stands_alone(judge, rows[most], float(taken[most])):
-            best, best_p = _unless_rivalled(judge, rows, taken), p
+            best, best_p = _unless_tied(judge, rows, taken), p
     return best
 
 
-def not_as_foretold(r: Floats, J: Floats, pure_dof: float, rows: Sequence[int]) -> tuple[int, ...]:
+def not_as_predicted(r: Floats, J: Floats, pure_dof: float, rows: Sequence[int]) -> tuple[int, ...]:
     """Those of a few ``rows`` of which something that they alone have is not known, and that show it: each takes more
-    out of the sum of squares than a coefficient of its own costs. Arguments are those of `spoiled`."""
+    out of the sum of squares than a coefficient of its own costs. Arguments are those of `outlier_set`."""
     n, parameters = J.shape
     q, _ = np.linalg.qr(J)
     judge = _Judge(r - q @ (q.T @ r), q, n - parameters, np.zeros(n), pure_dof)
@@ -149,16 +149,16 @@ def not_as_foretold(r: Floats, J: Floats, pure_dof: float, rows: Sequence[int]) 
     return tuple(i for i in rows if taken[i] > np.log(n) * judge.excess(judge.chi2 - taken[i], judge.left - 1))
 
 
-def _unless_rivalled(judge: _Judge, rows: Ints, taken: Floats) -> Spoiled:
+def _unless_tied(judge: _Judge, rows: Ints, taken: Floats) -> OutlierSet:
     size = rows.shape[1]
     most = float(taken.max())
     excess = judge.excess(max(judge.chi2 - most, 0.0), judge.left - size)
-    near = rows[taken >= most - RIVAL * size * excess]
+    near = rows[taken >= most - TIED * size * excess]
     sets = tuple(tuple(int(i) for i in row) for row in near)
     certain = tuple(sorted(set.intersection(*map(set, sets))))
-    rivals = tuple(tuple(i for i in each if i not in certain) for each in sets) if len(sets) > 1 else ()
+    tied = tuple(tuple(i for i in each if i not in certain) for each in sets) if len(sets) > 1 else ()
     doubtful = judge.by_rest(most, size) * len(rows) > DOUBT
-    return Spoiled(certain, rivals, bool(certain) and doubtful)
+    return OutlierSet(certain, tied, bool(certain) and doubtful)
 
 
 def _each_stands_alone(judge: _Judge, rows: Ints, both: float) -> bool:

@@ -11,8 +11,6 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Effect, lag_in
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, NotStill, Refused
-from triaxcal.estimate.aside import of_another_history, spoiled_among, with_aside, with_faulty, with_rivals
-from triaxcal.estimate.beyond import Beyond
 from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt, PoseResult, Residual
 from triaxcal.estimate.caution import (
     BirgeRatio,
@@ -24,22 +22,24 @@ from triaxcal.estimate.caution import (
     ResidualsTooSmall,
 )
 from triaxcal.estimate.cross_validation import cross_validated
-from triaxcal.estimate.outliers import Spoiled
+from triaxcal.estimate.excess import Excess
+from triaxcal.estimate.exclusion import outliers_among, with_excluded, with_faulty, with_tied_sets, with_unknown_history
+from triaxcal.estimate.outliers import OutlierSet
 from triaxcal.estimate.problem import (
     Linearised,
     Problem,
     State,
     by_shape,
-    everything,
     linearise,
+    linearise_all,
     parameters_by_theta,
     solve,
 )
 from triaxcal.estimate.shapes import shape_errors
+from triaxcal.estimate.slopes import left_of, slopes_p, with_slopes
 from triaxcal.estimate.start import DILUTION_LIMIT, begun
-from triaxcal.estimate.trends import left_of, trends_p, with_trends
 from triaxcal.model.directions import dilution, linear_design, most_wanted
-from triaxcal.poses.conditions import of_unknown_history
+from triaxcal.poses.covariates import of_unknown_history
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof, raised_dof
 
@@ -51,7 +51,7 @@ LEFT_LEAST = 3
 LEVERAGE_WARNING = 0.95
 SIGNIFICANT = 0.05
 CONTRADICTED = 0.01
-"""p of the trends inside the poses below which the coefficients are left to the means."""
+"""p of the slopes within the poses below which the coefficients are left to the means."""
 
 
 def fit(
@@ -60,12 +60,12 @@ def fit(
     signs: Sequence[float] = (1, 1, 1),
     reference: float = 1.0,
     effects: Sequence[Effect] = (),
-    aside: Sequence[int] | None = None,
+    excluded: Sequence[int] | None = None,
     why: Exclusion = Exclusion.CALLER,
 ) -> Calibration:
     """Fit the linear model, and the effects given, to still poses.
 
-    ``signs`` (3,) of the scale factors, which |a| does not show. ``aside`` are indices of poses to leave out, and
+    ``signs`` (3,) of the scale factors, which |a| does not show. ``excluded`` are indices of poses to leave out, and
     ``why``; where it is None, poses that something spoiled are found and left out (`triaxcal.estimate.outliers`), and
     where an effect goes with the pose before, a first pose in which the unit had not rested before. Poses with a fault
     are left out in any case.
@@ -74,21 +74,21 @@ def fit(
     """
     sound = [i for i, p in enumerate(poses) if not p.fault]
     if len(sound) < len(poses):
-        among = None if aside is None else [k for k, i in enumerate(sound) if i in aside]
+        among = None if excluded is None else [k for k, i in enumerate(sound) if i in excluded]
         kept = [poses[i] for i in sound]
-        found_of = fit(kept, signs=signs, reference=reference, effects=effects, aside=among, why=why)
+        found_of = fit(kept, signs=signs, reference=reference, effects=effects, excluded=among, why=why)
         return replace(with_faulty(found_of, poses), holds_at=HoldsAt.of(poses))
     whole, begin = begun(poses, signs=signs, reference=reference, effects=effects)
     missing = {n for e in effects for n in e.needs if n not in whole.channel_reference and lag_in(n) is None}
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
-    verdict = Spoiled(tuple(sorted(aside))) if aside is not None else Spoiled()
+    verdict = OutlierSet(tuple(sorted(excluded))) if excluded is not None else OutlierSet()
     by_means = None
     unknown: tuple[int, ...] = ()
-    if aside is None and len(poses) > 9 + sum(len(e.coefficients) for e in effects):
+    if excluded is None and len(poses) > 9 + sum(len(e.coefficients) for e in effects):
         by_means = solve(whole, begin, tuple(effects))
-        verdict = spoiled_among(whole, by_means, poses)
-        unknown = of_another_history(whole, by_means, poses, verdict.rows)
+        verdict = outliers_among(whole, by_means, poses)
+        unknown = with_unknown_history(whole, by_means, poses, verdict.rows)
         if set(verdict.rows) <= set(of_unknown_history(poses, effects)):
             verdict = replace(verdict, doubtful=False)  # that it is off says nothing of how well poses come back
     found = tuple(sorted((*verdict.rows, *unknown)))
@@ -101,26 +101,26 @@ def fit(
     judged = whole.only(np.setdiff1d(np.arange(len(poses)), unknown)) if verdict.doubtful else None
     calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, judged)
     if found:
-        calibration = with_aside(calibration, poses, found, verdict, Exclusion.OUTLIER if aside is None else why)
-    return replace(with_rivals(calibration, poses, verdict), holds_at=HoldsAt.of(poses))
+        calibration = with_excluded(calibration, poses, found, verdict, Exclusion.OUTLIER if excluded is None else why)
+    return replace(with_tied_sets(calibration, poses, verdict), holds_at=HoldsAt.of(poses))
 
 
 def _solved(
     problem: Problem, poses: Sequence[Pose], begin: State, effects: Sequence[Effect], by_means: State | None
 ) -> tuple[Problem, State]:
-    """What was fitted, and the fit: to the means (``by_means``, where that is known already), and to the trends inside
+    """What was fitted, and the fit: to the means (``by_means``, where that is known already), and to the slopes inside
     the poses as far as these agree with them.
 
-    Trends that do not agree go with something else, or the effect acts later than its channel says.
+    Slopes that do not agree go with something else, or the effect acts later than its channel says.
     """
-    both = with_trends(problem, poses, effects)
+    both = with_slopes(problem, poses, effects)
     contradicted = False
     if both is not None:
         try:
             state = solve(both, begin, tuple(effects))
         except (Refused, EffectFault):  # an effect may be known at the means alone
             state = None
-        contradicted = state is not None and trends_p(both, state, pure_error_dof(poses)) < CONTRADICTED
+        contradicted = state is not None and slopes_p(both, state, pure_error_dof(poses)) < CONTRADICTED
         if state is not None and not contradicted:
             return both, state
     state = by_means or solve(problem, begin, tuple(effects))
@@ -132,13 +132,14 @@ def _solved(
 
 @dataclass(frozen=True)
 class _Left:
-    """``chi2``, in units of the noise inside the poses, that a fit leaves in ``left`` degrees of freedom; ``wider`` the
-    same with poses left out whose residuals tell how well all come back, and what these show ``beyond`` noise."""
+    """``chi2``, in units of the noise inside the poses, that a fit leaves in ``left`` degrees of freedom;
+    ``with_doubtful`` the same with poses left out whose residuals tell how well all come back, and what these show
+    ``excess`` noise."""
 
     chi2: float
     left: int
-    wider: tuple[float, int]
-    beyond: Beyond
+    with_doubtful: tuple[float, int]
+    excess: Excess
 
     @classmethod
     def of(
@@ -149,40 +150,40 @@ class _Left:
         n = len(problem.u)
         # What the shape of an effect was chosen by is spent, though no column of the Jacobian stands for it.
         spent = len(state.theta) + sum(len(e.shape) for e in state.effects)
-        by_means = problem.further is None or n > spent
+        by_means = problem.slopes is None or n > spent
         r, J, s = everything_left
         own = (r[:n], J[:n], s[:n]) if by_means else everything_left
         chi2, left = left_of(own), len(own[0]) - spent
         if judged is None or not by_means:
-            return cls(chi2, left, (chi2, left), Beyond.shown(own, n, left, pure))
+            return cls(chi2, left, (chi2, left), Excess.shown(own, n, left, pure))
         others = linearise(judged, State.of(judged, state.sensor(problem)))
-        wider = left_of(others), left + len(judged.u) - n
-        return cls(chi2, left, wider, Beyond.shown(others, len(judged.u), wider[1], pure))
+        with_doubtful = left_of(others), left + len(judged.u) - n
+        return cls(chi2, left, with_doubtful, Excess.shown(others, len(judged.u), with_doubtful[1], pure))
 
 
 def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Problem | None) -> Calibration:
     with np.errstate(over="ignore", invalid="ignore"):
-        every_r, J, every_s = everything(problem, state)
+        every_r, J, every_s = linearise_all(problem, state)
     if not (np.isfinite(J).all() and np.isfinite(every_r).all()):
         raise NotStill("the fit ran away")
     n, p = len(poses), J.shape[1]
     found = _Left.of((every_r, J, every_s), problem, state, judged, pure_error_dof(poses))
-    noise, inflation = every_s[:n], found.beyond.inflation
-    if found.beyond.excess_g:
-        problem = found.beyond.beside(problem, state)
+    noise, birge_ratio = every_s[:n], found.excess.birge_ratio
+    if found.excess.excess_g:
+        problem = found.excess.beside(problem, state)
         state = solve(problem, state, state.effects)
-        every_r, J, every_s = everything(problem, state)
+        every_r, J, every_s = linearise_all(problem, state)
     r, s = every_r[:n], every_s[:n]
     weighted = J / every_s[:, None]
     q, _ = np.linalg.qr(weighted)
     leverage = np.clip((q**2).sum(axis=1), 0.0, 1.0)[:n]
     own = q.reshape(-1, n, p).transpose(1, 0, 2)
-    carries = np.linalg.eigvalsh(own @ own.transpose(0, 2, 1))[:, -1]
+    largest_leverage = np.linalg.eigvalsh(own @ own.transpose(0, 2, 1))[:, -1]
     free = np.sqrt(np.maximum(1 - leverage, 0.0))
     studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
-    dof = raised_dof(*found.wider, pure_error_dof(poses, leverage / leverage.sum()))
+    dof = raised_dof(*found.with_doubtful, pure_error_dof(poses, leverage / leverage.sum()))
     sensor = state.sensor(problem)
-    direction = sensor.specific_force(problem.u, problem.conditions)
+    direction = sensor.specific_force(problem.u, problem.covariates)
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     design = linear_design(direction, (problem.u - problem.middle) / problem.half)
     spread = dilution(direction, design)
@@ -191,7 +192,7 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
         raise NotStill(f"the fit ran away, to a dilution of {spread:.3g}")
     norms = np.linalg.norm(weighted, axis=0)
     shapes = by_shape(problem, state)
-    covariance = _covariance(problem, state, np.concatenate([J, shapes], axis=1) / every_s[:, None]) * inflation**2
+    covariance = _covariance(problem, state, np.concatenate([J, shapes], axis=1) / every_s[:, None]) * birge_ratio**2
     residual = Residual(
         rms_g=float(np.sqrt(np.mean(r**2))),
         max_abs_g=float(np.max(np.abs(r))),
@@ -213,18 +214,18 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
                 float(noise[i]),
                 float(studentized[i]),
                 float(leverage[i]),
-                raised_g=float(s[i]) * inflation,
-                carries=float(carries[i]),
+                raised_g=float(s[i]) * birge_ratio,
+                largest_leverage=float(largest_leverage[i]),
             )
             for i, pose in enumerate(poses)
         ),
         condition=float(np.linalg.cond(weighted / np.maximum(norms, 1e-300))),
         dilution=spread,
-        inflation=inflation,
-        excess_g=found.beyond.excess_g,
+        birge_ratio=birge_ratio,
+        excess_g=found.excess.excess_g,
         dof=dof,
-        shape_errors=shape_errors(problem, state, shapes, np.sqrt(np.diag(covariance)[p:]), inflation),
-        trends=problem.further is not None,
+        shape_errors=shape_errors(problem, state, shapes, np.sqrt(np.diag(covariance)[p:]), birge_ratio),
+        slopes=problem.slopes is not None,
     )
     return replace(calibration, cautions=tuple(_cautions(calibration)))
 
@@ -252,6 +253,6 @@ def _cautions(c: Calibration) -> Iterator[Caution]:
         yield HighLeverage(worst.pose.began, worst.leverage)
     p = c.residual.lack_of_fit_p
     if p is not None and p < SIGNIFICANT:
-        yield ExcessVariance(c.excess_g / c.reference) if c.excess_g else BirgeRatio(c.inflation)
+        yield ExcessVariance(c.excess_g / c.reference) if c.excess_g else BirgeRatio(c.birge_ratio)
     if p is not None and p > 1 - SIGNIFICANT / 5:
         yield ResidualsTooSmall()

@@ -21,7 +21,7 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import Effect, reshaped
 from triaxcal.errors import NotStill, Refused
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import conditions, references
+from triaxcal.poses.covariates import covariates, references
 
 Linearised = tuple[Floats, Floats, Floats]
 """Residuals (n,), their derivatives by theta (n, 9+p), their standard errors (n,)."""
@@ -36,7 +36,7 @@ CONVERGED = 1e-12
 """Relative step at which the search ends; the noise of any real pose is a million times larger."""
 
 
-class Further(Protocol):
+class SlopeData(Protocol):
     """What poses tell beside their means: a residual of each, which the model should make zero."""
 
     @property
@@ -61,7 +61,7 @@ class Further(Protocol):
 
 @dataclass(frozen=True)
 class Problem:
-    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each. ``further`` is
+    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each. ``slopes`` is
     fitted along with the means. ``excess`` is a standard deviation of |a| that all have beside their covariance."""
 
     u: Floats
@@ -72,22 +72,22 @@ class Problem:
     half: Floats
     signs: Floats
     reference: float
-    further: Further | None = None
+    slopes: SlopeData | None = None
     excess: float = 0.0
 
     @cached_property
-    def conditions(self) -> dict[str, Floats]:
-        return conditions(self.channels, self.channel_reference)
+    def covariates(self) -> dict[str, Floats]:
+        return covariates(self.channels, self.channel_reference)
 
     def with_channels(self, channels: Mapping[str, Floats]) -> Problem:
-        """The same problem with more conditions."""
+        """The same problem with more covariates."""
         return replace(self, channels=channels, channel_reference=references(channels) | dict(self.channel_reference))
 
     def only(self, rows: Ints | slice) -> Problem:
         """The same problem with some of its poses."""
         channels = {n: v[rows] for n, v in self.channels.items()}
-        further = self.further and self.further.only(rows)
-        return replace(self, u=self.u[rows], covariance=self.covariance[rows], channels=channels, further=further)
+        slopes = self.slopes and self.slopes.only(rows)
+        return replace(self, u=self.u[rows], covariance=self.covariance[rows], channels=channels, slopes=slopes)
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: in
 def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps: int) -> State:
     here: Linearised | None = None
     for left in reversed(range(steps)):
-        r, J, s = here or everything(problem, State(theta, effects))
+        r, J, s = here or linearise_all(problem, State(theta, effects))
         if not (np.isfinite(J).all() and np.isfinite(r).all() and np.abs(theta[:6]).max() < FAR * problem.reference):
             raise NotStill("the fit ran away")
         norm = np.linalg.norm(J / s[:, None], axis=0)
@@ -158,17 +158,17 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
 def _tried(problem: Problem, state: State, jacobian: bool) -> Linearised | None:
     """None where a step goes too far for the model."""
     try:
-        return everything(problem, state, jacobian)
+        return linearise_all(problem, state, jacobian)
     except Refused:
         return None
 
 
-def everything(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
+def linearise_all(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
     """`linearise`, and where the problem has something further the same of that, after the means of all poses."""
     means = linearise(problem, state, jacobian)
-    if problem.further is None:
+    if problem.slopes is None:
         return means
-    r, J, s = (np.concatenate(both) for both in zip(means, problem.further.linearise(state, jacobian), strict=True))
+    r, J, s = (np.concatenate(both) for both in zip(means, problem.slopes.linearise(state, jacobian), strict=True))
     return r, J, s
 
 
@@ -176,7 +176,7 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearis
     """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise, and what is
     beside it (n,)."""
     sensor = state.sensor(problem)
-    held = problem.conditions
+    held = problem.covariates
     if not jacobian:
         length = np.linalg.norm(sensor.specific_force(problem.u, held), axis=1)
         return length - problem.reference, np.empty((0, 0)), np.empty(0)
@@ -198,8 +198,8 @@ def by_coefficients(by_v: Floats, basis: Floats) -> Floats:
 
 
 def by_shape(problem: Problem, state: State) -> Floats:
-    """Derivatives of all residuals (`everything`) by the shapes of the effects (`Effect.shape`), (n,m), in thousandths
-    of each."""
+    """Derivatives of all residuals (`linearise_all`) by the shapes of the effects (`Effect.shape`), (n,m), in
+    thousandths of each."""
     columns = []
     for i, effect in enumerate(state.effects):
         for name, (value, _) in effect.shape.items():
@@ -207,9 +207,9 @@ def by_shape(problem: Problem, state: State) -> Floats:
             for sign in (1, -1):
                 other = reshaped(effect, name, value * (1 + sign * NEARBY))
                 effects = (*state.effects[:i], other, *state.effects[i + 1 :])
-                sides.append(everything(problem, State(state.theta, effects), jacobian=False)[0])
+                sides.append(linearise_all(problem, State(state.theta, effects), jacobian=False)[0])
             columns.append((sides[0] - sides[1]) / (2000 * NEARBY))
-    return np.array(columns).T if columns else np.empty((len(everything(problem, state, jacobian=False)[0]), 0))
+    return np.array(columns).T if columns else np.empty((len(linearise_all(problem, state, jacobian=False)[0]), 0))
 
 
 def parameters_by_theta(problem: Problem, state: State) -> Floats:

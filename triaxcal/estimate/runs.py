@@ -62,14 +62,14 @@ class ByRun(Wrapped):
     def needs(self) -> tuple[str, ...]:
         return (*self.whole.needs, RUN)
 
-    def variants(self, conditions: Mapping[str, Floats]) -> Sequence[Effect]:
+    def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         out: list[Effect] = []
         if not self.whole.lasting:
-            out += self.whole.variants(longest(conditions, range(self.runs)))
+            out += self.whole.variants(longest(covariates, range(self.runs)))
         for runs in self._sets():
-            fewest = min(int(np.sum(conditions[RUN] == run)) for run in runs)
+            fewest = min(int(np.sum(covariates[RUN] == run)) for run in runs)
             most = len(runs) * fewest / POSES_A_COEFFICIENT
-            out += [e for e in InRuns(self.whole, runs).variants(conditions) if len(e.coefficients) <= most]
+            out += [e for e in InRuns(self.whole, runs).variants(covariates) if len(e.coefficients) <= most]
         return tuple(out)
 
     def _sets(self) -> list[tuple[int, ...]]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.effects.contract import HELD, SINCE_START, Effect, reshaped
-from triaxcal.estimate.problem import Problem, State, everything
-from triaxcal.estimate.trends import left_of
+from triaxcal.estimate.problem import Problem, State, linearise_all
+from triaxcal.estimate.slopes import left_of
 
 UNLIKELY = 16.0
 """Chi-square over its minimum beyond which a value, and what is next to it, needs no closer look."""
@@ -22,17 +22,17 @@ NOTHING_LIKE = 1e300
 
 
 def shape_errors(
-    problem: Problem, state: State, columns: Floats, thousandths: Floats, inflation: float
+    problem: Problem, state: State, columns: Floats, thousandths: Floats, birge_ratio: float
 ) -> dict[str, float]:
     """By "effect.name"; none of a shape that moves nothing at all.
 
     ``columns`` (n,m) are the derivatives of the residuals by the shapes, ``thousandths`` (m,) the standard errors by
-    these, in thousandths of the shapes' values, raised by the ``inflation`` already.
+    these, in thousandths of the shapes' values, raised by the ``birge_ratio`` already.
     """
     out = {}
     named = [(i, name, value) for i, e in enumerate(state.effects) for name, (value, _) in e.shape.items()]
     for (i, name, value), column, thousandth in zip(named, columns.T, thousandths, strict=True):
-        error = _by_likelihood(problem, state, i, name, inflation) if has_edges(state.effects[i]) else None
+        error = _by_likelihood(problem, state, i, name, birge_ratio) if has_edges(state.effects[i]) else None
         if error is None and np.any(column):
             error = 1e-3 * abs(value) * float(thousandth)
         if error is not None:
@@ -64,16 +64,16 @@ def spread(value: float, chi2_at: Callable[[float], float], tried: Sequence[floa
 
 def edges_of(problem: Problem) -> Floats:
     """When poses begin and end, in seconds since the start."""
-    middle, half = problem.conditions[SINCE_START], problem.conditions[HELD] / 2
+    middle, half = problem.covariates[SINCE_START], problem.covariates[HELD] / 2
     return np.concatenate([middle - half, middle + half])
 
 
-def _by_likelihood(problem: Problem, state: State, i: int, name: str, inflation: float) -> float | None:
+def _by_likelihood(problem: Problem, state: State, i: int, name: str, birge_ratio: float) -> float | None:
     effect = state.effects[i]
-    tried = [v.shape[name][0] for v in effect.variants(problem.conditions) if name in v.shape]
+    tried = [v.shape[name][0] for v in effect.variants(problem.covariates) if name in v.shape]
 
     def chi2_at(value: float) -> float:
-        return _left(problem, state, i, name, value) / inflation**2
+        return _left(problem, state, i, name, value) / birge_ratio**2
 
     return spread(effect.shape[name][0], chi2_at, tried, edges_of(problem))
 
@@ -122,4 +122,4 @@ def _left(problem: Problem, state: State, i: int, name: str, value: float) -> fl
     """Chi-square with another value of a shape, everything else fitted again, in linear reckoning."""
     other = reshaped(state.effects[i], name, value)
     with np.errstate(over="ignore", invalid="ignore"):
-        return left_of(everything(problem, State(state.theta, (*state.effects[:i], other, *state.effects[i + 1 :]))))
+        return left_of(linearise_all(problem, State(state.theta, (*state.effects[:i], other, *state.effects[i + 1 :]))))

@@ -14,7 +14,7 @@ from triaxcal.estimate.ellipsoid import closed_form, coefficients
 from triaxcal.estimate.problem import Problem, State, linearise
 from triaxcal.model.directions import dilution, distinct, linear_design, most_wanted
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import channels_of, lags_for, references, with_scale
+from triaxcal.poses.covariates import channels_of, lags_for, references, with_scale
 from triaxcal.poses.pose import Pose
 
 DILUTION_LIMIT = 100.0
@@ -106,7 +106,7 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
 
 
 def with_history(problem: Problem, poses: Sequence[Pose], sensor: Sensor) -> Problem:
-    """The problem with the conditions that need the scale of the outputs: the pose before, the scatter."""
+    """The problem with the covariates that need the scale of the outputs: the pose before, the scatter."""
     return problem.with_channels(with_scale(problem.channels, poses, sensor.scale_factor, sensor.bias))
 
 

@@ -3,15 +3,32 @@
 `triaxcal.diagnosis` tells what follows from it; `benchmarks.frozen` holds it against what went before.
 """
 
-from triaxcal.evidence.actions import Action, Do
+from triaxcal.evidence.actions import Action, ActionKind
 from triaxcal.evidence.advice import Advice, Expected, advice
 from triaxcal.evidence.average import Average, Refusal, average, refusal
 from triaxcal.evidence.findings import Another, Findings, Named, Unexplained, findings
 from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.pooled import Pooled, pool
 from triaxcal.evidence.posterior import Posterior, posterior
-from triaxcal.evidence.together import Together, together
 
 __all__ = [
-    "Action", "Advice", "Another", "Average", "Do", "Expected", "Findings", "Named", "Odds", "Posterior", "Refusal",
-    "Together", "Unexplained", "advice", "average", "findings", "posterior", "refusal", "together",
+    "Action",
+    "ActionKind",
+    "Advice",
+    "Another",
+    "Average",
+    "Expected",
+    "Findings",
+    "Named",
+    "Odds",
+    "Pooled",
+    "Posterior",
+    "Refusal",
+    "Unexplained",
+    "advice",
+    "average",
+    "findings",
+    "pool",
+    "posterior",
+    "refusal",
 ]  # fmt: skip

@@ -37,7 +37,7 @@ LONGER = 4.0
 """Times as long a pose is to be held where each has an error of its own: half of what averages out is left."""
 
 
-class Do(StrEnum):
+class ActionKind(StrEnum):
     POSE = "pose"
     """A pose in a direction, next."""
     REPEAT = "repeat"
@@ -59,7 +59,7 @@ class Action:
     to be logged; empty where nobody knows which. The pose begins ``pause_s`` later than it would, or is held for
     ``hold_s``. ``information`` is what it is expected to bring, in nats, beside the actions before it."""
 
-    do: Do
+    do: ActionKind
     up: Floats | None = None
     label: str = ""
     again: int | None = None
@@ -70,13 +70,13 @@ class Action:
     information: float = 0.0
 
     @property
-    def price(self) -> float:
-        return {Do.CHANNEL: MOVED, Do.PAUSE: WAITED}.get(self.do, POSE)
+    def cost(self) -> float:
+        return {ActionKind.CHANNEL: MOVED, ActionKind.PAUSE: WAITED}.get(self.do, POSE)
 
 
 class Options:
     """After the poses of a posterior and those that were chosen: the actions, each with the pose that it gives, held as
-    long and as quietly as is usual here. Conditions stay as they last were, and the pose before is the last one."""
+    long and as quietly as is usual here. Covariates stay as they last were, and the pose before is the last one."""
 
     def __init__(self, seen: Posterior, wanted: Sequence[int]) -> None:
         """``wanted`` are poses that are to be taken again in any case, even if the unit has to leave one for that."""
@@ -115,12 +115,15 @@ class Options:
     def _after(self, last: Pose) -> Iterator[tuple[Action, Pose]]:
         next_s = last.end_s + self.gap_s
         for label, up, again in self.directions:
-            yield Action(Do.POSE if again is None else Do.REPEAT, up, label, again), self._pose(last, up, next_s)
+            yield (
+                Action(ActionKind.POSE if again is None else ActionKind.REPEAT, up, label, again),
+                self._pose(last, up, next_s),
+            )
         for label, up in cube_directions()[:FACES]:
             again = self._again(up)
             if self.lasted_s > 0:
                 later = self._pose(last, up, next_s + self.lasted_s)
-                yield Action(Do.PAUSE, up, label, again, pause_s=self.lasted_s), later
+                yield Action(ActionKind.PAUSE, up, label, again, pause_s=self.lasted_s), later
             for channel, whole in self.range.items():
                 for by in (whole, -whole):
                     settled = replace(
@@ -128,7 +131,7 @@ class Options:
                         channels={**last.channels, channel: last.channels[channel] + by},
                         rates=dict.fromkeys(last.rates, 0.0),
                     )
-                    yield Action(Do.CHANNEL, up, label, again, channel, by), self._pose(settled, up, next_s)
+                    yield Action(ActionKind.CHANNEL, up, label, again, channel, by), self._pose(settled, up, next_s)
 
     def _pose(self, last: Pose, up: Floats, start_s: float) -> Pose:
         nothing = np.zeros(3)
@@ -138,7 +141,7 @@ class Options:
             end_s=start_s + self.held_s,
             mean=self.sensor.output(up[None] * self.rows.problem.reference, {})[0],
             creep=nothing,
-            trend=nothing,
+            slope=nothing,
             channels=last.channels,
             rates=last.rates,
             bends=dict.fromkeys(last.bends, 0.0),

@@ -14,7 +14,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import TEMPERATURE
-from triaxcal.evidence.actions import LONGER, OPEN, Action, Do, Options
+from triaxcal.evidence.actions import LONGER, OPEN, Action, ActionKind, Options
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.predictive import Cells, Hypothesis, probabilities
 from triaxcal.evidence.rows import Rows
@@ -99,9 +99,9 @@ def _beside_poses(seen: Posterior) -> Iterator[Action]:
     rows = seen.evidence.rows
     if what is What.TIME:
         logged = any(TEMPERATURE in p.channels for p in rows.poses)
-        yield Action(Do.LOG, channel="" if logged else TEMPERATURE)
+        yield Action(ActionKind.LOG, channel="" if logged else TEMPERATURE)
     elif what is What.NOTHING:
-        yield Action(Do.HOLD, hold_s=LONGER * float(np.median(rows.held_s)))
+        yield Action(ActionKind.HOLD, hold_s=LONGER * float(np.median(rows.held_s)))
 
 
 class _Future:
@@ -132,9 +132,9 @@ class _Future:
         for i in range(len(found)):
             shown = chances.shown_with(len(self.poses) + i)
             gain[i] = self.entropy_after - self._entropy_of(chances.weight(len(self.poses) + i, shown))
-        rate = gain / [action.price for action, _ in found]
+        rate = gain / [action.cost for action, _ in found]
         if again is not None:
-            rate[[action.do is not Do.REPEAT or action.again != again for action, _ in found]] = -np.inf
+            rate[[action.do is not ActionKind.REPEAT or action.again != again for action, _ in found]] = -np.inf
         best = int(np.argmax(rate >= rate.max() - ALIKE * abs(rate.max())))
         if again is None and rate[best] < LEAST:
             return False

@@ -18,21 +18,21 @@ from triaxcal.effects import CATALOGUE, TEMPERATURE
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import HoldsAt
-from triaxcal.estimate.problem import State, everything, parameters_by_theta
+from triaxcal.estimate.problem import State, linearise_all, parameters_by_theta
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.rows import LINEAR
 from triaxcal.evidence.solved import NEGLIGIBLE, Solved, solved_cells
 from triaxcal.evidence.unmodelled import What, place
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import at_moment
+from triaxcal.poses.covariates import at_moment
 
 NOTICEABLE = 0.1
 """Of the standard error of a pose: a name that is unlikely and corrects less is not listed."""
 BIAS = slice(3, 6)
 """Of the nine parameters as the fit has them: to one of these a bias adds as it is."""
 THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
-EARNED = 0.03
+SELECTED_LEAST = 0.03
 """Of the mean square of what an unlikely name may do: a name that corrects less only adds coefficients that nobody
 knows."""
 STEPS = 3
@@ -88,7 +88,7 @@ def average(seen: Posterior, at: HoldsAt, solved: Sequence[Solved] | None = None
     likeliest sets (`solved_cells`), where they are known."""
     listed, solved = _likeliest(seen), solved_cells(seen) if solved is None else solved
     made = _of_listed(seen, at, listed, solved)
-    kept = [effect for effect in listed if _earns(seen, made, effect)]
+    kept = [effect for effect in listed if _selected(seen, made, effect)]
     return made if len(kept) == len(listed) else _of_listed(seen, at, kept, solved)
 
 
@@ -102,7 +102,7 @@ def _of_listed(seen: Posterior, at: HoldsAt, listed: Sequence[Effect], solved: S
     return _with_errors(seen, at, carried, moved, state, mean, wander, solved)
 
 
-def _earns(seen: Posterior, made: Average, effect: Effect) -> bool:
+def _selected(seen: Posterior, made: Average, effect: Effect) -> bool:
     """Whether a name is likely, or corrects a good part of what it may do."""
     if seen.of_names[effect.name] >= seen.evidence.odds.reported:
         return True
@@ -113,7 +113,7 @@ def _earns(seen: Posterior, made: Average, effect: Effect) -> bool:
     if not size.all():  # only in sets that are hardly likely
         return False
     corrects = float(np.sum((q / size) ** 2))
-    return corrects >= EARNED * (corrects + float(np.sum(np.diag(made.covariance)[own] / size**2)))
+    return corrects >= SELECTED_LEAST * (corrects + float(np.sum(np.diag(made.covariance)[own] / size**2)))
 
 
 def linear_alone(seen: Posterior, at: HoldsAt, linear: Sensor, solved: Sequence[Solved]) -> Average:
@@ -171,7 +171,7 @@ class _Carried:
             to = nothing if k is None else each[k]
             if id(term.effect) not in known:
                 known[id(term.effect)] = _carry(linear, to, _both(seen, term.effect, there))
-            found = known[id(term.effect)][:, list(term.kept)] * term.mix
+            found = known[id(term.effect)][:, list(term.kept)] * term.combination
             own = [] if k is None else [*range(9 + ends[k], 9 + ends[k + 1])]
             by_term[np.ix_([*range(9), *own], evidence.places([i]))] = found
         by_term[:9] /= rows.lengths[:, None]
@@ -221,7 +221,7 @@ def _both(seen: Posterior, effect: Effect, elsewhere: _Elsewhere) -> Floats:
 
 def _elsewhere(seen: Posterior, at: HoldsAt) -> _Elsewhere:
     """Of M readings all over the sphere, as of the next recording: derivatives by the linear parameters (M,9) over the
-    error of a pose, readings along the axes and derivatives by the biases (M,3), and the conditions."""
+    error of a pose, readings along the axes and derivatives by the biases (M,3), and the covariates."""
     rows = seen.evidence.rows
     up = np.array([v for _, v in cube_directions()]) * rows.problem.reference
     found = place(rows, rows.state.sensor(rows.problem).output(up, {}))
@@ -313,7 +313,7 @@ def _settled(seen: Posterior, deviation: Floats, carried: _Carried) -> State:
     wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + carried.columns @ deviation[9:]
     state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), carried.effects)
     for _ in range(STEPS):
-        r, _, _ = everything(rows.problem, state, jacobian=False)
+        r, _, _ = linearise_all(rows.problem, state, jacobian=False)
         step = np.linalg.lstsq(rows.linear, wanted - r / rows.error, rcond=None)[0] / rows.lengths
         state = State(state.theta + np.concatenate([step, np.zeros(len(deviation) - 9)]), carried.effects)
     return state

@@ -38,10 +38,10 @@ def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
         weights=made.weights,
         shape_errors=_shape_errors(seen, made),
         channel_reference={name: rows.problem.channel_reference[name] for name in needed},
-        inflation=1.0,
+        birge_ratio=1.0,
         excess_g=0.0,
         dof=rows.noise.students_dof + len(rows.z),
-        trends=rows.slopes,
+        slopes=rows.slopes,
         # What residuals show beyond noise is in the covariance, by the probability of whatever may have made it.
         cautions=tuple(c for c in before.cautions if not isinstance(c, BirgeRatio | ExcessVariance)),
         holds_at=at,
@@ -79,7 +79,7 @@ def _with_residuals(c: Calibration, rows: Rows, made: Average) -> Calibration:
 
 def _with_known_residuals(c: Calibration, rows: Rows, made: Average, places: list[int]) -> Calibration:
     poses = [p.pose for p in c.poses]
-    u, held = np.array([p.mean for p in poses]), c.conditions_of(poses)
+    u, held = np.array([p.mean for p in poses]), c.covariates_of(poses)
     length, by_u = c.sensor.magnitude(u, held)
     direction = c.sensor.specific_force(u, held)
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
@@ -117,7 +117,7 @@ def _with_known_residuals(c: Calibration, rows: Rows, made: Average, places: lis
 
 def _leverage(rows: Rows, used: list[int], made: Average) -> Floats:
     """(n,) of those poses: how much each decides its own prediction, where coefficients are held by their sizes."""
-    problem = replace(rows.problem.only(np.array(used)), further=None)
+    problem = replace(rows.problem.only(np.array(used)), slopes=None)
     _, J, error = linearise(problem, State.of(problem, made.sensor))
     weighted = J / error[:, None]
     return np.asarray(np.clip(np.einsum("np,pn->n", weighted, held_gain(weighted, made.spread)), 0.0, 1.0))

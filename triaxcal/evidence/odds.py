@@ -10,7 +10,7 @@ class Odds:
     """Odds and sizes before the poses were seen. A factor of 3 in any of them changes little where the poses are many.
 
     Sizes are those of a whole effect: the rms of what it adds, over the sphere and over the recording's range of its
-    condition. They mean the same for every recording.
+    covariate. They mean the same for every recording.
     """
 
     effect: float = 0.3

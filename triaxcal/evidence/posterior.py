@@ -17,7 +17,7 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.problem import State, everything
+from triaxcal.estimate.problem import State, linearise_all
 from triaxcal.estimate.runs import by_run
 from triaxcal.evidence.evidence import Evidence, SetEvidence
 from triaxcal.evidence.odds import Odds
@@ -25,7 +25,7 @@ from triaxcal.evidence.rows import Rows
 from triaxcal.evidence.sets import likely_sets
 from triaxcal.evidence.terms import Finer, Variant, terms_of, variant_of
 from triaxcal.evidence.unmodelled import What
-from triaxcal.poses.conditions import channels_of, still_conditions
+from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
 
 ROUNDS = 4
@@ -214,7 +214,7 @@ def looked_for(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None)
     the channels that move in these poses."""
     sound = [p for p in poses if not p.fault]
     if catalogue is None:
-        catalogue = catalogue_for(set(channels_of(sound)) - still_conditions(sound))
+        catalogue = catalogue_for(set(channels_of(sound)) - static_covariates(sound))
     return by_run(catalogue, sound)
 
 
@@ -295,19 +295,19 @@ def _point_of(seen: Posterior) -> State | None:
     inverse = np.linalg.inv(evidence.covariance(best.parts[int(np.argmax(best.by_part))]))
     left = inverse @ (rows.y - evidence.columns[:, evidence.places(best.members)] @ scaled)
     linear = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ left)
-    effects, coefficients, foretold = [], [], rows.linear @ linear - rows.y
+    effects, coefficients, predicted = [], [], rows.linear @ linear - rows.y
     ends = np.cumsum([0, *(term.rank for term in terms)])
     for term, mine in zip(terms, np.split(scaled, ends[1:-1]), strict=True):
         if term.effect is not None:
             own = np.zeros(len(term.effect.coefficients))
-            own[list(term.kept)] = term.mix * mine
+            own[list(term.kept)] = term.combination * mine
             effects.append(term.effect)
             coefficients.append(own)
-            foretold = foretold + rows.by_coefficients(term.effect) @ own
+            predicted = predicted + rows.by_coefficients(term.effect) @ own
     point = State(np.concatenate([rows.state.theta + linear / rows.lengths, *coefficients]), tuple(effects))
     try:
-        found, _, _ = everything(rows.problem, point, jacobian=False)
+        found, _, _ = linearise_all(rows.problem, point, jacobian=False)
     except Refused:
         return None
-    curved = rows.beside.T @ (found / rows.error - foretold)
+    curved = rows.beside.T @ (found / rows.error - predicted)
     return point if curved @ curved > evidence.odds.curved else None

@@ -129,7 +129,7 @@ def _columns(evidence: Evidence, members: Sequence[int], rows: Rows) -> Floats:
 
 def _of_term(term: Term, rows: Rows, known: dict[int, Floats]) -> Floats:
     if term.another >= 0:
-        return np.asarray(rows.linear * term.mix)
+        return np.asarray(rows.linear * term.combination)
     if term.effect is None:
         return np.zeros((len(rows.y), term.rank))
     if id(term.effect) not in known:
@@ -138,4 +138,4 @@ def _of_term(term: Term, rows: Rows, known: dict[int, Floats]) -> Floats:
         except EffectFault:
             columns = np.full((len(rows.y), len(term.effect.coefficients)), np.nan)
         known[id(term.effect)] = np.where(np.isfinite(columns), columns, 0.0)
-    return np.asarray(known[id(term.effect)][:, list(term.kept)] * term.mix)
+    return np.asarray(known[id(term.effect)][:, list(term.kept)] * term.combination)

@@ -17,11 +17,11 @@ from triaxcal.effects.contract import Effect, is_derived
 from triaxcal.estimate.calibration import Calibration, Residual
 from triaxcal.model.directions import spiral
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import at_moment
+from triaxcal.poses.covariates import at_moment
 
 SPHERE = 50
 """Directions: an effect of fifth order in the reading has no more than so many independent values over the sphere."""
-CONDITIONS = 7
+COVARIATES = 7
 """Values of the logged channels, from the least to the most: more than any effect has coefficients for them."""
 STEPS = 4
 """Of Gauss and Newton, from parameters that are right to a few parts in a thousand."""
@@ -30,7 +30,7 @@ STEPS = 4
 @dataclass(frozen=True)
 class Reduced:
     """``calibration`` has the kept effects alone; ``cost`` is the rms of what |a| then differs from the whole
-    correction over the sphere and the conditions of the poses, in the unit of the reference."""
+    correction over the sphere and the covariates of the poses, in the unit of the reference."""
 
     calibration: Calibration
     cost: float
@@ -71,7 +71,7 @@ def _with_residual(c: Calibration) -> Calibration:
     """In the recording's own poses. How well it would do without one of them nobody asked."""
     used = [p for p in c.poses if p.used]
     u = np.array([p.pose.mean for p in used])
-    off = c.sensor.magnitude(u, c.conditions_of([p.pose for p in used]))[0] - c.reference
+    off = c.sensor.magnitude(u, c.covariates_of([p.pose for p in used]))[0] - c.reference
     rms, largest = float(np.sqrt(np.mean(off**2))), float(np.max(np.abs(off)))
     floor = c.residual.noise_floor_g
     return replace(c, residual=Residual(rms, largest, None, floor, None))
@@ -84,11 +84,11 @@ def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Map
     in_use = at_moment(c.channel_reference, 1, c.moment)
     poses = [p.pose for p in c.poses if p.used]
     if poses:
-        logged = {n: v for n, v in c.conditions_of(poses).items() if not is_derived(n)}
+        logged = {n: v for n, v in c.covariates_of(poses).items() if not is_derived(n)}
     else:
         logged = {n: np.asarray(v) - c.channel_reference[n] for n, v in logged.items() if n in c.channel_reference}
     by_first = np.argsort(next(iter(logged.values())), kind="stable") if logged else np.zeros(1, dtype=int)
-    some = by_first[np.linspace(0, len(by_first) - 1, CONDITIONS).astype(int)] if logged else by_first
+    some = by_first[np.linspace(0, len(by_first) - 1, COVARIATES).astype(int)] if logged else by_first
     held = {n: logged[n][some] if n in logged else np.repeat(v, len(some)) for n, v in in_use.items()}
     return np.tile(up, (len(some), 1)), {n: np.repeat(v, len(up)) for n, v in held.items()}
 

@@ -13,11 +13,11 @@ from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import without_creep
-from triaxcal.estimate.problem import Problem, State, by_coefficients, everything
+from triaxcal.estimate.problem import Problem, State, by_coefficients, linearise_all
+from triaxcal.estimate.slopes import PoseSlopes
 from triaxcal.estimate.start import begun
-from triaxcal.estimate.trends import Trends
 from triaxcal.model.sensor import Radius
-from triaxcal.poses.conditions import channels_of, with_scale
+from triaxcal.poses.covariates import channels_of, with_scale
 from triaxcal.poses.noise_levels import NoiseLevels
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import noise_levels
@@ -58,15 +58,15 @@ class Rows:
     def of(
         cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], effects: Sequence[Effect] = ()
     ) -> Rows:
-        """About the ``linear`` fit of these poses, which leaves outliers out, with the conditions that these
+        """About the ``linear`` fit of these poses, which leaves outliers out, with the covariates that these
         ``effects`` need. Poses with a fault are left out. Raises
         as `triaxcal.estimate.start.begun` does; Refused where no degree of freedom is left."""
         places = np.array([i for i, p in enumerate(poses) if not p.fault], dtype=int)
         sound = [poses[i] for i in places]
-        poses = without_creep(sound) if np.isfinite([p.trend_error for p in sound]).all() else sound
+        poses = without_creep(sound) if np.isfinite([p.slope_error for p in sound]).all() else sound
         problem, _ = begun(poses, signs=signs, reference=linear.reference, effects=effects)
-        trends = Trends.of(problem, poses)
-        problem = problem if trends is None else replace(problem, further=trends)
+        slopes = PoseSlopes.of(problem, poses)
+        problem = problem if slopes is None else replace(problem, slopes=slopes)
         return cls._about(State.of(problem, replace(linear.sensor, effects=())), poses, places, problem)
 
     def about(self, point: State) -> Rows:
@@ -75,7 +75,7 @@ class Rows:
 
     @classmethod
     def _about(cls, point: State, poses: Sequence[Pose], places: Ints, problem: Problem) -> Rows:
-        r, J, error = everything(problem, point)
+        r, J, error = linearise_all(problem, point)
         r, J, n = r - J[:, LINEAR:] @ point.theta[LINEAR:], J[:, :LINEAR], len(poses)
         if len(r) <= LINEAR:
             raise Refused(f"{n} poses leave nothing over the nine parameters to judge effects by")
@@ -100,10 +100,10 @@ class Rows:
             u=np.array([p.mean for p in poses]),
             covariance=np.array([p.covariance for p in poses]),
             channels=with_scale(channels, poses, sensor.scale_factor, sensor.bias),
-            further=None,
+            slopes=None,
         )
-        problem = replace(problem, further=Trends.of(problem, poses) if self.slopes else None)
-        _, J, error = everything(problem, self.point)
+        problem = replace(problem, slopes=PoseSlopes.of(problem, poses) if self.slopes else None)
+        _, J, error = linearise_all(problem, self.point)
         nothing = np.empty((len(error), 0))
         return replace(
             self,
@@ -121,9 +121,9 @@ class Rows:
     def by_coefficients(self, effect: Effect) -> Floats:
         """(N,p) derivatives of the rows by the coefficients of an effect."""
         if id(effect) not in self._known:
-            problems, further = self._asked, self.problem.further
-            each = [by_coefficients(r.by_v, effect.basis(r.s, problem.conditions)) for problem, r in problems]
-            both = each if further is None else [each[0], further.along(each[1])]
+            problems, slopes = self._asked, self.problem.slopes
+            each = [by_coefficients(r.by_v, effect.basis(r.s, problem.covariates)) for problem, r in problems]
+            both = each if slopes is None else [each[0], slopes.along(each[1])]
             self._known[id(effect)] = effect, np.concatenate(both) / self.error[:, None]
         return self._known[id(effect)][1]
 
@@ -136,8 +136,8 @@ class Rows:
     @cached_property
     def _asked(self) -> list[tuple[Problem, Radius]]:
         """Where effects are asked: in the means, and inside the poses where these know their slopes."""
-        problems = [self.problem, *([] if self.problem.further is None else [self.problem.further.inside])]
-        return [(p, self.point.sensor(p).radius(p.u, p.conditions)) for p in problems]
+        problems = [self.problem, *([] if self.problem.slopes is None else [self.problem.slopes.inside])]
+        return [(p, self.point.sensor(p).radius(p.u, p.covariates)) for p in problems]
 
     @property
     def state(self) -> State:

@@ -16,7 +16,7 @@ from triaxcal.errors import Refused
 from triaxcal.evidence.odds import Odds
 from triaxcal.evidence.rows import Rows
 from triaxcal.model.directions import spiral
-from triaxcal.poses.conditions import still_conditions
+from triaxcal.poses.covariates import static_covariates
 
 FEWEST = 4
 """Poses that another unit or mounting has at least: fewer are outliers."""
@@ -30,15 +30,15 @@ AXES = 3
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """``columns`` (N,q) are those of coefficients of size one, so that ρ times them has the rms ρ; ``mix`` (q,) what
-    they were multiplied by. ``kind`` is the same for terms that exclude each other; ``pose`` is the outlier's, or −1;
-    ``another`` is the pose from which on there is another unit or mounting, or −1; ``kept`` are those coefficients of
-    the ``effect`` that are free."""
+    """``columns`` (N,q) are those of coefficients of size one, so that ρ times them has the rms ρ; ``combination`` (q,)
+    what they were multiplied by. ``kind`` is the same for terms that exclude each other; ``pose`` is the outlier's, or
+    −1; ``another`` is the pose from which on there is another unit or mounting, or −1; ``kept`` are those coefficients
+    of the ``effect`` that are free."""
 
     name: str
     kind: str
     columns: Floats
-    mix: Floats
+    combination: Floats
     log_prior: float
     effect: Effect | None = None
     kept: tuple[int, ...] = ()
@@ -63,7 +63,7 @@ def variant_of(effect: Effect) -> Variant:
 def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = ()) -> list[Term]:
     """Every form, shape and choice of axes of every effect that can act in these poses, every pose as an outlier, and
     every pose as the first of another unit or mounting. ``finer`` are divisions of shapes, one after the other."""
-    still = still_conditions(rows.poses)
+    still = static_covariates(rows.poses)
     known = rows.problem.channel_reference
     if not np.ptp(rows.t_s) > 0:  # means whose times nobody knows
         still = still | {TIME, SINCE_START}
@@ -76,7 +76,7 @@ def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequenc
 def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
     """Effects of other packages that cannot be used in these poses, though they could be loaded: name → reason."""
     found = {}
-    known, held = rows.problem.channel_reference, rows.problem.conditions
+    known, held = rows.problem.channel_reference, rows.problem.covariates
     s = rows.state.sensor(rows.problem).along_axes(rows.problem.u, held)
     for effect in catalogue:
         if is_foreign(effect) and all(n in known for n in effect.needs):
@@ -92,7 +92,7 @@ def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
 
 def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds, finer: Sequence[Finer]) -> Iterator[Term]:
     try:
-        variants = effect.variants(rows.problem.conditions)
+        variants = effect.variants(rows.problem.covariates)
     except (EffectFault, Refused):
         return
     forms: dict[tuple[str, ...], list[Effect]] = defaultdict(list)
@@ -109,12 +109,12 @@ def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds, finer: Sequ
                 index = list(kept)
                 if (size[index] < NOTHING_G).any():
                     continue
-                mix = 1 / (size[index] * np.sqrt(len(index)))
-                own = columns[:, index] * mix
+                combination = 1 / (size[index] * np.sqrt(len(index)))
+                own = columns[:, index] * combination
                 if np.linalg.norm(rows.beside.T @ own) < ABSORBED * np.linalg.norm(own):
                     continue
                 prior = share + np.log(of_axes * of_shape / len(forms))
-                yield Term(effect.name, effect.name, own, mix, prior, shape, kept)
+                yield Term(effect.name, effect.name, own, combination, prior, shape, kept)
 
 
 def _divided(shapes: Sequence[Effect], finer: Sequence[Finer]) -> list[tuple[Effect, float]]:
@@ -148,10 +148,10 @@ def _axes(parts: Sequence[str], odds: Odds) -> Iterator[tuple[tuple[int, ...], f
 
 def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
     """Derivatives of the rows by the coefficients (N,p), and the size of each (p,): the rms of what a coefficient of
-    one adds over the sphere and over the poses' conditions, about its mean over these. None where it cannot be told."""
+    one adds over the sphere and over the poses' covariates, about its mean over these. None where it cannot be told."""
     try:
         columns = rows.by_coefficients(effect)
-        held = rows.problem.conditions
+        held = rows.problem.covariates
         if is_foreign(effect):  # it may not know its slope
             effect.slope(rows.state.sensor(rows.problem).along_axes(rows.problem.u, held), held)
         up = spiral(SPHERE) * rows.problem.reference
@@ -172,8 +172,8 @@ def _outlier(rows: Rows, pose: int, odds: Odds) -> Term:
     columns[pose, 0] = 1 / rows.error[pose]
     if rows.slopes:
         columns[rows.n + pose, 1] = 1 / rows.error[rows.n + pose]
-    mix = np.full(columns.shape[1], 1 / np.sqrt(columns.shape[1]))
-    return Term("", f"outlier {pose}", columns * mix, mix, float(np.log(odds.outlier)), pose=pose)
+    combination = np.full(columns.shape[1], 1 / np.sqrt(columns.shape[1]))
+    return Term("", f"outlier {pose}", columns * combination, combination, float(np.log(odds.outlier)), pose=pose)
 
 
 def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
@@ -181,10 +181,10 @@ def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
     order = np.lexsort((rows.t_s, rows.run))
     cuts = range(FEWEST, rows.n - FEWEST + 1)
     size = np.sqrt(np.mean((rows.linear[: rows.n] * rows.error[: rows.n, None]) ** 2, axis=0))
-    mix = 1 / (np.maximum(size, NOTHING_G) * np.sqrt(len(size)))
+    combination = 1 / (np.maximum(size, NOTHING_G) * np.sqrt(len(size)))
     for cut in cuts:
         late = np.zeros(rows.n, dtype=bool)
         late[order[cut:]] = True
-        columns = rows.linear * np.resize(late, len(rows.y))[:, None] * mix
+        columns = rows.linear * np.resize(late, len(rows.y))[:, None] * combination
         prior = float(np.log(odds.another / len(cuts)))
-        yield Term("", "another", columns, mix, prior, another=int(order[cut]))
+        yield Term("", "another", columns, combination, prior, another=int(order[cut]))

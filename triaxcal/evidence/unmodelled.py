@@ -73,7 +73,7 @@ class Held:
 
     @classmethod
     def of(cls, rows: Rows) -> Held:
-        held = rows.problem.conditions
+        held = rows.problem.covariates
         before = np.stack([held[name] for name in BEFORE], axis=1) / rows.problem.reference
         return cls(place(rows, rows.problem.u), before, rows.t_s, rows.held_s, rows.run, rows.error, rows.slopes)
 

@@ -106,8 +106,8 @@ class FaceFarOff(Caution):
 class Frames:
     """``units`` in the order given, in one frame. ``covariance`` (3u,3u) of all their rotations.
 
-    ``chi2`` in ``left`` degrees of freedom: by how much the units disagree on the faces; ``inflation`` ≥ 1 by how much
-    the standard errors were raised for it.
+    ``chi2`` in ``left`` degrees of freedom: by how much the units disagree on the faces; ``birge_ratio`` ≥ 1 by how
+    much the standard errors were raised for it.
     """
 
     datum: Datum
@@ -116,7 +116,7 @@ class Frames:
     covariance: Floats
     chi2: float
     left: int
-    inflation: float
+    birge_ratio: float
     cautions: tuple[Caution, ...]
 
     @property
@@ -148,16 +148,16 @@ def frames(standings: Sequence[Standing], *, datum: Datum | None = None) -> Fram
     n = 3 * len(standings)
     left = sum(2 * len(s.faces) for s in standings) - n - 2 * len(faces) + 3
     p = float(chi2_sf(joint.chi2, left)) if left else 1.0
-    inflation = float(np.sqrt(joint.chi2 / left)) if p < LACK_OF_FIT else 1.0
-    covariance = joint.covariance * inflation**2
-    dofs = _dof(joint, standings) if inflation == 1 else [np.full(3, float(left))] * len(standings)
+    birge_ratio = float(np.sqrt(joint.chi2 / left)) if p < LACK_OF_FIT else 1.0
+    covariance = joint.covariance * birge_ratio**2
+    dofs = _dof(joint, standings) if birge_ratio == 1 else [np.full(3, float(left))] * len(standings)
     found = tuple(
         UnitFrame(s, joint.rotations[i], covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], dofs[i])
         for i, s in enumerate(standings)
     )
     fixture = fixture_of(faces, joint.up, covariance[n:, n:], joint.axes, joint.constraints()[0])
-    cautions = [*_cautions(fixture, datum), *([UnitsDisagree(inflation, p)] if inflation > 1 else [])]
-    return Frames(datum, found, fixture, covariance[:n, :n], joint.chi2, left, inflation, tuple(cautions))
+    cautions = [*_cautions(fixture, datum), *([UnitsDisagree(birge_ratio, p)] if birge_ratio > 1 else [])]
+    return Frames(datum, found, fixture, covariance[:n, :n], joint.chi2, left, birge_ratio, tuple(cautions))
 
 
 def _datum_is_there(datum: Datum, faces: Sequence[str]) -> None:

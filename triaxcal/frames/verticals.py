@@ -11,7 +11,7 @@ from triaxcal.arrays import Bools, Floats
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import conditions_elsewhere
+from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 
 SIGNIFICANT = 0.05
@@ -39,13 +39,13 @@ def verticals(calibration: Calibration) -> Verticals:
     used = np.array([r.used for r in results])
     p = calibration.residual.lack_of_fit_p
     # Without a misfit the noise inside the poses is known better than the residuals tell it.
-    scale = calibration.inflation if p is None or p < SIGNIFICANT else 1.0
+    scale = calibration.birge_ratio if p is None or p < SIGNIFICANT else 1.0
     direction, covariance = _directions(
         calibration.sensor,
         poses,
-        calibration.conditions_of(poses),
+        calibration.covariates_of(poses),
         calibration.reference,
-        calibration.covariance / calibration.inflation**2,
+        calibration.covariance / calibration.birge_ratio**2,
         used,
         calibration.excess_g,
     )
@@ -63,11 +63,11 @@ def verticals_under(
 ) -> Verticals:
     """Of poses of another recording than the calibration's; ``covariance`` (p,p) of `Calibration.parameters`.
 
-    Effects of time count as at one ``moment`` (`triaxcal.poses.conditions.of_moment`), since its clock is its own.
+    Effects of time count as at one ``moment`` (`triaxcal.poses.covariates.of_moment`), since its clock is its own.
     Raises InvalidData where a channel that the calibration needs is missing.
     """
     used = np.ones(len(poses), dtype=bool)
-    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
+    held = covariates_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
     direction, V = _directions(sensor, poses, held, reference, covariance, used)
     return Verticals(tuple(poses), direction, V, used, 1e6)
 

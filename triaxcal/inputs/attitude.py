@@ -253,7 +253,7 @@ def _concluded(
         poses=results,
         condition=float(np.sqrt(np.linalg.cond(np.linalg.inv(s.covariance) / np.outer(norms, norms)))),
         dilution=_dilution(s.data.ups),
-        inflation=raised,
+        birge_ratio=raised,
         dof=float(s.left if raised > 1 or s.estimated else max(s.data.dof, 1.0)),
         holds_at=HoldsAt.of(poses),
     )
@@ -365,8 +365,8 @@ def _cautions(found: AttitudeFit, s: TurntableSolution) -> Iterator[Caution]:
             yield AttitudeExcluded(row, attitude.off_rad, (x, y, z))
     if found.estimated and np.any(c.standard_errors > RAISED * found.noise_error):
         yield AttitudesContradict(found.attitude_error_rad)
-    if c.inflation > 1:
-        yield BirgeRatio(c.inflation, attitudes=True)
+    if c.birge_ratio > 1:
+        yield BirgeRatio(c.birge_ratio, attitudes=True)
     used = [p for p in c.poses if p.used]
     left = sum(1 - p.leverage for p in used)
     chi2 = sum((p.residual_g / p.standard_error_g) ** 2 for p in used)

@@ -27,7 +27,7 @@ ERROR_LEAST = 1e-8
 ERROR_MOST = 0.3
 """Attitudes that are off by more, in rad, carry nothing."""
 PAIRS_MOST = 400
-RIVAL = 0.02
+TIED = 0.02
 """Rows that take out of the sum of squares within this share of each other cannot be told apart."""
 
 
@@ -219,4 +219,4 @@ def wrong_by_residual(s: TurntableSolution) -> Ints:
     after = max(s.chi2 - most, 1e-300)
     p = float(f_sf(most / 3, 3, max(s.data.dof, 1.0)))
     p = max(p, float(f_sf(most / 3 / (after / left), 3, left))) * n
-    return np.flatnonzero(taken > (1 - RIVAL) * most) if p < ALARM else np.zeros(0, dtype=int)
+    return np.flatnonzero(taken > (1 - TIED) * most) if p < ALARM else np.zeros(0, dtype=int)

@@ -70,26 +70,26 @@ class Sensor:
             at += len(q)
         return Sensor(self.scale_factor + by[:3], self.misalignment + by[3:6], self.bias + by[6:9], tuple(effects))
 
-    def output(self, a: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        """u (n,3) for specific force (n,3); ``conditions`` are deviations from their references, each (n,)."""
+    def output(self, a: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        """u (n,3) for specific force (n,3); ``covariates`` are deviations from their references, each (n,)."""
         s = a @ self.axes.T
-        return self.scale_factor * (s + self.bias + self.departure(s, conditions))
+        return self.scale_factor * (s + self.bias + self.departure(s, covariates))
 
-    def departure(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def departure(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         """e (n,3) in g."""
         e = np.zeros_like(s)
         for effect, coefficients in self.effects:
-            e += effect.basis(s, conditions) @ coefficients
+            e += effect.basis(s, covariates) @ coefficients
         return e
 
-    def departure_slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def departure_slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         """∂e/∂s (n,3,3)."""
         slope = np.zeros((*s.shape, 3))
         for effect, coefficients in self.effects:
-            slope += effect.slope(s, conditions) @ coefficients
+            slope += effect.slope(s, covariates) @ coefficients
         return slope
 
-    def along_axes(self, u: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def along_axes(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
         """s = R a (n,3): the inverse up to the axes, by Newton's method where there are effects.
 
         Raises Refused where the model has no inverse at a reading, as the methods that follow from this do.
@@ -100,31 +100,31 @@ class Sensor:
         s = v.copy()
         with np.errstate(over="ignore", invalid="ignore"):  # beyond what the model holds for it may go anywhere
             for _ in range(50):
-                miss = s + self.departure(s, conditions) - v
-                step = _solved(self.departure_slope(s, conditions), miss)
+                miss = s + self.departure(s, covariates) - v
+                step = _solved(self.departure_slope(s, covariates), miss)
                 s -= step
                 if np.max(np.abs(step), initial=0.0) <= SOLVE_TOLERANCE * np.max(np.abs(v), initial=1.0):
                     break
         return s
 
-    def specific_force(self, u: Floats, conditions: Mapping[str, Floats]) -> Floats:
+    def specific_force(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
         """a (n,3) in g, sensor frame."""
-        return np.linalg.solve(self.axes, self.along_axes(u, conditions).T).T
+        return np.linalg.solve(self.axes, self.along_axes(u, covariates).T).T
 
-    def radius(self, u: Floats, conditions: Mapping[str, Floats]) -> Radius:
+    def radius(self, u: Floats, covariates: Mapping[str, Floats]) -> Radius:
         """The magnitude of the specific force and its gradients."""
-        s = self.along_axes(u, conditions)
+        s = self.along_axes(u, covariates)
         inverse = np.linalg.inv(self.axes)
         a = s @ inverse.T
         length = np.linalg.norm(a, axis=1)
         by_s = by_v = (a / length[:, None]) @ inverse
         if self.effects:
-            by_v = _solved(self.departure_slope(s, conditions).transpose(0, 2, 1), by_s)
+            by_v = _solved(self.departure_slope(s, covariates).transpose(0, 2, 1), by_s)
         return Radius(length, s, a, by_s, by_v)
 
-    def magnitude(self, u: Floats, conditions: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+    def magnitude(self, u: Floats, covariates: Mapping[str, Floats]) -> tuple[Floats, Floats]:
         """|a| (n,) and its gradient by the outputs (n,3)."""
-        found = self.radius(u, conditions)
+        found = self.radius(u, covariates)
         return found.length, found.by_v / self.scale_factor
 
 

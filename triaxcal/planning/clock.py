@@ -22,11 +22,11 @@ class OnPlansClock(Wrapped):
 
     needs: tuple[str, ...] = (TIME,)
 
-    def basis(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return self.whole.basis(s, _clocks(conditions[TIME]))
+    def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return self.whole.basis(s, _clocks(covariates[TIME]))
 
-    def slope(self, s: Floats, conditions: Mapping[str, Floats]) -> Floats:
-        return self.whole.slope(s, _clocks(conditions[TIME]))
+    def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        return self.whole.slope(s, _clocks(covariates[TIME]))
 
 
 def in_plan(effect: Effect) -> Effect:

@@ -1,4 +1,4 @@
-"""What poses in given directions and conditions tell of effects: the columns of a plan's design, by |a| alone."""
+"""What poses in given directions and covariates tell of effects: the columns of a plan's design, by |a| alone."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Asked:
 
 
 def ask(effects: Sequence[Effect]) -> Asked:
-    """What of the effects, taken together, |a| can show, were directions and conditions free."""
+    """What of the effects, taken together, |a| can show, were directions and covariates free."""
     rng = np.random.default_rng(0)
     a = rng.standard_normal((1500, 3))
     a /= np.linalg.norm(a, axis=1, keepdims=True)

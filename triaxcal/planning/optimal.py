@@ -1,4 +1,4 @@
-"""Plans for suspected effects: the directions and conditions that tell their coefficients best.
+"""Plans for suspected effects: the directions and covariates that tell their coefficients best.
 
 D_s-optimality (Atkinson, Donev and Tobias 2007, Optimum Experimental Designs, ch. 10): the smallest determinant of the
 covariance of the effects' coefficients, the nine parameters being a nuisance, ``log|M| − log|M₁₁|`` to be maximised.
@@ -117,7 +117,7 @@ class _Search:
         self.times = profile_times(count + 1)
 
     def held(self, levels: Mapping[str, Floats], k: int, n: int) -> dict[str, Floats]:
-        """Conditions of slot ``k`` for ``n`` candidates."""
+        """Covariates of slot ``k`` for ``n`` candidates."""
         return {TIME: np.full(n, self.times[k])} | {name: np.full(n, v[k]) for name, v in levels.items()}
 
     def levels_enough(self) -> int:
@@ -141,7 +141,7 @@ class _Search:
         return best
 
     def _blocks(self, levels: Mapping[str, Floats]) -> list[Floats]:
-        """Candidates' rows (C,9+q) by slot; slots of the same conditions share them."""
+        """Candidates' rows (C,9+q) by slot; slots of the same covariates share them."""
         timed = needs_time(self.asked.effects)
         known: dict[tuple[float, ...], Floats] = {}
         out = []

@@ -37,10 +37,10 @@ def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None 
     """
     n, effect = len(directions), in_plan(effect)
     rng = np.random.default_rng(0)
-    conditions = {TIME: profile_times(n)} | {c: rng.standard_normal(n) for c in effect.needs if c != TIME}
-    conditions |= {c: v for c, v in (held or {}).items() if c in conditions}
+    covariates = {TIME: profile_times(n)} | {c: rng.standard_normal(n) for c in effect.needs if c != TIME}
+    covariates |= {c: v for c, v in (held or {}).items() if c in covariates}
     seen, hidden = combinations(
-        linear_design(directions, directions), radial([effect], directions, conditions), VISIBLE
+        linear_design(directions, directions), radial([effect], directions, covariates), VISIBLE
     )
     names = [c.name for c in effect.coefficients]
     named = tuple({k: float(w) for k, w in zip(names, v, strict=True) if abs(w) > 1e-9} for v in _plainly(hidden.T))

@@ -1,4 +1,4 @@
-"""Conditions that no single reading shows and a whole recording does: how fast its channels go, and their lags."""
+"""Covariates that no single reading shows and a whole recording does: how fast its channels go, and their lags."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import lag_in, rate_of
-from triaxcal.poses.conditions import behind
+from triaxcal.poses.covariates import behind
 
 PARTS = 8
 """Averages in the time over which a rate is taken."""
 
 
-def followed(condition: str) -> str:
-    """The channel whose rate or lag this is; empty of any other condition."""
-    lag = lag_in(condition)
-    return lag[0] if lag else condition.removesuffix(rate_of("")) if condition.endswith(rate_of("")) else ""
+def followed(covariate: str) -> str:
+    """The channel whose rate or lag this is; empty of any other covariate."""
+    lag = lag_in(covariate)
+    return lag[0] if lag else covariate.removesuffix(rate_of("")) if covariate.endswith(rate_of("")) else ""
 
 
 @dataclass(frozen=True, eq=False)
 class InStream:
-    """``conditions`` are those that a recording shows: times (m,) in s, and the values (m,) there."""
+    """``covariates`` are those that a recording shows: times (m,) in s, and the values (m,) there."""
 
-    conditions: Mapping[str, tuple[Floats, Floats]]
+    covariates: Mapping[str, tuple[Floats, Floats]]
 
     @classmethod
     def of(
         cls, pieces: Iterable[tuple[Floats, Mapping[str, Floats]]], wanted: Sequence[str], over_s: float
     ) -> InStream:
-        """Of the ``wanted`` conditions those that are rates or lags of a channel here. A recording comes in ``pieces``,
+        """Of the ``wanted`` covariates those that are rates or lags of a channel here. A recording comes in ``pieces``,
         ascending times (n,) with the channels (n,) each; a rate is the slope of a straight line through ``over_s``."""
         held: dict[str, list[tuple[Floats, Floats]]] = {followed(name): [] for name in wanted}
         for t_s, channels in pieces if wanted else ():
@@ -47,8 +47,8 @@ class InStream:
         return cls(found)
 
     def at(self, t_s: Floats) -> dict[str, Floats]:
-        """(n,) of each condition at times (n,)."""
-        return {name: np.interp(t_s, times, values) for name, (times, values) in self.conditions.items()}
+        """(n,) of each covariate at times (n,)."""
+        return {name: np.interp(t_s, times, values) for name, (times, values) in self.covariates.items()}
 
 
 def _averages(t_s: Floats, values: Floats, over_s: float) -> tuple[Floats, Floats]:

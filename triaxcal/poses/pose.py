@@ -49,7 +49,7 @@ class Pose:
 
     ``channels`` are means over the span; ``t_s`` is the middle of the span, like ``start_s`` and ``end_s`` in seconds
     from the first sample. ``creep`` (3,) is the change of the outputs along the span, output units, where it is more
-    than noise, else zero; ``trend`` (3,) the same whether it is noise or not, and ``trend_error`` the standard error of
+    than noise, else zero; ``slope`` (3,) the same whether it is noise or not, and ``slope_error`` the standard error of
     its part along the measured vector, infinite where it is not known. ``rates`` are the channels' slopes in the middle
     of the span, per second, and ``bends`` their second derivatives, per second², from the span and half its length on
     either side; ``channel_errors``, ``rate_errors`` and ``bend_errors`` the standard errors of mean, slope and bend
@@ -67,8 +67,8 @@ class Pose:
     dof: float
     channels: Mapping[str, float] = field(default_factory=dict)
     creep: Floats = field(default_factory=lambda: np.zeros(3))
-    trend: Floats = field(default_factory=lambda: np.zeros(3))
-    trend_error: float = float("inf")
+    slope: Floats = field(default_factory=lambda: np.zeros(3))
+    slope_error: float = float("inf")
     channel_errors: Mapping[str, float] = field(default_factory=dict)
     rates: Mapping[str, float] = field(default_factory=dict)
     rate_errors: Mapping[str, float] = field(default_factory=dict)
@@ -163,14 +163,14 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
         [_correlation(w, s) * np.outer(e, e) for s, e in zip(spans, np.sqrt(noise.variance), strict=True)]
     )
     dof, shared_dof, levels = noise.dof.min(axis=1), noise.common_dof, noise.levels
-    trend, trend_error = noise.slope * (length + 1), np.full(len(spans), np.inf)
+    slope, slope_error = noise.slope * (length + 1), np.full(len(spans), np.inf)
     out = outward(mean)
     if out is not None:
         along, predicted = _along(w, spans, tracks, out, recording, creeping)
         covariance = _mended(covariance, out, along.variance[:, 0] * predicted**2)
         dof, shared_dof, levels = along.dof[:, 0], along.common_dof, along.levels
         # A unit that turns creeps across the measured vector; along it only where that shows by itself.
-        trend_error = along.slope_error[:, 0] * predicted * (length[:, 0] + 1)
+        slope_error = along.slope_error[:, 0] * predicted * (length[:, 0] + 1)
         radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
         creep = creep - radial[:, None] * out
     covariance = covariance + np.diag(_rounding(w, spans))
@@ -188,8 +188,8 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
             noise_levels=levels,
             channels={name: float(values[s.used].mean()) for name, values in w.channels.items()},
             creep=creep[i],
-            trend=trend[i],
-            trend_error=float(trend_error[i]),
+            slope=slope[i],
+            slope_error=float(slope_error[i]),
             channel_errors={name: channel.error for name, channel in logged[i].items()},
             rates={name: channel.rate for name, channel in logged[i].items()},
             rate_errors={name: channel.rate_error for name, channel in logged[i].items()},

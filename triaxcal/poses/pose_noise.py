@@ -112,8 +112,8 @@ class _Model:
 
     def significance(self, tracks: Sequence[Track], slope: Floats) -> Floats:
         """(k,q) of slopes, in standard deviations; of what exceeds the slope that a vibration makes."""
-        beyond = np.maximum(np.abs(slope) - self.vibration_slope(tracks), 0.0)
-        return np.asarray(np.sign(slope) * beyond / self.slope_error(tracks))
+        excess = np.maximum(np.abs(slope) - self.vibration_slope(tracks), 0.0)
+        return np.asarray(np.sign(slope) * excess / self.slope_error(tracks))
 
     def slope_error(self, tracks: Sequence[Track]) -> Floats:
         """(k,q) standard error of the slopes by noise."""

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 from triaxcal.diagnosis import Call, Loop, Verdict
 from triaxcal.effects.plugins import package_of
-from triaxcal.evidence.actions import Action, Do
+from triaxcal.evidence.actions import Action, ActionKind
 from triaxcal.evidence.average import Refusal
-from triaxcal.evidence.blind import Blind, Why
+from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.evidence.unmodelled import What
 from triaxcal.figures import plain
 from triaxcal.poses.when import moment, the_poses
@@ -91,9 +91,9 @@ def _apart(loop: Loop) -> Iterator[str]:
 
 def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     actions = loop.advice.actions
-    if beside := [_beside(action) for action in actions if action.do in (Do.LOG, Do.HOLD)]:
+    if beside := [_beside(action) for action in actions if action.do in (ActionKind.LOG, ActionKind.HOLD)]:
         yield "; ".join(beside)
-    if poses := [_pose(action, loop) for action in actions if action.do not in (Do.LOG, Do.HOLD)]:
+    if poses := [_pose(action, loop) for action in actions if action.do not in (ActionKind.LOG, ActionKind.HOLD)]:
         yield f"record next, in this order: {', then '.join(poses)}"
     if loop.too_uncertain:
         following = loop.next_recording
@@ -105,7 +105,7 @@ def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
 
 
 def _beside(action: Action) -> str:
-    if action.do is Do.HOLD:
+    if action.do is ActionKind.HOLD:
         return f"hold each pose for {action.hold_s:.0f} s, since each has an error of its own"
     return f"log {action.channel or 'what else may go with the time: the supply, a second temperature'}"
 
@@ -114,9 +114,9 @@ def _pose(action: Action, loop: Loop) -> str:
     again = None if action.again is None else moment(loop.after.poses[action.again].pose.began)
     where = _direction(action)
     pose = where if again is None else f"{where} as at {again}"
-    if action.do is Do.CHANNEL:
+    if action.do is ActionKind.CHANNEL:
         return f"{pose} with {action.channel} moved by {plain(action.by, sign='+')} and settled"
-    return f"{pose} after {action.pause_s:.0f} s of rest" if action.do is Do.PAUSE else pose
+    return f"{pose} after {action.pause_s:.0f} s of rest" if action.do is ActionKind.PAUSE else pose
 
 
 def _direction(action: Action) -> str:
@@ -125,7 +125,7 @@ def _direction(action: Action) -> str:
     return "up along (" + ", ".join(f"{v:+.2f}" for v in action.up) + ")"
 
 
-def blind(why: Blind) -> str:
+def blind(why: NotIdentifiable) -> str:
     """Why poses cannot show an effect in full."""
     match why.why:
         case Why.NOT_LOGGED:

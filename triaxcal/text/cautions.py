@@ -10,7 +10,7 @@ import numpy as np
 from triaxcal.estimate import caution as of_fit
 from triaxcal.figures import micro_g
 from triaxcal.frames import faces, frames, orientations, standing
-from triaxcal.inputs import attitude, passport
+from triaxcal.inputs import attitude, datasheet
 from triaxcal.inputs.turning import rotation
 from triaxcal.poses.when import moment, the_poses
 from triaxcal.uncertainty import extrapolation
@@ -137,17 +137,17 @@ def _(c: attitude.MagnitudeContradicts) -> str:
 
 
 @caution.register
-def _(c: passport.DatasheetContradicted) -> str:
+def _(c: datasheet.DatasheetContradicted) -> str:
     return (
-        f"passport and poses contradict each other (p {c.p:.1e}), most in {c.parameter}, which moved by "
-        f"{c.shift:+.1f} standard errors: the unit has changed, the passport's standard errors are too small, or a "
+        f"datasheet and poses contradict each other (p {c.p:.1e}), most in {c.parameter}, which moved by "
+        f"{c.shift:+.1f} standard errors: the unit has changed, the datasheet's standard errors are too small, or a "
         f"pose was not still; the standard errors are raised by {c.raised:.1f}"
     )
 
 
 @caution.register
-def _(c: passport.StillOfDatasheet) -> str:
-    return f"these poses say next to nothing of {', '.join(c.parameters)}: the values are still the passport's"
+def _(c: datasheet.StillOfDatasheet) -> str:
+    return f"these poses say next to nothing of {', '.join(c.parameters)}: the values are still the datasheet's"
 
 
 @caution.register

@@ -74,8 +74,8 @@ def budget(calibration: Calibration, stated: Stated | None = None, level: float 
     """The budget of a calibration fitted to still poses (`triaxcal.estimate.pose_fit.fit`)."""
     stated = stated or Stated()
     linearised = Linearised(calibration)
-    thermal, beyond = temperature(calibration, linearised, stated)
-    found = [*statistical(calibration, linearised, beyond), *reference(linearised, stated), *thermal]
+    thermal, excess = temperature(calibration, linearised, stated)
+    found = [*statistical(calibration, linearised, excess), *reference(linearised, stated), *thermal]
     found += thermometer(calibration, linearised, stated)
     found += not_held(calibration, stated)
     found += rounding(calibration, linearised, stated)

@@ -70,11 +70,11 @@ class Component:
         return cls(source, evaluation, dof, parameters, linearised.magnitude(covariance), basis, by)
 
 
-def statistical(calibration: Calibration, linearised: Linearised, beyond: float) -> list[Component]:
+def statistical(calibration: Calibration, linearised: Linearised, share: float) -> list[Component]:
     """What the scatter inside the poses, their creep, and residuals beyond both say, of which thermal effects leave the
-    share ``beyond``."""
+    ``share``."""
     poses = [p.pose for p in calibration.poses if p.used]
-    _, by_u = calibration.sensor.magnitude(linearised.problem.u, linearised.problem.conditions)
+    _, by_u = calibration.sensor.magnitude(linearised.problem.u, linearised.problem.covariates)
     creeping = np.array([p.creep_covariance for p in poses])
     S = linearised.by_residual
     creep = np.zeros(S.shape[1])
@@ -98,9 +98,9 @@ def statistical(calibration: Calibration, linearised: Linearised, beyond: float)
         out.append(Component.of(linearised, "creep", "B", np.inf, (S * creep) @ S.T, basis, CreepHalved()))
     if calibration.spread is not None:
         return out + _between(calibration, linearised, (S * linearised.noise**2) @ S.T)
-    excess = beyond * (calibration.covariance - (S * linearised.noise**2) @ S.T)
+    excess = share * (calibration.covariance - (S * linearised.noise**2) @ S.T)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
-        raised: Basis = BirgeFactor(calibration.inflation)
+        raised: Basis = BirgeFactor(calibration.birge_ratio)
         if calibration.excess_g:
             raised = Excess(calibration.excess_g / calibration.reference)
         out.append(Component.of(linearised, "lack_of_fit", "A", calibration.dof, excess, raised, CompleteModel()))

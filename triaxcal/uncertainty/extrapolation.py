@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import SINCE_START, TIME, Effect, reshaped
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.caution import Caution
-from triaxcal.poses.conditions import at_moment
+from triaxcal.poses.covariates import at_moment
 
 STEP = 1e-4
 """Relative step of the derivative by a shape, far above rounding and far below the curvature of any effect."""

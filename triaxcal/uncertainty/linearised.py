@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.estimate.beyond import Beyond
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.problem import Problem, State, by_shape, everything, linearise, parameters_by_theta
+from triaxcal.estimate.excess import Excess
+from triaxcal.estimate.problem import Problem, State, by_shape, linearise, linearise_all, parameters_by_theta
+from triaxcal.estimate.slopes import with_slopes
 from triaxcal.estimate.start import problem_of, with_history
-from triaxcal.estimate.trends import with_trends
 from triaxcal.model.directions import spiral
-from triaxcal.poses.conditions import at_moment
+from triaxcal.poses.covariates import at_moment
 
 SPHERE = 200
 
@@ -35,18 +35,18 @@ class Linearised:
         self.problem = replace(problem, channel_reference=means | dict(calibration.channel_reference))
         self.state = State.of(self.problem, sensor)
         self.effects = self.state.effects
-        if calibration.trends:
-            self.problem = with_trends(self.problem, poses, self.effects) or self.problem
-        self.noise = everything(self.problem, self.state)[2]
+        if calibration.slopes:
+            self.problem = with_slopes(self.problem, poses, self.effects) or self.problem
+        self.noise = linearise_all(self.problem, self.state)[2]
         """(n,) standard errors of the residuals by the noise and creep of the poses."""
-        self.problem = Beyond(excess_g=calibration.excess_g).beside(self.problem, self.state)
-        _, J, self.error = everything(self.problem, self.state)
+        self.problem = Excess(excess_g=calibration.excess_g).beside(self.problem, self.state)
+        _, J, self.error = linearise_all(self.problem, self.state)
         # What the shapes of effects were chosen by blurs the parameters too.
         self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
         self.gain = held_gain(self.weighted, calibration.spread)
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
-        """(p,n): shift of the parameters for an error of each residual (`triaxcal.estimate.problem.everything`)."""
+        """(p,n): shift of the parameters for an error of each residual (`triaxcal.estimate.problem.linearise_all`)."""
         self.up = spiral(SPHERE) * calibration.reference
         """(m,3) specific force all over the sphere."""
         self.sphere = self._sphere(calibration, {})
@@ -61,7 +61,7 @@ class Linearised:
         u = calibration.sensor.output(self.up, held)
         channels = {n: held[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
         none = np.zeros((len(u), 3, 3))
-        return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, further=None)
+        return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, slopes=None)
 
     def magnitude(self, covariance: Floats) -> float:
         """rms over the sphere of the uncertainty of |a| that a covariance (p,p) of the parameters makes."""

@@ -1,4 +1,4 @@
-"""How well a calibration foretells another recording of the same unit: beside its own error, how units start."""
+"""How well a calibration predicts another recording of the same unit: beside its own error, how units start."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects.contract import RUN
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.poses.conditions import at_moment
+from triaxcal.poses.covariates import at_moment
 from triaxcal.uncertainty import Budget
 
 START_TO_START = 2e-3
@@ -64,7 +64,7 @@ def _between_runs(c: Calibration) -> tuple[float, float] | None:
     runs = sorted({p.pose.run.index for p in poses})
     if len(runs) < 2:
         return None
-    found = c.sensor.radius(np.array([p.pose.mean for p in poses]), c.conditions_of([p.pose for p in poses]))
+    found = c.sensor.radius(np.array([p.pose.mean for p in poses]), c.covariates_of([p.pose for p in poses]))
     off, error = found.length - c.reference, np.array([p.error_g for p in poses])
     biases, variances = [], []
     for run in runs:

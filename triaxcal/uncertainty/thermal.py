@@ -7,7 +7,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE, TEMPERATURE, Effect
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.problem import everything
+from triaxcal.estimate.problem import linearise_all
 from triaxcal.poses.pure_error import LACK_OF_FIT
 from triaxcal.uncertainty.basis import (
     PosesAtOtherTemperatures,
@@ -43,7 +43,7 @@ def temperature(calibration: Calibration, linearised: Linearised, stated: Stated
     if TEMPERATURE not in linearised.problem.channel_reference or not missing:
         return [], 1.0
     extra = sum(len(e.coefficients) for e in missing)
-    r, J, _ = everything(linearised.problem, linearised.state.extended(missing))
+    r, J, _ = linearise_all(linearised.problem, linearised.state.extended(missing))
     # What residuals show beyond noise may be these very effects.
     s = linearised.noise
     spread = np.concatenate([[_sensitivity(e, calibration.reference, stated)] * len(e.coefficients) for e in missing])
@@ -52,7 +52,7 @@ def temperature(calibration: Calibration, linearised: Linearised, stated: Stated
     absorbed = linearised.gain @ (J[:, p:] * spread / linearised.error[:, None])
     rest = Z - linearised.weighted * (linearised.error / s)[:, None] @ absorbed
     # With the prior's width as unit: what the poses do not show stays as wide as it was.
-    # By the means alone: trends know nothing of an effect whose coefficients, and so its conditions' errors, are zero.
+    # By the means alone: slopes know nothing of an effect whose coefficients, and so its covariates' errors, are zero.
     n = len(linearised.problem.u)
     left = _posterior(rest[:n])
     mean = -left @ rest[:n].T @ (r / s)[:n]
@@ -63,7 +63,7 @@ def temperature(calibration: Calibration, linearised: Linearised, stated: Stated
         float(v @ v) / max(len(r) - linearised.weighted.shape[1] - dof, 1e-9)
         for v, dof in ((r / s, 0.0), (after, taken))
     )
-    beyond = min(max(after_ratio - 1, 0.0) / (before_ratio - 1), 1.0) if before_ratio > 1 else 1.0
+    excess = min(max(after_ratio - 1, 0.0) / (before_ratio - 1), 1.0) if before_ratio > 1 else 1.0
     covariances = np.eye(extra), left, _posterior(Z[:n]), left + np.outer(mean, mean)
     of_parameters = [through @ c @ through.T for c in covariances]
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
@@ -71,7 +71,7 @@ def temperature(calibration: Calibration, linearised: Linearised, stated: Stated
     by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
     told = not isinstance(by, PosesAtOtherTemperatures)
     basis = UnmodelledTemperature(names, moved, told, stated=stated.thermal_sensitivity is not None)
-    return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)], beyond
+    return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)], excess
 
 
 def _as_probable(calibration: Calibration, linearised: Linearised) -> list[Component]:

@@ -8,16 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from triaxcal import text
-from triaxcal.agreement import agreement
 from triaxcal.calibration_document import Document, calibration_document
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.moment import Moment
+from triaxcal.pooling import pooled_analysis
 from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit
+from triaxcald.cli.methods import Way, chosen_way, telling_default_signs
 from triaxcald.cli.results import show_calibration, show_loop, show_summary, text_of_held_out
 from triaxcald.cli.several import (
     as_one_unit,
@@ -31,7 +32,6 @@ from triaxcald.cli.several import (
     show_by_recording,
 )
 from triaxcald.cli.showing import Choice, chosen, judge, read_recording, telling_data_quality, warn
-from triaxcald.cli.ways import Way, chosen_way, telling_default_signs
 from triaxcald.errors import InputError
 from triaxcald.files import write_text
 from triaxcald.inputs import Measured
@@ -151,7 +151,7 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
             loops.append(_loop(a, replace(measured, data_quality=named_quality(measured)), choice))
         except Refused as e:
             raise Refused(f"{measured.name}: {e}", wanted=e.wanted) from e
-    found = agreement(loops)
+    found = pooled_analysis(loops)
     results = []
     for loop, measured, choice in zip(loops, recordings, choices, strict=True):
         results.append(

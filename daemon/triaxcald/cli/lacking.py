@@ -16,7 +16,7 @@ from triaxcal.estimate.start import rough_directions, wanted_for
 from triaxcal.model.directions import FULL, cube_directions, most_wanted
 from triaxcal.planning.addition import ENOUGH, Addition, Had, additions
 from triaxcal.planning.design import ask, channels_needed, profile_times
-from triaxcal.poses.conditions import channels_of
+from triaxcal.poses.covariates import channels_of
 from triaxcal.poses.pose import Pose
 
 

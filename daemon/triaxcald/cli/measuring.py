@@ -15,14 +15,14 @@ from triaxcal.effects.contract import RUN, SINCE_START, TIME
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import with_creep_left
-from triaxcal.estimate.held_out import magnitude_errors
+from triaxcal.estimate.hold_out import magnitude_errors
 from triaxcal.rounding import error
 from triaxcal.units import ErrorUnit
 from triaxcald.cli.console import emit
 from triaxcald.cli.showing import counted, judge, read_recording, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, read_document
-from triaxcald.likeness import shape_beside, shape_in, unlike_shapes
+from triaxcald.same_unit import shape_beside, shape_in, unlike_shapes
 from triaxcald.verification import Verification, pose_rows, trust, unlike
 
 

@@ -11,7 +11,7 @@ from triaxcal.calibration_document import assumed_in, holds_of
 from triaxcal.diagnosis import Loop
 from triaxcal.effects import TEMPERATURE
 from triaxcal.estimate.calibration import Calibration, Residual
-from triaxcal.estimate.held_out import HeldOut
+from triaxcal.estimate.hold_out import HoldOut
 from triaxcal.figures import probability
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty import Budget, Combined, budget
@@ -107,7 +107,7 @@ def show_summary(lines: Sequence[str]) -> None:
         print(textwrap.fill(f"{name:<9}{line}", WIDTH, subsequent_indent=" " * 9, break_long_words=False))
 
 
-def text_of_held_out(held: HeldOut, small: ErrorUnit) -> str:
+def text_of_held_out(held: HoldOut, small: ErrorUnit) -> str:
     before, after, floor = map(small.in_full, (held.before_rms_g, held.after_rms_g, held.noise_floor_g))
     return f"held out rms {before} before, {after} after, noise floor {floor} ({held.poses} poses)"
 

@@ -8,19 +8,19 @@ from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
-from triaxcal.agreement import Agreement, Answer
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import Refused
 from triaxcal.estimate.runs import residuals_by_run, together
 from triaxcal.figures import plain
+from triaxcal.pooling import Answer, PooledAnalysis
 from triaxcal.text import diagnosis
-from triaxcal.text.agreement import verdict
+from triaxcal.text.pooling import verdict
 from triaxcald.cli.console import table
 from triaxcald.cli.results import WORTH_A_LINE
 from triaxcald.cli.showing import Choice, chosen, read_recording, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured
-from triaxcald.likeness import shape_by_poses, shape_of, unlike_shapes
+from triaxcald.same_unit import shape_by_poses, shape_of, unlike_shapes
 from triaxcald.verification import unlike
 
 COLUMNS = {
@@ -151,7 +151,9 @@ def show_by_recording(loop: Loop, names: Sequence[str], choice: Choice) -> None:
     )
 
 
-def show_agreement(found: Agreement, names: Sequence[str], loops: Sequence[Loop], choices: Sequence[Choice]) -> None:
+def show_agreement(
+    found: PooledAnalysis, names: Sequence[str], loops: Sequence[Loop], choices: Sequence[Choice]
+) -> None:
     small = choices[0].small
     table(
         f"each unit by itself, {small}",

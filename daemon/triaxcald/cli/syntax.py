@@ -145,14 +145,17 @@ def _add_ways(parser: argparse.ArgumentParser) -> None:
     ways = parser.add_mutually_exclusive_group()
     ways.add_argument("--turning", action="store_true", help="the unit turned and never rested: fit all samples")
     ways.add_argument("--attitudes", metavar="ATT.csv", help="which way was up in each pose, from a turntable")
-    ways.add_argument("--passport", metavar="CAL.json", help="values known from before, to be refined by the poses")
+    ways.add_argument(
+        "--datasheet", "--passport", metavar="CAL.json",
+        help="values known from before, to be refined by the poses",
+    )  # fmt: skip
     parser.add_argument(
         "--attitude-error", type=_attitude_error, metavar="RAD",
         help="standard error of the attitudes by axis; default: estimated",
     )  # fmt: skip
     parser.add_argument(
-        "--passport-error", type=_three_errors, metavar="REL,RAD,G",
-        help="standard errors of the passport's scale factors (relative), misalignments, biases; default: its own",
+        "--datasheet-error", "--passport-error", type=_three_errors, metavar="REL,RAD,G",
+        help="standard errors of the datasheet's scale factors (relative), misalignments, biases; default: its own",
     )  # fmt: skip
 
 

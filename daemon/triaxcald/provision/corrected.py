@@ -48,11 +48,11 @@ def departure_g(
     if len(readings) < LEAST or (described := sensor_in(profile, snapshot)) is None:
         return None
     sensor, reference_c = described
-    conditions = {"temp_c": channels["temp_c"] - reference_c} if "temp_c" in channels else {}
-    if any(need not in conditions for effect, _ in sensor.effects for need in effect.needs):
+    covariates = {"temp_c": channels["temp_c"] - reference_c} if "temp_c" in channels else {}
+    if any(need not in covariates for effect, _ in sensor.effects for need in effect.needs):
         return None
     try:
-        expected = sensor.specific_force(readings, conditions)
+        expected = sensor.specific_force(readings, covariates)
     except Refused:
         return None
     return float(np.median(np.linalg.norm(corrected - expected, axis=1)))

@@ -13,14 +13,14 @@ from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import MICRO_G, clean, micro, micro_g, unit_label
 from triaxcald.report.ink import AXES, BAND, FLOOR, draw, hang_grid
 from triaxcald.report.over_time import stage_colours
-from triaxcald.report.stages import HeldOut, Stage
+from triaxcald.report.stages import HoldOut, Stage
 from triaxcald.report.stream import StreamOverview
 
 Group = tuple[str, list[tuple[str, float]], float | None]
 _LONGEST_LABEL = 34
 
 
-def bars_picture(stages: Sequence[Stage], held_out: HeldOut | None, unit: ErrorUnit = MICRO_G) -> Markup | None:
+def bars_picture(stages: Sequence[Stage], held_out: HoldOut | None, unit: ErrorUnit = MICRO_G) -> Markup | None:
     """Errors of every stage against the noise floor, or None when none is known."""
     groups = _bar_groups(stages, held_out)
     if not groups:
@@ -72,7 +72,7 @@ def stream_picture(stream: StreamOverview) -> Markup | None:
     return draw("streams", alt, (8.0, 4.0), paint)
 
 
-def _bar_groups(stages: Sequence[Stage], held_out: HeldOut | None) -> list[Group]:
+def _bar_groups(stages: Sequence[Stage], held_out: HoldOut | None) -> list[Group]:
     floor_g = next((s.residual.noise_floor_g for s in reversed(stages) if s.residual.noise_floor_g), None)
     held_out_floor_g = held_out.noise_floor_g if held_out else None
     rows = (

@@ -17,7 +17,7 @@ from triaxcal.evidence.odds import Odds
 from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names
-from triaxcald.report.stages import HeldOut, Residual, Stage, held_out_of, stages_of
+from triaxcald.report.stages import HoldOut, Residual, Stage, held_out_of, stages_of
 from triaxcald.report.untrusted import Vector, mapping, numbers, texts, vector, words
 
 _OF_A_POSE = (
@@ -112,7 +112,7 @@ class Outcome:
     refused: str | None
     searched: bool
     stages: tuple[Stage, ...]
-    held_out: HeldOut | None
+    held_out: HoldOut | None
     findings: tuple[Finding, ...]
     unexplained: Unexplained | None
     nothing_probability: float | None

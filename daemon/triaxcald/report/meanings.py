@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from triaxcal.effects.contract import RUN, condition_of
+from triaxcal.effects.contract import RUN, covariate_of
 from triaxcald.report.figures import clean, digits, effect_title, power
 
 _ALONE = "{by}, in recording {n} alone"
@@ -218,7 +218,7 @@ def told(effect: str, references: Mapping[str, float | None]) -> Told:
     if meaning is None:
         return Told(title, title.lower(), "", "", "")
     letter, name = meaning.reference or ("", "")
-    value = references.get(name.replace("{c}", condition_of(channel)))
+    value = references.get(name.replace("{c}", covariate_of(channel)))
     where = [meaning.symbols] if meaning.symbols else []
     if letter == "t₀" and RUN in references:
         where.append("t₀: the middle of each recording's poses")

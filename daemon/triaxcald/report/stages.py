@@ -34,7 +34,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HoldOut:
     before_rms_g: float | None
     after_rms_g: float | None
     noise_floor_g: float | None
@@ -46,12 +46,12 @@ def residual_of(value: object) -> Residual | None:
     return Residual(*(number(known.get(field.name)) for field in fields(Residual))) if known else None
 
 
-def held_out_of(document: Mapping[str, object]) -> HeldOut | None:
+def held_out_of(document: Mapping[str, object]) -> HoldOut | None:
     known = mapping(document.get("held_out"))
     if not known:
         return None
     poses = number(known.get("poses"))
-    return HeldOut(
+    return HoldOut(
         number(known.get("before_rms_g")),
         number(known.get("after_rms_g")),
         number(known.get("noise_floor_g")),
@@ -63,7 +63,7 @@ def stages_of(
     document: Mapping[str, object],
     calibration: Mapping[str, object],
     by_pose_g: tuple[Sequence[float | None], Sequence[float | None]],
-    held_out: HeldOut | None,
+    held_out: HoldOut | None,
 ) -> tuple[Stage, ...]:
     """Before and after; one where they are the same. ``by_pose_g`` has the residuals of both."""
     before_g, after_g = by_pose_g

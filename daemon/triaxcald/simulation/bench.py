@@ -17,7 +17,7 @@ from triaxcal.effects.contract import Effect, channel_of
 from triaxcal.errors import InvalidData
 from triaxcal.model.directions import directions, elsewhere
 from triaxcal.model.sensor import Sensor
-from triaxcal.synthetic import CONDITIONS, Environment, SyntheticUnit, Tumble
+from triaxcal.synthetic import COVARIATES, Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.files import read_whole
@@ -152,7 +152,7 @@ def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[Effect, F
         raise InputError(f"{here}: {', '.join(held)} are not of one form of it") from None
     if bad := next((n for n, (v, _) in effect.shape.items() if not v > 0), None):
         raise InputError(f"{here}.{bad}: has to be above 0")
-    if lacking := set(effect.needs) - CONDITIONS:
+    if lacking := set(effect.needs) - COVARIATES:
         needed = ", ".join(map(channel_of, sorted(lacking)))
         raise InputError(f"{here}: a simulated unit has no {needed}, which it goes with")
     return effect, coefficients

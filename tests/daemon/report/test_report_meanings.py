@@ -22,13 +22,13 @@ FORMS += [effect_named("channel_scale_factor:supply_v"), *(BiasDrift(d) for d in
 FORMS += [Hysteresis("memory"), Hysteresis("reversal")]
 RNG = np.random.default_rng(11)
 S = RNG.uniform(-1, 1, (5, 3))
-CONDITIONS = {
+COVARIATES = {
     name: RNG.uniform(0.5, 2.0, 5)
     for name in {*(n for e in FORMS for n in e.needs), *BEFORE, *CHANGE, *SCATTER, SINCE_START, HELD}
 }
-CONDITIONS |= {lag_of("temp_c", constant_s): RNG.uniform(-1, 1, 5) for constant_s in LAGS_S}
-CONDITIONS[HELD] = np.zeros(5)
-CONDITIONS[SINCE_START] = np.arange(5.0)
+COVARIATES |= {lag_of("temp_c", constant_s): RNG.uniform(-1, 1, 5) for constant_s in LAGS_S}
+COVARIATES[HELD] = np.zeros(5)
+COVARIATES[SINCE_START] = np.arange(5.0)
 
 
 def hinge(s: np.ndarray, effect: Effect) -> np.ndarray:
@@ -39,7 +39,7 @@ def hinge(s: np.ndarray, effect: Effect) -> np.ndarray:
 
 def by_hand(text: str, effect: Effect, axis: int) -> np.ndarray:
     """What a factor on the page says, reckoned without the effect's own code."""
-    s, c = S[:, axis], CONDITIONS
+    s, c = S[:, axis], COVARIATES
     need = c[effect.needs[0]] if effect.needs else np.zeros(5)
     if product := re.fullmatch(r"s_([xyz]) s_([xyz])", text):
         return np.asarray(S[:, "xyz".index(product[1])] * S[:, "xyz".index(product[2])])
@@ -76,7 +76,7 @@ def by_hand(text: str, effect: Effect, axis: int) -> np.ndarray:
 @pytest.mark.parametrize("effect", FORMS, ids=lambda e: f"{e.name}-{len(e.coefficients)}-{e.coefficients[0].name}")
 def test_what_the_page_says_a_coefficient_is_multiplied_by_is_what_the_effect_does(effect: Effect) -> None:
     shaped = effect.shaped(dict.fromkeys(effect.shape, 2.5)) if effect.shape else effect
-    basis = shaped.basis(S, CONDITIONS)
+    basis = shaped.basis(S, COVARIATES)
     for i, coefficient in enumerate(shaped.coefficients):
         axis, text = factor(effect.name, coefficient.name)
         for k, name in enumerate("xyz"):

@@ -45,7 +45,7 @@ def recovers(with_effect: Callable[[Effect, Sequence[float]], Sensor], twenty_si
             ups = twenty_six[rng.permutation(26)]
             poses = noisy_poses(sensor, ups, SIGMA_G, rng, channels=channels, channel_reference=reference)
             c = fit(poses, signs=(-1, -1, -1), effects=[effect])
-            found.append((c.values - true) / (c.standard_errors / c.inflation))
+            found.append((c.values - true) / (c.standard_errors / c.birge_ratio))
         pulls = np.array(found)
         each = CHANCE / pulls.shape[1]
         low, high = stats.chi2.ppf([each / 2, 1 - each / 2], SEEDS - 1) / (SEEDS - 1)

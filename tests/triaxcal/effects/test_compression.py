@@ -13,7 +13,7 @@ from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.compression import KINDS, KNEES, Compression
 from triaxcal.effects.contract import BEFORE
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.blind import Blind, Why
+from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.planning.visibility import sight
@@ -82,7 +82,7 @@ def test_the_knee_is_where_least_is_left_and_has_an_error(
     ups = rng.standard_normal((60, 3))
     ups /= np.linalg.norm(ups, axis=1, keepdims=True)
     poses = noisy_poses(with_effect(Compression("odd", 0.8), [1e-2, -1e-2, 1e-2]), ups, 1.5e-5, rng)
-    fits = {knee: fit(poses, signs=MINUS, effects=[Compression("odd", knee)], aside=()) for knee in KNEES}
+    fits = {knee: fit(poses, signs=MINUS, effects=[Compression("odd", knee)], excluded=()) for knee in KNEES}
     best = min(fits, key=lambda knee: fits[knee].residual.rms_g)
     assert best == 0.8
     _, error, unit = fits[best].coefficients_of("compression")["knee"]
@@ -106,4 +106,4 @@ def test_poses_in_few_directions_say_that_they_cannot_show_it(
     poses = noisy_poses(with_effect(Compression(), [0, 0, 0]), ups, 1.5e-5, np.random.default_rng(0))
     loop = diagnose(poses, signs=MINUS, catalogue=[Compression()])
     assert loop.after.blind_to == ("compression",)
-    assert loop.blind["compression"] == Blind(Why.FEW_DIRECTIONS)
+    assert loop.blind["compression"] == NotIdentifiable(Why.FEW_DIRECTIONS)

@@ -15,8 +15,8 @@ UPS /= np.linalg.norm(UPS, axis=1, keepdims=True)
 
 def share(kind: str, s: np.ndarray) -> np.ndarray:
     """(n,p) by which |a| is off, from what the term adds along the force."""
-    conditions = {TIME: np.linspace(-200.0, 200.0, len(s))}
-    return np.einsum("ni,nip->np", s, Empirical(kind).basis(s, conditions)) / np.sum(s**2, axis=1)[:, None]
+    covariates = {TIME: np.linspace(-200.0, 200.0, len(s))}
+    return np.einsum("ni,nip->np", s, Empirical(kind).basis(s, covariates)) / np.sum(s**2, axis=1)[:, None]
 
 
 @pytest.mark.parametrize(("kind", "count"), [("odd", 7), ("even", 9)])
@@ -51,12 +51,12 @@ def test_over_the_whole_sphere_the_nine_parameters_absorb_none_of_it(kind: str) 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_the_slope_is_the_finite_difference_of_the_basis(kind: str) -> None:
     effect, s = Empirical(kind), UPS[:20] * 1.1
-    conditions = {TIME: np.linspace(-200.0, 200.0, 20)}
-    slope = effect.slope(s, conditions)
+    covariates = {TIME: np.linspace(-200.0, 200.0, 20)}
+    slope = effect.slope(s, covariates)
     assert slope.shape == (20, 3, 3, len(effect.coefficients))
     for by in range(3):
         h = 1e-6 * np.eye(3)[by]
-        difference = (effect.basis(s + h, conditions) - effect.basis(s - h, conditions)) / 2e-6
+        difference = (effect.basis(s + h, covariates) - effect.basis(s - h, covariates)) / 2e-6
         assert slope[:, :, by] == pytest.approx(difference, rel=1e-6, abs=1e-7)
 
 

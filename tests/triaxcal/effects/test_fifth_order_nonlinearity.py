@@ -11,7 +11,7 @@ from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.fifth_order_nonlinearity import FifthOrderNonlinearity
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.blind import Blind, Why
+from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.directions import directions, linear_design
 from triaxcal.model.sensor import Sensor
 from triaxcal.planning.design import combinations, radial
@@ -56,4 +56,4 @@ def test_poses_without_edges_say_that_they_show_its_sum_alone(
     poses = noisy_poses(with_effect(effect, [0, 0, 0]), fourteen, 1.5e-5, np.random.default_rng(0))
     loop = diagnose(poses, signs=MINUS, catalogue=[effect])
     assert loop.after.blind_to == (effect.name,)
-    assert loop.blind[effect.name] == Blind(Why.FEW_DIRECTIONS)
+    assert loop.blind[effect.name] == NotIdentifiable(Why.FEW_DIRECTIONS)

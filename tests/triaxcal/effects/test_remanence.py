@@ -15,9 +15,9 @@ from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.remanence import Remanence
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.blind import Blind, Why
+from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import of_unknown_history
+from triaxcal.poses.covariates import of_unknown_history
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)
@@ -42,7 +42,7 @@ def test_it_is_told_from_a_memory_in_proportion(
     rng = np.random.default_rng(0)
     sensor = with_effect(Remanence(), [1e-3, -1e-3, 1e-3])
     poses = noisy_poses(sensor, twenty_six[rng.permutation(26)], 1.5e-5, rng)
-    right, wrong = (fit(poses, signs=MINUS, effects=[e], aside=()).residual for e in (Remanence(), Hysteresis()))
+    right, wrong = (fit(poses, signs=MINUS, effects=[e], excluded=()).residual for e in (Remanence(), Hysteresis()))
     assert right.lack_of_fit_p is not None
     assert right.lack_of_fit_p > 1e-3
     assert wrong.rms_g > 3 * right.rms_g
@@ -75,4 +75,4 @@ def test_poses_that_all_follow_the_same_one_say_that_they_cannot_show_it(
     poses = noisy_poses(with_effect(effect, [0, 0, 0]), twenty_six, 1.5e-5, np.random.default_rng(0))
     loop = diagnose([replace(p, before=rest) for p in poses], signs=MINUS, catalogue=[effect])
     assert loop.after.blind_to == (effect.name,)
-    assert loop.blind[effect.name] == Blind(Why.MOVED_ALONG)
+    assert loop.blind[effect.name] == NotIdentifiable(Why.MOVED_ALONG)

@@ -12,7 +12,7 @@ from triaxcal.effects import Effect
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.scale_factor_drift import ScaleFactorDrift
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.blind import Blind, Why
+from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses
 
@@ -42,7 +42,9 @@ def test_it_is_not_a_drifting_bias(
     ups = twenty_six[rng.permutation(26)]
     sensor = with_effect(ScaleFactorDrift(), TRUTH)
     poses = noisy_poses(sensor, ups, 1.5e-5, rng, channel_reference=MIDDLE)
-    right, wrong = (fit(poses, signs=MINUS, effects=[e], aside=()).residual for e in (ScaleFactorDrift(), BiasDrift()))
+    right, wrong = (
+        fit(poses, signs=MINUS, effects=[e], excluded=()).residual for e in (ScaleFactorDrift(), BiasDrift())
+    )
     assert right.lack_of_fit_p is not None
     assert right.lack_of_fit_p > 1e-3
     assert wrong.rms_g > 3 * right.rms_g
@@ -55,4 +57,4 @@ def test_poses_all_taken_at_one_moment_say_that_they_cannot_show_it(
     poses = noisy_poses(with_effect(effect, [0, 0, 0]), fourteen, 1.5e-5, np.random.default_rng(0), hold_s=0.0)
     loop = diagnose(poses, signs=MINUS, catalogue=[effect])
     assert loop.after.blind_to == (effect.name,)
-    assert loop.blind[effect.name] == Blind(Why.MOVED_ALONG)
+    assert loop.blind[effect.name] == NotIdentifiable(Why.MOVED_ALONG)

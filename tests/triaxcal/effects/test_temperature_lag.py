@@ -16,9 +16,9 @@ from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.creep import with_creep_left
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.blind import Blind, Why
+from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import behind, channels_of, conditions_elsewhere, lags_for
+from triaxcal.poses.covariates import behind, channels_of, covariates_elsewhere, lags_for
 from triaxcal.poses.pose import Pose, Run
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble, noisy_poses
 
@@ -125,7 +125,7 @@ def test_poses_of_another_recording_have_the_lag_of_their_own_temperature(
 ) -> None:
     poses = swinging(paper_unit, twenty_six, np.random.default_rng(0))
     reference = {"temp_c": 20.0, "temp_c.lag:33": 0.0}
-    held = conditions_elsewhere(poses, reference, paper_unit.scale_factor, paper_unit.bias)
+    held = covariates_elsewhere(poses, reference, paper_unit.scale_factor, paper_unit.bias)
     assert held["temp_c"] == pytest.approx(SWINGING["temp_c"] - 20)
     assert held["temp_c.lag:33"] == pytest.approx(behind(T_S, SWINGING["temp_c"], 33))
 
@@ -138,7 +138,7 @@ def test_it_is_told_from_a_bias_that_follows_at_once_and_from_one_by_the_rate(
     poses = [replace(p, rates={"temp_c": 3 / 20 * np.cos(p.t_s / 20) - np.sin(p.t_s / 7) / 7}) for p in poses]
     effects = [[TemperatureLag(33.0)], [effect_named("temperature_bias")],
                [effect_named("temperature_bias"), effect_named("thermal_gradient")]]  # fmt: skip
-    right, at_once, by_rate = (fit(poses, signs=MINUS, effects=e, aside=()).residual for e in effects)
+    right, at_once, by_rate = (fit(poses, signs=MINUS, effects=e, excluded=()).residual for e in effects)
     assert right.lack_of_fit_p is not None
     assert right.lack_of_fit_p > 1e-3
     assert at_once.rms_g > 3 * right.rms_g
@@ -151,7 +151,7 @@ def test_the_time_constant_is_where_least_is_left_and_has_an_error(
     rng = np.random.default_rng(0)
     poses = swinging(with_effect(TemperatureLag(47.0), TRUTH), twenty_six[rng.permutation(26)], rng)
     tried = TemperatureLag().variants({SINCE_START: T_S})
-    fits = {e.shape["time_constant"][0]: fit(poses, signs=MINUS, effects=[e], aside=()) for e in tried}
+    fits = {e.shape["time_constant"][0]: fit(poses, signs=MINUS, effects=[e], excluded=()) for e in tried}
     best = min(fits, key=lambda constant_s: fits[constant_s].residual.rms_g)
     assert best == 47
     _, error, unit = fits[best].coefficients_of("temperature_lag")["time_constant"]
@@ -177,8 +177,8 @@ def test_from_a_stream_it_comes_back_with_the_trends_inside_the_poses(
         readings, temp_c = unit.sample(t)
         _, _, poses = detect(t, readings, {"temp_c": temp_c})
         assert len(poses) == 26
-        c = fit(poses, signs=MINUS, effects=[effect], aside=())
-        assert c.trends
+        c = fit(poses, signs=MINUS, effects=[effect], excluded=())
+        assert c.slopes
         assert np.all(np.abs(c.values[9:] - truth) < 4.5 * c.standard_errors[9:]), seed
         assert np.all(c.standard_errors[9:] < 0.2 * np.abs(truth))
         assert c.residual.lack_of_fit_p is not None
@@ -200,7 +200,7 @@ def test_inside_a_pose_it_explains_the_creep_of_the_lagging_temperature(
                 rates={"temp_c": float(rate[i])})
         for i, p in enumerate(swinging(sensor, twenty_six[rng.permutation(26)], rng))
     ]  # fmt: skip
-    left = with_creep_left(poses, fit(poses, signs=MINUS, effects=[effect], aside=()))
+    left = with_creep_left(poses, fit(poses, signs=MINUS, effects=[effect], excluded=()))
     for before, after in zip(poses, left, strict=True):
         assert np.linalg.norm(after.creep) <= 0.2 * np.linalg.norm(before.creep) + 1e-12
 
@@ -214,6 +214,6 @@ def test_poses_whose_temperature_stands_still_or_is_not_known_say_so(
     for poses, why in ((still, Why.STOOD_STILL), (plain, Why.NOT_LOGGED)):
         loop = diagnose(poses, signs=MINUS, catalogue=[effect])
         assert loop.after.blind_to == (effect.name,)
-        assert loop.blind[effect.name] == Blind(why, "temp_c")
+        assert loop.blind[effect.name] == NotIdentifiable(why, "temp_c")
     with pytest.raises(InvalidData, match="no channel temp_c, which the effects need"):
         fit(plain, signs=MINUS, effects=[effect])

@@ -50,8 +50,8 @@ def with_slopes(poses: list[Pose], seed: int) -> list[Pose]:
     return [
         replace(
             p,
-            trend=p.creep + error * rng.standard_normal(3),
-            trend_error=error,
+            slope=p.creep + error * rng.standard_normal(3),
+            slope_error=error,
             rate_errors=still,
             bends=still,
             bend_errors=still,
@@ -242,7 +242,7 @@ def test_of_a_pose_that_only_turns_an_effect_makes_no_creep_along_the_measured_v
                 p, creep=across, covariance=p.covariance + (np.outer(across, across) - np.outer(p.creep, p.creep)) / 12
             )
         )
-    model = fit(quiet, signs=MINUS, effects=[effect_named("temperature_bias")], aside=())
+    model = fit(quiet, signs=MINUS, effects=[effect_named("temperature_bias")], excluded=())
     left = with_creep_left(turning, model)
     for before, after, still, g in zip(turning, left, quiet, out, strict=True):
         assert g @ after.covariance @ g < 1.1 * g @ still.covariance @ g

@@ -7,14 +7,14 @@ from typing import TypeVar
 
 import numpy as np
 import pytest
+from benchmarks.outlier_set import clean_loses, measure
 from scipy import stats
 
-from benchmarks.spoiled import clean_loses, measure
 from benchmarks.truth import plan
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.estimate.calibration import Calibration, Exclusion
 from triaxcal.estimate.caution import Caution, Outlier, OutliersExcluded, PosesExcludedByCaller, UnknownHistoryExcluded
-from triaxcal.estimate.outliers import not_as_foretold, spoiled
+from triaxcal.estimate.outliers import not_as_predicted, outlier_set
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.directions import linear_design
 from triaxcal.model.sensor import Sensor
@@ -55,7 +55,7 @@ def test_one_or_two_spoiled_poses_of_the_26_are_named(
         for i in bad:
             poses[i] = spoil(poses[i], paper_unit, twenty_six[i], sigmas * rng.choice([-1, 1]))
         found = fit(poses, signs=SIGNS)
-        clean = fit(poses, signs=SIGNS, aside=bad)
+        clean = fit(poses, signs=SIGNS, excluded=bad)
         named += left_out(found) == bad
         pulls.append((found.values - true) / clean.standard_errors)
         clean_pulls.append((clean.values - true) / clean.standard_errors)
@@ -131,7 +131,7 @@ def test_a_pose_that_only_the_noise_inside_the_poses_calls_spoiled_leaves_the_er
         poses = noisy_poses(paper_unit, fourteen, SIGMA, np.random.default_rng(seed))
         for sigmas in doubtful:
             found = fit([*poses[:4], spoil(poses[4], paper_unit, fourteen[4], sigmas), *poses[5:]], signs=SIGNS)
-            told = fit([p.pose for p in found.poses], signs=SIGNS, aside=[4])
+            told = fit([p.pose for p in found.poses], signs=SIGNS, excluded=[4])
             if left_out(found) == [4] and caution_of(found, OutliersExcluded).doubtful:
                 doubtful[sigmas] += 1
                 assert np.all(found.standard_errors > 1.5 * told.standard_errors)
@@ -150,10 +150,10 @@ def test_the_pose_that_every_likely_pair_contains_is_left_out() -> None:
         r = rng.standard_normal(n)
         r[3] += 200
         r[int(rng.integers(4, n))] += 8
-        verdict = spoiled(r, design, np.full(n, 1e6), 1e6)
-        if verdict.rivals:
+        verdict = outlier_set(r, design, np.full(n, 1e6), 1e6)
+        if verdict.tied:
             assert verdict.rows == (3,)
-            assert all(3 not in each for each in verdict.rivals)
+            assert all(3 not in each for each in verdict.tied)
             shown += 1
     assert shown > 5
 
@@ -177,10 +177,10 @@ def test_a_first_pose_that_another_went_before_is_left_out_and_not_called_spoile
         (unknown,) = caution_of(c, UnknownHistoryExcluded).poses
         assert unknown.began == poses[0].began
         assert c.poses[0].excluded is Exclusion.UNKNOWN_HISTORY
-        told = fit(poses, signs=SIGNS, effects=[Hysteresis()], aside=[0])
+        told = fit(poses, signs=SIGNS, effects=[Hysteresis()], excluded=[0])
         assert isinstance(told.cautions[0], PosesExcludedByCaller)
         assert c.cautions[1:] == told.cautions[1:]
-        assert c.inflation == told.inflation
+        assert c.birge_ratio == told.birge_ratio
         assert not any(isinstance(caution, OutliersExcluded) for caution in c.cautions)
 
 
@@ -220,5 +220,5 @@ def test_a_pose_is_as_foretold_unless_it_takes_out_more_than_a_coefficient_costs
     for taken, found in ((0.9 * np.log(n), ()), (1.1 * np.log(n), (4,))):
         own = np.eye(n)[4] - q @ q[4]
         r = own / np.linalg.norm(own) * np.sqrt(taken)
-        assert not_as_foretold(r, design, 1e6, [4]) == found
-        assert not_as_foretold(r, design, 1e6, []) == ()
+        assert not_as_predicted(r, design, 1e6, [4]) == found
+        assert not_as_predicted(r, design, 1e6, []) == ()

@@ -130,7 +130,7 @@ def test_the_covariance_of_effects_too_is_the_spread_over_seeds(
             channel_reference={"temp_c": round(float(wandering(26)["temp_c"].mean()), 1)},
         )
         c = fit(poses, signs=MINUS, effects=chosen)
-        pulls.append((c.values - truth) / (c.standard_errors / c.inflation))
+        pulls.append((c.values - truth) / (c.standard_errors / c.birge_ratio))
     each = 1e-3 / len(truth)
     low, high = stats.chi2.ppf([each / 2, 1 - each / 2], seeds - 1) / (seeds - 1)
     variance = np.var(pulls, axis=0, ddof=1)
@@ -170,9 +170,9 @@ def test_poses_measured_worse_weigh_less(paper_unit: Sensor, twenty_six: np.ndar
     for seed in range(40):
         poses = noisy_poses(paper_unit, twenty_six, error, np.random.default_rng(seed))
         c = fit(poses, signs=MINUS)
-        weighted.append((c.values - truth) / c.standard_errors * c.inflation)
+        weighted.append((c.values - truth) / c.standard_errors * c.birge_ratio)
         flat = fit([replace(p, covariance=np.eye(3) * 1e-9) for p in poses], signs=MINUS)
-        equal.append((flat.values - truth) / c.standard_errors * c.inflation)
+        equal.append((flat.values - truth) / c.standard_errors * c.birge_ratio)
     # 13 good poses leave only the weighted fit near its bound; the equal one is tens of times off.
     assert 0.7 < np.mean(np.square(weighted)) < 1.3
     assert np.mean(np.square(equal)) > 20
@@ -184,7 +184,7 @@ def test_a_noisy_axis_weighs_less_and_the_errors_stay_true(paper_unit: Sensor, t
     for seed in range(60):
         poses = noisy_poses(paper_unit, twenty_six, np.array([1e-5, 1e-5, 1e-3]), np.random.default_rng(seed))
         c = fit(poses, signs=MINUS)
-        pulls.append((c.values - truth) / c.standard_errors * c.inflation)
+        pulls.append((c.values - truth) / c.standard_errors * c.birge_ratio)
         flat = fit([replace(p, covariance=np.eye(3) * 1e-9) for p in poses], signs=MINUS)
         z_errors.append(c.values[0] - truth[0])
         flat_errors.append(flat.values[0] - truth[0])
@@ -293,7 +293,7 @@ def test_a_faulty_pose_and_a_spoiled_one_are_both_left_out(paper_unit: Sensor, t
     poses[12] = replace(poses[12], mean=poses[12].mean + 1e-3 * twenty_six[12] * paper_unit.scale_factor)
     found = fit(poses, signs=MINUS)
     assert [i for i, p in enumerate(found.poses) if not p.used] == [3, 12]
-    assert [i for i, p in enumerate(fit(poses, signs=MINUS, aside=(3, 5)).poses) if not p.used] == [3, 5]
+    assert [i for i, p in enumerate(fit(poses, signs=MINUS, excluded=(3, 5)).poses) if not p.used] == [3, 5]
 
 
 @pytest.mark.parametrize(
@@ -310,4 +310,4 @@ def test_a_step_to_where_the_model_has_no_inverse_is_one_too_far(
     for i in rng.choice(26, 2, replace=False):
         poses[i] = replace(poses[i], mean=poses[i].mean * (1 + amount))
     with contextlib.suppress(Refused):
-        fit(poses, signs=MINUS, effects=[effect_named(name)], aside=())
+        fit(poses, signs=MINUS, effects=[effect_named(name)], excluded=())

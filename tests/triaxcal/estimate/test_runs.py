@@ -24,7 +24,7 @@ from triaxcal.estimate.problem import solve
 from triaxcal.estimate.runs import ByRun, by_run, residuals_by_run, together
 from triaxcal.estimate.start import problem_of, start
 from triaxcal.model.directions import directions
-from triaxcal.poses.conditions import channels_of, conditions_elsewhere
+from triaxcal.poses.covariates import channels_of, covariates_elsewhere
 from triaxcal.poses.pose import Began, Pose, Run
 
 K, ANGLES, BIAS = np.array([2.4, -2.1, 2.2]), np.array([6e-3, 4e-3, -1e-3]), np.array([5e-3, -3e-3, 4e-3])
@@ -75,10 +75,10 @@ def test_one_recording_stays_as_it_is_and_is_searched_as_ever() -> None:
 
 
 def test_time_counts_from_the_middle_of_each_run_and_the_start_from_its_own(three: list[Pose]) -> None:
-    conditions = channels_of(three)
-    assert np.array_equal(conditions[RUN], np.repeat([0.0, 1.0, 2.0], 14))
-    assert np.array_equal(conditions[SINCE_START], np.tile((np.arange(14) + 0.5) * HOLD_S, 3))
-    assert np.allclose(conditions[TIME], np.tile((np.arange(14) - 6.5) * HOLD_S, 3), atol=0.051)
+    covariates = channels_of(three)
+    assert np.array_equal(covariates[RUN], np.repeat([0.0, 1.0, 2.0], 14))
+    assert np.array_equal(covariates[SINCE_START], np.tile((np.arange(14) + 0.5) * HOLD_S, 3))
+    assert np.allclose(covariates[TIME], np.tile((np.arange(14) - 6.5) * HOLD_S, 3), atol=0.051)
 
 
 def test_a_pose_says_which_recording_it_is_of(three: list[Pose]) -> None:
@@ -108,9 +108,9 @@ def test_a_recording_without_a_pose_is_named() -> None:
 
 
 def test_a_drift_in_one_run_is_zero_in_the_others(three: list[Pose]) -> None:
-    conditions = channels_of(three)
-    basis = InRuns(BiasDrift(), (1,)).basis(np.zeros((42, 3)), conditions)
-    expected = np.where(conditions[RUN] == 1, conditions[TIME], 0.0)
+    covariates = channels_of(three)
+    basis = InRuns(BiasDrift(), (1,)).basis(np.zeros((42, 3)), covariates)
+    expected = np.where(covariates[RUN] == 1, covariates[TIME], 0.0)
     assert np.array_equal(basis, expected[:, None, None] * np.eye(3))
 
 
@@ -136,12 +136,12 @@ def test_the_runs_biases_have_the_units_for_their_mean(three: list[Pose]) -> Non
 
 
 def tried(poses: Sequence[Pose]) -> list[Effect]:
-    conditions = channels_of(poses)
-    return [v for e in by_run(CATALOGUE, poses) for v in e.variants(conditions)]
+    covariates = channels_of(poses)
+    return [v for e in by_run(CATALOGUE, poses) for v in e.variants(covariates)]
 
 
 def test_every_form_that_is_tried_is_read_back_from_its_coefficients(three: list[Pose]) -> None:
-    conditions, rng = channels_of(three), np.random.default_rng(3)
+    covariates, rng = channels_of(three), np.random.default_rng(3)
     checked = set()
     for effect in tried(three):
         if RUN not in effect.needs:
@@ -150,7 +150,7 @@ def test_every_form_that_is_tried_is_read_back_from_its_coefficients(three: list
         values = dict(zip([c.name for c in effect.coefficients], q, strict=True))
         again, q2 = effect_of(effect.name, values | {n: v for n, (v, _) in effect.shape.items()})
         s = rng.standard_normal((42, 3))
-        assert np.allclose(again.basis(s, conditions) @ q2, effect.basis(s, conditions) @ q, atol=1e-12)
+        assert np.allclose(again.basis(s, covariates) @ q2, effect.basis(s, covariates) @ q, atol=1e-12)
         checked.add(effect.name)
     assert checked == {"bias_drift", "warm_up", "bias_step", "run_bias", "run_scale_factor", "scale_factor_drift"}
 
@@ -166,7 +166,7 @@ def test_effects_of_the_clocks_are_tried_alike_in_each_alone_and_by_run(three: l
 def test_elsewhere_everything_that_was_a_runs_own_is_zero(three: list[Pose]) -> None:
     reference = {TIME: 0.0, SINCE_START: 0.0, HELD: 0.0, RUN: 0.0}
     for poses in (recording(np.random.default_rng(9)), three):
-        away = conditions_elsewhere(poses, reference, K, BIAS)
+        away = covariates_elsewhere(poses, reference, K, BIAS)
         for effect in tried(three):
             if RUN in effect.needs:
                 assert not effect.basis(np.ones((len(poses), 3)), away).any(), effect
@@ -189,9 +189,9 @@ def test_coefficients_and_standard_errors_of_three_runs_are_right_over_many_seed
             recording(rng, lambda t: shifts[1] + slope * (t - middle)[:, None], square=square),
             recording(rng, lambda t: shifts[2] + 0 * t[:, None], square=square),
         ]
-        found = fit(together(runs), signs=SIGNS, effects=effects, aside=())
+        found = fit(together(runs), signs=SIGNS, effects=effects, excluded=())
         off = found.values - truth
-        chi2 += float(off @ np.linalg.solve(found.covariance / found.inflation**2, off))
+        chi2 += float(off @ np.linalg.solve(found.covariance / found.birge_ratio**2, off))
     low, high = stats.chi2.ppf([0.0005, 0.9995], len(truth) * seeds)
     assert low < chi2 < high
 

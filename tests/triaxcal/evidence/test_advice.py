@@ -14,7 +14,7 @@ from tests.undeclared.examine import Case, still_poses
 from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SINCE_START, TIME
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence import Action, Advice, Do, Posterior, advice, posterior
+from triaxcal.evidence import Action, ActionKind, Advice, Posterior, advice, posterior
 from triaxcal.evidence.advice import LEAST
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
@@ -57,7 +57,7 @@ def gone_on(unit: Sensor, poses: list[Pose], last: np.ndarray, actions: Sequence
 
 def in_directions_at_random(count: int, seed: int) -> list[Action]:
     up = np.random.default_rng(seed).standard_normal((count, 3))
-    return [Action(Do.POSE, v / np.linalg.norm(v)) for v in up]
+    return [Action(ActionKind.POSE, v / np.linalg.norm(v)) for v in up]
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def test_each_action_is_worth_its_price_and_their_information_is_the_entropy_tha
 ) -> None:
     for made in (f.made for f in followed):
         poses = [action for action in made.actions if action.up is not None]
-        assert all(action.information >= LEAST * action.price for action in poses)
+        assert all(action.information >= LEAST * action.cost for action in poses)
         gone = sum(action.information for action in poses)
         assert made.entropy - made.entropy_after == pytest.approx(gone)
         assert len(poses) <= 3
@@ -138,7 +138,7 @@ def test_a_unit_is_turned_from_each_pose_to_the_next(followed: list[Followed]) -
 
 def test_functions_that_agree_on_the_cube_are_told_apart_in_directions_between(followed: list[Followed]) -> None:
     for made in (f.made for f in followed[: len(SEEDS)]):
-        assert made.actions[0].do is Do.POSE
+        assert made.actions[0].do is ActionKind.POSE
         assert "2" in made.actions[0].label
 
 
@@ -157,7 +157,7 @@ def test_a_pose_that_may_be_an_outlier_is_taken_again_and_then_is_one(
     seen = seen_in(poses)
     assert 0.1 < seen.of_outliers[5] < 0.99
     made = advice(seen)
-    assert (made.actions[0].do, made.actions[0].again, made.actions[0].label) == (Do.REPEAT, 5, "+X+Y+Z")
+    assert (made.actions[0].do, made.actions[0].again, made.actions[0].label) == (ActionKind.REPEAT, 5, "+X+Y+Z")
     after = seen_in(gone_on(paper_unit, poses, last, made.actions, seed))
     assert after.of_outliers[5] > seen.of_outliers[5]
     # Counted among all that were given.
@@ -173,7 +173,7 @@ def test_a_pose_on_which_a_certain_name_hangs_is_taken_again(
     without[4] = 0.5
     monkeypatch.setattr(type(seen), "without_each_pose", lambda self, name: without)
     made = advice(seen)
-    assert [(action.do, action.again) for action in made.actions] == [(Do.REPEAT, 4)]
+    assert [(action.do, action.again) for action in made.actions] == [(ActionKind.REPEAT, 4)]
 
 
 def swinging(poses: list[Pose], unit: Sensor) -> list[Pose]:
@@ -187,14 +187,14 @@ def test_what_goes_with_time_goes_with_something_to_be_logged(poses_with: Poses,
     for logged, channel in ((True, ""), (False, "temp_c")):
         seen = seen_in([replace(p, channels=p.channels if logged else {}) for p in poses])
         first = advice(seen).actions[0]
-        assert (first.do, first.channel) == (Do.LOG, channel)
+        assert (first.do, first.channel) == (ActionKind.LOG, channel)
 
 
 def test_poses_with_an_error_of_their_own_are_held_longer(poses_with: Poses) -> None:
     off_g = 20 * SIGMA_G * np.random.default_rng(6).standard_normal(30)
     poses = [replace(p, mean=p.mean * (1 + d)) for p, d in zip(poses_with(6), off_g, strict=True)]
     first = advice(seen_in(poses)).actions[0]
-    assert (first.do, first.hold_s) == (Do.HOLD, 4 * HOLD_S)
+    assert (first.do, first.hold_s) == (ActionKind.HOLD, 4 * HOLD_S)
 
 
 def test_a_temperature_that_went_with_time_is_moved_or_time_goes_without_it(
@@ -204,10 +204,10 @@ def test_a_temperature_that_went_with_time_is_moved_or_time_goes_without_it(
     drift = np.array([4e-7, -3e-7, 5e-7])
     moved_along = [replace(p, mean=p.mean + paper_unit.scale_factor * drift * p.t_s) for p in poses]
     made = advice(posterior(moved_along, fit(moved_along, signs=MINUS), signs=MINUS, catalogue=CATALOGUE))
-    (moved,) = (action for action in made.actions if action.do is Do.CHANNEL)
+    (moved,) = (action for action in made.actions if action.do is ActionKind.CHANNEL)
     assert moved.channel == "temp_c"
     assert abs(moved.by) == pytest.approx(np.ptp([p.channels["temp_c"] for p in poses]))
-    (paused,) = (action for action in made.actions if action.do is Do.PAUSE)
+    (paused,) = (action for action in made.actions if action.do is ActionKind.PAUSE)
     assert paused.pause_s == pytest.approx(poses[-1].end_s)
     assert made.expected["temperature_bias"].if_it_acts > 0.8 > 0.4 > made.expected["temperature_bias"].now
 
@@ -222,7 +222,7 @@ def test_poses_are_advised_where_nobody_knows_when_they_were_taken(with_effects:
     poses, _ = taken(with_effects(second_order_nonlinearity=[6e-4, -4e-4, 5e-4]), 26, 0)
     made = advice(seen_in([replace(p, start_s=0.0, end_s=0.0, channels={}) for p in poses]))
     assert made.actions
-    assert {action.do for action in made.actions} <= {Do.POSE, Do.REPEAT}
+    assert {action.do for action in made.actions} <= {ActionKind.POSE, ActionKind.REPEAT}
 
 
 def test_slopes_inside_the_poses_count_in_what_is_to_come() -> None:

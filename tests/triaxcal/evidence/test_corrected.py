@@ -15,7 +15,7 @@ from triaxcal.evidence import posterior
 from triaxcal.evidence.corrected import corrected
 from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import at_moment
+from triaxcal.poses.covariates import at_moment
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.extrapolation import Extrapolated

@@ -79,7 +79,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
         for i, size in zip(members, found.sizes[cell], strict=True):
             term = evidence.terms[i]
             assert term.effect is not None
-            columns.append(size * of_rows.by_coefficients(term.effect)[:, list(term.kept)] * term.mix)
+            columns.append(size * of_rows.by_coefficients(term.effect)[:, list(term.kept)] * term.combination)
         return np.concatenate([FLAT * of_rows.linear, *columns], axis=1)
 
     both = np.concatenate([design(rows), design(ahead)])

@@ -41,9 +41,9 @@ def errors_g(sensor: Sensor, whole: Calibration, **held: float) -> np.ndarray:
     rng = np.random.default_rng(0)
     up = rng.standard_normal((400, 3))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
-    conditions = {name: np.full(400, held.get(name, 0.0)) for name in whole.channel_reference}
-    u = whole.sensor.output(up, conditions)
-    return np.asarray(np.linalg.norm(sensor.specific_force(u, conditions), axis=1) - 1)
+    covariates = {name: np.full(400, held.get(name, 0.0)) for name in whole.channel_reference}
+    u = whole.sensor.output(up, covariates)
+    return np.asarray(np.linalg.norm(sensor.specific_force(u, covariates), axis=1) - 1)
 
 
 def test_a_device_that_knows_every_effect_holds_the_same(fitted: Callable[..., Calibration]) -> None:
@@ -104,4 +104,4 @@ def test_errors_follow_the_parameters_into_the_device(fitted: Callable[..., Cali
     alone = reduced(whole, lambda effect: False).calibration
     bare = fit([p.pose for p in whole.poses], signs=MINUS)
     assert alone.covariance.shape == (9, 9)
-    assert alone.standard_errors[:3] == pytest.approx(bare.standard_errors[:3] / bare.inflation, rel=0.6)
+    assert alone.standard_errors[:3] == pytest.approx(bare.standard_errors[:3] / bare.birge_ratio, rel=0.6)

@@ -29,7 +29,7 @@ def test_coefficients_of_size_one_add_an_rms_of_one(rows: Rows) -> None:
         terms = [term for term in terms_of(rows, [effect_named(name)], Odds()) if term.effect is not None]
         for term in terms:
             assert term.effect is not None
-            basis = term.effect.basis(s, {})[:, :, list(term.kept)] * term.mix
+            basis = term.effect.basis(s, {})[:, :, list(term.kept)] * term.combination
             added = np.einsum("nip,np->ni", basis, rng.standard_normal((len(s), term.rank)))
             assert np.sqrt(np.mean(np.sum(added**2, axis=1))) == pytest.approx(1.0, rel=0.1)
 

@@ -70,7 +70,7 @@ class Bench:
         return cls(sensor, fixture, mount, plan, noisy_poses(sensor, up @ mount, sigma, rng))
 
     def calibrated(self) -> Calibration:
-        return fit(self.poses, signs=tuple(np.sign(self.sensor.scale_factor)), aside=())
+        return fit(self.poses, signs=tuple(np.sign(self.sensor.scale_factor)), excluded=())
 
     def stood(self, labels: Sequence[str | None] | None = None, **known: float) -> Standing:
         found = verticals(self.calibrated())
@@ -148,7 +148,7 @@ def test_the_covariance_is_the_cramer_rao_bound_of_the_whole_model(
     mount = Rotation.from_rotvec(turned * np.array([1.0, -0.7, 0.5])).as_matrix()
     bench = Bench.of(paper_unit, 3, sigma=sigma, mount=mount)
     c = bench.calibrated()
-    found = verticals(replace(c, inflation=1.0, covariance=c.covariance / c.inflation**2))
+    found = verticals(replace(c, birge_ratio=1.0, covariance=c.covariance / c.birge_ratio**2))
     labelling = labelled(found.direction, found.used, [label for label, _ in bench.plan] + [None] * len(NO_FACE))
     (unit,) = frames([stand(found, labelling, Assumed(seating=0.0))]).units
     limit = bound(bench, sigma)
@@ -171,7 +171,7 @@ def test_pulls_of_rotation_faces_and_tilt_have_the_variance_they_should(paper_un
         seating = 3e-5 if seed % 2 else 0.0
         bench = Bench.of(paper_unit, seed, seating=seating)
         c = bench.calibrated()
-        found = verticals(replace(c, inflation=1.0, covariance=c.covariance / c.inflation**2))
+        found = verticals(replace(c, birge_ratio=1.0, covariance=c.covariance / c.birge_ratio**2))
         result = frames([stand(found, recognise(found.direction, found.used), Assumed(seating=seating))])
         (unit,) = result.units
         rotation.append(np.linalg.solve(np.linalg.cholesky(unit.covariance), bench.miss(result)))
@@ -515,7 +515,7 @@ def test_a_calibration_of_another_recording_adds_its_uncertainty(paper_unit: Sen
         c = Bench.of(paper_unit, 500 + seed, sigma=3e-5).calibrated()
         bench = Bench.of(paper_unit, seed, plan=in_pairs(np.random.default_rng(seed)))
         found = verticals_under(
-            c.sensor, bench.poses[:12], c.covariance / c.inflation**2, channel_reference=c.channel_reference
+            c.sensor, bench.poses[:12], c.covariance / c.birge_ratio**2, channel_reference=c.channel_reference
         )
         result = frames([stand(found, recognise(found.direction, found.used), Assumed(seating=0.0))])
         (unit,) = result.units

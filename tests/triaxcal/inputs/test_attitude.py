@@ -91,7 +91,7 @@ def test_the_stated_errors_are_the_cramer_rao_bound(error_rad: float) -> None:
     poses, C = turntable(plan(14), 0, error_rad=error_rad)
     found = fit_attitudes(poses, plan(14), signs=SIGNS, attitude_error_rad=error_rad)
     bound = np.sqrt(np.diag(Likelihood(poses, plan(14), C, error_rad).bound()))
-    assert stated(found) == pytest.approx(bound * found.calibration.inflation, rel=0.01)
+    assert stated(found) == pytest.approx(bound * found.calibration.birge_ratio, rel=0.01)
 
 
 @pytest.mark.parametrize("error_rad", [1e-5, 1e-2])
@@ -159,7 +159,7 @@ def test_the_error_of_the_attitudes_is_estimated_and_told() -> None:
 def test_an_error_declared_too_small_is_noticed_and_raises_the_errors() -> None:
     poses, _ = turntable(plan(14), 2, error_rad=1e-3)
     c = fit_attitudes(poses, plan(14), signs=SIGNS, attitude_error_rad=1e-5).calibration
-    assert c.inflation > 10
+    assert c.birge_ratio > 10
     assert any(isinstance(caution, MagnitudeContradicts) for caution in c.cautions)
     assert c.residual.lack_of_fit_p is not None
     assert c.residual.lack_of_fit_p < 1e-6

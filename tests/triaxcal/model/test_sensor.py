@@ -36,7 +36,7 @@ EVERYTHING: dict[str, list[float]] = {
 }
 
 
-def conditions(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def covariates(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     within = {name: rng.uniform(-1, 1, n) for name in (*BEFORE, *CHANGE)}
     within |= {name: rng.uniform(0, 1e-4, n) for name in SCATTER}
     there = {"temp_c": rng.uniform(-15, 15, n), rate_of("temp_c"): rng.uniform(-0.1, 0.1, n)}
@@ -66,7 +66,7 @@ def test_matrix_and_centre_invert_the_linear_model(paper_unit: Sensor) -> None:
 def test_there_and_back_with_every_effect_is_exact(seed: int, with_effects: Callable[..., Sensor]) -> None:
     rng = np.random.default_rng(seed)
     sensor = with_effects(**EVERYTHING)
-    a, held = rng.uniform(-1.2, 1.2, (30, 3)), conditions(30, rng)
+    a, held = rng.uniform(-1.2, 1.2, (30, 3)), covariates(30, rng)
     assert sensor.specific_force(sensor.output(a, held), held) == pytest.approx(a, abs=1e-12)
 
 
@@ -82,7 +82,7 @@ def test_the_magnitude_s_gradient_is_its_central_difference(with_effects: Callab
     sensor = with_effects(**EVERYTHING)
     assert {effect.name for effect, _ in sensor.effects} == {effect.name for effect in CATALOGUE}
     rng = np.random.default_rng(1)
-    held = conditions(15, rng)
+    held = covariates(15, rng)
     u = sensor.output(rng.standard_normal((15, 3)), held)
     length, gradient = sensor.magnitude(u, held)
     assert length == pytest.approx(np.linalg.norm(sensor.specific_force(u, held), axis=1))

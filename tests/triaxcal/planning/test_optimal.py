@@ -43,7 +43,7 @@ def log_information(a: np.ndarray, columns: np.ndarray) -> float:
     return float(np.linalg.slogdet(rest.T @ rest)[1])
 
 
-def conditions(plan: OptimalPlan) -> dict[str, np.ndarray]:
+def covariates(plan: OptimalPlan) -> dict[str, np.ndarray]:
     return {"t_s": np.linspace(-1, 1, len(plan.ups)), **plan.levels}
 
 
@@ -116,7 +116,7 @@ def test_it_beats_the_plain_plan_of_as_many_poses_and_keeps_the_nine_parameters_
     found = planned(count, effect)
     plain = np.array([v for _, v in directions(count)])
     plain = np.concatenate([plain, plain[:1]])
-    held = conditions(found)
+    held = covariates(found)
 
     def value(a: np.ndarray) -> float:
         return log_information(a, np.einsum("ni,nip->np", a, effect.basis(a, held)))

@@ -156,8 +156,8 @@ def test_a_pose_of_little_weight_does_not_count_for_one() -> None:
     wanted = most_wanted(a, weights=noisy)
     assert wanted
     root = np.sqrt(np.append(noisy, np.ones(len(wanted))))[:, None]
-    everything = np.concatenate([a, vectors(wanted)])
-    assert dilution(everything, linear_design(everything, everything) * root) <= 2.0
+    linearise_all = np.concatenate([a, vectors(wanted)])
+    assert dilution(linearise_all, linear_design(linearise_all, linearise_all) * root) <= 2.0
     assert most_wanted(a, weights=np.full(14, 4.0)) == []
 
 

@@ -56,10 +56,10 @@ class Half(type(effect_named("second_order_nonlinearity"))):  # type: ignore[mis
 
     name: str = "half"
 
-    def basis(self, s: np.ndarray, conditions: Mapping[str, np.ndarray]) -> np.ndarray:
+    def basis(self, s: np.ndarray, covariates: Mapping[str, np.ndarray]) -> np.ndarray:
         return per_axis(s**2 * [1.0, 0.0, 1.0])
 
-    def slope(self, s: np.ndarray, conditions: Mapping[str, np.ndarray]) -> np.ndarray:
+    def slope(self, s: np.ndarray, covariates: Mapping[str, np.ndarray]) -> np.ndarray:
         return per_axis_slope(2 * s * [1.0, 0.0, 1.0])
 
 

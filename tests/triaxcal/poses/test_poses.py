@@ -106,7 +106,7 @@ def test_pulls_of_trends_along_the_measured_vector_have_variance_one(
         poses = detect(t_s, clean + 1e-4 * noise)[2]
         up = fourteen / paper_unit.scale_factor
         up = up / np.linalg.norm(up, axis=1, keepdims=True)
-        pulls += [u @ p.trend / p.trend_error for u, p in zip(up, poses, strict=True)]
+        pulls += [u @ p.slope / p.slope_error for u, p in zip(up, poses, strict=True)]
     assert len(pulls) == SEEDS * 14
     assert np.mean(np.square(pulls)) == pytest.approx(1, abs=0.35)
 

@@ -25,7 +25,7 @@ from triaxcal.estimate.caution import (
 from triaxcal.frames.orientations import NotFlush
 from triaxcal.frames.standing import SingleOrientation
 from triaxcal.inputs.attitude import AttitudeExcluded, AttitudesTied, MagnitudeContradicts, Row
-from triaxcal.inputs.passport import DatasheetContradicted, StillOfDatasheet
+from triaxcal.inputs.datasheet import DatasheetContradicted, StillOfDatasheet
 from triaxcal.inputs.turning.rotation import StretchesDiffer
 from triaxcal.poses.pose import Began
 from triaxcal.text import caution
@@ -97,13 +97,13 @@ SENTENCES: list[tuple[Caution, str]] = [
     ),
     (
         DatasheetContradicted(1.2e-9, "bias.y", 20.04, 3.21),
-        "passport and poses contradict each other (p 1.2e-09), most in bias.y, which moved by +20.0 standard errors: "
-        "the unit has changed, the passport's standard errors are too small, or a pose was not still; the standard "
+        "datasheet and poses contradict each other (p 1.2e-09), most in bias.y, which moved by +20.0 standard errors: "
+        "the unit has changed, the datasheet's standard errors are too small, or a pose was not still; the standard "
         "errors are raised by 3.2",
     ),
     (
         StillOfDatasheet(("bias.x", "bias.y")),
-        "these poses say next to nothing of bias.x, bias.y: the values are still the passport's",
+        "these poses say next to nothing of bias.x, bias.y: the values are still the datasheet's",
     ),
     (
         StretchesDiffer(2.04, 3.96),

@@ -42,8 +42,8 @@ def _sphere_rms(c: Calibration, truth: Sensor) -> float:
 
 def test_noise_alone_is_what_the_fit_itself_says(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(1))
-    c = fit(poses, signs=SIGNS, aside=())
-    assert c.inflation == 1
+    c = fit(poses, signs=SIGNS, excluded=())
+    assert c.birge_ratio == 1
     b = budget(c)
     assert [line.source for line in b.components] == ["noise"]
     np.testing.assert_allclose(b.parameters.standard, c.standard_errors, rtol=1e-9)
@@ -72,7 +72,7 @@ def test_all_sources_together_scatter_as_the_budget_says(
         warm = {"temp_c": TEMPERATURES_C}
         poses = noisy_poses(unit, up, NOISE, rng, channels=warm, channel_reference={"temp_c": 25.0})
         poses = [_creeping(p, change, rng) for p, change in zip(poses, creep, strict=True)]
-        c = fit(poses, signs=SIGNS, aside=())
+        c = fit(poses, signs=SIGNS, excluded=())
         found.append(c.values)
         errors.append(_sphere_rms(c, paper_unit) ** 2)
         # Residuals that happen to exceed the noise are no source of their own here.
@@ -105,7 +105,7 @@ def test_a_thermal_effect_that_shows_in_the_residuals_counts_once(
         unit = Sensor(paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias, pairs)
         warm = {"temp_c": 25 + moved_k * rng.permutation(np.linspace(-0.5, 0.5, 26))}
         poses = noisy_poses(unit, twenty_six, NOISE, rng, channels=warm, channel_reference={"temp_c": 25.0})
-        c = fit(poses, signs=SIGNS, aside=())
+        c = fit(poses, signs=SIGNS, excluded=())
         ratios.append((_sphere_rms(c, paper_unit) / float(budget(c).magnitude.standard)) ** 2)
     assert abs(np.mean(ratios) - 1) < 4 * np.std(ratios) / np.sqrt(len(ratios))
 
@@ -117,7 +117,7 @@ def test_the_largest_term_dominates_and_halving_it_is_worth_what_it_says(
     paper_unit: Sensor, twenty_six: np.ndarray, noise: float, reference: float, dominant: str
 ) -> None:
     poses = noisy_poses(paper_unit, twenty_six, noise, np.random.default_rng(2))
-    c = fit(poses, signs=SIGNS, aside=())
+    c = fit(poses, signs=SIGNS, excluded=())
     b = budget(c, Stated(reference=reference))
     assert b.dominant.source == dominant
     assert sum(b.share(x) for x in b.components) == pytest.approx(1)
@@ -133,7 +133,7 @@ def test_no_expanded_uncertainty_is_below_the_standard_error_that_the_fit_states
     channels = {"temp_c": 25 + 2 * np.sin(np.arange(26) * 1.7)}
     rng = np.random.default_rng(5)
     poses = noisy_poses(truth, twenty_six, NOISE, rng, channels=channels, channel_reference={"temp_c": 25.0})
-    c = fit(poses, signs=SIGNS, aside=())
+    c = fit(poses, signs=SIGNS, excluded=())
     assert c.excess_g > 5 * c.residual.noise_floor_g
     b = budget(c)
     assert np.all(b.parameters.standard >= c.standard_errors)
@@ -141,7 +141,7 @@ def test_no_expanded_uncertainty_is_below_the_standard_error_that_the_fit_states
 
 
 def test_what_nobody_stated_is_said_not_to_be_evaluated(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
-    c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, aside=())
+    c = fit(noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(2)), signs=SIGNS, excluded=())
     assert budget(c).not_evaluated == (ReferenceTakenAsExact(), TemperatureNotLogged("temp_c"))
     assert budget(c, Stated(reference=0.0)).not_evaluated == (TemperatureNotLogged("temp_c"),)
 
@@ -151,10 +151,10 @@ def test_what_a_single_reading_lacks_is_said_to_be_in_no_line(paper_unit: Sensor
     poses = noisy_poses(paper_unit, twenty_six, NOISE, rng)
     told = [replace(p, covariance=p.covariance / 25) for p in poses]
     said = [
-        [x for x in budget(fit(ps, signs=SIGNS, aside=())).not_evaluated if isinstance(x, SingleReading)]
+        [x for x in budget(fit(ps, signs=SIGNS, excluded=())).not_evaluated if isinstance(x, SingleReading)]
         for ps in (poses, told)
     ]
     assert said[0] == []
-    crossed = fit(told, signs=SIGNS, aside=()).residual.cross_validated_rms_g
+    crossed = fit(told, signs=SIGNS, excluded=()).residual.cross_validated_rms_g
     assert crossed is not None
     assert said[1] == [SingleReading(crossed)]

@@ -1,4 +1,4 @@
-"""How well a calibration foretells another recording, by what recordings of one unit show of how it starts."""
+"""How well a calibration predicts another recording, by what recordings of one unit show of how it starts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.runs import by_run, together
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import channels_of, conditions, references
+from triaxcal.poses.covariates import channels_of, covariates, references
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import budget
@@ -47,7 +47,7 @@ def test_of_several_recordings_the_start_is_measured(paper_unit: Sensor) -> None
     told = []
     for seed in range(8):
         poses = together([run_of(paper_unit, 100 * seed + k, start_g=5e-4) for k in range(5)])
-        c = fit(poses, signs=MINUS, aside=())
+        c = fit(poses, signs=MINUS, excluded=())
         found = next_recording(c, budget(c))
         assert found.source is Source.MEASURED
         told.append(found.start_to_start)
@@ -60,7 +60,7 @@ def test_recordings_that_start_alike_say_so(paper_unit: Sensor) -> None:
 
 
 def test_few_recordings_widen_the_interval(paper_unit: Sensor) -> None:
-    two = fit(together([run_of(paper_unit, k, start_g=5e-4) for k in range(2)]), signs=MINUS, aside=())
+    two = fit(together([run_of(paper_unit, k, start_g=5e-4) for k in range(2)]), signs=MINUS, excluded=())
     found = next_recording(two, budget(two))
     assert found.expanded_uncertainty > 2.5 * found.start_to_start
 
@@ -69,7 +69,7 @@ def test_errors_in_the_next_recording_stay_within_what_is_stated(paper_unit: Sen
     within = []
     for seed in range(30):
         runs = [run_of(paper_unit, 50 * seed + k, start_g=4e-4) for k in range(5)]
-        c = fit(together(runs[:4]), signs=MINUS, aside=())
+        c = fit(together(runs[:4]), signs=MINUS, excluded=())
         stated = next_recording(c, budget(c)).expanded_uncertainty
         u = np.array([p.mean for p in runs[4]])
         off = np.linalg.norm((u - c.sensor.centre) @ c.sensor.matrix.T, axis=1) - 1
@@ -88,7 +88,7 @@ def test_what_differs_from_run_to_run_counts_though_an_effect_explains_it(paper_
         runs.append([replace(p, mean=p.mean + scale * w) for p, w in zip(poses, warm, strict=True)])
     poses = together(runs)
     (effect,) = (e for e in by_run([effect_named("warm_up")], poses) if e.name == "warm_up")
-    shown = next(e for e in effect.variants(_conditions(poses)) if len(e.coefficients) == 12 and 200 < _tau(e) < 450)
+    shown = next(e for e in effect.variants(_covariates(poses)) if len(e.coefficients) == 12 and 200 < _tau(e) < 450)
     c = fit(poses, signs=MINUS, effects=[shown])
     end_s = max(p.end_s for p in runs[-1])
     biases = decays * np.exp(-end_s / _tau(shown))
@@ -99,6 +99,6 @@ def _tau(effect: Effect) -> float:
     return next(value for value, _ in effect.shape.values())
 
 
-def _conditions(poses: list[Pose]) -> dict[str, np.ndarray]:
+def _covariates(poses: list[Pose]) -> dict[str, np.ndarray]:
     channels = channels_of(poses)
-    return conditions(channels, references(channels))
+    return covariates(channels, references(channels))

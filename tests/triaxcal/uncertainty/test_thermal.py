@@ -35,12 +35,12 @@ def test_a_thermometer_matters_once_thermal_effects_are_in_the_model(
     unit = with_effects(temperature_bias=[3e-4, -2e-4, 1e-4])
     swing = {"temp_c": 25 + 6 * np.sin(np.arange(26) * 1.7)}
     poses = noisy_poses(unit, twenty_six, NOISE, np.random.default_rng(5), channels=swing)
-    c = fit(poses, signs=SIGNS, effects=[effect_named("temperature_bias")], aside=())
+    c = fit(poses, signs=SIGNS, effects=[effect_named("temperature_bias")], excluded=())
     line = next(x for x in budget(c, Stated(thermometer_k=0.4)).components if x.source == "thermometer")
     coefficients = c.values[9:12]
     np.testing.assert_allclose(line.parameters[6:9], np.abs(coefficients) * 0.4, rtol=0.02)
     assert ThermometerNotStated() in budget(c).not_evaluated
-    sources = [x.source for x in budget(fit(poses, signs=SIGNS, aside=()), Stated(thermometer_k=0.4)).components]
+    sources = [x.source for x in budget(fit(poses, signs=SIGNS, excluded=()), Stated(thermometer_k=0.4)).components]
     assert "thermometer" not in sources
     assert "temperature" in sources
 
@@ -49,7 +49,7 @@ def test_what_temperature_may_have_done_grows_with_how_far_it_moved(paper_unit: 
     def share(swing_k: float) -> float:
         moved = {"temp_c": 25 + swing_k * np.sin(np.arange(26) * 1.7)}
         poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=moved)
-        found = budget(fit(poses, signs=SIGNS, aside=())).components
+        found = budget(fit(poses, signs=SIGNS, excluded=())).components
         return next(x.magnitude for x in found if x.source == "temperature")
 
     steady, moving, wild = share(0.001), share(0.05), share(20.0)
@@ -64,7 +64,7 @@ def test_what_was_stated_of_the_sensitivity_takes_the_place_of_what_is_typical(
 ) -> None:
     """Where the poses tell nothing, the line is as large as the sensitivity."""
     poses = _warming(paper_unit, fourteen, np.linspace(24.9, 25.1, 14), noise=1e-3)
-    c = fit(poses, signs=SIGNS, aside=())
+    c = fit(poses, signs=SIGNS, excluded=())
 
     def line(sensitivity: float | None) -> Component | None:
         found = budget(c, Stated(thermal_sensitivity=sensitivity)).components
@@ -89,12 +89,12 @@ def test_a_steady_temperature_costs_nothing_whatever_it_is(
 ) -> None:
     held = {"temp_c": np.full(26, steady_c)}
     poses = noisy_poses(paper_unit, twenty_six, NOISE, np.random.default_rng(5), channels=held)
-    line = next(x for x in budget(fit(poses, signs=SIGNS, aside=())).components if x.source == "temperature")
+    line = next(x for x in budget(fit(poses, signs=SIGNS, excluded=())).components if x.source == "temperature")
     assert line.magnitude < 1e-3 * NOISE
 
 
 def _line(poses: Sequence[Pose], *effects: str) -> Component:
-    c = fit(poses, signs=SIGNS, effects=[effect_named(n) for n in effects], aside=())
+    c = fit(poses, signs=SIGNS, effects=[effect_named(n) for n in effects], excluded=())
     return next(x for x in budget(c).components if x.source == "temperature")
 
 

@@ -54,10 +54,10 @@ UNEQUAL = 2.5
 """Ratio of the axes' noises from which on weights, which this fit has not, would lower the errors by a tenth."""
 STRETCHES_LEAST = 30
 """With fewer, the scatter between stretches says too little for nine parameters."""
-SPOILED_SIGMA = 6.0
-SPOILED_MOST = 0.05
+OUTLIER_SIGMA = 6.0
+OUTLIERS_MOST = 0.05
 """Stretches that stand out so far from the others are left out, if they are no more than this share."""
-SPOILED_ROUNDS = 4
+OUTLIER_ROUNDS = 4
 SPIKE = 10.0
 """How many times farther than nine tenths of all others a stretch may reach."""
 STEPS = 0.5
@@ -132,7 +132,7 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
     s = np.asarray(signs, dtype=float)
     whole = moments.summary()
     try:
-        held, e, unseen = _without_spoiled(whole)
+        held, e, unseen = _without_outliers(whole)
         judged = _Judged(held, e)
         if not judged.dilution < DILUTION_MOST:
             raise DirectionsLacking((judged.dilution, DILUTION_MOST))
@@ -140,7 +140,7 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
         refusal.wanted = _wanted(whole, s, refusal)
         raise
     p = judged.lack_of_fit_p
-    entries, inflation = judged.covariance(raised=p is not None and p < LACK_OF_FIT)
+    entries, birge_ratio = judged.covariance(raised=p is not None and p < LACK_OF_FIT)
     G = coefficients_by_entries(e, held, reference)
     shares = _by_share(held, e, reference) * unseen
     flip = np.r_[s, s[1] * s[2], s[0] * s[2], s[0] * s[1], s]
@@ -161,8 +161,8 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
         poses=(),
         condition=judged.condition,
         dilution=judged.dilution,
-        inflation=inflation,
-        dof=float(max(len(held.counts) - 10, 1) if inflation > 1 else held.count - 9),
+        birge_ratio=birge_ratio,
+        dof=float(max(len(held.counts) - 10, 1) if birge_ratio > 1 else held.count - 9),
     )
     noise_g = np.sqrt(e.variance) * held.half / k
     found = RotationFit(calibration, noise_g, unseen, held.count, len(held.counts))
@@ -170,18 +170,18 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
     return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found, whole, held, raised))))
 
 
-def _without_spoiled(held: Summary) -> tuple[Summary, Ellipsoid, float]:
+def _without_outliers(held: Summary) -> tuple[Summary, Ellipsoid, float]:
     """Without stretches that a knock or a lost word spoiled, which stand out from all the others."""
     spikes = _spiky(held)
-    if spikes.any() and spikes.sum() <= max(SPOILED_MOST * len(spikes), 1):
+    if spikes.any() and spikes.sum() <= max(OUTLIERS_MOST * len(spikes), 1):
         held = held.only(~spikes)
     e, unseen = _ellipsoid_and_noise(held)
-    for _ in range(SPOILED_ROUNDS):
+    for _ in range(OUTLIER_ROUNDS):
         judged = _Judged(held, e)
         z = judged.error / judged.noise
         z -= np.median(z)
-        bad: Bools = np.abs(z) > SPOILED_SIGMA * max(1.4826 * float(np.median(np.abs(z))), 1.0)
-        if not bad.any() or len(z) < STRETCHES_LEAST or bad.sum() > max(SPOILED_MOST * len(z), 1):
+        bad: Bools = np.abs(z) > OUTLIER_SIGMA * max(1.4826 * float(np.median(np.abs(z))), 1.0)
+        if not bad.any() or len(z) < STRETCHES_LEAST or bad.sum() > max(OUTLIERS_MOST * len(z), 1):
             break
         held = held.only(~bad)
         e, unseen = _ellipsoid_and_noise(held)
@@ -307,8 +307,8 @@ def _cautions(found: RotationFit, whole: Summary, held: Summary, unseen: float) 
         yield StretchesExcluded(len(whole.counts) - len(held.counts), gone)
     if c.dilution > DILUTION_WARNING:
         yield FewDirections(c.dilution)
-    if c.inflation > 1:
-        yield StretchesDiffer(c.residual.rms_g / c.residual.noise_floor_g, c.inflation)
+    if c.birge_ratio > 1:
+        yield StretchesDiffer(c.residual.rms_g / c.residual.noise_floor_g, c.birge_ratio)
     if np.any(found.noise_g) and (found.unseen_share == 1 or unseen > UNSEEN_WARNING):
         yield NoiseUnseen(found.unseen_share)
     low, high = float(np.min(found.noise_g)), float(np.max(found.noise_g))

@@ -114,9 +114,9 @@ class QualityDetector:
         noisy = self._steps.scatters(step)
         rate_hz = 1e9 / self._period_ns
         cells = self._cells.cells()
-        rails, spoiled = faults.saturation(cells, self._runs, holds, step, roughness, noisy)
+        rails, affected = faults.saturation(cells, self._runs, holds, step, roughness, noisy)
         frozen = faults.frozen_runs(cells, self._runs, noisy)
-        for poses, runs in zip(spoiled, frozen, strict=False):
+        for poses, runs in zip(affected, frozen, strict=False):
             poses.update(i for r in (*runs, *frozen[-1]) for i in holds.touched(r.start_ns, r.end_ns))
         slow, twice = faults.repeated_samples(self._runs, noisy, rate_hz)
         flat = self._low == self._high
@@ -128,7 +128,7 @@ class QualityDetector:
             self._missing(),
             twice,
             mains.pickup(lines, rate_hz) if lines else None,
-            faults.coarse_quantization(holds, spoiled, step),
+            faults.coarse_quantization(holds, affected, step),
         ]
         return [f for f in found if f is not None]
 

@@ -45,7 +45,7 @@ def saturation(
 ) -> tuple[Finding | None, list[set[int]]]:
     """And the poses that lie at a rail, by axis."""
     rails: list[AtRail] = []
-    spoiled: list[set[int]] = [set(), set(), set()]
+    affected: list[set[int]] = [set(), set(), set()]
     place = holds.within(cells.start_ns, cells.end_ns)
     for axis in np.flatnonzero(noisy).tolist() if len(cells) else ():
         long = [r for r in runs.runs(axis) if r.samples > runs.allowed(axis)]
@@ -58,10 +58,10 @@ def saturation(
             if not (known or piled or _coincident(value, step[axis], scatter[axis])):
                 continue
             touched = sorted({*piled, *_clipped(count * at_rail, place, cells.size)})
-            spoiled[axis].update(touched)
+            affected[axis].update(touched)
             first = holds.seconds(int(cells.start_ns[at_rail][0]))
             rails.append(AtRail(AXES[axis], rail, number, first, holds.touching(touched)))
-    return Saturation(tuple(rails)) if rails else None, spoiled
+    return Saturation(tuple(rails)) if rails else None, affected
 
 
 def _extremes(cells: Cells, axis: int) -> tuple[float, float]:
@@ -179,13 +179,13 @@ def repeated_samples(
     return None, DuplicateSamples(triple, samples)
 
 
-def coarse_quantization(holds: Holds, spoiled: Sequence[set[int]], step: Floats) -> Finding | None:
+def coarse_quantization(holds: Holds, affected: Sequence[set[int]], step: Floats) -> Finding | None:
     """Where steps are wider than twice the scatter in the poses, so that a mean keeps part of its rounding error;
-    ``spoiled`` are poses, by axis, that lack their scatter for another reason.
+    ``affected`` are poses, by axis, that lack their scatter for another reason.
     """
     axes = []
     for axis in np.flatnonzero(step > 0).tolist():
-        sound = [i for i in range(len(holds)) if i not in spoiled[axis]]
+        sound = [i for i in range(len(holds)) if i not in affected[axis]]
         if not sound:
             continue
         q, variance = float(step[axis]), float(holds.variance[sound, axis].mean())

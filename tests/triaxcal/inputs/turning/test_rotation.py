@@ -247,7 +247,7 @@ def test_what_is_not_white_is_said_and_covered_by_the_stated_errors(unit: Sensor
     for seed in range(15):
         u = unit.output(a + disturbed(a, np.random.default_rng(seed)), {})
         c = fitted(u).calibration
-        assert c.inflation > 1.5
+        assert c.birge_ratio > 1.5
         assert any(isinstance(caution, StretchesDiffer) for caution in c.cautions)
         pulls.append((c.values - truth(unit)) / c.standard_errors)
     # 135 pulls, of which those of one seed go together: the rms of true ones is below this in all but one of 1000 sets.

@@ -32,7 +32,7 @@ Form = tuple[str, tuple[str, ...], tuple[int, ...]]
 
 
 @dataclass(frozen=True, eq=False)
-class Together:
+class Pooled:
     """Hypotheses are that one effect acts in every unit, of one form, shape and size, or that each unit is for itself.
 
     ``shared`` is the probability of the first by name, ``apart`` that of the second. ``probability`` is that each
@@ -72,7 +72,7 @@ class Together:
         return tuple(out)
 
 
-def together(units: Sequence[Posterior]) -> Together:
+def pool(units: Sequence[Posterior]) -> Pooled:
     """Of units whose posteriors are of one catalogue and one grid of sizes (`Posterior.resized`). Names that some unit
     cannot show are left out. Where an effect acts in all, another is asked about beside it."""
     found, given = _asked(units, frozenset()), units
@@ -88,7 +88,7 @@ def together(units: Sequence[Posterior]) -> Together:
     return found
 
 
-def _beside(found: Together, more: Together, p: float) -> Together:
+def _beside(found: Pooled, more: Pooled, p: float) -> Pooled:
     """With what was asked beside an effect that acts in all with probability ``p``."""
     better = {n: p * q for n, q in more.probability.items() if p * q > found.probability[n]}
     of_names = dict(found.probability) | better
@@ -100,7 +100,7 @@ def _beside(found: Together, more: Together, p: float) -> Together:
     )
 
 
-def _asked(units: Sequence[Posterior], acting: frozenset[str]) -> Together:
+def _asked(units: Sequence[Posterior], acting: frozenset[str]) -> Pooled:
     """Beside effects that are ``acting`` in all sets of every unit."""
     first = units[0].evidence
     terms = [_terms(unit.evidence) for unit in units]
@@ -136,7 +136,7 @@ def _asked(units: Sequence[Posterior], acting: frozenset[str]) -> Together:
     }
     alone = float(np.exp(apart - total))
     none = _product(unit.of_sets_of_names.get(frozenset(), 0.0) for unit in units)
-    found = Together(units, shared, alone, {}, of_values, shapes, alone * none)
+    found = Pooled(units, shared, alone, {}, of_values, shapes, alone * none)
     acts = {name: found.one_of((name,)) for name in shared}
     return replace(found, probability=dict(sorted(acts.items(), key=lambda item: -item[1])))
 
@@ -271,7 +271,7 @@ def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations
     first = units[0].evidence.terms[index[0]]
     scaled = []
     for unit, of_unit, i in zip(units, equations, index, strict=True):
-        scale = first.mix / unit.evidence.terms[i].mix
+        scale = first.combination / unit.evidence.terms[i].combination
         information, score = of_unit.of_terms[i]
         scaled.append((scale[:, None] * information * scale, scale * score))
     shared = (

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from triaxcal.agreement import Agreement, Answer
-from triaxcal.text.agreement import verdict
+from triaxcal.pooling import Answer, PooledAnalysis
+from triaxcal.text.pooling import verdict
 
 
-def found(answer: Answer, *agreed: tuple[str, ...], probability: float = 0.0) -> Agreement:
-    return Agreement(answer, agreed, probability, (), 0.1)
+def found(answer: Answer, *agreed: tuple[str, ...], probability: float = 0.0) -> PooledAnalysis:
+    return PooledAnalysis(answer, agreed, probability, (), 0.1)
 
 
 def test_effects_that_act_in_all_units_are_named() -> None:

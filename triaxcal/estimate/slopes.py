@@ -1,8 +1,8 @@
 """How |a| goes inside the poses: data of its own beside the means.
 
 What moves the bias from pose to pose moves it inside the poses as well, unless it is something that a pose has all
-along. So an effect that explains the means foretells a slope for every pose; and of two that explain the means as well,
-often because the linear parameters make up for what they get wrong, one foretells slopes that are not there. As with
+along. So an effect that explains the means predicts a slope for every pose; and of two that explain the means as well,
+often because the linear parameters make up for what they get wrong, one predicts slopes that are not there. As with
 the means, only the length of the vector is looked at: a unit may turn on its stand as it likes.
 """
 
@@ -16,8 +16,8 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import HELD, SINCE_START, TIME, Effect, channel_of, is_derived, lag_in, rate_of
-from triaxcal.estimate.problem import Linearised, Problem, State, everything, linearise
-from triaxcal.poses.conditions import rate_of_lag
+from triaxcal.estimate.problem import Linearised, Problem, State, linearise, linearise_all
+from triaxcal.poses.covariates import rate_of_lag
 from triaxcal.poses.pose import Pose
 
 PLACES = np.linspace(-0.5, 0.5, 6)
@@ -25,23 +25,23 @@ PLACES = np.linspace(-0.5, 0.5, 6)
 
 
 @dataclass(frozen=True)
-class Trends:
+class PoseSlopes:
     """``inside`` are the poses at all `PLACES`, one place after the other, ``middle`` as they are in the middle, both
-    with the covariance of the trends; ``errors`` (n,) by condition those of the changes that the conditions are said to
-    have gone through, and ``moving`` the conditions that go through any."""
+    with the covariance of the slopes; ``errors`` (n,) by covariate those of the changes that the covariates are said to
+    have gone through, and ``moving`` the covariates that go through any."""
 
     inside: Problem
     middle: Problem
     errors: Mapping[str, Floats]
     moving: frozenset[str]
-    wider: Floats | float = 1.0
+    widening: Floats | float = 1.0
     """Times the errors that the noise makes, (n,) or all."""
 
     @classmethod
-    def of(cls, problem: Problem, poses: Sequence[Pose]) -> Trends | None:
+    def of(cls, problem: Problem, poses: Sequence[Pose]) -> PoseSlopes | None:
         """None where the poses do not know theirs."""
-        error = np.array([p.trend_error for p in poses])
-        if not np.isfinite(error).all() or not np.isfinite([p.trend for p in poses]).all():
+        error = np.array([p.slope_error for p in poses])
+        if not np.isfinite(error).all() or not np.isfinite([p.slope for p in poses]).all():
             return None
         length = np.array([p.end_s - p.start_s for p in poses])
         change, errors = _changes(problem, poses, length)
@@ -50,7 +50,7 @@ class Trends:
         middle = replace(problem, excess=0.0, covariance=error[:, None, None] ** 2 * np.eye(3))
         inside = replace(
             middle,
-            u=_moved(problem.u, np.array([p.trend for p in poses])),
+            u=_moved(problem.u, np.array([p.slope for p in poses])),
             covariance=np.concatenate([middle.covariance] * len(PLACES)),
             # A moment is asked for, not a mean over the pose.
             channels={n: _moved(v, change[n]) for n, v in problem.channels.items()}
@@ -73,27 +73,27 @@ class Trends:
             channels = dict(self.middle.channels) | {name: self.middle.channels[name] + self.errors[name]}
             there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
             variance = variance + (there - here) ** 2
-        return r, J, self.wider * np.sqrt(variance)
+        return r, J, self.widening * np.sqrt(variance)
 
     def along(self, values: Floats) -> Floats:
         """(n,…) by how much ``values`` (k·n,…) at all `PLACES` go up along each pose."""
         slope = PLACES / (PLACES @ PLACES)
         return np.tensordot(slope, values.reshape(len(slope), -1, *values.shape[1:]), 1)
 
-    def widened(self, factor: Floats) -> Trends:
-        return replace(self, wider=self.wider * factor)
+    def widened(self, factor: Floats) -> PoseSlopes:
+        return replace(self, widening=self.widening * factor)
 
-    def only(self, rows: Ints | slice) -> Trends:
+    def only(self, rows: Ints | slice) -> PoseSlopes:
         """Those of some of the poses."""
         n = len(self.middle.u)
         kept = np.arange(n)[rows]
         inside = self.inside.only(np.concatenate([kept + n * k for k in range(len(PLACES))]))
         errors = {name: error[rows] for name, error in self.errors.items()}
-        wider: Floats = np.broadcast_to(self.wider, n)[rows]
-        return replace(self, inside=inside, middle=self.middle.only(rows), errors=errors, wider=wider)
+        widening: Floats = np.broadcast_to(self.widening, n)[rows]
+        return replace(self, inside=inside, middle=self.middle.only(rows), errors=errors, widening=widening)
 
     def chi2(self, state: State, weighted: Floats) -> float:
-        """How far the trends are from those that a model foretells, as a sum of squares of n; as near as the means,
+        """How far the slopes are from those that a model predicts, as a sum of squares of n; as near as the means,
         whose weighted derivatives by theta (n, 9+p) are given, let the model come.
         """
         r, J, error = self.linearise(state)
@@ -101,35 +101,35 @@ class Trends:
         return unabsorbed(stacked, np.concatenate([np.zeros(len(weighted)), r / error]))
 
     def rms_g(self, state: State) -> float:
-        """By how much |a| is off its mean over a pose, beyond noise and what the model foretells: rms of all, the
+        """By how much |a| is off its mean over a pose, beyond noise and what the model predicts: rms of all, the
         quieter the more."""
         r, _, error = self.linearise(state)
-        beyond = float(np.sum((r / error) ** 2)) - len(r)
-        return float(np.sqrt(max(beyond, 0.0) / np.sum(error**-2.0) / 12))
+        excess = float(np.sum((r / error) ** 2)) - len(r)
+        return float(np.sqrt(max(excess, 0.0) / np.sum(error**-2.0) / 12))
 
-    def touch(self, effects: Sequence[Effect]) -> bool:
+    def inform(self, effects: Sequence[Effect]) -> bool:
         """Whether any of the effects goes with something that moves inside the poses."""
         return any(n in self.moving for e in effects for n in e.needs)
 
 
-def with_trends(problem: Problem, poses: Sequence[Pose], effects: Sequence[Effect]) -> Problem | None:
-    """The problem with the trends beside the means; None where they tell nothing of the effects."""
-    trends = Trends.of(problem, poses) if effects else None
-    return replace(problem, further=trends) if trends is not None and trends.touch(effects) else None
+def with_slopes(problem: Problem, poses: Sequence[Pose], effects: Sequence[Effect]) -> Problem | None:
+    """The problem with the slopes beside the means; None where they tell nothing of the effects."""
+    slopes = PoseSlopes.of(problem, poses) if effects else None
+    return replace(problem, slopes=slopes) if slopes is not None and slopes.inform(effects) else None
 
 
-def trends_p(problem: Problem, state: State, pure: float) -> float:
-    """Probability of trends as far as these from those that the model foretells, by the noise inside the poses, of
+def slopes_p(problem: Problem, state: State, pure: float) -> float:
+    """Probability of slopes as far as these from those that the model predicts, by the noise inside the poses, of
     which ``pure`` degrees of freedom are known; ``state`` is that of a fit to everything."""
     left = len(problem.u) - max(len(state.theta) - len(problem.u), 0)
     if left <= 0:
         return 0.0
-    return float(f_sf(left_by_trends(problem, state) / left, left, max(pure, 1.0)))
+    return float(f_sf(left_by_slopes(problem, state) / left, left, max(pure, 1.0)))
 
 
-def left_by_trends(problem: Problem, state: State) -> float:
+def left_by_slopes(problem: Problem, state: State) -> float:
     """By how much the sum of squares of a fit to everything is larger than that of a fit to the means alone."""
-    r, _, s = everything(problem, state)
+    r, _, s = linearise_all(problem, state)
     apart = float(np.sum((r / s) ** 2)) - left_by_means(problem, state)
     return max(apart, 0.0) if np.isfinite(apart) else np.inf
 
@@ -161,7 +161,7 @@ def _moved(values: Floats, change: Floats) -> Floats:
 
 
 def _changes(problem: Problem, poses: Sequence[Pose], length: Floats) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    """By condition, (n,) each: by how much it changes along each pose, and the standard error of that."""
+    """By covariate, (n,) each: by how much it changes along each pose, and the standard error of that."""
     change = dict.fromkeys((TIME, SINCE_START), length)
     errors: dict[str, Floats] = {}
     for name in problem.channels:

@@ -12,8 +12,8 @@ from enum import StrEnum
 
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import InvalidData
+from triaxcal.evidence.pooled import Pooled, pool
 from triaxcal.evidence.shapes import Shape, shapes_of
-from triaxcal.evidence.together import Together, together
 
 
 class Answer(StrEnum):
@@ -51,7 +51,7 @@ class Common:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class PooledAnalysis:
     """``agreed`` are groups of effects, in each of which one acts in every unit; where the answer is only likely, that
     one effect. ``probability`` is that of the most doubtful of the groups. ``effects`` are all that
     every unit could have shown, the likeliest first; ``nothing`` is the probability that none acts in any unit."""
@@ -63,13 +63,13 @@ class Agreement:
     nothing: float
 
 
-def agreement(loops: Sequence[Loop]) -> Agreement:
+def pooled_analysis(loops: Sequence[Loop]) -> PooledAnalysis:
     """Of units that were diagnosed one by one. Raises InvalidData for fewer than two."""
     if len(loops) < 2:
         raise InvalidData("whether units agree takes two of them")
     smallest = min(float(loop.seen.evidence.sizes[0]) for loop in loops)
     units = [loop.seen.resized(smallest) for loop in loops]
-    found = together(units)
+    found = pool(units)
     odds = units[0].evidence.odds
     agreed = found.certain(odds.certain)
     first, likeliest = next(iter(found.probability.items()), ("", 0.0))
@@ -80,7 +80,7 @@ def agreement(loops: Sequence[Loop]) -> Agreement:
     else:
         shown = found.nothing < odds.reported or any(loop.findings or loop.candidates for loop in loops)
         answer = Answer.DISAGREE if shown else Answer.NOTHING
-    return Agreement(
+    return PooledAnalysis(
         answer,
         agreed,
         min((_probability(group, found) for group in agreed), default=0.0),
@@ -89,11 +89,11 @@ def agreement(loops: Sequence[Loop]) -> Agreement:
     )
 
 
-def _probability(group: tuple[str, ...], found: Together) -> float:
+def _probability(group: tuple[str, ...], found: Pooled) -> float:
     return found.probability[group[0]] if len(group) == 1 else found.one_of(group)
 
 
-def _common(name: str, found: Together, loops: Sequence[Loop]) -> Common:
+def _common(name: str, found: Pooled, loops: Sequence[Loop]) -> Common:
     named, listed = [], []
     for i, loop in enumerate(loops):
         for finding in loop.findings:

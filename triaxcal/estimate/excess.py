@@ -18,7 +18,7 @@ import scipy
 from triaxcal.arrays import Floats
 from triaxcal.errors import NotStill
 from triaxcal.estimate.problem import Linearised, Problem, State, linearise
-from triaxcal.estimate.trends import left_of
+from triaxcal.estimate.slopes import left_of
 from triaxcal.poses.pure_error import lack_of_fit_p
 
 NO_CHANCE = 1e-4
@@ -29,15 +29,15 @@ EXACT = 1e-10
 
 
 @dataclass(frozen=True)
-class Beyond:
-    """``inflation`` is a factor on all errors, or ``excess_g`` a standard deviation of |a|, in units of the reference
+class Excess:
+    """``birge_ratio`` is a factor on all errors, or ``excess_g`` a standard deviation of |a|, in units of the reference
     vector, that all poses have beside their noise."""
 
-    inflation: float = 1.0
+    birge_ratio: float = 1.0
     excess_g: float = 0.0
 
     @classmethod
-    def shown(cls, left_by: Linearised, n: int, left: int, pure_dof: float) -> Beyond:
+    def shown(cls, left_by: Linearised, n: int, left: int, pure_dof: float) -> Excess:
         """That with which the sum of squares that a fit leaves is its ``left`` degrees of freedom, in linear reckoning
         from residuals, derivatives and errors near its minimum, of which the first ``n`` are the means of the poses.
         ``pure_dof`` are the degrees of freedom of the noise inside the poses.
@@ -68,8 +68,8 @@ class Beyond:
         mean is: what acts between poses may act inside them as well."""
         if not self.excess_g:
             return problem
-        further = problem.further and problem.further.widened(_widened(linearise(problem, state)[2], self.excess_g))
-        return replace(problem, excess=self.excess_g, further=further)
+        slopes = problem.slopes and problem.slopes.widened(_widened(linearise(problem, state)[2], self.excess_g))
+        return replace(problem, excess=self.excess_g, slopes=slopes)
 
 
 def _widened(error: Floats, excess: float) -> Floats:

@@ -17,11 +17,11 @@ from triaxcal.effects.temperature_bias import TemperatureBias
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import (
+from triaxcal.poses.covariates import (
     at_reference,
     channels_of,
-    conditions,
-    conditions_elsewhere,
+    covariates,
+    covariates_elsewhere,
     of_readings,
     of_unknown_history,
     references,
@@ -90,12 +90,12 @@ def test_a_logged_channel_stands_beside_the_derived_condition_of_its_name(name: 
     # It counts from its mean, elsewhere and for single readings too, as any other channel does.
     reference = references(found)
     assert reference[condition] == 5.5
-    assert conditions_elsewhere(poses, reference, K, B)[condition].tolist() == [-1.5, 1.5, 0.0]
+    assert covariates_elsewhere(poses, reference, K, B)[condition].tolist() == [-1.5, 1.5, 0.0]
     given = {"temp_c": np.zeros(1), "supply_v": np.zeros(1), name: np.array([6.0])}
     held, missing = of_readings(given, {condition: 5.5}, 1, CLOCKS)
     assert (held[condition].tolist(), missing) == ([0.5], ())
     with pytest.raises(InvalidData, match=f"no channel {name},"):
-        conditions_elsewhere(three, reference, K, B)
+        covariates_elsewhere(three, reference, K, B)
 
 
 def test_an_effect_of_a_channel_is_found_whatever_the_channel_is_called(
@@ -134,7 +134,7 @@ def test_channels_and_time_count_from_a_round_mean_and_all_else_from_zero(three:
     assert reference[TIME] == 25.0
     assert reference["supply_v"] == 5.0
     assert {v for n, v in reference.items() if n not in ("temp_c", TIME, "supply_v")} == {0.0}
-    held = conditions(channels_of(three), reference)
+    held = covariates(channels_of(three), reference)
     assert held["temp_c"] == pytest.approx([-1.1, -0.1, 1.2])
     assert held[TIME].tolist() == [-18.0, -7.0, 25.0]
     assert held[SINCE_START].tolist() == [7.0, 18.0, 50.0]
@@ -143,7 +143,7 @@ def test_channels_and_time_count_from_a_round_mean_and_all_else_from_zero(three:
 def test_a_channel_that_is_not_finite_has_no_reference_and_is_left_out() -> None:
     channels = {"temp_c": np.array([20.0, np.nan]), TIME: np.array([1.0, 3.0])}
     assert references(channels) == {TIME: 2.0}
-    assert set(conditions(channels, references(channels))) == {TIME}
+    assert set(covariates(channels, references(channels))) == {TIME}
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_poses_of_another_recording_count_their_time_as_at_the_reference_and_lon
     three: list[Pose],
 ) -> None:
     reference = {"temp_c": 20.0, TIME: 130.0, SINCE_START: 0.0, HELD: 0.0, "before_x": 0.0, "temp_c.rate": 0.0}
-    found = conditions_elsewhere(three, reference, K, B)
+    found = covariates_elsewhere(three, reference, K, B)
     assert set(found) == set(reference)
     assert found[TIME].tolist() == [0.0, 0.0, 0.0]
     assert np.all(np.isposinf(found[SINCE_START]))
@@ -180,7 +180,7 @@ def test_poses_of_another_recording_count_their_time_as_at_the_reference_and_lon
 
 def test_poses_of_another_recording_without_the_channel_are_refused_by_its_name(three: list[Pose]) -> None:
     with pytest.raises(InvalidData, match="humidity_rh"):
-        conditions_elsewhere(three, {"humidity_rh": 40.0}, K, B)
+        covariates_elsewhere(three, {"humidity_rh": 40.0}, K, B)
 
 
 def test_single_readings_need_no_condition_that_nobody_logs() -> None:
@@ -205,7 +205,7 @@ def test_single_readings_without_a_channel_count_as_at_its_reference_and_say_so(
 
 def test_poses_of_another_recording_count_their_time_as_at_the_moment_that_is_chosen(three: list[Pose]) -> None:
     reference = {TIME: 130.0, SINCE_START: 0.0}
-    found = conditions_elsewhere(three, reference, K, B, (240.0, 230.0))
+    found = covariates_elsewhere(three, reference, K, B, (240.0, 230.0))
     assert found[SINCE_START].tolist() == [240.0] * 3
     assert found[TIME].tolist() == [100.0] * 3
 
@@ -219,7 +219,7 @@ def test_at_the_reference_nothing_deviates_and_the_start_was_long_ago() -> None:
 def test_the_fit_knows_the_conditions_of_its_own_poses(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     """By the true scale and bias: those fitted differ by parts in a hundred thousand."""
     poses = noisy_poses(paper_unit, twenty_six, 1e-6, np.random.default_rng(0))
-    held = fit(poses, signs=(-1, -1, -1), effects=[Hysteresis()]).conditions_of(poses)
+    held = fit(poses, signs=(-1, -1, -1), effects=[Hysteresis()]).covariates_of(poses)
     s = twenty_six @ paper_unit.axes.T
     before = np.concatenate([s[:1], s[:-1]])
     assert set(held) == set(BEFORE)

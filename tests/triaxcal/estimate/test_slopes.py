@@ -14,12 +14,12 @@ from triaxcal.effects import effect_named
 from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, xyz
 from triaxcal.effects.plugins import Foreign
 from triaxcal.errors import Refused
-from triaxcal.estimate.beyond import Beyond
 from triaxcal.estimate.cross_validation import cross_validated
+from triaxcal.estimate.excess import Excess
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.problem import State, everything, linearise, solve
+from triaxcal.estimate.problem import State, linearise, linearise_all, solve
+from triaxcal.estimate.slopes import PoseSlopes, left_by_slopes, slopes_p, with_slopes
 from triaxcal.estimate.start import problem_of, start
-from triaxcal.estimate.trends import Trends, left_by_trends, trends_p, with_trends
 from triaxcal.evidence import Posterior, Refusal, posterior
 from triaxcal.evidence.unmodelled import What
 from triaxcal.model.sensor import Sensor
@@ -62,8 +62,8 @@ def moving(
             rate_errors={"temp_c": 0.0},
             bends={"temp_c": 0.0},
             bend_errors={"temp_c": 0.0},
-            trend=end[i] - begin[i] + scale * TREND_G * rng.standard_normal(3),
-            trend_error=scale * TREND_G,
+            slope=end[i] - begin[i] + scale * TREND_G * rng.standard_normal(3),
+            slope_error=scale * TREND_G,
         )
         for i, p in enumerate(poses)
     ]
@@ -74,14 +74,14 @@ def misfit(poses: list[Pose], effects: tuple[Effect, ...]) -> float:
     problem = problem_of(poses, signs=MINUS, reference=1.0)
     state = solve(problem, start(problem, poses, MINUS), effects)
     _, J, s = linearise(problem, State(state.theta, effects))
-    trends = Trends.of(problem, poses)
-    assert trends
-    return trends.chi2(state, J / s[:, None])
+    slopes = PoseSlopes.of(problem, poses)
+    assert slopes
+    return slopes.chi2(state, J / s[:, None])
 
 
 def blind(poses: list[Pose]) -> list[Pose]:
     """The same poses without their trends."""
-    return [replace(p, trend_error=np.inf) for p in poses]
+    return [replace(p, slope_error=np.inf) for p in poses]
 
 
 def seen_in(poses: list[Pose]) -> Posterior:
@@ -119,7 +119,7 @@ def test_a_unit_that_turns_on_its_stand_has_no_trend(paper_unit: Sensor, twenty_
     across = np.cross(twenty_six, rng.standard_normal(twenty_six.shape))
     across *= 1e-3 / np.linalg.norm(across, axis=1, keepdims=True)
     turned = across @ paper_unit.axes.T * paper_unit.scale_factor
-    tilted = [replace(p, trend=p.trend + t) for p, t in zip(poses, turned, strict=True)]
+    tilted = [replace(p, slope=p.slope + t) for p, t in zip(poses, turned, strict=True)]
     assert misfit(tilted, ()) == pytest.approx(misfit(poses, ()), rel=0.1)
 
 
@@ -134,21 +134,21 @@ def test_a_thermometer_that_says_nothing_of_its_rate_proves_nothing(paper_unit: 
 
 def test_poses_that_know_no_trend_have_none(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     poses = noisy_poses(paper_unit, twenty_six, SIGMA_G, np.random.default_rng(0))
-    assert Trends.of(problem_of(poses, signs=MINUS, reference=1.0), poses) is None
+    assert PoseSlopes.of(problem_of(poses, signs=MINUS, reference=1.0), poses) is None
 
 
 def test_a_model_that_does_not_hold_inside_the_poses_is_infinitely_far_from_their_trends(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
     poses = moving(paper_unit, twenty_six, np.random.default_rng(0))
-    problem = with_trends(problem_of(poses, signs=MINUS, reference=1.0), poses, (TEMPERATURE,))
+    problem = with_slopes(problem_of(poses, signs=MINUS, reference=1.0), poses, (TEMPERATURE,))
     assert problem is not None
     fitted = solve(problem, start(problem, poses, MINUS), (TEMPERATURE,))
-    assert left_by_trends(problem, fitted) < 100
+    assert left_by_slopes(problem, fitted) < 100
     nowhere = State(fitted.theta * np.nan, fitted.effects)
     with np.errstate(invalid="ignore"):
-        assert left_by_trends(problem, nowhere) == np.inf
-        assert trends_p(problem, nowhere, 1e6) == 0.0
+        assert left_by_slopes(problem, nowhere) == np.inf
+        assert slopes_p(problem, nowhere, 1e6) == 0.0
 
 
 OF_TIME = {"bias_drift", "warm_up", "bias_step", "temperature_bias", "temperature_bias_quadratic",
@@ -179,7 +179,7 @@ def test_what_has_no_name_and_moves_inside_the_poses_goes_with_the_time(
     rng = np.random.default_rng(8)
     hot = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, 3 * SENSITIVITY),))
     kept = [replace(p, channels={}, rates={}, rate_errors={}, bends={}, bend_errors={}) for p in hot]
-    still = [replace(p, trend=np.zeros(3)) for p in kept]
+    still = [replace(p, slope=np.zeros(3)) for p in kept]
     moves, rests = (diagnose(poses, signs=MINUS, catalogue=[SQUARE]) for poses in (kept, still))
     for loop in (moves, rests):
         assert loop.found.unexplained.probability > 0.99
@@ -215,12 +215,12 @@ class Table(Effect):
     remedy: str = "Make the table longer."
     end_k: float = 2.0
 
-    def basis(self, s: np.ndarray, conditions: Mapping[str, np.ndarray]) -> np.ndarray:
-        if np.abs(conditions["temp_c"]).max() > self.end_k:
+    def basis(self, s: np.ndarray, covariates: Mapping[str, np.ndarray]) -> np.ndarray:
+        if np.abs(covariates["temp_c"]).max() > self.end_k:
             raise ValueError("outside the table")
-        return on_each_axis(conditions["temp_c"])
+        return on_each_axis(covariates["temp_c"])
 
-    def slope(self, s: np.ndarray, conditions: Mapping[str, np.ndarray]) -> np.ndarray:
+    def slope(self, s: np.ndarray, covariates: Mapping[str, np.ndarray]) -> np.ndarray:
         return no_slope(s)
 
     def advice(self, largest: float, floor: float) -> str:
@@ -234,7 +234,7 @@ class Table(Effect):
 def test_an_effect_of_another_package_that_is_known_at_the_means_alone_is_left_out_and_told(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
-    """What it foretells inside the poses nobody knows."""
+    """What it predicts inside the poses nobody knows."""
     poses = moving(paper_unit, twenty_six, np.random.default_rng(4), ((TEMPERATURE, SENSITIVITY),))
     means = np.array([p.channels["temp_c"] for p in poses])
     table = Table(end_k=float(np.abs(means - round(float(means.mean()), 1)).max()) + 1e-4)
@@ -264,12 +264,12 @@ def test_trends_fitted_along_with_the_means_narrow_the_intervals_and_these_hold_
     rng, inside, narrower, seeds = np.random.default_rng(6), 0, [], 60
     for _ in range(seeds):
         poses = moving(paper_unit, fourteen[rng.permutation(14)], rng, ((TEMPERATURE, SENSITIVITY),))
-        c, means = (fit(p, signs=MINUS, effects=[TEMPERATURE], aside=()) for p in (poses, blind(poses)))
-        assert not means.trends
+        c, means = (fit(p, signs=MINUS, effects=[TEMPERATURE], excluded=()) for p in (poses, blind(poses)))
+        assert not means.slopes
         low, high = (side[9:] for side in c.interval())
         inside += int(np.count_nonzero((low < SENSITIVITY) & (high > SENSITIVITY)))
-        if c.trends:
-            narrower.append(c.standard_errors[9:] / c.inflation / (means.standard_errors[9:] / means.inflation))
+        if c.slopes:
+            narrower.append(c.standard_errors[9:] / c.birge_ratio / (means.standard_errors[9:] / means.birge_ratio))
     assert len(narrower) > 0.96 * seeds
     assert np.max(narrower) < 1
     assert np.mean(narrower) < 0.95
@@ -279,9 +279,9 @@ def test_trends_fitted_along_with_the_means_narrow_the_intervals_and_these_hold_
 def test_trends_that_contradict_the_means_have_no_part_in_the_fit(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     """A unit that follows its thermometer late, so that inside the poses it goes the other way."""
     poses = moving(paper_unit, twenty_six, np.random.default_rng(7), ((TEMPERATURE, SENSITIVITY),))
-    late = [replace(p, trend=-p.trend) for p in poses]
-    c, means = (fit(p, signs=MINUS, effects=[TEMPERATURE], aside=()) for p in (late, blind(poses)))
-    assert not c.trends
+    late = [replace(p, slope=-p.slope) for p in poses]
+    c, means = (fit(p, signs=MINUS, effects=[TEMPERATURE], excluded=()) for p in (late, blind(poses)))
+    assert not c.slopes
     assert np.array_equal(c.values, means.values)
 
 
@@ -291,9 +291,9 @@ def test_means_that_leave_nothing_are_not_believed_against_the_trends(
     """Twelve poses fit twelve parameters whatever they are."""
     ups = twenty_six[np.random.default_rng(3).permutation(26)[:12]]
     poses = moving(paper_unit, ups, np.random.default_rng(7), ((TEMPERATURE, SENSITIVITY),))
-    assert fit(poses, signs=MINUS, effects=[TEMPERATURE], aside=()).trends
+    assert fit(poses, signs=MINUS, effects=[TEMPERATURE], excluded=()).slopes
     with pytest.raises(Refused, match="12 poses cannot carry 12 parameters"):
-        fit([replace(p, trend=-p.trend) for p in poses], signs=MINUS, effects=[TEMPERATURE], aside=())
+        fit([replace(p, slope=-p.slope) for p in poses], signs=MINUS, effects=[TEMPERATURE], excluded=())
 
 
 def test_trends_have_no_part_in_a_model_that_nothing_moves_inside_the_poses(
@@ -301,8 +301,8 @@ def test_trends_have_no_part_in_a_model_that_nothing_moves_inside_the_poses(
 ) -> None:
     poses = moving(paper_unit, twenty_six, np.random.default_rng(8), ((SQUARE, np.array([2e-3, -1e-3, 3e-3])),))
     for effects in ([], [SQUARE]):
-        c, means = (fit(p, signs=MINUS, effects=effects, aside=()) for p in (poses, blind(poses)))
-        assert not c.trends
+        c, means = (fit(p, signs=MINUS, effects=effects, excluded=()) for p in (poses, blind(poses)))
+        assert not c.slopes
         assert np.array_equal(c.values, means.values)
 
 
@@ -334,7 +334,7 @@ def test_fourteen_poses_carry_six_coefficients_by_what_moves_inside_them(
 def test_a_pose_left_out_for_cross_validation_leaves_with_its_trend(paper_unit: Sensor, fourteen: np.ndarray) -> None:
     """Against as many fits from the beginning."""
     poses = moving(paper_unit, fourteen, np.random.default_rng(9), ((TEMPERATURE, SENSITIVITY),))
-    problem = with_trends(problem_of(poses, signs=MINUS), poses, [TEMPERATURE])
+    problem = with_slopes(problem_of(poses, signs=MINUS), poses, [TEMPERATURE])
     assert problem
     begin = start(problem, poses, MINUS)
     state = solve(problem, begin, (TEMPERATURE,))
@@ -351,15 +351,15 @@ def test_what_all_poses_have_beside_their_noise_widens_the_trend_of_each_as_its_
     rng = np.random.default_rng(11)
     poses = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),))
     poses = [replace(p, covariance=p.covariance * f) for p, f in zip(poses, rng.uniform(1, 9, 26), strict=True)]
-    problem = with_trends(problem_of(poses, signs=MINUS), poses, [TEMPERATURE])
+    problem = with_slopes(problem_of(poses, signs=MINUS), poses, [TEMPERATURE])
     assert problem
     state = solve(problem, start(problem, poses, MINUS), (TEMPERATURE,))
-    before = everything(problem, state)[2].reshape(2, 26)
-    beside = Beyond(excess_g=SIGMA_G).beside(problem, state)
-    after = everything(beside, state)[2].reshape(2, 26)
+    before = linearise_all(problem, state)[2].reshape(2, 26)
+    beside = Excess(excess_g=SIGMA_G).beside(problem, state)
+    after = linearise_all(beside, state)[2].reshape(2, 26)
     assert after[0] == pytest.approx(np.hypot(before[0], SIGMA_G))
     assert after[1] / before[1] == pytest.approx(after[0] / before[0])
-    some = everything(beside.only(np.array([3, 20])), state)[2].reshape(2, 2)
+    some = linearise_all(beside.only(np.array([3, 20])), state)[2].reshape(2, 2)
     assert some == pytest.approx(after[:, [3, 20]])
 
 
@@ -373,8 +373,8 @@ def test_means_that_come_back_less_well_leave_honest_errors_beside_the_trends(
         off = 4 * SIGMA_G * rng.standard_normal((26, 1)) * twenty_six * paper_unit.scale_factor
         poses = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),))
         poses = [replace(p, mean=p.mean + o) for p, o in zip(poses, off, strict=True)]
-        c = fit(poses, signs=MINUS, effects=[TEMPERATURE], aside=())
-        if c.trends and c.excess_g:
+        c = fit(poses, signs=MINUS, effects=[TEMPERATURE], excluded=())
+        if c.slopes and c.excess_g:
             pulls.append((c.values[:6] - truth[:6]) / c.standard_errors[:6])
     assert len(pulls) > 15
     assert 0.8 < np.sqrt(np.mean(np.square(pulls))) < 1.2
@@ -384,8 +384,8 @@ def test_the_budget_of_a_fit_to_means_and_trends_has_the_errors_of_the_fit(
     paper_unit: Sensor, fourteen: np.ndarray
 ) -> None:
     poses = moving(paper_unit, fourteen, np.random.default_rng(10), ((TEMPERATURE, SENSITIVITY),))
-    c = fit(poses, signs=MINUS, effects=[TEMPERATURE], aside=())
-    assert c.trends
+    c = fit(poses, signs=MINUS, effects=[TEMPERATURE], excluded=())
+    assert c.slopes
     scatter = [part.parameters for part in budget(c).components if part.evaluation == "A"]
     assert np.sqrt(np.sum(np.square(scatter), axis=0)) == pytest.approx(c.standard_errors, rel=1e-6)
     # An error of the reference is one of the scale factors, and nothing of the temperature's.
@@ -401,9 +401,9 @@ def test_what_moves_inside_the_poses_and_is_not_foretold_has_a_size(paper_unit: 
     for _ in range(10):
         poses = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),))
         problem = problem_of(poses, signs=MINUS, reference=1.0)
-        trends = Trends.of(problem, poses)
-        assert trends
-        off_g.append([trends.rms_g(solve(problem, start(problem, poses, MINUS), e)) for e in ((), (TEMPERATURE,))])
+        slopes = PoseSlopes.of(problem, poses)
+        assert slopes
+        off_g.append([slopes.rms_g(solve(problem, start(problem, poses, MINUS), e)) for e in ((), (TEMPERATURE,))])
     moved = np.linalg.inv(paper_unit.axes) @ np.outer(SENSITIVITY, history(26)[1] * HOLD_S)
     along_g = np.einsum("in,ni->n", moved, twenty_six)
     unforetold_g, foretold_g = np.mean(off_g, axis=0)
@@ -419,7 +419,7 @@ def test_what_moves_inside_the_poses_alone_says_nothing_of_the_means(
     truth = np.array([1e-3, -8e-4, 6e-4])
     poses = moving(paper_unit, twenty_six, rng, ((SQUARE, truth),))
     for share, only in ((0.0, False), (3e-4, True)):
-        odd = [replace(p, trend=p.trend + share * rng.standard_normal() * p.mean) for p in poses]
+        odd = [replace(p, slope=p.slope + share * rng.standard_normal() * p.mean) for p in poses]
         loop = diagnose(odd, signs=MINUS, catalogue=[SQUARE, TEMPERATURE])
         inside = loop.seen.of_kinds[What.INSIDE]
         assert inside > 0.99 if only else inside < 0.05
@@ -438,7 +438,7 @@ def test_what_an_effect_of_the_means_foretells_in_vain_inside_the_poses_is_a_par
     means = moving(paper_unit, twenty_six, rng, ((TEMPERATURE, SENSITIVITY),))
     for share, in_vain in ((0.0, False), (0.5, True)):
         poses = [
-            replace(p, trend=q.trend, rates={"temp_c": share * p.rates["temp_c"]})
+            replace(p, slope=q.slope, rates={"temp_c": share * p.rates["temp_c"]})
             for p, q in zip(means, quiet, strict=True)
         ]
         loop = diagnose(poses, signs=MINUS, catalogue=[TEMPERATURE, SQUARE])

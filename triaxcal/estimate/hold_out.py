@@ -12,7 +12,7 @@ from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import with_creep_left
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import conditions_elsewhere
+from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 
 CLEARLY = 2.0
@@ -20,7 +20,7 @@ CLEARLY = 2.0
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HoldOut:
     """In the unit of the reference."""
 
     before_rms_g: float
@@ -32,7 +32,7 @@ class HeldOut:
     """Whether the linear calibration is clearly better in these poses."""
 
 
-def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HeldOut:
+def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HoldOut:
     """Raises InvalidData where there is no check pose, or where these lack a channel that the effects need."""
     if not check:
         raise InvalidData("the check recording has no still pose")
@@ -42,7 +42,7 @@ def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> 
         raise InvalidData(f"the check recording: {e}") from e
     more = last[0] ** 2 - first[0] ** 2
     worse = len(more) > 1 and float(more.mean()) > CLEARLY * float(more.std(ddof=1)) / np.sqrt(len(more))
-    return HeldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), bool(worse))
+    return HoldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), bool(worse))
 
 
 def magnitude_errors(
@@ -56,11 +56,11 @@ def magnitude_errors(
     """|a| − reference (n,) of poses under a sensor's model, and its standard error (n,) from their noise.
 
     The poses are of another recording than the model's, whose clock is its own: effects of time count as at one
-    ``moment`` (`triaxcal.poses.conditions.of_moment`). Raises InvalidData where a channel that the effects need is
+    ``moment`` (`triaxcal.poses.covariates.of_moment`). Raises InvalidData where a channel that the effects need is
     missing.
     """
     u = np.array([p.mean for p in poses])
-    held = conditions_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
+    held = covariates_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
     length, by_u = sensor.magnitude(u, held)
     covariance = np.array([p.covariance for p in poses])
     return length - reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))

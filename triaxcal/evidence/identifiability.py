@@ -11,7 +11,7 @@ import numpy as np
 from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, rate_of
 from triaxcal.evidence.evidence import Evidence
 from triaxcal.planning.visibility import VISIBLE
-from triaxcal.poses.conditions import still_conditions
+from triaxcal.poses.covariates import static_covariates
 
 
 class Why(StrEnum):
@@ -20,7 +20,7 @@ class Why(StrEnum):
     """The channel is missing in some poses."""
     RATE_UNKNOWN = "rate_unknown"
     NOT_KNOWN = "not_known"
-    """A condition that follows from the poses does not here."""
+    """A covariate that follows from the poses does not here."""
     STOOD_STILL = "stood_still"
     EVEN_RATE = "even_rate"
     """The channel changes no faster in one pose than in another."""
@@ -31,14 +31,14 @@ class Why(StrEnum):
 
 
 @dataclass(frozen=True)
-class Blind:
+class NotIdentifiable:
     """``channel`` is empty where no channel is to blame."""
 
     why: Why
     channel: str = ""
 
 
-def blind_to(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping[str, Blind]:
+def blind_to(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping[str, NotIdentifiable]:
     """By name, in the order of the ``catalogue``."""
     shown = {name for name in {term.name for term in evidence.terms} if name and _in_full(evidence, name)}
     return {effect.name: _why(evidence, effect) for effect in catalogue if effect.name not in shown}
@@ -56,18 +56,18 @@ def _in_full(evidence: Evidence, name: str) -> bool:
     return False
 
 
-def _why(evidence: Evidence, effect: Effect) -> Blind:
+def _why(evidence: Evidence, effect: Effect) -> NotIdentifiable:
     rows = evidence.rows
-    known, still = rows.problem.channel_reference, still_conditions(rows.poses)
+    known, still = rows.problem.channel_reference, static_covariates(rows.poses)
     for name in effect.needs:
         rate, channel = name.endswith(rate_of("")), channel_of(name.removesuffix(rate_of("")))
         logged = any(channel in p.channels for p in rows.poses)
         if name not in known and (rate or not is_derived(name)) and not (rate and logged):
-            return Blind(Why.SOMETIMES_LOGGED if logged else Why.NOT_LOGGED, channel)
+            return NotIdentifiable(Why.SOMETIMES_LOGGED if logged else Why.NOT_LOGGED, channel)
         if name not in known:
-            return Blind(Why.RATE_UNKNOWN, channel) if rate else Blind(Why.NOT_KNOWN, name)
+            return NotIdentifiable(Why.RATE_UNKNOWN, channel) if rate else NotIdentifiable(Why.NOT_KNOWN, name)
         if name in still:
             if name in SCATTER:
-                return Blind(Why.EVEN_SCATTER)
-            return Blind(Why.EVEN_RATE if rate else Why.STOOD_STILL, channel)
-    return Blind(Why.MOVED_ALONG if effect.needs else Why.FEW_DIRECTIONS)
+                return NotIdentifiable(Why.EVEN_SCATTER)
+            return NotIdentifiable(Why.EVEN_RATE if rate else Why.STOOD_STILL, channel)
+    return NotIdentifiable(Why.MOVED_ALONG if effect.needs else Why.FEW_DIRECTIONS)

@@ -23,7 +23,7 @@ from triaxcal.effects.contract import (
     TIME,
     Effect,
     channel_of,
-    condition_of,
+    covariate_of,
     is_derived,
     lag_in,
     lag_of,
@@ -38,17 +38,17 @@ SCATTER_MOVES = 0.1
 """Scatter stands still unless it differs from pose to pose by this share, and by `MOVES` times what chance makes."""
 
 
-def conditions(channels: Mapping[str, Floats], reference: Mapping[str, float]) -> dict[str, Floats]:
+def covariates(channels: Mapping[str, Floats], reference: Mapping[str, float]) -> dict[str, Floats]:
     """Deviations of the channels from their references; a channel with no reference is left out."""
     return {name: np.asarray(channels[name]) - value for name, value in reference.items() if name in channels}
 
 
 def channels_of(poses: Sequence[Pose], wanted: Iterable[str] = ()) -> dict[str, Floats]:
     """The channels' means by pose, (n,) each, their rates, and the time of each pose and for how long it was held; of
-    the channels' lags (`lag_of`) those that are among the conditions ``wanted``."""
+    the channels' lags (`lag_of`) those that are among the covariates ``wanted``."""
     out: dict[str, Floats] = {}
     for channel in sorted(set.intersection(*(set(p.channels) for p in poses)) if poses else set()):
-        name = condition_of(channel)
+        name = covariate_of(channel)
         out[name] = np.array([p.channels[channel] for p in poses])
         if all(channel in p.rates for p in poses):
             out[rate_of(name)] = np.array([p.rates[channel] for p in poses])
@@ -106,7 +106,7 @@ def lags_for(effects: Iterable[Effect]) -> tuple[str, ...]:
 def with_scale(
     channels: Mapping[str, Floats], poses: Sequence[Pose], scale_factor: Floats, bias: Floats
 ) -> dict[str, Floats]:
-    """With the conditions that need ``scale_factor`` (3,) output/g and ``bias`` (3,) g."""
+    """With the covariates that need ``scale_factor`` (3,) output/g and ``bias`` (3,) g."""
     now = np.array([p.mean for p in poses])
     before = np.array([p.mean if p.before is None else p.before for p in poses])
     change = (now - before) / scale_factor
@@ -117,14 +117,14 @@ def with_scale(
 
 
 def of_unknown_history(poses: Sequence[Pose], effects: Iterable[Effect]) -> tuple[int, ...]:
-    """Which poses nothing is known of that one of the effects needs: what was before them. The conditions have them as
+    """Which poses nothing is known of that one of the effects needs: what was before them. The covariates have them as
     if the unit had rested there before."""
     needed = {n for e in effects for n in e.needs} & {*BEFORE, *CHANGE}
     return tuple(i for i, p in enumerate(poses) if p.before is None) if needed else ()
 
 
 def references(channels: Mapping[str, Floats]) -> dict[str, float]:
-    """Whence conditions are counted: channels and time from their means, what is itself a deviation from zero.
+    """Whence covariates are counted: channels and time from their means, what is itself a deviation from zero.
 
     Rounded, so that a reference temperature reads well and fits a float32 register: to a tenth, or to a tenth of the
     range where that is finer.
@@ -141,14 +141,14 @@ def _decimals(span: float) -> int:
     return max(1, 1 - math.floor(math.log10(span))) if span > 0 else 6
 
 
-def conditions_elsewhere(
+def covariates_elsewhere(
     poses: Sequence[Pose],
     reference: Mapping[str, float],
     scale_factor: Floats,
     bias: Floats,
     moment: tuple[float, float] | None = None,
 ) -> dict[str, Floats]:
-    """`conditions` of poses of another recording than that which ``reference`` is of, whose clock is its own: effects
+    """`covariates` of poses of another recording than that which ``reference`` is of, whose clock is its own: effects
     of time count as at one ``moment`` (`of_moment`). Raises InvalidData where a channel is missing.
     """
     channels = with_scale(channels_of(poses, reference), poses, scale_factor, bias)
@@ -158,7 +158,7 @@ def conditions_elsewhere(
         named = ", ".join(map(channel_of, missing))
         raise InvalidData(f"the poses have no channel {named}, which the calibration needs")
     channels |= {name: np.full(len(poses), value) for name, value in of_moment(reference, moment).items()}
-    return conditions(channels, reference)
+    return covariates(channels, reference)
 
 
 def of_moment(reference: Mapping[str, float], moment: tuple[float, float] | None) -> dict[str, float]:
@@ -169,12 +169,12 @@ def of_moment(reference: Mapping[str, float], moment: tuple[float, float] | None
 
 
 def at_reference(names: Iterable[str], n: int) -> dict[str, Floats]:
-    """n times the conditions at which every effect is at its reference: no deviation, and long after the start."""
+    """n times the covariates at which every effect is at its reference: no deviation, and long after the start."""
     return {name: np.full(n, np.inf if name in (SINCE_START, RUN) else 0.0) for name in names}
 
 
 def at_moment(reference: Mapping[str, float], n: int, moment: tuple[float, float] | None) -> dict[str, Floats]:
-    """n times the conditions that a unit in use meets: no deviation, and the clocks at the ``moment`` (`of_moment`)."""
+    """n times the covariates that a unit in use meets: no deviation, and the clocks at the ``moment`` (`of_moment`)."""
     clocks = of_moment(reference, moment)
     held = {name: np.full(n, t - reference[name]) for name, t in clocks.items() if name in reference}
     return at_reference(reference, n) | held
@@ -183,12 +183,12 @@ def at_moment(reference: Mapping[str, float], n: int, moment: tuple[float, float
 def of_readings(
     channels: Mapping[str, Floats], reference: Mapping[str, float], n: int, clocks: Mapping[str, Floats | float]
 ) -> tuple[dict[str, Floats], tuple[str, ...]]:
-    """`conditions` of n single readings, for whoever applies a calibration; and those that are needed and were not
+    """`covariates` of n single readings, for whoever applies a calibration; and those that are needed and were not
     given: a channel, its rate, scatter, the pose before. These count as at their reference.
 
-    A derived condition may be among the ``channels``, unless the reference knows a logged channel of that name.
+    A derived covariate may be among the ``channels``, unless the reference knows a logged channel of that name.
     """
-    given = {condition_of(name) if condition_of(name) in reference else name: v for name, v in channels.items()}
+    given = {covariate_of(name) if covariate_of(name) in reference else name: v for name, v in channels.items()}
     known: dict[str, Floats | float] = {**clocks, **given}
     default = at_reference(reference, n)
     held = {
@@ -198,17 +198,17 @@ def of_readings(
     return held, tuple(name for name in reference if name not in known and name != HELD)
 
 
-def still_conditions(poses: Sequence[Pose]) -> set[str]:
-    """Conditions that do not move from pose to pose by more than their own noise.
+def static_covariates(poses: Sequence[Pose]) -> set[str]:
+    """Covariates that do not move from pose to pose by more than their own noise.
 
-    A coefficient of such a condition would be one of chance.
+    A coefficient of such a covariate would be one of chance.
     """
     still = set()
     for name in sorted(set.intersection(*(set(p.channels) for p in poses))):
         if not _moves([p.channels[name] for p in poses], [p.channel_errors.get(name, 0.0) for p in poses]):
-            still.add(condition_of(name))
+            still.add(covariate_of(name))
         if not _moves([p.rates.get(name, 0.0) for p in poses], [p.rate_errors.get(name, 0.0) for p in poses]):
-            still.add(rate_of(condition_of(name)))
+            still.add(rate_of(covariate_of(name)))
     scatter = np.array([p.scatter for p in poses])
     chance = np.sqrt(2 / np.array([max(p.samples, 2) for p in poses]))
     share = scatter.std(axis=0) / np.maximum(scatter.mean(axis=0), 1e-300)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from triaxcal.agreement import Agreement, Answer
+from triaxcal.pooling import Answer, PooledAnalysis
 from triaxcal.text.advice import chance
 
 
-def verdict(found: Agreement) -> str:
+def verdict(found: PooledAnalysis) -> str:
     """Which effects act in all units, or that none does."""
     match found.answer:
         case Answer.AGREE:
@@ -19,7 +19,7 @@ def verdict(found: Agreement) -> str:
             return "no unit shows an effect"
 
 
-def _effects(found: Agreement) -> str:
+def _effects(found: PooledAnalysis) -> str:
     return " and on ".join(_one_of(group) for group in found.agreed)
 
 

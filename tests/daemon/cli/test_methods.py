@@ -1,4 +1,4 @@
-"""fit --turning, --attitudes, --passport, and other references than gravity: documents, exit codes, one-line errors."""
+"""fit --turning, --attitudes, --datasheet, and references other than gravity: documents, exit codes, errors."""
 
 from __future__ import annotations
 
@@ -258,24 +258,24 @@ def test_an_attitude_file_that_is_not_there(files: Path, triaxcal: Run, tmp_path
     triaxcal("fit", files / "14.csv", "--attitudes", tmp_path / "none.csv").failed(2, "none.csv: cannot be read")
 
 
-# Refinement of passport values
+# Refinement of datasheet values
 
 
 @pytest.fixture
-def passport(files: Path, asked: Run, tmp_path: Path) -> Path:
+def datasheet(files: Path, asked: Run, tmp_path: Path) -> Path:
     done = asked("fit", files / "turning.csv", "--turning", SIGNS, "--output-unit", "V", "--json")
     assert done.code == 0
-    path = tmp_path / "passport.json"
+    path = tmp_path / "datasheet.json"
     path.write_text(done.out, "utf-8")
     return path
 
 
-def test_four_poses_refine_a_passport(files: Path, triaxcal: Run, tmp_path: Path, passport: Path) -> None:
+def test_four_poses_refine_a_datasheet(files: Path, triaxcal: Run, tmp_path: Path, datasheet: Path) -> None:
     cal, report = tmp_path / "cal.json", tmp_path / "r.html"
-    done = triaxcal("fit", files / "4.csv", "--passport", passport, "--json", "-o", cal, "--report", report)
+    done = triaxcal("fit", files / "4.csv", "--datasheet", datasheet, "--json", "-o", cal, "--report", report)
     assert done.code == 0
     is_calibration(done.json)
-    before = json.loads(passport.read_text())
+    before = json.loads(datasheet.read_text())
     assert done.json["units"] == before["units"]
     for name in ("scale_factor", "misalignment", "bias"):
         assert np.all(np.array(done.json["standard_error"][name]) <= before["standard_error"][name])
@@ -284,40 +284,40 @@ def test_four_poses_refine_a_passport(files: Path, triaxcal: Run, tmp_path: Path
     assert np.max(np.abs(pulls(done.json, UNIT))) < 4.5
     assert done.json["passport"]["conflict_p"] > 1e-3
     assert set(done.json["passport"]["source"]["scale_factor"]) <= {"poses", "passport", "both"}
-    again = triaxcal("fit", files / "check.csv", "--passport", cal)
+    again = triaxcal("fit", files / "check.csv", "--datasheet", cal)
     assert again.code == 0
     assert "poses' share" in again.out
 
 
-def test_errors_given_stand_for_the_passports_own(files: Path, triaxcal: Run, tmp_path: Path, passport: Path) -> None:
-    document = json.loads(passport.read_text())
+def test_errors_given_stand_for_the_datasheets_own(files: Path, triaxcal: Run, tmp_path: Path, datasheet: Path) -> None:
+    document = json.loads(datasheet.read_text())
     del document["standard_error"]
     bare = tmp_path / "bare.json"
     bare.write_text(json.dumps(document))
-    triaxcal("fit", files / "4.csv", "--passport", bare).failed(
-        2, "bare.json: standard_error: missing", "--passport-error"
+    triaxcal("fit", files / "4.csv", "--datasheet", bare).failed(
+        2, "bare.json: standard_error: missing", "--datasheet-error"
     )
-    done = triaxcal("fit", files / "4.csv", "--passport", bare, "--passport-error", "1e-3,1e-4,1e-3", "--json")
+    done = triaxcal("fit", files / "4.csv", "--datasheet", bare, "--datasheet-error", "1e-3,1e-4,1e-3", "--json")
     assert done.code == 0
     assert done.json["passport"]["standard_error"]["bias"] == [1e-3] * 3
 
 
-def test_a_unit_that_has_changed_contradicts_its_passport(
-    files: Path, triaxcal: Run, tmp_path: Path, passport: Path
+def test_a_unit_that_has_changed_contradicts_its_datasheet(
+    files: Path, triaxcal: Run, tmp_path: Path, datasheet: Path
 ) -> None:
-    document = json.loads(passport.read_text())
+    document = json.loads(datasheet.read_text())
     document["bias"][1] += 0.01
-    passport.write_text(json.dumps(document))
-    done = triaxcal("fit", files / "4.csv", "--passport", passport)
+    datasheet.write_text(json.dumps(document))
+    done = triaxcal("fit", files / "4.csv", "--datasheet", datasheet)
     assert done.code == 0
-    assert "passport and poses contradict each other" in done.err
+    assert "datasheet and poses contradict each other" in done.err
 
 
-def test_a_certificate_is_a_passport_and_its_effects_come_with_it(triaxcal: Run, tmp_path: Path) -> None:
+def test_a_certificate_is_a_datasheet_and_its_effects_come_with_it(triaxcal: Run, tmp_path: Path) -> None:
     certificate = tmp_path / "certificate.json"
     with Recording.open(RECORDING) as recording:
         certificate.write_bytes(recording.attachments["certificate.json"])
-    done = triaxcal("fit", RECORDING, "--passport", certificate, "--json")
+    done = triaxcal("fit", RECORDING, "--datasheet", certificate, "--json")
     assert done.code == 0
     is_calibration(done.json)
     assert "second_order_nonlinearity" in done.json["terms"]
@@ -335,33 +335,33 @@ def test_a_certificate_is_a_passport_and_its_effects_come_with_it(triaxcal: Run,
         ({"format": "other"}, "format: expected a triaxcal.calibration/1"),
     ],
 )
-def test_a_faulty_passport_is_one_line(
-    files: Path, triaxcal: Run, passport: Path, change: dict[str, Any], words: str
+def test_a_faulty_datasheet_is_one_line(
+    files: Path, triaxcal: Run, datasheet: Path, change: dict[str, Any], words: str
 ) -> None:
-    passport.write_text(json.dumps(json.loads(passport.read_text()) | change))
-    triaxcal("fit", files / "4.csv", "--passport", passport).failed(2, "passport.json: ", words)
+    datasheet.write_text(json.dumps(json.loads(datasheet.read_text()) | change))
+    triaxcal("fit", files / "4.csv", "--datasheet", datasheet).failed(2, "datasheet.json: ", words)
 
 
-def test_another_units_passport_is_an_error(triaxcal: Run, tmp_path: Path) -> None:
+def test_another_units_datasheet_is_an_error(triaxcal: Run, tmp_path: Path) -> None:
     certificate = tmp_path / "certificate.json"
     with Recording.open(RECORDING) as recording:
         document = json.loads(recording.attachments["certificate.json"])
     document["unit"]["serial"] = "9999"
     certificate.write_text(json.dumps(document))
-    for command in (["fit", RECORDING, "--passport"], ["frame", RECORDING, "--calibration"]):
+    for command in (["fit", RECORDING, "--datasheet"], ["frame", RECORDING, "--calibration"]):
         triaxcal(*command, certificate).failed(2, "unit.serial is 9999")
 
 
 def test_numbers_that_no_unit_has_are_refused_in_one_line(
-    files: Path, triaxcal: Run, passport: Path, tmp_path: Path
+    files: Path, triaxcal: Run, datasheet: Path, tmp_path: Path
 ) -> None:
-    passport.write_text(json.dumps(json.loads(passport.read_text()) | {"scale_factor": [-1e300, 1e-300, 1.0]}))
-    triaxcal("fit", files / "4.csv", "--passport", passport).failed(3, "far from these poses")
+    datasheet.write_text(json.dumps(json.loads(datasheet.read_text()) | {"scale_factor": [-1e300, 1e-300, 1.0]}))
+    triaxcal("fit", files / "4.csv", "--datasheet", datasheet).failed(3, "far from these poses")
 
 
-def test_signs_and_reference_must_be_the_passports(files: Path, triaxcal: Run, passport: Path) -> None:
-    triaxcal("fit", files / "4.csv", "--passport", passport, "--sign=+,+,+").failed(2, "--sign: ", "other signs")
-    triaxcal("fit", files / "4.csv", "--passport", passport, "--reference", "9.81").failed(2, "--reference 9.81")
+def test_signs_and_reference_must_be_the_datasheets(files: Path, triaxcal: Run, datasheet: Path) -> None:
+    triaxcal("fit", files / "4.csv", "--datasheet", datasheet, "--sign=+,+,+").failed(2, "--sign: ", "other signs")
+    triaxcal("fit", files / "4.csv", "--datasheet", datasheet, "--reference", "9.81").failed(2, "--reference 9.81")
 
 
 # Options
@@ -370,13 +370,13 @@ def test_signs_and_reference_must_be_the_passports(files: Path, triaxcal: Run, p
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--turning", "--passport", "c.json"], "not allowed with argument --turning"),
+        (["--turning", "--datasheet", "c.json"], "not allowed with argument --turning"),
         (["--attitudes", "a.csv", "--turning"], "not allowed with argument --attitudes"),
         (["--attitude-error", "1e-3"], "there are no --attitudes"),
-        (["--passport-error", "1,1,1"], "there is no --passport"),
+        (["--datasheet-error", "1,1,1"], "there is no --datasheet"),
         (["--attitudes", "a.csv", "--attitude-error", "-1"], "expected radians between 0 and 0.3"),
-        (["--passport", "c.json", "--passport-error", "1,1"], "expected three numbers of at least 0"),
-        (["--passport", "c.json", "--passport-error", "1,1,nan"], "expected three numbers of at least 0"),
+        (["--datasheet", "c.json", "--datasheet-error", "1,1"], "expected three numbers of at least 0"),
+        (["--datasheet", "c.json", "--datasheet-error", "1,1,nan"], "expected three numbers of at least 0"),
         (
             ["--turning", "--reference-uncertainty", "1e-5"],
             "--reference-uncertainty: with --turning there is no budget",
@@ -441,7 +441,7 @@ def test_another_reference_turns_is_stated_and_refined(name: str, triaxcal: Run,
     assert np.max(np.abs(pulls(turned.json, sensor))) < 4.5
     assert turned.json["noise_g"] == pytest.approx([noise] * 3, rel=0.05)
     few = still(tmp_path / "few.csv", sensor, UPS[2:6], noise, 6, magnitude)
-    refined = triaxcal("fit", few, "--passport", cal, "--json")
+    refined = triaxcal("fit", few, "--datasheet", cal, "--json")
     assert refined.code == 0
     assert refined.json["units"]["reference"] == options[3]
     assert np.max(np.abs(pulls(refined.json, sensor))) < 4.5

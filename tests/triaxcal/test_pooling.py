@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from triaxcal.agreement import Agreement, Answer, Common, agreement
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, Verdict, diagnose
 from triaxcal.effects import Effect, effect_named
@@ -16,6 +15,7 @@ from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.model.directions import directions
+from triaxcal.pooling import Answer, Common, PooledAnalysis, pooled_analysis
 from triaxcal.poses.pose import Pose
 
 SIGMA_G, HOLD_S, COUNT = 1e-5, 10.0, 26
@@ -55,27 +55,27 @@ def nothing(rng: np.random.Generator) -> Added:
     return lambda t_s, s: np.zeros_like(s)
 
 
-def units(seed: int, *made: Callable[[np.random.Generator], Added]) -> tuple[list[Loop], Agreement]:
+def units(seed: int, *made: Callable[[np.random.Generator], Added]) -> tuple[list[Loop], PooledAnalysis]:
     rng = np.random.default_rng(seed)
     loops = [unit(rng, make(rng)) for make in made]
-    return loops, agreement(loops)
+    return loops, pooled_analysis(loops)
 
 
 def alike(time_constants_s: Sequence[float], size_g: float = 1e-4) -> list[Callable[[np.random.Generator], Added]]:
     return [lambda rng, tau=tau: warming(rng, tau, size_g) for tau in time_constants_s]  # type: ignore[misc]
 
 
-def named(found: Agreement, name: str) -> Common:
+def named(found: PooledAnalysis, name: str) -> Common:
     return next(c for c in found.effects if c.effect == name)
 
 
 @pytest.fixture(scope="module")
-def slow() -> tuple[list[Loop], Agreement]:
+def slow() -> tuple[list[Loop], PooledAnalysis]:
     """Six units that warm up so slowly that one alone is hardly told from a drift."""
     return units(2, *alike([250.0] * 6, 2e-4))
 
 
-def test_what_single_units_cannot_tell_apart_all_together_do(slow: tuple[list[Loop], Agreement]) -> None:
+def test_what_single_units_cannot_tell_apart_all_together_do(slow: tuple[list[Loop], PooledAnalysis]) -> None:
     loops, found = slow
     assert not any(f.verdict is Verdict.ADOPTED for loop in loops for f in loop.findings)
     assert found.answer is Answer.AGREE
@@ -85,7 +85,7 @@ def test_what_single_units_cannot_tell_apart_all_together_do(slow: tuple[list[Lo
     assert named(found, "bias_drift").probability < 0.05
 
 
-def test_who_names_it_and_who_lists_it_is_told(slow: tuple[list[Loop], Agreement]) -> None:
+def test_who_names_it_and_who_lists_it_is_told(slow: tuple[list[Loop], PooledAnalysis]) -> None:
     loops, found = slow
     best = found.effects[0]
     for i, loop in enumerate(loops):
@@ -96,11 +96,11 @@ def test_who_names_it_and_who_lists_it_is_told(slow: tuple[list[Loop], Agreement
         assert best.units[i] == pytest.approx(loop.probabilities["warm_up"], abs=0.05)  # another grid of sizes
 
 
-def test_values_of_their_own_are_not_called_common(slow: tuple[list[Loop], Agreement]) -> None:
+def test_values_of_their_own_are_not_called_common(slow: tuple[list[Loop], PooledAnalysis]) -> None:
     assert slow[1].effects[0].common < 0.01
 
 
-def test_the_shared_time_constant_is_better_known_than_the_units_own(slow: tuple[list[Loop], Agreement]) -> None:
+def test_the_shared_time_constant_is_better_known_than_the_units_own(slow: tuple[list[Loop], PooledAnalysis]) -> None:
     shape = slow[1].effects[0].shapes["time_constant"]
     assert shape.shared.unit == "s"
     assert shape.shared.standard_error is not None
@@ -116,7 +116,7 @@ def test_a_step_that_units_share_lies_between_two_poses_as_far_as_its_standard_e
         at_s = HOLD_S * int(rng.integers(6, 20))
         size = 3e-4 * np.sign(rng.standard_normal(3))
         loops = [unit(rng, lambda t, s: np.where(t[:, None] < at_s, -size, 0.0), [BiasStep()]) for _ in range(2)]  # noqa: B023
-        shared = agreement(loops).effects[0].shapes["at"].shared
+        shared = pooled_analysis(loops).effects[0].shapes["at"].shared
         assert shared.standard_error is not None
         off.append((shared.value - at_s) / shared.standard_error)
     assert np.max(np.abs(off)) < 2
@@ -166,4 +166,4 @@ def test_units_that_show_nothing_agree_on_nothing() -> None:
 def test_one_unit_alone_has_nobody_to_agree_with() -> None:
     loops, _ = units(13, *alike([60.0] * 2))
     with pytest.raises(InvalidData, match="takes two"):
-        agreement(loops[:1])
+        pooled_analysis(loops[:1])

@@ -12,7 +12,7 @@ from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.held_out import held_out, magnitude_errors
+from triaxcal.estimate.hold_out import held_out, magnitude_errors
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -47,8 +47,8 @@ def test_a_calibration_that_does_worse_than_the_linear_one_elsewhere_is_found_ou
     quiet = poses_of(paper_unit, twenty_six, 0)
     poses = [replace(p, mean=p.mean + e) for p, e in zip(quiet, swing, strict=True)]
     check = poses_of(paper_unit, twenty_six, 1)
-    before = fit(poses, signs=MINUS, aside=())
-    wrong = fit(poses, signs=MINUS, aside=(), effects=[effect_named("cross_coupling")])
+    before = fit(poses, signs=MINUS, excluded=())
+    wrong = fit(poses, signs=MINUS, excluded=(), effects=[effect_named("cross_coupling")])
     held = held_out(before, wrong, check)
     assert held.after_rms_g > 1.2 * held.before_rms_g
     assert held.worse

@@ -1,4 +1,4 @@
-"""fit by other ways: a turning unit, poses of known attitude, refinement of passport values."""
+"""fit by other ways: a turning unit, poses of known attitude, refinement of datasheet values."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.figures import probability
 from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
-from triaxcal.inputs.passport import Refinement, refine
+from triaxcal.inputs.datasheet import Refinement, refine
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.inputs.turning.rotation import RotationFit, fit_rotation
-from triaxcald import ways_in
+from triaxcald import methods
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import micro, table
 from triaxcald.cli.results import cross_validated, show_coefficients
@@ -34,13 +34,13 @@ def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | N
     """The way that the options ask for; None for still poses alone. Raises InputError for options without their way."""
     if a.attitude_error is not None and not a.attitudes:
         raise InputError("--attitude-error: there are no --attitudes")
-    if a.passport_error is not None and not a.passport:
-        raise InputError("--passport-error: there is no --passport")
-    way = "--turning" if a.turning else "--attitudes" if a.attitudes else "--passport" if a.passport else None
+    if a.datasheet_error is not None and not a.datasheet:
+        raise InputError("--datasheet-error: there is no --datasheet")
+    way = "--turning" if a.turning else "--attitudes" if a.attitudes else "--datasheet" if a.datasheet else None
     for option in ("reference_uncertainty", "thermometer_uncertainty", "thermal_sensitivity"):
         if way and getattr(a, option) is not None:
             raise InputError(f"--{option.replace('_', '-')}: with {way} there is no budget that it would count in")
-    return _turning if a.turning else _attitudes if a.attitudes else _passport if a.passport else None
+    return _turning if a.turning else _attitudes if a.attitudes else _datasheet if a.datasheet else None
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def _turning(a: argparse.Namespace) -> Way:
     choice = chosen(a, measured)
     with telling_data_quality(measured), telling_default_signs(a, measured):
         found = fit_rotation(moments, signs=choice.signs, reference=choice.reference)
-    document = ways_in.turning_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    document = methods.turning_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     calibration = found.calibration
     still = [p for p in measured.poses if not p.creep.any()]
     if len(still) >= POSES_ENOUGH:
@@ -94,7 +94,7 @@ def _attitudes(a: argparse.Namespace) -> Way:
             reference=choice.reference,
             attitude_error_rad=a.attitude_error,
         )
-    document = ways_in.attitudes_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    document = methods.attitudes_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
     return measured, document, found.calibration, lambda: _show_attitudes(found, choice)
 
 
@@ -138,40 +138,40 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
     )
 
 
-def _passport(a: argparse.Namespace) -> Way:
-    held = read_document(a.passport)
+def _datasheet(a: argparse.Namespace) -> Way:
+    held = read_document(a.datasheet)
     measured = read_recording(a, a.recording)
-    require_unit(held, measured, where=a.passport)
+    require_unit(held, measured, where=a.datasheet)
     choice = chosen(a, measured)
     said = a.reference or measured.reference or getattr(a, "latitude", None)
-    passport, units = ways_in.read_passport(
-        held, where=a.passport, errors=a.passport_error, reference=choice.reference if said is not None else None
+    datasheet, units = methods.read_datasheet(
+        held, where=a.datasheet, errors=a.datasheet_error, reference=choice.reference if said is not None else None
     )
-    if a.sign and any(k * s < 0 for k, s in zip(passport.sensor.scale_factor, a.sign, strict=True)):
-        raise InputError(f"--sign: the scale factors in {a.passport} have other signs")
+    if a.sign and any(k * s < 0 for k, s in zip(datasheet.sensor.scale_factor, a.sign, strict=True)):
+        raise InputError(f"--sign: the scale factors in {a.datasheet} have other signs")
     choice = replace(
         choice,
-        reference=passport.reference,
+        reference=datasheet.reference,
         output_unit=choice.output_unit or units.get("output", ""),
         reference_unit=a.reference_unit or units.get("reference") or choice.reference_unit,
     )
     with telling_data_quality(measured), np.errstate(all="ignore"):  # numbers out of a file may be any
-        found = refine(measured.poses, passport)
-    document = ways_in.passport_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
-    return measured, document, found.calibration, lambda: _show_passport(found, choice)
+        found = refine(measured.poses, datasheet)
+    document = methods.datasheet_document(found, output_unit=choice.output_unit, reference_unit=choice.reference_unit)
+    return measured, document, found.calibration, lambda: _show_datasheet(found, choice)
 
 
-def _show_passport(found: Refinement, choice: Choice) -> None:
+def _show_datasheet(found: Refinement, choice: Choice) -> None:
     c = found.calibration
     table(
-        f"passport values, refined by {len(c.poses)} poses",
-        ["", "passport", "standard error", "refined", "standard error", "shift, by chance 1", "poses' share", "from"],
+        f"datasheet values, refined by {len(c.poses)} poses",
+        ["", "datasheet", "standard error", "refined", "standard error", "shift, by chance 1", "poses' share", "from"],
         [
             [name, f"{old:.9g}", f"{error:.2g}", f"{new:.9g}", f"{now:.2g}", f"{shift:+.1f}", f"{share:.0%}", source]
             for name, old, error, new, now, shift, share, source in zip(
                 c.parameters,
-                found.passport.values,
-                found.passport.standard_error,
+                found.datasheet.values,
+                found.datasheet.standard_error,
                 c.values,
                 c.standard_errors,
                 found.shift,
@@ -183,6 +183,6 @@ def _show_passport(found: Refinement, choice: Choice) -> None:
     )
     r, small = c.residual, choice.small
     print(
-        f"|a| off by {small.in_full(r.rms_g)} rms, noise floor {small.in_full(r.noise_floor_g)}; passport and poses "
+        f"|a| off by {small.in_full(r.rms_g)} rms, noise floor {small.in_full(r.noise_floor_g)}; datasheet and poses "
         f"agree with p {probability(found.conflict_p)}"
     )

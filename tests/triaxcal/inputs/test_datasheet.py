@@ -1,4 +1,4 @@
-"""Passport values refined by few poses, judged by truth over seeds and by the full posterior of an outside solver."""
+"""Datasheet values refined by few poses, judged by truth over seeds and by the full posterior of an outside solver."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy import optimize, stats
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.inputs.passport import DatasheetContradicted, Passport, StillOfDatasheet, refine
+from triaxcal.inputs.datasheet import Datasheet, DatasheetContradicted, StillOfDatasheet, refine
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -25,10 +25,10 @@ def sensor(values: np.ndarray) -> Sensor:
     return Sensor(values[:3], values[3:6], values[6:9])
 
 
-def passport(seed: int, error: np.ndarray = ERROR, reference: float = 1.0) -> Passport:
+def datasheet(seed: int, error: np.ndarray = ERROR, reference: float = 1.0) -> Datasheet:
     """One as good as it says."""
     rng = np.random.default_rng([seed, 1])
-    return Passport(sensor(TRUTH + rng.standard_normal(9) * error), error, {}, reference)
+    return Datasheet(sensor(TRUTH + rng.standard_normal(9) * error), error, {}, reference)
 
 
 def poses(count: int, seed: int, noise: float = 1e-5) -> list[Pose]:
@@ -42,7 +42,7 @@ def test_truth_comes_back_within_the_stated_errors_however_few_the_poses(count: 
     squares = []
     seeds = 40
     for seed in range(seeds):
-        c = refine(poses(count, seed, noise), passport(seed)).calibration
+        c = refine(poses(count, seed, noise), datasheet(seed)).calibration
         e = (c.values - TRUTH) / ERROR
         squares.append(e @ np.linalg.solve(c.covariance / np.outer(ERROR, ERROR), e))
     low, high = stats.chi2.interval(0.9998, 9 * seeds)
@@ -54,7 +54,7 @@ def test_each_standard_error_is_true_where_the_poses_know_a_thousand_times_bette
     """The nine together lie on a curved surface then, of which a covariance knows nothing; each by itself does not."""
     pulls = []
     for seed in range(40):
-        c = refine(poses(count, seed, 1e-6), passport(seed)).calibration
+        c = refine(poses(count, seed, 1e-6), datasheet(seed)).calibration
         pulls.append((c.values - TRUTH) / c.standard_errors)
     low, high = stats.chi2.interval(0.9998, 40 * 3) / np.array(40 * 3)  # pulls of one seed go together
     assert low < np.mean(np.square(pulls)) < high
@@ -62,7 +62,7 @@ def test_each_standard_error_is_true_where_the_poses_know_a_thousand_times_bette
 
 @pytest.mark.parametrize("count", [2, 5])
 def test_the_result_is_the_mode_of_the_posterior(count: int) -> None:
-    held, prior = poses(count, 3), passport(3)
+    held, prior = poses(count, 3), datasheet(3)
     c = refine(held, prior).calibration
     u = np.array([p.mean for p in held])
     sigma = np.array([p.standard_error for p in held])
@@ -83,19 +83,19 @@ def test_the_result_is_the_mode_of_the_posterior(count: int) -> None:
     assert c.standard_errors / ERROR == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-2)
 
 
-def test_with_enough_poses_and_a_vague_passport_it_is_the_fit_to_the_poses() -> None:
+def test_with_enough_poses_and_a_vague_datasheet_it_is_the_fit_to_the_poses() -> None:
     held = poses(14, 2)
-    vague = Passport(sensor(TRUTH * 1.05), np.abs(TRUTH) * 10, {}, 1.0)
-    found, free = refine(held, vague), fit(held, signs=SIGNS, aside=())
+    vague = Datasheet(sensor(TRUTH * 1.05), np.abs(TRUTH) * 10, {}, 1.0)
+    found, free = refine(held, vague), fit(held, signs=SIGNS, excluded=())
     assert np.max(np.abs(found.calibration.values - free.values) / free.standard_errors) < 1e-3
     assert found.sources == ("poses",) * 9
 
 
 def test_one_pose_moves_only_the_axis_that_it_points_along() -> None:
-    found = refine(poses(1, 1), passport(1))
+    found = refine(poses(1, 1), datasheet(1))
     assert [found.sources[i] for i in (0, 6)] == ["both", "both"]
     assert [found.sources[i] for i in (1, 2, 3, 4, 5, 7, 8)] == ["passport"] * 7
-    moved = (found.calibration.values - found.passport.values) / ERROR
+    moved = (found.calibration.values - found.datasheet.values) / ERROR
     assert np.max(np.abs(moved[[1, 2, 3, 4, 5, 7, 8]])) < 0.1 < np.max(np.abs(moved[[0, 6]]))
     kept = ("scale_factor.y", "scale_factor.z", *(f"misalignment.{a}" for a in "xyz"), "bias.y", "bias.z")
     assert found.calibration.cautions == (StillOfDatasheet(kept),)
@@ -104,15 +104,15 @@ def test_one_pose_moves_only_the_axis_that_it_points_along() -> None:
 def test_shares_of_information_grow_with_every_pose() -> None:
     before = np.zeros(9)
     for count in range(1, 15):
-        share = refine(poses(count, 1), passport(1)).share
+        share = refine(poses(count, 1), datasheet(1)).share
         assert np.all(share >= before - 1e-4)
         before = share
     assert np.all(before > 0.99)
 
 
-def test_a_passport_as_good_as_it_says_hardly_ever_conflicts() -> None:
+def test_a_datasheet_as_good_as_it_says_hardly_ever_conflicts() -> None:
     seeds = 200
-    conflicts = [refine(poses(4, seed), passport(seed)).conflict_p for seed in range(seeds)]
+    conflicts = [refine(poses(4, seed), datasheet(seed)).conflict_p for seed in range(seeds)]
     p = np.array([c for c in conflicts if c is not None])
     assert len(p) == seeds
     assert stats.binom.ppf(1e-4, seeds, 0.1) <= np.sum(p < 0.1) <= stats.binom.isf(1e-4, seeds, 0.1)
@@ -120,13 +120,13 @@ def test_a_passport_as_good_as_it_says_hardly_ever_conflicts() -> None:
 
 def test_a_unit_that_has_changed_conflicts_and_the_value_is_named() -> None:
     for seed in range(20):
-        prior = passport(seed)
+        prior = datasheet(seed)
         values = prior.values
         values[7] += 20 * ERROR[7]
-        found = refine(poses(6, seed), Passport(sensor(values), ERROR, {}, 1.0))
+        found = refine(poses(6, seed), Datasheet(sensor(values), ERROR, {}, 1.0))
         assert found.conflict_p is not None
         assert found.conflict_p < 1e-6
-        assert found.calibration.inflation > 2
+        assert found.calibration.birge_ratio > 2
         caution = found.calibration.cautions[0]
         assert isinstance(caution, DatasheetContradicted)
         assert caution.parameter == "bias.y"
@@ -135,13 +135,13 @@ def test_a_unit_that_has_changed_conflicts_and_the_value_is_named() -> None:
 def test_a_value_without_error_stays_where_it_is() -> None:
     error = ERROR.copy()
     error[3:6] = 0
-    prior = Passport(sensor(TRUTH), error, {}, 1.0)
+    prior = Datasheet(sensor(TRUTH), error, {}, 1.0)
     c = refine(poses(6, 1), prior).calibration
     assert np.array_equal(c.values[3:6], TRUTH[3:6])
     assert np.all(c.standard_errors[3:6] == 0)
 
 
-def test_a_passport_from_earlier_poses_and_new_poses_are_as_good_as_all_poses_at_once() -> None:
+def test_a_datasheet_from_earlier_poses_and_new_poses_are_as_good_as_all_poses_at_once() -> None:
     """Its errors go together: 10 K away from where the coefficients count from, a bias is hardly told from its drift
     with temperature."""
     effect = effect_named("temperature_bias")
@@ -153,21 +153,21 @@ def test_a_passport_from_earlier_poses_and_new_poses_are_as_good_as_all_poses_at
         channels={"temp_c": 35 + rng.uniform(-1, 1, 40)}, channel_reference={"temp_c": 25.0},
     )  # fmt: skip
     earlier, today = held[:26], held[26:]
-    whole = fit(held, signs=SIGNS, effects=[effect], aside=())
-    before = fit(earlier, signs=SIGNS, effects=[effect], aside=())
+    whole = fit(held, signs=SIGNS, effects=[effect], excluded=())
+    before = fit(earlier, signs=SIGNS, effects=[effect], excluded=())
     reference = before.channel_reference["temp_c"]
     # Moved to 25 °C, as if it had been made to count from there.
-    values, V = _counted_from(before.values, before.covariance / before.inflation**2, 25.0 - reference)
+    values, V = _counted_from(before.values, before.covariance / before.birge_ratio**2, 25.0 - reference)
     error = np.sqrt(np.diag(V))
     known = Sensor(values[:3], values[3:6], values[6:9], ((effect, values[9:]),))
-    prior = Passport(known, error, {"temp_c": 25.0}, 1.0, V / np.outer(error, error))
+    prior = Datasheet(known, error, {"temp_c": 25.0}, 1.0, V / np.outer(error, error))
     found = refine(today, prior).calibration
     values, V = _counted_from(
-        whole.values, whole.covariance / whole.inflation**2, 25.0 - whole.channel_reference["temp_c"]
+        whole.values, whole.covariance / whole.birge_ratio**2, 25.0 - whole.channel_reference["temp_c"]
     )
     np.testing.assert_allclose(found.standard_errors, np.sqrt(np.diag(V)), rtol=0.02)
     assert np.max(np.abs(found.values - values) / np.sqrt(np.diag(V))) < 0.1
-    assert found.inflation == 1
+    assert found.birge_ratio == 1
 
 
 def _counted_from(values: np.ndarray, V: np.ndarray, by_k: float) -> tuple[np.ndarray, np.ndarray]:
@@ -177,7 +177,7 @@ def _counted_from(values: np.ndarray, V: np.ndarray, by_k: float) -> tuple[np.nd
     return M @ values, M @ V @ M.T
 
 
-def test_effects_of_the_passport_are_kept_and_refined_too() -> None:
+def test_effects_of_the_datasheet_are_kept_and_refined_too() -> None:
     effect = effect_named("temperature_bias")
     q = np.array([2e-4, -1e-4, 1e-4])
     hot = Sensor(UNIT.scale_factor, UNIT.misalignment, UNIT.bias, ((effect, q),))
@@ -187,12 +187,12 @@ def test_effects_of_the_passport_are_kept_and_refined_too() -> None:
         channel_reference={"temp_c": 25.0},
     )  # fmt: skip
     known = Sensor(UNIT.scale_factor, UNIT.misalignment, UNIT.bias, ((effect, q * 1.1),))
-    found = refine(held, Passport(known, np.concatenate([ERROR, np.full(3, 3e-5)]), {"temp_c": 25.0}, 1.0))
+    found = refine(held, Datasheet(known, np.concatenate([ERROR, np.full(3, 3e-5)]), {"temp_c": 25.0}, 1.0))
     c = found.calibration
     assert np.max(np.abs(c.values[9:] - q) / c.standard_errors[9:]) < 4
     assert np.all(c.standard_errors[9:] < 3e-5)
     with pytest.raises(InvalidData, match="no channel temp_c"):
-        refine(poses(4, 1), Passport(known, np.concatenate([ERROR, np.full(3, 3e-5)]), {"temp_c": 25.0}, 1.0))
+        refine(poses(4, 1), Datasheet(known, np.concatenate([ERROR, np.full(3, 3e-5)]), {"temp_c": 25.0}, 1.0))
 
 
 def test_a_field_of_48_microtesla_with_its_hard_iron_is_no_harder() -> None:
@@ -202,7 +202,7 @@ def test_a_field_of_48_microtesla_with_its_hard_iron_is_no_harder() -> None:
     squares = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        prior = Passport(sensor(iron + rng.standard_normal(9) * error), error, {}, 48.0)
+        prior = Datasheet(sensor(iron + rng.standard_normal(9) * error), error, {}, 48.0)
         c = refine(noisy_poses(sensor(iron), ups, 0.02, rng), prior).calibration
         e = (c.values - iron) / error
         squares.append(e @ np.linalg.solve(c.covariance / np.outer(error, error), e))
@@ -212,10 +212,10 @@ def test_a_field_of_48_microtesla_with_its_hard_iron_is_no_harder() -> None:
 
 def test_no_pose_is_refused() -> None:
     with pytest.raises(Refused, match="no still pose"):
-        refine([], passport(1))
+        refine([], datasheet(1))
 
 
 @pytest.mark.parametrize("error", [np.zeros(9), np.ones(8), -np.ones(9), np.full(9, np.nan)])
 def test_standard_errors_that_are_none_are_an_error(error: np.ndarray) -> None:
     with pytest.raises(InvalidData, match="standard error"):
-        Passport(UNIT, error, {}, 1.0)
+        Datasheet(UNIT, error, {}, 1.0)

@@ -11,7 +11,7 @@ from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Posterior, posterior
-from triaxcal.evidence.together import together
+from triaxcal.evidence.pooled import pool
 from triaxcal.poses.pose import Pose
 
 UNITS = 8
@@ -34,7 +34,7 @@ def test_an_effect_with_common_values_is_certain_in_all_and_in_none_alone(
     weak = {"temperature_bias": [1.4e-5, -1.2e-5, 1e-5]}
     units = of_units([poses_with(seed, **weak) for seed in range(UNITS)])
     assert max(unit.of_names.get("temperature_bias", 0.0) for unit in units) < 0.9
-    found = together(units)
+    found = pool(units)
     assert next(iter(found.probability)) == "temperature_bias"
     assert found.probability["temperature_bias"] > 0.9  # that it is a little bent cannot be excluded
     assert found.nothing < 0.01
@@ -45,13 +45,13 @@ def test_an_effect_with_common_values_is_certain_in_all_and_in_none_alone(
 def test_values_of_their_own_are_not_called_common(poses_with: Callable[..., list[Pose]]) -> None:
     rng = np.random.default_rng(3)
     values = rng.standard_normal((UNITS, 3)) * 4e-5
-    found = together(of_units([poses_with(i, temperature_bias=list(q)) for i, q in enumerate(values)]))
+    found = pool(of_units([poses_with(i, temperature_bias=list(q)) for i, q in enumerate(values)]))
     assert found.probability["temperature_bias"] > 0.99
     assert found.common["temperature_bias"] < 0.01
 
 
 def test_where_nothing_acts_nothing_is_found_together(poses_with: Callable[..., list[Pose]]) -> None:
-    found = together(of_units([poses_with(seed + 50) for seed in range(UNITS)]))
+    found = pool(of_units([poses_with(seed + 50) for seed in range(UNITS)]))
     assert max(found.probability.values()) < 0.5
     assert found.apart > 0.5
     assert found.nothing > 0.3
@@ -64,7 +64,7 @@ def test_what_one_unit_has_alone_is_no_effect_of_all(poses_with: Callable[..., l
     poses[2] = poses_with(72, hysteresis=[8e-4, -7e-4, 9e-4])
     units = of_units(poses)
     assert units[2].of_names["hysteresis"] > 0.99
-    found = together(units)
+    found = pool(units)
     assert found.probability["hysteresis"] < 0.01
     assert found.nothing < 0.01
 
@@ -76,14 +76,14 @@ def test_what_takes_the_place_of_an_unmodelled_part_in_each_is_an_effect_of_all(
     rng = np.random.default_rng(5)
     poses = [poses_with(i, second_order_nonlinearity=list(1.5e-4 * rng.standard_normal(3))) for i in range(UNITS)]
     units = of_units(poses)
-    found = together(units)
+    found = pool(units)
     assert min(unit.of_names["second_order_nonlinearity"] for unit in units) < 0.95
     assert found.probability["second_order_nonlinearity"] > 0.99
 
 
 def test_names_that_one_unit_cannot_show_are_left_out(poses_with: Callable[..., list[Pose]]) -> None:
     cold = [replace(p, channels={}) for p in poses_with(1)]
-    found = together(of_units([poses_with(0), cold]))
+    found = pool(of_units([poses_with(0), cold]))
     assert "temperature_bias" not in found.probability
     assert "hysteresis" in found.probability
 
@@ -97,5 +97,5 @@ def test_what_no_name_describes_in_each_is_no_common_effect(poses_with: Callable
         at = [swing * np.sin(2 * np.pi * p.t_s / 110 + phase) for p in poses_with(seed)]
         scale = np.array([-2.41, -2.40, -2.37])
         poses.append([replace(p, mean=p.mean + scale * b) for p, b in zip(poses_with(seed), at, strict=True)])
-    found = together(of_units(poses))
+    found = pool(of_units(poses))
     assert max(found.probability.values()) < 0.9

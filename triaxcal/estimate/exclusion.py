@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.arrays import Ints
-from triaxcal.estimate.beyond import Beyond
 from triaxcal.estimate.calibration import Calibration, Exclusion, PoseResult
 from triaxcal.estimate.caution import (
     Caution,
@@ -19,49 +18,50 @@ from triaxcal.estimate.caution import (
     PosesExcludedByCaller,
     UnknownHistoryExcluded,
 )
-from triaxcal.estimate.outliers import Spoiled, not_as_foretold, spoiled
+from triaxcal.estimate.excess import Excess
+from triaxcal.estimate.outliers import OutlierSet, not_as_predicted, outlier_set
 from triaxcal.estimate.problem import Problem, State, linearise, solve
-from triaxcal.poses.conditions import of_unknown_history
+from triaxcal.poses.covariates import of_unknown_history
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import of_both, pose_dof, pure_error_dof
 
-SPOILED_ROUNDS = 4
+OUTLIER_ROUNDS = 4
 
 
-def spoiled_among(problem: Problem, state: State, poses: Sequence[Pose]) -> Spoiled:
+def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> OutlierSet:
     """Indices of spoiled poses, from the fit to all. Sought anew without those found, until the same are found again:
     a pose spoiled by a thousand times its noise bends the fit so far that linear reckoning is off.
 
     What the others show beside their noise, all are taken to have: by the noise alone the quietest would look spoiled.
     """
     own, together = pose_dof(poses), pure_error_dof(poses)
-    dof, pure, judged, found = own, together, problem, Spoiled()
-    for _ in range(SPOILED_ROUNDS):
+    dof, pure, judged, found = own, together, problem, OutlierSet()
+    for _ in range(OUTLIER_ROUNDS):
         r, J, s = linearise(judged, state)
-        again = spoiled(r / s, J / s[:, None], dof, pure)
+        again = outlier_set(r / s, J / s[:, None], dof, pure)
         if again.rows == found.rows:
             return again
         found = again
         rest: Ints = np.delete(np.arange(len(poses)), found.rows)
         others, left = problem.only(rest), len(rest) - len(state.theta)
         state = solve(others, state, state.effects)
-        judged = replace(problem, excess=Beyond.shown(linearise(others, state), len(rest), left, together).excess_g)
+        judged = replace(problem, excess=Excess.shown(linearise(others, state), len(rest), left, together).excess_g)
         share = judged.excess**2 / linearise(judged, state)[2] ** 2
         dof, pure = of_both(share, left, own), float(of_both(share.mean(), left, together))
     return found
 
 
-def of_another_history(
-    problem: Problem, state: State, poses: Sequence[Pose], aside: tuple[int, ...]
+def with_unknown_history(
+    problem: Problem, state: State, poses: Sequence[Pose], excluded: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """Poses, besides those ``aside``, that are not as if the unit had rested there before; what was is not known."""
-    if not (unknown := set(of_unknown_history(poses, state.effects)) - set(aside)):
+    """Poses, besides those ``excluded``, that are not as if the unit had rested there before; what was is not known."""
+    if not (unknown := set(of_unknown_history(poses, state.effects)) - set(excluded)):
         return ()
-    rest: Ints = np.delete(np.arange(len(poses)), aside)
+    rest: Ints = np.delete(np.arange(len(poses)), excluded)
     problem = problem.only(rest)
     r, J, s = linearise(problem, solve(problem, state, state.effects))
     rows = [k for k, i in enumerate(rest) if i in unknown]
-    found = not_as_foretold(r / s, J / s[:, None], pure_error_dof([poses[i] for i in rest]), rows)
+    found = not_as_predicted(r / s, J / s[:, None], pure_error_dof([poses[i] for i in rest]), rows)
     return tuple(int(rest[k]) for k in found)
 
 
@@ -80,9 +80,9 @@ def _among(
 ) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
     """The results of a calibration with those of further poses left out among them, by rows of all; and these."""
     u = np.array([p.mean for p in poses])
-    conditioned = calibration.conditions_of(poses)
-    length, by_u = calibration.sensor.magnitude(u, conditioned)
-    a = calibration.sensor.specific_force(u, conditioned)
+    covariates = calibration.covariates_of(poses)
+    length, by_u = calibration.sensor.magnitude(u, covariates)
+    a = calibration.sensor.specific_force(u, covariates)
     results, added = list(calibration.poses), []
     for i, reason in sorted(reasons.items()):
         noise = float(np.sqrt(by_u[i] @ poses[i].covariance @ by_u[i]))
@@ -93,8 +93,8 @@ def _among(
     return tuple(results), added
 
 
-def with_aside(
-    calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: Spoiled, why: Exclusion
+def with_excluded(
+    calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: OutlierSet, why: Exclusion
 ) -> Calibration:
     """The calibration with the poses left out among its results, in order of time, and cautions that name them: those
     that an effect knows no history of, and else as ``why`` says."""
@@ -114,9 +114,9 @@ def with_aside(
     return replace(calibration, poses=results, cautions=(*cautions, *calibration.cautions))
 
 
-def with_rivals(calibration: Calibration, poses: Sequence[Pose], verdict: Spoiled) -> Calibration:
+def with_tied_sets(calibration: Calibration, poses: Sequence[Pose], verdict: OutlierSet) -> Calibration:
     """The calibration with a caution of sets of poses one of which may be spoiled, where nobody can tell which."""
-    if not verdict.rivals:
+    if not verdict.tied:
         return calibration
-    tied = OutlierSetsTied(tuple(tuple(poses[i].began for i in rows) for rows in verdict.rivals))
+    tied = OutlierSetsTied(tuple(tuple(poses[i].began for i in rows) for rows in verdict.tied))
     return replace(calibration, cautions=(tied, *calibration.cautions))

@@ -18,7 +18,7 @@ from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.figures import plain
-from triaxcal.poses.conditions import conditions_elsewhere
+from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 
 MISALIGNMENT_RAD, SCALE_FACTOR = 1e-3, 6e-3
@@ -69,7 +69,7 @@ def shape_beside(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
     sensor = held.sensor
     if sensor.effects:
         try:
-            at = conditions_elsewhere(poses, held.channel_reference, sensor.scale_factor, sensor.bias, held.moment)
+            at = covariates_elsewhere(poses, held.channel_reference, sensor.scale_factor, sensor.bias, held.moment)
             s = sensor.along_axes(np.array([p.mean for p in poses]), at)
         except Refused:
             return None

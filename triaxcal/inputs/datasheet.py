@@ -1,8 +1,8 @@
-"""Refinement of passport values: a calibration that is known from before, brought up to date by a few still poses.
+"""Refinement of datasheet values: a calibration that is known from before, brought up to date by a few still poses.
 
-The paper's reference 3 adds increments to passport values until |a| is right in the poses. Here the passport's values
+The paper's reference 3 adds increments to datasheet values until |a| is right in the poses. Here the datasheet's values
 are observations with standard errors of their own beside the poses (JCGM 102; Bayes with normal priors): fewer poses
-than parameters will do, each parameter is moved as far as the poses know better than the passport, and whether the two
+than parameters will do, each parameter is moved as far as the poses know better than the datasheet, and whether the two
 contradict each other can be tested.
 """
 
@@ -20,26 +20,26 @@ from triaxcal.estimate.caution import Caution
 from triaxcal.estimate.problem import Problem, State, linearise, parameters_by_theta
 from triaxcal.model.directions import dilution, linear_design
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.conditions import conditions_elsewhere
+from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof
 
 STEPS_MOST = 60
 CONVERGED = 1e-12
 CONFLICT = 0.01
-FROM_POSES, FROM_PASSPORT = 0.9, 0.1
-"""Share of the information on a parameter from which on it counts as the poses', or still as the passport's."""
+FROM_POSES, FROM_DATASHEET = 0.9, 0.1
+"""Share of the information on a parameter from which on it counts as the poses', or still as the datasheet's."""
 
 
 class FarFromPoses(Refused):
-    """The poses are too far from the passport's values."""
+    """The poses are too far from the datasheet's values."""
 
     def __init__(self) -> None:
-        super().__init__("the refinement did not converge: the passport values are far from these poses")
+        super().__init__("the refinement did not converge: the datasheet values are far from these poses")
 
 
 @dataclass(frozen=True)
-class Passport:
+class Datasheet:
     """Values known from before. ``standard_error`` (9+p,) in the order of `Calibration.parameters`: scale factors,
     misalignments, biases, effects' coefficients; a zero holds a value fast. ``correlation`` (9+p,9+p) of their errors,
     none where it is None."""
@@ -60,11 +60,11 @@ class Passport:
         n = 9 + sum(len(e.coefficients) for e, _ in self.sensor.effects)
         error = self.standard_error
         if error.shape != (n,) or not (np.isfinite(error).all() and np.all(error >= 0)):
-            raise InvalidData(f"a passport of {n} values needs as many standard errors of at least 0")
+            raise InvalidData(f"a datasheet of {n} values needs as many standard errors of at least 0")
         if not np.any(error > 0):
-            raise InvalidData("every passport value has a standard error of 0: nothing is left to refine")
+            raise InvalidData("every datasheet value has a standard error of 0: nothing is left to refine")
         if self.correlation is not None and self.correlation.shape != (n, n):
-            raise InvalidData(f"the correlation of a passport of {n} values is a matrix of as many rows")
+            raise InvalidData(f"the correlation of a datasheet of {n} values is a matrix of as many rows")
 
     @property
     def values(self) -> Floats:
@@ -87,7 +87,7 @@ class Passport:
 
 @dataclass(frozen=True)
 class DatasheetContradicted(Caution):
-    """Poses and passport values contradict each other (probability ``p``), most in ``parameter``, which moved by
+    """Poses and datasheet values contradict each other (probability ``p``), most in ``parameter``, which moved by
     ``shift`` standard errors; standard errors are ``raised`` so many times."""
 
     p: float
@@ -111,7 +111,7 @@ class Refinement:
     """
 
     calibration: Calibration
-    passport: Passport
+    datasheet: Datasheet
     share: Floats
     shift: Floats
     conflict_p: float | None
@@ -119,27 +119,27 @@ class Refinement:
     @property
     def sources(self) -> tuple[str, ...]:
         """ "poses", "passport" or "both" for each parameter."""
-        return tuple("poses" if s > FROM_POSES else "passport" if s < FROM_PASSPORT else "both" for s in self.share)
+        return tuple("poses" if s > FROM_POSES else "passport" if s < FROM_DATASHEET else "both" for s in self.share)
 
 
-def refine(poses: Sequence[Pose], passport: Passport) -> Refinement:
-    """Refine passport values by still poses, however few.
+def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
+    """Refine datasheet values by still poses, however few.
 
-    Raises Refused where there is none, InvalidData where a channel that the passport's effects need is missing.
+    Raises Refused where there is none, InvalidData where a channel that the datasheet's effects need is missing.
     """
     if not poses:
-        raise Refused("no still pose: there is nothing to refine the passport values by")
-    problem = _problem(poses, passport)
-    free = passport.standard_error > 0
-    root = passport.root
-    z, information = _solved(problem, passport, root)
-    p = passport.values + root @ z
-    prior = passport.standard_error**2
+        raise Refused("no still pose: there is nothing to refine the datasheet values by")
+    problem = _problem(poses, datasheet)
+    free = datasheet.standard_error > 0
+    root = datasheet.root
+    z, information = _solved(problem, datasheet, root)
+    p = datasheet.values + root @ z
+    prior = datasheet.standard_error**2
     covariance = root @ np.linalg.inv(information) @ root.T
-    state = _state(problem, passport, p)
+    state = _state(problem, datasheet, p)
     r, J, s = linearise(problem, state)
     J = J @ _theta_by_parameters(problem, state)
-    moved = p - passport.values
+    moved = p - datasheet.values
     chi2 = float(np.sum((r / s) ** 2) + z @ z)
     pure = pure_error_dof(poses)
     conflict_p = lack_of_fit_p(chi2, len(poses), pure if pure >= 1 else 1e6)
@@ -151,39 +151,39 @@ def refine(poses: Sequence[Pose], passport: Passport) -> Refinement:
     calibration = Calibration(
         sensor=state.sensor(problem),
         covariance=covariance * raised**2,
-        reference=passport.reference,
-        channel_reference=dict(passport.channel_reference),
+        reference=datasheet.reference,
+        channel_reference=dict(datasheet.channel_reference),
         residual=_residual(r, s, leverage, conflict_p),
         poses=_results(problem, state, poses, r, s, leverage),
         condition=_condition(information),
         dilution=_dilution(problem, state),
-        inflation=raised,
+        birge_ratio=raised,
         dof=float(max(len(poses), 1) if raised > 1 else max(pure, 1.0)),
-        holds_at=passport.holds_at,
+        holds_at=datasheet.holds_at,
     )
-    found = Refinement(calibration, passport, share, shift, conflict_p)
+    found = Refinement(calibration, datasheet, share, shift, conflict_p)
     return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found))))
 
 
-def _problem(poses: Sequence[Pose], passport: Passport) -> Problem:
-    """Scaled by what the passport expects, since few poses have no range of their own."""
-    sensor = passport.sensor
-    held = conditions_elsewhere(poses, passport.channel_reference, sensor.scale_factor, sensor.bias, passport.moment)
+def _problem(poses: Sequence[Pose], datasheet: Datasheet) -> Problem:
+    """Scaled by what the datasheet expects, since few poses have no range of their own."""
+    sensor = datasheet.sensor
+    held = covariates_elsewhere(poses, datasheet.channel_reference, sensor.scale_factor, sensor.bias, datasheet.moment)
     return Problem(
         u=np.array([p.mean for p in poses]),
         covariance=np.array([p.covariance for p in poses]),
-        channels={name: held[name] + value for name, value in passport.channel_reference.items()},
-        channel_reference=passport.channel_reference,
+        channels={name: held[name] + value for name, value in datasheet.channel_reference.items()},
+        channel_reference=datasheet.channel_reference,
         middle=sensor.centre,
-        half=np.abs(sensor.scale_factor) * passport.reference,
+        half=np.abs(sensor.scale_factor) * datasheet.reference,
         signs=np.sign(sensor.scale_factor),
-        reference=passport.reference,
+        reference=datasheet.reference,
     )
 
 
-def _state(problem: Problem, passport: Passport, p: Floats) -> State:
+def _state(problem: Problem, datasheet: Datasheet, p: Floats) -> State:
     k, angles, b = p[:3], p[3:6], p[6:9]
-    effects = tuple(e for e, _ in passport.sensor.effects)
+    effects = tuple(e for e, _ in datasheet.sensor.effects)
     return State(np.concatenate([problem.half / k, b - problem.middle / k, angles, p[9:]]), effects)
 
 
@@ -191,22 +191,22 @@ def _theta_by_parameters(problem: Problem, state: State) -> Floats:
     return np.linalg.inv(parameters_by_theta(problem, state))
 
 
-def _solved(problem: Problem, passport: Passport, root: Floats) -> tuple[Floats, Floats]:
+def _solved(problem: Problem, datasheet: Datasheet, root: Floats) -> tuple[Floats, Floats]:
     """Shifts (q,) of the values along ``root`` (9+p,q) and the information (q,q) on them: Gauss–Newton with halved
     steps."""
     z = np.zeros(root.shape[1])
-    free = passport.standard_error > 0
-    size = max(float(np.linalg.norm(passport.values[free] / passport.standard_error[free])), 1.0)
+    free = datasheet.standard_error > 0
+    size = max(float(np.linalg.norm(datasheet.values[free] / datasheet.standard_error[free])), 1.0)
 
     def cost(z: Floats, s: Floats) -> float:
-        p = passport.values + root @ z
-        if np.any(p[:3] * passport.values[:3] <= 0):
+        p = datasheet.values + root @ z
+        if np.any(p[:3] * datasheet.values[:3] <= 0):
             return float("inf")
-        r, _, _ = linearise(problem, _state(problem, passport, p), jacobian=False)
+        r, _, _ = linearise(problem, _state(problem, datasheet, p), jacobian=False)
         return float(np.sum((r / s) ** 2) + z @ z)
 
     for _ in range(STEPS_MOST):
-        state = _state(problem, passport, passport.values + root @ z)
+        state = _state(problem, datasheet, datasheet.values + root @ z)
         r, J, s = linearise(problem, state)
         if not (np.isfinite(J).all() and np.isfinite(r).all() and np.all(s > 0)):
             raise FarFromPoses
@@ -230,7 +230,7 @@ def _solved(problem: Problem, passport: Passport, root: Floats) -> tuple[Floats,
 
 
 def _residual(r: Floats, s: Floats, leverage: Floats, p: float | None) -> Residual:
-    alone = r / np.maximum(1 - leverage, 1e-9)  # of each pose under passport and all other poses
+    alone = r / np.maximum(1 - leverage, 1e-9)  # of each pose under datasheet and all other poses
     return Residual(
         rms_g=float(np.sqrt(np.mean(r**2))),
         max_abs_g=float(np.max(np.abs(r))),
@@ -243,7 +243,7 @@ def _residual(r: Floats, s: Floats, leverage: Floats, p: float | None) -> Residu
 def _results(
     problem: Problem, state: State, poses: Sequence[Pose], r: Floats, s: Floats, leverage: Floats
 ) -> tuple[PoseResult, ...]:
-    a = state.sensor(problem).specific_force(problem.u, problem.conditions)
+    a = state.sensor(problem).specific_force(problem.u, problem.covariates)
     direction = a / np.linalg.norm(a, axis=1, keepdims=True)
     free = np.sqrt(np.maximum(1 - leverage, 0.0))
     studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
@@ -259,8 +259,8 @@ def _condition(information: Floats) -> float:
 
 
 def _dilution(problem: Problem, state: State) -> float:
-    """Of the poses alone, without the passport."""
-    a = state.sensor(problem).specific_force(problem.u, problem.conditions)
+    """Of the poses alone, without the datasheet."""
+    a = state.sensor(problem).specific_force(problem.u, problem.covariates)
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     return dilution(a, linear_design(a, (problem.u - problem.middle) / problem.half))
 
@@ -270,7 +270,7 @@ def _cautions(found: Refinement) -> Iterator[Caution]:
     if found.conflict_p is not None and found.conflict_p < CONFLICT:
         worst = int(np.argmax(np.abs(found.shift)))
         yield DatasheetContradicted(
-            found.conflict_p, names[worst], float(found.shift[worst]), found.calibration.inflation
+            found.conflict_p, names[worst], float(found.shift[worst]), found.calibration.birge_ratio
         )
     if kept := tuple(n for n, s in zip(names, found.sources, strict=True) if s == "passport"):
         yield StillOfDatasheet(kept)

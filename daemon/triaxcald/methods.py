@@ -1,4 +1,4 @@
-"""Calibrations that come by other ways than still poses of unknown attitude: their documents, and passports as read.
+"""Calibrations that come by other ways than still poses of unknown attitude: their documents, and datasheets as read.
 
 All are `triaxcal.calibration/1`, with what the way adds under a key of its own.
 """
@@ -14,7 +14,7 @@ from triaxcal.calibration_document import LINEAR, Document, by_parameter, calibr
 from triaxcal.calibration_reading import calibration_part, holds_at_of, sensor_of
 from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.inputs.attitude import AttitudeFit
-from triaxcal.inputs.passport import Passport, Refinement
+from triaxcal.inputs.datasheet import Datasheet, Refinement
 from triaxcal.inputs.turning.rotation import RotationFit
 from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
 from triaxcald.errors import InputError
@@ -56,13 +56,13 @@ def attitudes_document(found: AttitudeFit, *, output_unit: str, reference_unit: 
     return document
 
 
-def passport_document(found: Refinement, *, output_unit: str, reference_unit: str) -> Document:
+def datasheet_document(found: Refinement, *, output_unit: str, reference_unit: str) -> Document:
     c = found.calibration
     document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
     document["passport"] = {
         "conflict_p": probability(found.conflict_p),
-        "value": by_parameter(c, [number(float(v)) for v in found.passport.values]),
-        "standard_error": by_parameter(c, [uncertainty(float(v)) for v in found.passport.standard_error]),
+        "value": by_parameter(c, [number(float(v)) for v in found.datasheet.values]),
+        "standard_error": by_parameter(c, [uncertainty(float(v)) for v in found.datasheet.standard_error]),
         "shift_standard_errors": by_parameter(c, [uncertainty(float(v)) for v in found.shift]),
         "share_of_poses": by_parameter(c, [uncertainty(float(v)) for v in found.share]),
         "source": by_parameter(c, found.sources),
@@ -70,10 +70,10 @@ def passport_document(found: Refinement, *, output_unit: str, reference_unit: st
     return document
 
 
-def read_passport(
+def read_datasheet(
     document: Mapping[str, Any], *, where: str, errors: tuple[float, float, float] | None, reference: float | None
-) -> tuple[Passport, Mapping[str, str]]:
-    """The passport values in a calibration, loop or certificate document, and its units.
+) -> tuple[Datasheet, Mapping[str, str]]:
+    """The datasheet values in a calibration, loop or certificate document, and its units.
 
     ``errors`` stand for the document's, and for its correlation: of the scale factors relative to them, of the
     misalignments in rad, of the biases in the unit of the reference. ``reference`` is the magnitude in the
@@ -88,17 +88,17 @@ def read_passport(
         linear = np.concatenate([np.abs(sensor.scale_factor) * relative, np.full(3, angle), np.full(3, bias)])
         correlation = None
     elif "standard_error" not in part:
-        raise InputError(f"{where}: standard_error: missing; expected them, or --passport-error")
+        raise InputError(f"{where}: standard_error: missing; expected them, or --datasheet-error")
     else:
         linear = linear_errors_of(part, where=where)
         correlation = correlation_of(part, sensor, where=where)
     standard_error = np.concatenate([linear, effect_errors_of(part, sensor, where=where)])
     if not np.any(standard_error > 0):
-        whose = f"{where}: standard_error" if errors is None else "--passport-error"
+        whose = f"{where}: standard_error" if errors is None else "--datasheet-error"
         raise InputError(f"{whose}: all are 0, so that nothing is left to refine")
     units = part.get("units")
     held = {str(k): str(v) for k, v in units.items()} if isinstance(units, Mapping) else {}
     magnitude = own if reference is None else reference
-    return Passport(
+    return Datasheet(
         sensor, standard_error, channel_reference, magnitude, correlation, holds_at_of(part, where=where)
     ), held
