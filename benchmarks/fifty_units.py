@@ -22,7 +22,7 @@ import triaxcal as tc
 from benchmarks.table import Table
 from triaxcal.arrays import Floats
 
-RATE, HELD_S, MOVED_S, NOISE_V, VOLTS_PER_G = 100, 2.0, 1.0, 1e-3, 2.0
+RATE, DURATION_S, MOVED_S, NOISE_V, VOLTS_PER_G = 100, 2.0, 1.0, 1e-3, 2.0
 BY_HAND, BLOCK = 0.05, 1e-3
 """Standard deviation in rad of how far a direction is off."""
 FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
@@ -48,7 +48,7 @@ class Unit:
         for one, other in zip(ups, [*ups[1:], ups[-1]], strict=True):
             move = (1 - way) * one + way * other
             length = np.linalg.norm(move, axis=1)[:, None]
-            pieces += [np.repeat(one[None], int(HELD_S * RATE), axis=0), move / np.maximum(length, 0.1)]
+            pieces += [np.repeat(one[None], int(DURATION_S * RATE), axis=0), move / np.maximum(length, 0.1)]
         a = np.concatenate(pieces)
         frame = pd.DataFrame(self.volts(a), columns=["ax", "ay", "az"])
         frame.insert(0, "time", np.arange(len(a)) / RATE)
@@ -56,11 +56,13 @@ class Unit:
 
     def session(self) -> tuple[pd.DataFrame, pd.DataFrame]:
         """Accelerometer and gyroscope on six faces and in three turns, and where each section begins and ends."""
-        n = int(HELD_S * RATE)
+        n = int(DURATION_S * RATE)
         faces = FACES + BLOCK * self.rng.standard_normal(FACES.shape)
         held = [np.repeat(v[None], n, axis=0) for v in faces]
         turned = [np.repeat(faces[2 * i][None], n, axis=0) for i in range(3)]
-        rates = [np.zeros((n, 3))] * 6 + [np.repeat(-360 / HELD_S * np.eye(3)[i][None], n, axis=0) for i in range(3)]
+        rates = [np.zeros((n, 3))] * 6 + [
+            np.repeat(-360 / DURATION_S * np.eye(3)[i][None], n, axis=0) for i in range(3)
+        ]
         frame = pd.DataFrame(self.volts(np.concatenate(held + turned)), columns=["acc_x", "acc_y", "acc_z"])
         frame[["gyr_x", "gyr_y", "gyr_z"]] = np.concatenate(rates)
         starts = n * np.arange(len(SECTIONS))

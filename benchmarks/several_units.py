@@ -22,7 +22,7 @@ from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence import posterior
+from triaxcal.evidence import posterior_of
 from triaxcal.evidence.pooled import together
 from triaxcal.evidence.rows import Rows
 from triaxcal.model.directions import directions
@@ -81,7 +81,7 @@ def session(kind: str, seed: int) -> Told:
     for _ in range(UNITS):
         along = {"own": rng.standard_normal(3), "common": common, "nothing": None}[kind]
         poses = poses_of(rng, name, along)
-        units.append(posterior(poses, fit(poses, signs=SIGNS), signs=SIGNS, smallest_g=0.1 * NOISE_G))
+        units.append(posterior_of(poses, fit(poses, signs=SIGNS), signs=SIGNS, smallest_g=0.1 * NOISE_G))
     found = together(units)
     return Told(name, found.nothing <= 1 - CERTAIN, found.certain(CERTAIN), found.common.get(name, 0.0) > 0.5)
 

@@ -16,7 +16,7 @@ from triaxcal.documents import Calibration
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate import pose_fit
-from triaxcal.estimate.creep import with_creep_left
+from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
 from triaxcal.estimate.means import poses_of_means
 from triaxcal.evidence.findings import Unexplained
@@ -159,9 +159,9 @@ def find_poses(
         raise InvalidData(f"{len(samples)} samples: {e}") from e
     judge.feed(samples.time_ns, samples.readings)
     judge.finish()
-    seen = judge.findings(windows, spans)
-    found = Poses(poses_of(windows, spans, untrusted_poses(seen)) if windows is not None else ())
-    found.data_quality = tuple(text.quality_line(f, output_unit) for f in seen)
+    posterior = judge.findings(windows, spans)
+    found = Poses(poses_of(windows, spans, untrusted_poses(posterior)) if windows is not None else ())
+    found.data_quality = tuple(text.quality_line(f, output_unit) for f in posterior)
     found.output_unit = output_unit
     return found
 
@@ -261,7 +261,7 @@ def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> V
     c = calibration.fitted
     error, noise = magnitude_errors(
         c.sensor,
-        with_creep_left(found, c, elsewhere=True),
+        with_unexplained_creep(found, c, elsewhere=True),
         channel_reference=c.channel_reference,
         reference=c.reference,
         moment=c.moment,

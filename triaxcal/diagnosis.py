@@ -20,9 +20,9 @@ from triaxcal.evidence.advice import Advice, advice, decided
 from triaxcal.evidence.average import Refusal, average, refusal
 from triaxcal.evidence.corrected import corrected
 from triaxcal.evidence.findings import Findings, Named, findings
-from triaxcal.evidence.identifiability import NotIdentifiable, blind_to
+from triaxcal.evidence.identifiability import NotIdentifiable, not_identifiable
 from triaxcal.evidence.odds import Odds
-from triaxcal.evidence.posterior import Posterior, looked_for, posterior
+from triaxcal.evidence.posterior import Posterior, considered, posterior_of
 from triaxcal.evidence.terms import faults_of
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
@@ -79,8 +79,8 @@ class Candidate:
 @dataclass(frozen=True)
 class Loop:
     """The closed loop. ``before`` is the linear calibration, ``after`` the one that is handed on; ``found`` all that is
-    read off the posterior. ``blind`` are effects that these poses cannot show in full, ``faulty`` those of other
-    packages that cannot be used, each with the reason."""
+    read off the posterior. ``not_identifiable`` are effects that these poses cannot show in full, ``faulty`` those of
+    other packages that cannot be used, each with the reason."""
 
     before: Calibration
     after: Calibration
@@ -89,20 +89,20 @@ class Loop:
     candidates: tuple[Candidate, ...]
     refusal: Refusal | None
     held_out: HoldOut | None
-    blind: Mapping[str, NotIdentifiable]
+    not_identifiable: Mapping[str, NotIdentifiable]
     faulty: Mapping[str, str]
-    seen: Posterior = field(repr=False, compare=False)
+    posterior: Posterior = field(repr=False, compare=False)
 
     @property
     def probabilities(self) -> Mapping[str, float]:
         """That each effect acts, whatever else does, the likeliest first."""
-        return self.seen.of_names
+        return self.posterior.of_names
 
     @cached_property
     def advice(self) -> Advice:
         """What to record next; nothing where that cannot be told."""
         try:
-            return advice(self.seen)
+            return advice(self.posterior)
         except Refused:  # the model has no inverse in poses to come
             return Advice((), 0.0, 0.0, {})
 
@@ -122,7 +122,7 @@ class Loop:
     def call(self) -> Call:
         if self.refusal in (Refusal.UNMODELLED, Refusal.ANOTHER):
             return Call.INVESTIGATE
-        known = decided(self.seen) and not self.candidates
+        known = decided(self.posterior) and not self.candidates
         more = self.too_uncertain or self.found.outliers or (not known and self.advice.actions)
         return Call.RECORD_MORE if more else Call.USABLE
 
@@ -149,35 +149,35 @@ def diagnose(
     moment = HoldsAt.of(sound, at)
     if moment is None:
         raise Refused("no pose without a fault")
-    seen = posterior(poses, linear, signs=signs, catalogue=catalogue, odds=odds)
-    before = replace(_without_outliers(poses, linear, signs, seen), holds_at=moment)
-    effects = looked_for(poses, catalogue)
-    faulty = faults_of(seen.evidence.rows, effects)
-    blind = blind_to(seen.evidence, [e for e in effects if e.name not in faulty])
-    before, after = (c.with_blind_to(tuple(blind)) for c in (before, corrected(before, seen, moment)))
-    found, refused = findings(seen), refusal(seen)
-    told = _Told(seen, moment, after)
+    posterior = posterior_of(poses, linear, signs=signs, catalogue=catalogue, odds=odds)
+    before = replace(_without_outliers(poses, linear, signs, posterior), holds_at=moment)
+    effects = considered(poses, catalogue)
+    faulty = faults_of(posterior.evidence.rows, effects)
+    hidden = not_identifiable(posterior.evidence, [e for e in effects if e.name not in faulty])
+    before, after = (c.with_blind_to(tuple(hidden)) for c in (before, corrected(before, posterior, moment)))
+    found, refused = findings(posterior), refusal(posterior)
+    report = _Report(posterior, moment, after)
     sound_check = None if check is None else [p for p in check if not p.fault]
     return Loop(
         before=before,
         after=after,
         found=found,
-        findings=tuple(told.finding(named, refused) for named in found.named),
-        candidates=tuple(Candidate(name, p, told.given(name)[0]) for name, p in found.candidates.items()),
+        findings=tuple(report.finding(named, refused) for named in found.named),
+        candidates=tuple(Candidate(name, p, report.given(name)[0]) for name, p in found.candidates.items()),
         refusal=refused,
         held_out=None if sound_check is None else held_out(before, after, sound_check),
-        blind=blind,
+        not_identifiable=hidden,
         faulty=(dict(plugins()[1]) if catalogue is None else {}) | faulty,
-        seen=seen,
+        posterior=posterior,
     )
 
 
 def _without_outliers(
-    poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], seen: Posterior
+    poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], posterior: Posterior
 ) -> Calibration:
     """The linear calibration without the poses that are outliers whatever else acts, and with all others."""
-    likely = {int(i): float(p) for i, p in zip(seen.evidence.rows.places, seen.of_outliers, strict=True)}
-    outliers = [i for i, p in likely.items() if p >= seen.evidence.odds.reported]
+    likely = {int(i): float(p) for i, p in zip(posterior.evidence.rows.places, posterior.of_outliers, strict=True)}
+    outliers = [i for i, p in likely.items() if p >= posterior.evidence.odds.reported]
     if outliers != [i for i, p in enumerate(linear.poses) if p.excluded == Exclusion.OUTLIER]:
         with suppress(Refused):  # the others may not carry a fit
             linear = fit(poses, signs=signs, reference=linear.reference, excluded=outliers, why=Exclusion.OUTLIER)
@@ -187,10 +187,10 @@ def _without_outliers(
 
 
 @dataclass(frozen=True)
-class _Told:
+class _Report:
     """What is told of an effect of this name: as it is in ``after``, or as it would be if it acted."""
 
-    seen: Posterior
+    posterior: Posterior
     moment: HoldsAt
     after: Calibration
 
@@ -211,8 +211,8 @@ class _Told:
 
     def given(self, name: str) -> tuple[Coefficients, str]:
         """If it acts."""
-        made = average(self.seen.given(name), self.moment)
-        reference = self.seen.evidence.rows.problem.channel_reference
+        made = average(self.posterior.given(name), self.moment)
+        reference = self.posterior.evidence.rows.problem.channel_reference
         c = replace(self.after, sensor=made.sensor, covariance=made.covariance, channel_reference=reference)
         return self._of(c, name)
 

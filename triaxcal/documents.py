@@ -38,7 +38,7 @@ BESIDE, BESIDE_S = 1.2, 60.0
 """A recording ends after its last pose: by a fifth of its length and a minute at most."""
 HOLD_S = 1.0
 """By so much a recording may end before its last pose seemed to."""
-HELD_S = 5.0
+DURATION_S = 5.0
 """As long as a person holds a pose, where a document does not say."""
 OUT = ("ax", "ay", "az")
 UNCERTAINTY = ("u_ax", "u_ay", "u_az")
@@ -203,13 +203,13 @@ class Calibration:
         readings = tables.readings_of(u)
         rows = np.atleast_2d(readings)
         times = self._times(t, own_recording, time_unit, len(rows))
-        held = self._covariates(len(rows), channels or {}, times)
+        covariates = self._covariates(len(rows), channels or {}, times)
         sensor = self._fitted.sensor
-        a = sensor.specific_force(rows, held) if sensor.effects else (rows - sensor.centre) @ sensor.matrix.T
+        a = sensor.specific_force(rows, covariates) if sensor.effects else (rows - sensor.centre) @ sensor.matrix.T
         if sensor.effects:
-            self._require_inverse(rows, a, held)
+            self._require_inverse(rows, a, covariates)
         a = a.reshape(readings.shape)
-        errors = self._uncertainty(rows, held).reshape(readings.shape) if uncertainty else None
+        errors = self._uncertainty(rows, covariates).reshape(readings.shape) if uncertainty else None
         if table is None:
             return a if errors is None else (a, errors)
         out = dict(zip(OUT, a.T, strict=True))
@@ -221,10 +221,10 @@ class Calibration:
         return tuple(name for name in needs if followed(name))
 
     @property
-    def held_s(self) -> float:
+    def duration_s(self) -> float:
         """How long the poses were held of which it is, in the median: over such a time rates of channels are taken."""
-        held = [p.pose.end_s - p.pose.start_s for p in self._fitted.poses]
-        return float(np.median(held)) if held else HELD_S
+        durations = [p.pose.end_s - p.pose.start_s for p in self._fitted.poses]
+        return float(np.median(durations)) if durations else DURATION_S
 
     def _channels_in(self, table: Any, by_ours: Mapping[str, str]) -> dict[str, Any]:
         """Of those that the model needs: under their own names, and under those that they are called by."""
@@ -250,7 +250,7 @@ class Calibration:
             if name in names
         }
         whole = {channel: v for channel, v in values.items() if np.isfinite(v).all()}
-        return InStream.of([(t_s, whole)], needed, self.held_s).at(t_s)
+        return InStream.of([(t_s, whole)], needed, self.duration_s).at(t_s)
 
     def _needed(self) -> set[str]:
         return {name if is_derived(name) else channel_of(name) for name in self._fitted.channel_reference} - {TIME}
@@ -288,14 +288,14 @@ class Calibration:
         known = [float(e) for e in ends if isinstance(e, int | float)]
         return max(known) if known else None
 
-    def _require_inverse(self, u: Floats, a: Floats, held: Mapping[str, Floats]) -> None:
+    def _require_inverse(self, u: Floats, a: Floats, covariates: Mapping[str, Floats]) -> None:
         """Raises Refused where the readings do not come out of what they were made into."""
         with np.errstate(all="ignore"):
-            back = self._fitted.sensor.output(a, held)
+            back = self._fitted.sensor.output(a, covariates)
             wrong = ~(np.abs(back - u).max(axis=1) <= RETURNS * (1 + np.abs(u).max(axis=1)))
         wrong &= np.isfinite(u).all(axis=1)
-        for name in {n for e, _ in self._fitted.sensor.effects for n in e.needs} & held.keys():
-            wrong &= ~np.isnan(held[name])
+        for name in {n for e, _ in self._fitted.sensor.effects for n in e.needs} & covariates.keys():
+            wrong &= ~np.isnan(covariates[name])
         if wrong.any():
             raise Refused(
                 f"the model has no inverse at reading {int(np.flatnonzero(wrong)[0])}: it lies far beyond what the "
@@ -306,7 +306,7 @@ class Calibration:
         if not isinstance(channels, Mapping):
             raise InvalidData("channels: expected values by name, as in {'temp_c': 25.0}")
         given = {name: tables.channel_of_samples(name, v, n) for name, v in channels.items()}
-        held, missing = self._fitted.covariates_of_readings(n, given, times)
+        covariates, missing = self._fitted.covariates_of_readings(n, given, times)
         missing = tuple(channel_of(name) if not is_derived(name) else name for name in missing)
         if missing:
             effects = [e.name for e, _ in self._fitted.sensor.effects if set(e.needs) & set(missing)]
@@ -318,29 +318,29 @@ class Calibration:
                 MissingChannel,
                 stacklevel=3,
             )
-        return held
+        return covariates
 
     def uncertainty_in(self, poses: Sequence[Pose]) -> Floats:
         """(n,) standard uncertainty of |a| in poses of another recording that the calibration leaves, without the
         noise of these poses. Raises InvalidData where a channel that the effects need is missing."""
         c = self._fitted
         u = np.array([p.mean for p in poses])
-        held = covariates_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
-        a = c.sensor.specific_force(u, held)
+        covariates = covariates_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
+        a = c.sensor.specific_force(u, covariates)
         up = a / np.linalg.norm(a, axis=1, keepdims=True)
         variance = np.zeros(len(u))
-        for step in self._steps(u, held):
+        for step in self._steps(u, covariates):
             variance += np.sum(step * up, axis=1) ** 2
         return np.sqrt(variance)
 
-    def _uncertainty(self, u: Floats, held: Mapping[str, Floats]) -> Floats:
+    def _uncertainty(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
         """(n,3)"""
         variance = np.zeros(u.shape)
-        for step in self._steps(u, held):
+        for step in self._steps(u, covariates):
             variance += step**2
         return np.sqrt(variance)
 
-    def _steps(self, u: Floats, held: Mapping[str, Floats]) -> Iterator[Floats]:
+    def _steps(self, u: Floats, covariates: Mapping[str, Floats]) -> Iterator[Floats]:
         """(n,3) each: one standard error along each principal axis of the parameters' covariance, and what it does."""
         c = self._fitted
         covariance = c.covariance * np.outer(*[self._after_the_recording(c)] * 2)
@@ -348,9 +348,9 @@ class Calibration:
             yield np.full(u.shape, np.nan)
             return
         size, axes = np.linalg.eigh(covariance)
-        sensor, a = c.sensor, c.sensor.specific_force(u, held)
+        sensor, a = c.sensor, c.sensor.specific_force(u, covariates)
         for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
-            yield sensor.moved(step).specific_force(u, held) - a
+            yield sensor.moved(step).specific_force(u, covariates) - a
 
     def _after_the_recording(self, c: Fitted) -> Floats:
         """(p,) standard uncertainties over standard errors: what the budget has beside the fit."""

@@ -67,8 +67,8 @@ def pooled_analysis(loops: Sequence[Loop]) -> PooledAnalysis:
     """Of units that were diagnosed one by one. Raises InvalidData for fewer than two."""
     if len(loops) < 2:
         raise InvalidData("whether units agree takes two of them")
-    smallest = min(float(loop.seen.evidence.sizes[0]) for loop in loops)
-    units = [loop.seen.resized(smallest) for loop in loops]
+    smallest = min(float(loop.posterior.evidence.sizes[0]) for loop in loops)
+    units = [loop.posterior.resized(smallest) for loop in loops]
     found = pool(units)
     odds = units[0].evidence.odds
     agreed = found.certain(odds.certain)

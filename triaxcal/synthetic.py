@@ -9,14 +9,14 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import TEMPERATURE
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, LAGS_S, SINCE_START, TIME, lag_in, lag_of, rate_of
+from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, LAGS_S, SINCE_START, TIME, lag_in, lag_of, rate_of
 from triaxcal.model.gravity import STANDARD_GRAVITY
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import behind
 from triaxcal.poses.pose import Pose
 
 LAGS = {lag_of(TEMPERATURE, constant_s): constant_s for constant_s in LAGS_S}
-COVARIATES = frozenset({TEMPERATURE, rate_of(TEMPERATURE), *LAGS, TIME, SINCE_START, HELD, *BEFORE, *CHANGE})
+COVARIATES = frozenset({TEMPERATURE, rate_of(TEMPERATURE), *LAGS, TIME, SINCE_START, DURATION, *BEFORE, *CHANGE})
 """What an effect of a synthetic unit may go with."""
 
 
@@ -126,7 +126,7 @@ class SyntheticUnit:
         a = self.path.specific_force(t_s)
         held = {TEMPERATURE: temperature, TIME: t_s}
         covariates = {n: v - self.channel_reference[n] for n, v in held.items() if n in self.channel_reference}
-        covariates |= {SINCE_START: t_s, HELD: np.zeros(len(t_s))}
+        covariates |= {SINCE_START: t_s, DURATION: np.zeros(len(t_s))}
         covariates[rate_of(TEMPERATURE)] = self.environment.temperature_rate(t_s)
         needs = {name for effect, _ in self.sensor.effects for name in effect.needs}
         covariates |= {n: self.environment.temperature_lag(t_s, LAGS[n]) for n in needs & LAGS.keys()}
@@ -161,7 +161,7 @@ def noisy_poses(
     reference = channel_reference or {}
     s = directions @ sensor.axes.T
     before = np.concatenate([s[:1], s[:-1]])
-    own = {TIME: t_s, SINCE_START: t_s, HELD: np.full(n, hold_s)}
+    own = {TIME: t_s, SINCE_START: t_s, DURATION: np.full(n, hold_s)}
     own |= {name: before[:, i] for i, name in enumerate(BEFORE)} | {
         name: (s - before)[:, i] for i, name in enumerate(CHANGE)
     }

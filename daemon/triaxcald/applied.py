@@ -80,7 +80,7 @@ def applied(
             )
             for at in range(0, len(samples.time_ns), BLOCK)
         )
-    followed = InStream.of(pieces, calibration.needs_recording(), calibration.held_s)
+    followed = InStream.of(pieces, calibration.needs_recording(), calibration.duration_s)
     if derived := ", ".join(followed.covariates):
         found.remarks += (f"{derived}: of the recording's own channels and times, where it logs none",)
     columns = OUT + UNCERTAINTY * uncertainty

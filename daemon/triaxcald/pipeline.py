@@ -10,7 +10,7 @@ import numpy as np
 
 from triaxcal import text
 from triaxcal.errors import InvalidData
-from triaxcal.poses.pose import Held, Pose, held_of, poses_of
+from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
 from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
 from triaxcal_drivers.catalogue import driver_named
@@ -88,10 +88,10 @@ class Pipeline:
         windows = self.windows
         return [] if windows is None else poses_of(windows, self._still(windows))
 
-    def held(self) -> list[Held]:
+    def held(self) -> list[StillSpan]:
         """The same without their noise, which takes longer than all the rest: enough to guide an operator by."""
         windows = self.windows
-        return [] if windows is None else held_of(windows, self._still(windows))
+        return [] if windows is None else still_spans_of(windows, self._still(windows))
 
     def _still(self, windows: Windows) -> list[Span]:
         """The still spans so far, found once for the same windows."""

@@ -13,7 +13,7 @@ from triaxcal.diagnosis import Call, Loop, Verdict, diagnose
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.runs import together
-from triaxcal.evidence import Refusal, posterior
+from triaxcal.evidence import Refusal, posterior_of
 from triaxcal.evidence.identifiability import Why
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
@@ -99,7 +99,7 @@ def test_an_outlier_is_left_out_before_and_after(poses_with: Poses, knocked: Kno
 def test_poses_that_an_effect_explains_are_no_outliers(poses_with: Poses) -> None:
     loop = closed(poses_with(8, bias_step=[3e-3, -2e-3, 3e-3]))
     assert all(p.used for p in loop.before.poses)
-    assert max(loop.seen.of_outliers) < 0.5
+    assert max(loop.posterior.of_outliers) < 0.5
 
 
 def test_a_faulty_pose_has_no_part_and_stays_in_the_list(poses_with: Poses) -> None:
@@ -131,12 +131,12 @@ def test_poses_of_another_recording_judge_before_and_after(poses_with: Poses) ->
 def test_what_poses_cannot_show_is_told_with_the_reason(poses_with: Poses) -> None:
     still = [replace(p, channels={"temp_c": 25.0}) for p in poses_with(3)]
     loop = closed(still)
-    assert loop.blind["temperature_bias"].why is Why.STOOD_STILL
-    assert loop.blind["temperature_bias"].channel == "temp_c"
+    assert loop.not_identifiable["temperature_bias"].why is Why.STOOD_STILL
+    assert loop.not_identifiable["temperature_bias"].channel == "temp_c"
     bare = closed([replace(p, channels={}) for p in still])
-    assert bare.blind["temperature_bias"].why is Why.NOT_LOGGED
-    assert "second_order_nonlinearity" not in bare.blind
-    assert loop.after.blind_to == tuple(loop.blind)
+    assert bare.not_identifiable["temperature_bias"].why is Why.NOT_LOGGED
+    assert "second_order_nonlinearity" not in bare.not_identifiable
+    assert loop.after.blind_to == tuple(loop.not_identifiable)
 
 
 @pytest.mark.parametrize("count", [10, 12])
@@ -148,5 +148,5 @@ def test_poses_with_hardly_anything_to_spare_correct_nothing_that_nobody_knows(p
 
 def test_effects_of_several_runs_are_looked_for_once(poses_with: Poses) -> None:
     poses = together([poses_with(1), poses_with(2)])
-    terms = posterior(poses, fit(poses, signs=MINUS), signs=MINUS).evidence.terms
-    assert [t.name for t in closed(poses).seen.evidence.terms] == [t.name for t in terms]
+    terms = posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS).evidence.terms
+    assert [t.name for t in closed(poses).posterior.evidence.terms] == [t.name for t in terms]

@@ -17,7 +17,7 @@ import triaxcal as tc
 from triaxcal.effects import CATALOGUE, Effect
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias, ChannelScaleFactor
-from triaxcal.effects.contract import HELD, SINCE_START, TIME, is_derived
+from triaxcal.effects.contract import DURATION, SINCE_START, TIME, is_derived
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.calibration import HoldsAt, Residual
 from triaxcal.estimate.pose_fit import fit
@@ -49,8 +49,8 @@ def truly(c: tc.Calibration, rng: np.random.Generator, n: int) -> tuple[np.ndarr
     a = rng.standard_normal((n, 3))
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     sensor, reference = c.fitted.sensor, c.fitted.channel_reference
-    off = {name: 0.5 * rng.standard_normal(n) for name in reference if name not in (TIME, SINCE_START, HELD)}
-    clocks = {SINCE_START: T_S, TIME: SINCE_MIDDLE_S, HELD: 0.0}
+    off = {name: 0.5 * rng.standard_normal(n) for name in reference if name not in (TIME, SINCE_START, DURATION)}
+    clocks = {SINCE_START: T_S, TIME: SINCE_MIDDLE_S, DURATION: 0.0}
     held = off | {k: np.full(n, v - reference[k]) for k, v in clocks.items() if k in reference}
     return a, sensor.output(a, held), {k: v + reference[k] for k, v in off.items()}
 
@@ -70,7 +70,9 @@ def test_readings_of_a_unit_with_any_effect_come_out_true(effect: Effect, loaded
         assert c.apply(u[7], channels=one) == pytest.approx(a[7], abs=1e-8)
 
 
-@pytest.mark.parametrize("effect", [e for e in FORMS if set(e.needs) - {TIME, SINCE_START, HELD}], ids=lambda e: e.name)
+@pytest.mark.parametrize(
+    "effect", [e for e in FORMS if set(e.needs) - {TIME, SINCE_START, DURATION}], ids=lambda e: e.name
+)
 def test_a_channel_that_is_not_given_counts_as_at_its_reference_and_is_said(effect: Effect, paper_unit: Sensor) -> None:
     c = calibration_with(paper_unit, effect, np.random.default_rng(4))
     a, _, channels = truly(c, np.random.default_rng(5), 20)
@@ -90,7 +92,7 @@ def test_effects_of_time_hold_at_one_moment_or_at_each_of_their_own_recording(
     a, _, _ = truly(c, rng, 30)
     t = np.linspace(1.0, T_S, 30)
     reference = c.fitted.channel_reference
-    clocks = {SINCE_START: t, TIME: t - (T_S - SINCE_MIDDLE_S), HELD: np.zeros(30)}
+    clocks = {SINCE_START: t, TIME: t - (T_S - SINCE_MIDDLE_S), DURATION: np.zeros(30)}
     u = c.fitted.sensor.output(a, {k: v - reference[k] for k, v in clocks.items() if k in reference})
     assert c.apply(u, t=t, own_recording=True) == pytest.approx(a, abs=1e-8)
     assert c.apply(u)[-1] == pytest.approx(a[-1], abs=1e-8)

@@ -25,7 +25,7 @@ from triaxcal.effects.contract import (
     BEFORE,
     CHANGE,
     DERIVED,
-    HELD,
+    DURATION,
     LAGS_S,
     RUN,
     SCATTER,
@@ -63,7 +63,7 @@ EVERY = [*FORMS, *CHANNEL_EFFECTS]
 # One pose, in round numbers: s = (2, −3, 5) g, ΔT = 7 K and so on. Half of it lies before the step at 40 s.
 S = np.array([[2.0, -3.0, 5.0]])
 HERE: dict[str, float] = {
-    "temp_c": 7.0, rate_of("temp_c"): 0.25, "supply_v": -0.5, TIME: 11.0, SINCE_START: 40.0, HELD: 10.0,
+    "temp_c": 7.0, rate_of("temp_c"): 0.25, "supply_v": -0.5, TIME: 11.0, SINCE_START: 40.0, DURATION: 10.0,
     "before_x": 0.5, "before_y": -0.25, "before_z": 0.75, "change_x": 1.5, "change_y": -2.75, "change_z": 0.0,
     "scatter_x": 1e-4, "scatter_y": 4e-4, "scatter_z": 9e-4,
     **{lag_of("temp_c", constant_s): -1e-3 * constant_s for constant_s in LAGS_S},
@@ -119,7 +119,7 @@ def one() -> dict[str, np.ndarray]:
 
 def held(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     out = {name: rng.uniform(-300, 300, n) for name in HERE}
-    return out | {SINCE_START: rng.uniform(0, 600, n), HELD: rng.uniform(1, 20, n)}
+    return out | {SINCE_START: rng.uniform(0, 600, n), DURATION: rng.uniform(1, 20, n)}
 
 
 @pytest.mark.parametrize("effect", KNOWN, ids=each)
@@ -201,7 +201,7 @@ def test_hysteresis_by_the_way_goes_through_zero_where_hardly_anything_changed()
 
 def test_a_step_counts_in_full_before_it_in_part_within_a_pose_and_not_at_all_after_it() -> None:
     middle, lasts = np.array([5.0, 15.0, 25.0, 35.0]), np.array([10.0, 10.0, 8.0, 10.0])
-    held = {SINCE_START: middle, HELD: lasts}
+    held = {SINCE_START: middle, DURATION: lasts}
     # Poses end at 10, 20, 29, 40 s; 17 s is seven tenths through the second.
     expected = {10.0: [-1, 0, 0, 0], 17.0: [-1, -0.7, 0, 0], 20.5: [-1, -1, 0, 0], 23.0: [-1, -1, -0.25, 0]}
     for at_s, weights in expected.items():
@@ -212,7 +212,7 @@ def test_a_step_counts_in_full_before_it_in_part_within_a_pose_and_not_at_all_af
 
 def test_the_search_tries_a_step_between_any_two_poses_and_within_all_but_the_first_and_last() -> None:
     middle, lasts = np.array([5.0, 17.0, 32.0, 45.0]), np.array([10.0, 10.0, 12.0, 10.0])
-    tried = [v.shape["at"] for v in BiasStep().variants({SINCE_START: middle, HELD: lasts})]
+    tried = [v.shape["at"] for v in BiasStep().variants({SINCE_START: middle, DURATION: lasts})]
     # Poses are 0–10, 12–22, 26–38, 40–50 s.
     assert [value for value, _ in tried] == pytest.approx([11.0, 17.0, 24.0, 32.0, 39.0])
     assert {unit for _, unit in tried} == {"s"}
@@ -340,7 +340,8 @@ def test_every_logged_channel_gets_a_bias_and_a_scale_factor_effect_of_its_own()
 
 
 @pytest.mark.parametrize(
-    "channel", ["flow.rate", "temp_c.rate", "temp_c.lag:33", TIME, HELD, "before_x", f"{HELD}.logged", "x.logged"]
+    "channel",
+    ["flow.rate", "temp_c.rate", "temp_c.lag:33", TIME, DURATION, "before_x", f"{DURATION}.logged", "x.logged"],
 )
 def test_a_logged_channel_may_have_any_name(channel: str) -> None:
     condition = covariate_of(channel)
@@ -358,7 +359,7 @@ def test_no_two_logged_channels_are_one_condition() -> None:
         TIME,
         "supply_v",
         "supply_v.logged",
-        *(f"{n}{'.logged' * k}" for n in (HELD, "a.rate") for k in range(4)),
+        *(f"{n}{'.logged' * k}" for n in (DURATION, "a.rate") for k in range(4)),
     ]
     assert len({covariate_of(c) for c in channels}) == len(channels)
     # Names that collide with nothing stay as documents have them.
@@ -382,7 +383,7 @@ def test_every_effect_is_one_file_of_its_own_name() -> None:
 
 
 def test_the_conditions_that_need_no_channel_are_those_of_the_contract() -> None:
-    assert set(DERIVED) == {TIME, SINCE_START, HELD, *BEFORE, *CHANGE, *SCATTER, RUN}
+    assert set(DERIVED) == {TIME, SINCE_START, DURATION, *BEFORE, *CHANGE, *SCATTER, RUN}
     for effect in CATALOGUE:
         assert all(n in {*DERIVED, "temp_c", "temp_c.rate"} or lag_in(n) for n in effect.needs)
 

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import HELD, SINCE_START, Coefficient, Effect, no_slope, on_each_axis, xyz
+from triaxcal.effects.contract import DURATION, SINCE_START, Coefficient, Effect, no_slope, on_each_axis, xyz
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,12 @@ class BiasStep(Effect):
     at_s: float = 0.0
     name: str = "bias_step"
     coefficients: tuple[Coefficient, ...] = xyz("g")
-    needs: tuple[str, ...] = (SINCE_START, HELD)
+    needs: tuple[str, ...] = (SINCE_START, DURATION)
     lasting: bool = True
     remedy: str = "Look for what happened then (a knock, a supply, a loose part) and record again."
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        held = np.maximum(covariates[HELD], 1e-9)
+        held = np.maximum(covariates[DURATION], 1e-9)
         begin = covariates[SINCE_START] - held / 2
         return on_each_axis(-np.clip((self.at_s - begin) / held, 0.0, 1.0))
 
@@ -44,7 +44,7 @@ class BiasStep(Effect):
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         """Between any two poses, and in the middle of any but the first and the last."""
-        t, held = covariates[SINCE_START], covariates[HELD]
+        t, held = covariates[SINCE_START], covariates[DURATION]
         order = np.argsort(t)
         begin, end = (t - held / 2)[order], (t + held / 2)[order]
         moments = [*(end[:-1] + begin[1:]) / 2, *t[order][1:-1]]

@@ -12,11 +12,11 @@ from triaxcal.effects.contract import (
     Coefficient,
     Effect,
     covariate_of,
-    held_within,
     no_slope,
     on_each_axis,
     per_axis,
     per_axis_slope,
+    steady_within,
     xyz,
 )
 
@@ -46,7 +46,7 @@ class ChannelBias(Effect):
         return f"Hold {self.channel} steadier, or correct the bias by it, in the host."
 
     def advice(self, largest: float, floor: float) -> str:
-        return held_within(self.remedy, largest, floor, f"[{self.channel}]")
+        return steady_within(self.remedy, largest, floor, f"[{self.channel}]")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return on_each_axis(covariates[covariate_of(self.channel)])
@@ -78,7 +78,7 @@ class ChannelScaleFactor(Effect):
         return f"Hold {self.channel} steadier, or correct the scale factor by it, in the host."
 
     def advice(self, largest: float, floor: float) -> str:
-        return held_within(self.remedy, largest, floor, f"[{self.channel}]")
+        return steady_within(self.remedy, largest, floor, f"[{self.channel}]")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis(s * covariates[covariate_of(self.channel)][:, None])

@@ -21,7 +21,7 @@ TIME = "t_s"
 """The name under which time stands among the covariates, in seconds."""
 SINCE_START = "since_start_s"
 """Seconds since the first sample of the recording; infinite for a unit in use, which started long ago."""
-HELD = "held_s"
+DURATION = "held_s"
 """How long the unit was held still, in seconds; zero where a single reading is asked for."""
 BEFORE = ("before_x", "before_y", "before_z")
 """The specific force along each sensitive axis in the pose before, in g; in the first pose, that of the pose itself."""
@@ -31,7 +31,7 @@ SCATTER = ("scatter_x", "scatter_y", "scatter_z")
 """The variance of the readings inside the pose along each axis, in g²."""
 RUN = "run_index"
 """Which of several recordings of the unit, from 0; infinite for a unit in use, which is in none of them."""
-CLOCKS = (TIME, SINCE_START, HELD)
+CLOCKS = (TIME, SINCE_START, DURATION)
 """Covariates that follow from when and for how long the unit was held."""
 DERIVED = (*CLOCKS, *BEFORE, *CHANGE, *SCATTER, RUN)
 """Covariates that no channel has to be logged for, beside the rates of those that are."""
@@ -188,7 +188,7 @@ def span_of(t_s: Floats) -> tuple[float, float]:
     return 1.5 * whole / max(len(t_s) - 1, 1), whole
 
 
-def held_within(remedy: str, largest: float, floor: float, unit: str) -> str:
+def steady_within(remedy: str, largest: float, floor: float, unit: str) -> str:
     """A remedy that says how steady is steady enough, for an effect that goes with a covariate in ``unit``."""
     if not 0 < floor < np.inf or not largest:
         return remedy

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, held_within, no_slope, on_each_axis, xyz
+from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, steady_within, xyz
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class TemperatureBias(Effect):
     remedy: str = "Correct the bias by the logged temperature, or hold the temperature steadier."
 
     def advice(self, largest: float, floor: float) -> str:
-        return held_within(self.remedy, largest, floor, "K")
+        return steady_within(self.remedy, largest, floor, "K")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return on_each_axis(covariates["temp_c"])

@@ -14,11 +14,11 @@ from triaxcal.effects.contract import (
     SINCE_START,
     Coefficient,
     Effect,
-    held_within,
     lag_of,
     no_slope,
     on_each_axis,
     span_of,
+    steady_within,
     xyz,
 )
 
@@ -55,7 +55,7 @@ class TemperatureLag(Effect):
         return (CHANNEL, *(lag_of(CHANNEL, constant_s) for constant_s in self._weights()))
 
     def advice(self, largest: float, floor: float) -> str:
-        return held_within(self.remedy, largest, floor, "K")
+        return steady_within(self.remedy, largest, floor, "K")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         behind = sum(weight * covariates[lag_of(CHANNEL, c)] for c, weight in self._weights().items())

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, held_within, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import Coefficient, Effect, per_axis, per_axis_slope, steady_within, xyz
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class TemperatureScaleFactor(Effect):
     remedy: str = "Correct the scale factor by the logged temperature, or hold the temperature steadier."
 
     def advice(self, largest: float, floor: float) -> str:
-        return held_within(self.remedy, largest, floor, "K")
+        return steady_within(self.remedy, largest, floor, "K")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis(s * covariates["temp_c"][:, None])

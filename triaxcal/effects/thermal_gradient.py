@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, held_within, no_slope, on_each_axis, rate_of, xyz
+from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, rate_of, steady_within, xyz
 
 RATE = rate_of("temp_c")
 
@@ -21,7 +21,7 @@ class ThermalGradient(Effect):
     remedy: str = "Let the temperature settle before each pose, or correct the bias by its rate, in the host."
 
     def advice(self, largest: float, floor: float) -> str:
-        return held_within(self.remedy, largest, floor, "K/s")
+        return steady_within(self.remedy, largest, floor, "K/s")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return on_each_axis(covariates[RATE])

@@ -209,8 +209,8 @@ class Calibration:
     def specific_force(self, readings: Floats, channels: Mapping[str, Floats]) -> Floats:
         """a (n,3) of single readings (n,3) in output units, with the ``channels`` (n,) that are known of them. Raises
         Refused where the model has no inverse there."""
-        held, _ = self.covariates_of_readings(len(readings), channels)
-        return self.sensor.specific_force(readings, held)
+        covariates, _ = self.covariates_of_readings(len(readings), channels)
+        return self.sensor.specific_force(readings, covariates)
 
     def covariates_of_readings(
         self, n: int, channels: Mapping[str, Floats], t_s: Floats | None = None

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import HELD, SINCE_START, TIME, channel_of, is_derived, lag_in
+from triaxcal.effects.contract import DURATION, SINCE_START, TIME, channel_of, is_derived, lag_in
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.poses.covariates import covariates_elsewhere, rate_of_lag
@@ -27,18 +27,18 @@ def without_creep(poses: Sequence[Pose]) -> list[Pose]:
     return [_with(p, np.zeros(3)) if p.creep.any() else p for p in poses]
 
 
-def with_creep_left(poses: Sequence[Pose], model: Calibration, *, elsewhere: bool = False) -> list[Pose]:
+def with_unexplained_creep(poses: Sequence[Pose], model: Calibration, *, elsewhere: bool = False) -> list[Pose]:
     """The same poses with so much of their creep as the model's effects do not explain. ``elsewhere``: they are of
     another recording than the model, of whose clocks it knows nothing.
     """
     if not any(p.creep.any() for p in poses) or not model.sensor.effects:
         return list(poses)
-    held = _held(poses, model, elsewhere)
+    covariates = _covariates(poses, model, elsewhere)
     try:
-        change = _change(poses, model, held, elsewhere)
+        change = _change(poses, model, covariates, elsewhere)
     except EffectFault:  # known in the middle of the poses alone
         return list(poses)
-    left = [_beside(p.creep, c, g) for p, c, g in zip(poses, change, _outward(poses, model, held), strict=True)]
+    left = [_beside(p.creep, c, g) for p, c, g in zip(poses, change, _outward(poses, model, covariates), strict=True)]
     return [
         _with(p, rest) if p.creep.any() and rest @ rest < p.creep @ p.creep else p
         for p, rest in zip(poses, left, strict=True)
@@ -53,40 +53,40 @@ def _beside(creep: Floats, change: Floats, outward: Floats) -> Floats:
     return np.asarray(left - (left @ outward) * outward if turns else left)
 
 
-def _outward(poses: Sequence[Pose], model: Calibration, held: Mapping[str, Floats]) -> Floats:
+def _outward(poses: Sequence[Pose], model: Calibration, covariates: Mapping[str, Floats]) -> Floats:
     """(n,3) unit gradients of |a| by the outputs."""
-    _, by_u = model.sensor.magnitude(np.array([p.mean for p in poses]), held)
+    _, by_u = model.sensor.magnitude(np.array([p.mean for p in poses]), covariates)
     return np.asarray(by_u / np.linalg.norm(by_u, axis=1, keepdims=True))
 
 
-def _held(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> dict[str, Floats]:
+def _covariates(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> dict[str, Floats]:
     sensor = model.sensor
     if elsewhere:
         return covariates_elsewhere(poses, model.channel_reference, sensor.scale_factor, sensor.bias, model.moment)
     return dict(model.covariates_of(poses))
 
 
-def _change(poses: Sequence[Pose], model: Calibration, held: Mapping[str, Floats], elsewhere: bool) -> Floats:
+def _change(poses: Sequence[Pose], model: Calibration, covariates: Mapping[str, Floats], elsewhere: bool) -> Floats:
     """(n,3) by how much the model's effects change the outputs from the beginning of each pose to its end."""
     sensor = model.sensor
     length = np.array([p.end_s - p.start_s for p in poses])
     ends = []
     for half in (-length / 2, length / 2):
-        at = dict(held)
-        if HELD in held:
-            at[HELD] = np.zeros(len(poses))  # moments, not means
-        for name in held:
+        at = dict(covariates)
+        if DURATION in covariates:
+            at[DURATION] = np.zeros(len(poses))  # moments, not means
+        for name in covariates:
             if name in (TIME, SINCE_START):
-                at[name] = held[name] if elsewhere else held[name] + half
+                at[name] = covariates[name] if elsewhere else covariates[name] + half
                 continue
             lag = lag_in(name)
             channel = channel_of(lag[0] if lag else name)
             if (lag is None and is_derived(name)) or any(channel not in p.rates for p in poses):
                 continue
             rate = np.array([p.rates[channel] for p in poses])
-            at[name] = held[name] + half * (rate if lag is None else rate_of_lag(held[name], rate, lag[1]))
+            at[name] = covariates[name] + half * (rate if lag is None else rate_of_lag(covariates[name], rate, lag[1]))
         ends.append(at)
-    s = sensor.along_axes(np.array([p.mean for p in poses]), held)
+    s = sensor.along_axes(np.array([p.mean for p in poses]), covariates)
     first, last = (sensor.departure(s, at) for at in ends)
     return np.asarray(sensor.scale_factor * (last - first))
 

@@ -10,7 +10,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.creep import with_creep_left
+from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
@@ -37,7 +37,7 @@ def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> 
     if not check:
         raise InvalidData("the check recording has no still pose")
     try:
-        first, last = _errors(before, check), _errors(after, with_creep_left(check, after, elsewhere=True))
+        first, last = _errors(before, check), _errors(after, with_unexplained_creep(check, after, elsewhere=True))
     except InvalidData as e:
         raise InvalidData(f"the check recording: {e}") from e
     more = last[0] ** 2 - first[0] ** 2
@@ -60,8 +60,8 @@ def magnitude_errors(
     missing.
     """
     u = np.array([p.mean for p in poses])
-    held = covariates_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
-    length, by_u = sensor.magnitude(u, held)
+    covariates = covariates_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
+    length, by_u = sensor.magnitude(u, covariates)
     covariance = np.array([p.covariance for p in poses])
     return length - reference, np.sqrt(np.einsum("ni,nij,nj->n", by_u, covariance, by_u))
 

@@ -176,14 +176,14 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearis
     """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise, and what is
     beside it (n,)."""
     sensor = state.sensor(problem)
-    held = problem.covariates
+    covariates = problem.covariates
     if not jacobian:
-        length = np.linalg.norm(sensor.specific_force(problem.u, held), axis=1)
+        length = np.linalg.norm(sensor.specific_force(problem.u, covariates), axis=1)
         return length - problem.reference, np.empty((0, 0)), np.empty(0)
-    length, s, a, by_s, by_v = sensor.radius(problem.u, held)
+    length, s, a, by_s, by_v = sensor.radius(problem.u, covariates)
     x = (problem.u - problem.middle) / problem.half
     angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
-    effects = [by_coefficients(by_v, e.basis(s, held)) for e in state.effects]
+    effects = [by_coefficients(by_v, e.basis(s, covariates)) for e in state.effects]
     J = np.concatenate([by_v * x, -by_v, angles, *effects], axis=1)
     by_u = by_v / sensor.scale_factor
     variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
-from triaxcal.effects.contract import HELD, SINCE_START, Effect, reshaped
+from triaxcal.effects.contract import DURATION, SINCE_START, Effect, reshaped
 from triaxcal.estimate.problem import Problem, State, linearise_all
 from triaxcal.estimate.slopes import left_of
 
@@ -43,7 +43,7 @@ def shape_errors(
 def has_edges(effect: Effect) -> bool:
     """Whether it changes at the edges of poses, as a step does: the likelihood of its shape has kinks there, and is
     flat between two poses, so that its curvature tells nothing."""
-    return HELD in effect.needs
+    return DURATION in effect.needs
 
 
 def spread(value: float, chi2_at: Callable[[float], float], tried: Sequence[float], edges: Floats) -> float | None:
@@ -64,7 +64,7 @@ def spread(value: float, chi2_at: Callable[[float], float], tried: Sequence[floa
 
 def edges_of(problem: Problem) -> Floats:
     """When poses begin and end, in seconds since the start."""
-    middle, half = problem.covariates[SINCE_START], problem.covariates[HELD] / 2
+    middle, half = problem.covariates[SINCE_START], problem.covariates[DURATION] / 2
     return np.concatenate([middle - half, middle + half])
 
 

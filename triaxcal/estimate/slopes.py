@@ -15,7 +15,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
-from triaxcal.effects.contract import HELD, SINCE_START, TIME, Effect, channel_of, is_derived, lag_in, rate_of
+from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect, channel_of, is_derived, lag_in, rate_of
 from triaxcal.estimate.problem import Linearised, Problem, State, linearise, linearise_all
 from triaxcal.poses.covariates import rate_of_lag
 from triaxcal.poses.pose import Pose
@@ -54,7 +54,7 @@ class PoseSlopes:
             covariance=np.concatenate([middle.covariance] * len(PLACES)),
             # A moment is asked for, not a mean over the pose.
             channels={n: _moved(v, change[n]) for n, v in problem.channels.items()}
-            | {HELD: np.zeros(len(PLACES) * len(poses))},
+            | {DURATION: np.zeros(len(PLACES) * len(poses))},
         )
         return cls(inside, middle, errors, moving)
 

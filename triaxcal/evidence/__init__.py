@@ -9,7 +9,7 @@ from triaxcal.evidence.average import Average, Refusal, average, refusal
 from triaxcal.evidence.findings import Another, Findings, Named, Unexplained, findings
 from triaxcal.evidence.odds import Odds
 from triaxcal.evidence.pooled import Pooled, pool
-from triaxcal.evidence.posterior import Posterior, posterior
+from triaxcal.evidence.posterior import Posterior, posterior_of
 
 __all__ = [
     "Action",
@@ -29,6 +29,6 @@ __all__ = [
     "average",
     "findings",
     "pool",
-    "posterior",
+    "posterior_of",
     "refusal",
 ]  # fmt: skip

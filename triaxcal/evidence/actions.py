@@ -59,7 +59,7 @@ class Action:
     to be logged; empty where nobody knows which. The pose begins ``pause_s`` later than it would, or is held for
     ``hold_s``. ``information`` is what it is expected to bring, in nats, beside the actions before it."""
 
-    do: ActionKind
+    kind: ActionKind
     up: Floats | None = None
     label: str = ""
     again: int | None = None
@@ -71,29 +71,31 @@ class Action:
 
     @property
     def cost(self) -> float:
-        return {ActionKind.CHANNEL: MOVED, ActionKind.PAUSE: WAITED}.get(self.do, POSE)
+        return {ActionKind.CHANNEL: MOVED, ActionKind.PAUSE: WAITED}.get(self.kind, POSE)
 
 
 class Options:
     """After the poses of a posterior and those that were chosen: the actions, each with the pose that it gives, held as
     long and as quietly as is usual here. Covariates stay as they last were, and the pose before is the last one."""
 
-    def __init__(self, seen: Posterior, wanted: Sequence[int]) -> None:
+    def __init__(self, posterior: Posterior, wanted: Sequence[int]) -> None:
         """``wanted`` are poses that are to be taken again in any case, even if the unit has to leave one for that."""
-        self.rows = seen.evidence.rows
+        self.rows = posterior.evidence.rows
         self.wanted = {int(self.rows.places[i]) for i in wanted}
         poses = self.rows.poses
         self.sensor = self.rows.state.sensor(self.rows.problem)
         self.usual = poses[int(np.argsort(self.rows.error[: self.rows.n], kind="stable")[self.rows.n // 2])]
         self.last = max(poses, key=lambda p: (p.run.index, p.t_s))
         run = sorted((p for p in poses if p.run == self.last.run), key=lambda p: p.t_s)
-        self.held_s = float(np.median(self.rows.held_s))
+        self.duration_s = float(np.median(self.rows.duration_s))
         gaps = [after.start_s - before.end_s for before, after in itertools.pairwise(run)]
         self.gap_s = max(float(np.median(gaps)), 0.0) if gaps else 0.0
         self.lasted_s = run[-1].end_s - run[0].start_s
-        self.range = {channel: _range(poses, channel) for channel in _channels(seen) if channel in self.last.channels}
+        self.range = {
+            channel: _range(poses, channel) for channel in _channels(posterior) if channel in self.last.channels
+        }
         self.taken = place(self.rows, self.rows.problem.u).up
-        self.suspects = list(dict.fromkeys([*wanted, *_suspects(seen)]))
+        self.suspects = list(dict.fromkeys([*wanted, *_suspects(posterior)]))
         cube = cube_directions()
         known = np.concatenate([self.taken, [up for _, up in cube]])
         planned = [(label, up) for label, up in cube if not self._near(up, self.suspects)]
@@ -138,7 +140,7 @@ class Options:
         return replace(
             self.usual,
             start_s=start_s,
-            end_s=start_s + self.held_s,
+            end_s=start_s + self.duration_s,
             mean=self.sensor.output(up[None] * self.rows.problem.reference, {})[0],
             creep=nothing,
             slope=nothing,
@@ -166,19 +168,19 @@ def _label(up: Floats) -> str:
     return next((label for label, v in cube_directions() if float(v @ up) > SAME), "")
 
 
-def _suspects(seen: Posterior) -> list[int]:
+def _suspects(posterior: Posterior) -> list[int]:
     """Poses that may be outliers, and then those that are far off the linear fit."""
-    rows, outlier = seen.evidence.rows, seen.of_outliers
-    spread = np.linalg.norm(rows.beside, axis=1)
-    off = np.abs(rows.beside @ rows.z / np.maximum(spread, 1e-9))[: rows.n]
+    rows, outlier = posterior.evidence.rows, posterior.of_outliers
+    spread = np.linalg.norm(rows.complement, axis=1)
+    off = np.abs(rows.complement @ rows.z / np.maximum(spread, 1e-9))[: rows.n]
     found = [i for i in range(rows.n) if outlier[i] >= OPEN or off[i] >= FAR]
     return sorted(found, key=lambda i: (outlier[i] < OPEN, -off[i]))[:AGAIN]
 
 
-def _channels(seen: Posterior) -> list[str]:
+def _channels(posterior: Posterior) -> list[str]:
     """Logged ones with which an effect goes that may act."""
-    effects = {t.name: t.effect for t in seen.evidence.terms if t.effect is not None}
-    likely = [effects[name] for name, p in seen.of_names.items() if p >= OPEN]
+    effects = {t.name: t.effect for t in posterior.evidence.terms if t.effect is not None}
+    likely = [effects[name] for name, p in posterior.of_names.items() if p >= OPEN]
     needed = (need for effect in likely for need in effect.needs if not is_derived(need))
     return list(dict.fromkeys(map(channel_of, needed)))
 

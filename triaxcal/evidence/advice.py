@@ -16,13 +16,13 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import TEMPERATURE
 from triaxcal.evidence.actions import LONGER, OPEN, Action, ActionKind, Options
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.predictive import Cells, Hypothesis, probabilities
+from triaxcal.evidence.predictive import Hypothesis, Predictive, probabilities
 from triaxcal.evidence.rows import Rows
 from triaxcal.evidence.unmodelled import What
 from triaxcal.poses.pose import Pose
 
 SHARE = 0.99
-"""Of the probability that the sets hold which are asked, if so few do (`triaxcal.evidence.solved.CELLS`)."""
+"""Of the probability that the sets hold which are asked, if so few do (`triaxcal.evidence.mixture.CELLS`)."""
 DRAWS = 256
 """Of what the poses may show: an expected entropy is then known to a few hundredths."""
 LEAST = 0.05
@@ -53,62 +53,62 @@ class Advice:
     expected: Mapping[str, Expected]
 
 
-def advice(seen: Posterior, most: int = 3) -> Advice:
+def advice(posterior: Posterior, most: int = 3) -> Advice:
     """Up to so many poses, at best `MOST`, beside what to log and how long to hold them. Raises Refused where the
     model does not hold in poses to come."""
-    if decided(seen):
+    if decided(posterior):
         return Advice((), 0.0, 0.0, {})
     most = min(most, MOST)
-    future = _Future(Cells.likeliest(seen, SHARE))
-    wanted = _decisive(seen)[:most]
-    options = Options(seen, wanted)
+    future = _Future(Predictive.likeliest(posterior, SHARE))
+    wanted = _decisive(posterior)[:most]
+    options = Options(posterior, wanted)
     for pose in wanted:
-        future.take(options, int(seen.evidence.rows.places[pose]))
+        future.take(options, int(posterior.evidence.rows.places[pose]))
     while len(future.actions) < most and future.take(options):
         pass
-    names = {name: p for name, p in seen.of_names.items() if OPEN < p < 1 - OPEN}
+    names = {name: p for name, p in posterior.of_names.items() if OPEN < p < 1 - OPEN}
     expected = {name: Expected(p, future.if_it_acts(name, p)) for name, p in names.items()}
-    return Advice((*_beside_poses(seen), *future.actions), future.entropy, future.entropy_after, expected)
+    return Advice((*_given_poses(posterior), *future.actions), future.entropy, future.entropy_after, expected)
 
 
-def decided(seen: Posterior) -> bool:
+def decided(posterior: Posterior) -> bool:
     """Whether it is likelier than not that nothing acts but what is certain."""
-    certain = seen.evidence.odds.certain
-    names = frozenset(name for group in seen.certain if len(group) == 1 for name in group)
-    outliers = frozenset(np.flatnonzero(seen.of_outliers >= certain).tolist())
-    settled = probabilities(seen).get(Hypothesis(names, outliers, -1, None), 0.0)
-    return settled >= seen.evidence.odds.reported
+    certain = posterior.evidence.odds.certain
+    names = frozenset(name for group in posterior.certain if len(group) == 1 for name in group)
+    outliers = frozenset(np.flatnonzero(posterior.of_outliers >= certain).tolist())
+    settled = probabilities(posterior).get(Hypothesis(names, outliers, -1, None), 0.0)
+    return settled >= posterior.evidence.odds.reported
 
 
-def _decisive(seen: Posterior) -> list[int]:
+def _decisive(posterior: Posterior) -> list[int]:
     """Poses without which a name that is certain would not be: to be taken again, whatever the posterior expects."""
-    certain = seen.evidence.odds.certain
+    certain = posterior.evidence.odds.certain
     out = []
-    for name, p in seen.of_names.items():
-        without = seen.without_each_pose(name) if p >= certain else np.array([p])
+    for name, p in posterior.of_names.items():
+        without = posterior.without_each_pose(name) if p >= certain else np.array([p])
         if p >= certain > without.min():
             out.append(int(np.argmin(without)))
     return list(dict.fromkeys(out))
 
 
-def _beside_poses(seen: Posterior) -> Iterator[Action]:
+def _given_poses(posterior: Posterior) -> Iterator[Action]:
     """What no pose tells: a channel that nobody logs, and an error that every pose has of its own."""
-    if seen.of_unmodelled < seen.evidence.odds.reported:
+    if posterior.of_unmodelled < posterior.evidence.odds.reported:
         return
-    what = next(what for what in seen.of_kinds if what is not What.INSIDE)
-    rows = seen.evidence.rows
+    what = next(what for what in posterior.of_kinds if what is not What.INSIDE)
+    rows = posterior.evidence.rows
     if what is What.TIME:
         logged = any(TEMPERATURE in p.channels for p in rows.poses)
         yield Action(ActionKind.LOG, channel="" if logged else TEMPERATURE)
     elif what is What.NOTHING:
-        yield Action(ActionKind.HOLD, hold_s=LONGER * float(np.median(rows.held_s)))
+        yield Action(ActionKind.HOLD, hold_s=LONGER * float(np.median(rows.duration_s)))
 
 
 class _Future:
     """Draws of what the actions taken so far will show: of draw s the rows ``shown`` (S,K), those of one pose side by
     side, under the cell ``truth`` (S,)."""
 
-    def __init__(self, cells: Cells) -> None:
+    def __init__(self, cells: Predictive) -> None:
         self.cells = cells
         order = np.argsort(cells.of, kind="stable")
         ends = np.cumsum(cells.weight[order])
@@ -134,7 +134,7 @@ class _Future:
             gain[i] = self.entropy_after - self._entropy_of(chances.weight(len(self.poses) + i, shown))
         rate = gain / [action.cost for action, _ in found]
         if again is not None:
-            rate[[action.do is not ActionKind.REPEAT or action.again != again for action, _ in found]] = -np.inf
+            rate[[action.kind is not ActionKind.REPEAT or action.again != again for action, _ in found]] = -np.inf
         best = int(np.argmax(rate >= rate.max() - ALIKE * abs(rate.max())))
         if again is None and rate[best] < LEAST:
             return False

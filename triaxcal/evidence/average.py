@@ -19,9 +19,9 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.estimate.problem import State, linearise_all, parameters_by_theta
+from triaxcal.evidence.mixture import NEGLIGIBLE, Components, components
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.rows import LINEAR
-from triaxcal.evidence.solved import NEGLIGIBLE, Solved, solved_cells
 from triaxcal.evidence.unmodelled import What, place
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor
@@ -39,8 +39,8 @@ STEPS = 3
 """Of Newton's method, for nine parameters a few parts in a thousand from where they go."""
 
 
-_Elsewhere = tuple[Floats, Floats, Floats, dict[str, Floats]]
-"""As `_elsewhere` has it."""
+_NextReadings = tuple[Floats, Floats, Floats, dict[str, Floats]]
+"""As `_next_readings` has it."""
 
 
 class Refusal(StrEnum):
@@ -57,10 +57,10 @@ class Refusal(StrEnum):
 @dataclass(frozen=True, eq=False)
 class Average:
     """``sensor`` has one entry for each likely name, by the mean of its coefficients: sets without the effect count,
-    with zero. ``covariance`` (9+p,9+p) is that of its scale factors, misalignments, biases and coefficients, within
-    the sets and between them, of which ``thermal`` is the part of sets with a thermal effect that is not listed;
-    ``spread`` (p,) are the coefficients' standard deviations before the poses were seen, as the probabilities and sizes
-    after have them. ``weights`` has the probability of each name. ``wander`` (3,) g, which the biases hold, is what a
+    with zero. ``covariance`` (9+p,9+p) is that of its scale factors, misalignments, biases and coefficients, within the
+    sets and between them, of which ``thermal`` is the part of sets with a thermal effect that is not listed; ``spread``
+    (p,) are the coefficients' standard deviations before the poses were seen, as the probabilities and sizes after have
+    them. ``weights`` has the probability of each name. ``process_bias`` (3,) g, which the biases hold, is what a
     process in time adds to them at the moment for which all this holds."""
 
     sensor: Sensor
@@ -68,43 +68,43 @@ class Average:
     thermal: Floats
     spread: Floats
     weights: Mapping[str, float]
-    wander: Floats
+    process_bias: Floats
 
 
-def refusal(seen: Posterior) -> Refusal | None:
-    odds = seen.evidence.odds
-    if seen.of_another.sum() >= odds.refused:
+def refusal(posterior: Posterior) -> Refusal | None:
+    odds = posterior.evidence.odds
+    if posterior.of_another.sum() >= odds.refused:
         return Refusal.ANOTHER
-    if seen.of_unmodelled >= odds.refused:
+    if posterior.of_unmodelled >= odds.refused:
         return Refusal.UNMODELLED
-    certain = [name for name, p in seen.of_names.items() if p >= odds.certain]
-    if any(seen.without_any_pose(name) < odds.refused for name in certain):
+    certain = [name for name, p in posterior.of_names.items() if p >= odds.certain]
+    if any(posterior.without_any_pose(name) < odds.refused for name in certain):
         return Refusal.ONE_POSE
     return None
 
 
-def average(seen: Posterior, at: HoldsAt, solved: Sequence[Solved] | None = None) -> Average:
+def average(posterior: Posterior, at: HoldsAt, solved: Sequence[Components] | None = None) -> Average:
     """Over all sets, sizes and parts; it holds for another recording as at a moment of this one. ``solved`` are the
-    likeliest sets (`solved_cells`), where they are known."""
-    listed, solved = _likeliest(seen), solved_cells(seen) if solved is None else solved
-    made = _of_listed(seen, at, listed, solved)
-    kept = [effect for effect in listed if _selected(seen, made, effect)]
-    return made if len(kept) == len(listed) else _of_listed(seen, at, kept, solved)
+    likeliest sets (`components`), where they are known."""
+    listed, solved = _likeliest(posterior), components(posterior) if solved is None else solved
+    made = _of_listed(posterior, at, listed, solved)
+    kept = [effect for effect in listed if _selected(posterior, made, effect)]
+    return made if len(kept) == len(listed) else _of_listed(posterior, at, kept, solved)
 
 
-def _of_listed(seen: Posterior, at: HoldsAt, listed: Sequence[Effect], solved: Sequence[Solved]) -> Average:
-    carried = _Carried.of(seen, at, listed)
-    mean, left = _mean(seen, carried)
-    state = _settled(seen, mean, carried)
-    sensor = state.sensor(seen.evidence.rows.problem)
-    wander = _wander(seen, left, at.t_s)
-    moved = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + wander, sensor.effects)
-    return _with_errors(seen, at, carried, moved, state, mean, wander, solved)
+def _of_listed(posterior: Posterior, at: HoldsAt, listed: Sequence[Effect], solved: Sequence[Components]) -> Average:
+    projection = _Projection.of(posterior, at, listed)
+    mean, left = _mean(posterior, projection)
+    state = _where_linearised(posterior, mean, projection)
+    sensor = state.sensor(posterior.evidence.rows.problem)
+    process_bias = _process_bias(posterior, left, at.t_s)
+    moved = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + process_bias, sensor.effects)
+    return _with_errors(posterior, at, projection, moved, state, mean, process_bias, solved)
 
 
-def _selected(seen: Posterior, made: Average, effect: Effect) -> bool:
+def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
     """Whether a name is likely, or corrects a good part of what it may do."""
-    if seen.of_names[effect.name] >= seen.evidence.odds.reported:
+    if posterior.of_names[effect.name] >= posterior.evidence.odds.reported:
         return True
     ends = np.cumsum([LINEAR, *(len(q) for _, q in made.sensor.effects)])
     k = next(k for k, (other, _) in enumerate(made.sensor.effects) if other is effect)
@@ -116,33 +116,35 @@ def _selected(seen: Posterior, made: Average, effect: Effect) -> bool:
     return corrects >= SELECTED_LEAST * (corrects + float(np.sum(np.diag(made.covariance)[own] / size**2)))
 
 
-def linear_alone(seen: Posterior, at: HoldsAt, linear: Sensor, solved: Sequence[Solved]) -> Average:
+def linear_alone(posterior: Posterior, at: HoldsAt, linear: Sensor, solved: Sequence[Components]) -> Average:
     """The ``linear`` sensor with the errors that all likely sets make of it: what is handed on where no effect is
     corrected."""
-    rows = seen.evidence.rows
+    rows = posterior.evidence.rows
     state = State.of(rows.problem, linear)
-    carried, mean = _Carried.of(seen, at, []), state.theta - rows.state.theta
-    return _with_errors(seen, at, carried, linear, state, mean, np.zeros(3), solved)
+    projection, mean = _Projection.of(posterior, at, []), state.theta - rows.state.theta
+    return _with_errors(posterior, at, projection, linear, state, mean, np.zeros(3), solved)
 
 
 def _with_errors(
-    seen: Posterior,
+    posterior: Posterior,
     at: HoldsAt,
-    carried: _Carried,
+    projection: _Projection,
     sensor: Sensor,
     state: State,
     mean: Floats,
-    wander: Floats,
-    solved: Sequence[Solved],
+    process_bias: Floats,
+    solved: Sequence[Components],
 ) -> Average:
-    G = parameters_by_theta(seen.evidence.rows.problem, state)
-    spread = _Spread.of(seen, solved, mean, carried, wander, at.t_s)
-    weights = {effect.name: seen.of_names[effect.name] for effect in carried.effects}
-    return Average(sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, wander)
+    G = parameters_by_theta(posterior.evidence.rows.problem, state)
+    spread = _Spread.of(posterior, solved, mean, projection, process_bias, at.t_s)
+    weights = {effect.name: posterior.of_names[effect.name] for effect in projection.effects}
+    return Average(
+        sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, process_bias
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Carried:
+class _Projection:
     """``effects`` in the form and the shape that stands for each name, ``columns`` (N,p) theirs. ``by_term`` (9+p,C)
     are the parameters, as deviations, by the scaled coefficients of all terms; zero for outliers. What a name that is
     not listed does goes into the nine parameters, as far as these can take it."""
@@ -152,25 +154,25 @@ class _Carried:
     by_term: Floats
 
     @classmethod
-    def of(cls, seen: Posterior, at: HoldsAt, likeliest: Sequence[Effect]) -> _Carried:
-        evidence = seen.evidence
+    def of(cls, posterior: Posterior, at: HoldsAt, likeliest: Sequence[Effect]) -> _Projection:
+        evidence = posterior.evidence
         rows = evidence.rows
-        there = _elsewhere(seen, at)
-        each = [_both(seen, effect, there) for effect in likeliest]
+        there = _next_readings(posterior, at)
+        each = [_derivatives(posterior, effect, there) for effect in likeliest]
         ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
         linear = np.concatenate([rows.linear, there[0]])
         by_term = np.zeros((9 + ends[-1], evidence.columns.shape[1]))
         of_name = {effect.name: k for k, effect in enumerate(likeliest)}
         nothing = np.empty((len(linear), 0))
         known: dict[int, Floats] = {}
-        for i in sorted({i for found in seen.sets for i in found.members}):
+        for i in sorted({i for found in posterior.sets for i in found.members}):
             term = evidence.terms[i]
             if term.effect is None:
                 continue
             k = of_name.get(term.name)
             to = nothing if k is None else each[k]
             if id(term.effect) not in known:
-                known[id(term.effect)] = _carry(linear, to, _both(seen, term.effect, there))
+                known[id(term.effect)] = _projected(linear, to, _derivatives(posterior, term.effect, there))
             found = known[id(term.effect)][:, list(term.kept)] * term.combination
             own = [] if k is None else [*range(9 + ends[k], 9 + ends[k + 1])]
             by_term[np.ix_([*range(9), *own], evidence.places([i]))] = found
@@ -179,28 +181,30 @@ class _Carried:
         return cls(tuple(likeliest), columns, by_term)
 
 
-def _likeliest(seen: Posterior) -> list[Effect]:
+def _likeliest(posterior: Posterior) -> list[Effect]:
     """Of each name that is listed the form and the shape of the greatest weight, the likeliest name first."""
     weight: dict[int, float] = defaultdict(float)
     effects: dict[int, Effect] = {}
     corrects: dict[str, float] = defaultdict(float)
-    for w, found in zip(seen.weight, seen.sets, strict=True):
+    for w, found in zip(posterior.weight, posterior.sets, strict=True):
         scaled = np.exp(found.by_part - found.total) @ found.mean
-        ends = np.cumsum([0, *(seen.evidence.terms[i].rank for i in found.members)])
+        ends = np.cumsum([0, *(posterior.evidence.terms[i].rank for i in found.members)])
         for i, first, last in zip(found.members, ends, ends[1:], strict=False):
-            term = seen.evidence.terms[i]
+            term = posterior.evidence.terms[i]
             if term.effect is not None:
                 weight[id(term.effect)] += float(w)
                 effects[id(term.effect)] = term.effect
                 corrects[term.name] += float(w) * float(np.sqrt(np.mean(scaled[first:last] ** 2)))
-    least = NOTICEABLE * seen.evidence.rows.of_a_pose
+    least = NOTICEABLE * posterior.evidence.rows.of_a_pose
     out: dict[str, Effect] = {}
     for key in sorted(weight, key=lambda key: -weight[key]):
         out.setdefault(effects[key].name, effects[key])
-    return [out[n] for n, p in seen.of_names.items() if p >= seen.evidence.odds.reported or corrects[n] > least]
+    return [
+        out[n] for n, p in posterior.of_names.items() if p >= posterior.evidence.odds.reported or corrects[n] > least
+    ]
 
 
-def _carry(linear: Floats, to: Floats, of: Floats) -> Floats:
+def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
     """(9+p,q): the deviation of the linear parameters, and the coefficients, that come nearest to a unit of each."""
     size = np.maximum(np.linalg.norm(to, axis=0), 1e-300)
     found = np.linalg.lstsq(np.concatenate([linear, to / size], axis=1), of, rcond=1e-9)[0]
@@ -208,35 +212,35 @@ def _carry(linear: Floats, to: Floats, of: Floats) -> Floats:
     return np.asarray(found)
 
 
-def _both(seen: Posterior, effect: Effect, elsewhere: _Elsewhere) -> Floats:
+def _derivatives(posterior: Posterior, effect: Effect, next_readings: _NextReadings) -> Floats:
     """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of |a| in the next recording."""
-    rows = seen.evidence.rows
-    _, along, by_v, held = elsewhere
+    rows = posterior.evidence.rows
+    _, along, by_v, covariates = next_readings
     try:
-        there = -np.einsum("ni,nip->np", by_v, effect.basis(along, held)) / rows.of_a_pose
+        there = -np.einsum("ni,nip->np", by_v, effect.basis(along, covariates)) / rows.of_a_pose
     except EffectFault:  # of another package, which does not say what it adds there
         there = np.zeros((len(along), len(effect.coefficients)))
     return np.concatenate([rows.by_coefficients(effect), there])
 
 
-def _elsewhere(seen: Posterior, at: HoldsAt) -> _Elsewhere:
+def _next_readings(posterior: Posterior, at: HoldsAt) -> _NextReadings:
     """Of M readings all over the sphere, as of the next recording: derivatives by the linear parameters (M,9) over the
     error of a pose, readings along the axes and derivatives by the biases (M,3), and the covariates."""
-    rows = seen.evidence.rows
+    rows = posterior.evidence.rows
     up = np.array([v for _, v in cube_directions()]) * rows.problem.reference
     found = place(rows, rows.state.sensor(rows.problem).output(up, {}))
     reference = rows.problem.channel_reference
-    held = at_moment(reference, len(up), at.clocks)
-    return found.linear / rows.of_a_pose, found.along, -found.by_v, held
+    covariates = at_moment(reference, len(up), at.clocks)
+    return found.linear / rows.of_a_pose, found.along, -found.by_v, covariates
 
 
-def _mean(seen: Posterior, carried: _Carried) -> tuple[Floats, dict[int, Floats]]:
+def _mean(posterior: Posterior, projection: _Projection) -> tuple[Floats, dict[int, Floats]]:
     """(9+p,) deviations; and by part the rows that are left, weighted by the inverse of their covariance."""
-    evidence = seen.evidence
+    evidence = posterior.evidence
     rows = evidence.rows
     scaled = np.zeros(evidence.columns.shape[1])
     by_part: dict[int, Floats] = defaultdict(lambda: np.zeros(len(rows.y)))
-    for found, weight in zip(seen.sets, seen.weight, strict=True):
+    for found, weight in zip(posterior.sets, posterior.weight, strict=True):
         if weight < NEGLIGIBLE:
             continue
         share = np.exp(found.by_part - found.total) * weight
@@ -245,7 +249,7 @@ def _mean(seen: Posterior, carried: _Carried) -> tuple[Floats, dict[int, Floats]
         scaled[places] += mean.sum(axis=0)
         for part, of_part, q in zip(found.parts, share, mean, strict=True):
             by_part[part] += of_part * rows.y - evidence.columns[:, places] @ q
-    deviation = carried.by_term @ scaled
+    deviation = projection.by_term @ scaled
     left: dict[int, Floats] = {}
     for part, target in by_part.items():
         inverse = np.linalg.inv(evidence.covariance(part))
@@ -266,15 +270,21 @@ class _Spread:
 
     @classmethod
     def of(
-        cls, seen: Posterior, solved: Sequence[Solved], mean: Floats, carried: _Carried, wander: Floats, t_s: float
+        cls,
+        posterior: Posterior,
+        solved: Sequence[Components],
+        mean: Floats,
+        projection: _Projection,
+        process_bias: Floats,
+        t_s: float,
     ) -> _Spread:
         """Within each set, part and choice of sizes, and between them. The biases are those of the moment, with what a
         process in time adds."""
-        listed = {effect.name for effect in carried.effects}
+        listed = {effect.name for effect in projection.effects}
         whole, thermal = np.zeros((2, len(mean), len(mean)))
         prior, total = np.zeros(len(mean) - LINEAR), 0.0
         for cells in solved:
-            size, here = _moments(cells, seen, mean, carried, wander, t_s)
+            size, here = _moments(cells, posterior, mean, projection, process_bias, t_s)
             total += float(cells.share.sum())
             whole += here
             prior += size
@@ -284,16 +294,16 @@ class _Spread:
 
 
 def _moments(
-    cells: Solved, seen: Posterior, mean: Floats, carried: _Carried, wander: Floats, t_s: float
+    cells: Components, posterior: Posterior, mean: Floats, projection: _Projection, process_bias: Floats, t_s: float
 ) -> tuple[Floats, Floats]:
     """Sums over the choices, by their share: the variances (p,) that the sizes give the coefficients of an average,
     and the second moments (9+p,9+p) about its mean."""
-    rows, assumed = seen.evidence.rows, seen.evidence.parts[cells.part]
-    to = np.concatenate([np.zeros((len(mean), LINEAR)), carried.by_term[:, cells.places]], axis=1)
+    rows, assumed = posterior.evidence.rows, posterior.evidence.parts[cells.part]
+    to = np.concatenate([np.zeros((len(mean), LINEAR)), projection.by_term[:, cells.places]], axis=1)
     size = cells.share @ (cells.sizes**2 @ (to[LINEAR:, LINEAR:] ** 2).T)
     to[:LINEAR, :LINEAR] += np.diag(1 / rows.lengths)
     off = cells.here @ to.T - mean
-    off[:, BIAS] -= wander
+    off[:, BIAS] -= process_bias
     wandering = np.zeros((3, 3))
     if assumed.kind is not None and assumed.kind.what is What.TIME:
         there = assumed.tau**2 * assumed.kind.bias_at(rows, t_s) @ cells.inverse
@@ -306,21 +316,21 @@ def _moments(
     return size, spread + (cells.share[:, None] * off).T @ off
 
 
-def _settled(seen: Posterior, deviation: Floats, carried: _Carried) -> State:
+def _where_linearised(posterior: Posterior, deviation: Floats, projection: _Projection) -> State:
     """Where residuals are those of the linearisation: the nine parameters take up what the effects are in truth beside
     what they are to first order."""
-    rows = seen.evidence.rows
-    wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + carried.columns @ deviation[9:]
-    state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), carried.effects)
+    rows = posterior.evidence.rows
+    wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + projection.columns @ deviation[9:]
+    state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), projection.effects)
     for _ in range(STEPS):
         r, _, _ = linearise_all(rows.problem, state, jacobian=False)
         step = np.linalg.lstsq(rows.linear, wanted - r / rows.error, rcond=None)[0] / rows.lengths
-        state = State(state.theta + np.concatenate([step, np.zeros(len(deviation) - 9)]), carried.effects)
+        state = State(state.theta + np.concatenate([step, np.zeros(len(deviation) - 9)]), projection.effects)
     return state
 
 
-def _wander(seen: Posterior, left: Mapping[int, Floats], t_s: float) -> Floats:
-    evidence = seen.evidence
+def _process_bias(posterior: Posterior, left: Mapping[int, Floats], t_s: float) -> Floats:
+    evidence = posterior.evidence
     out = np.zeros(3)
     for part, weighted in left.items():
         assumed = evidence.parts[part]

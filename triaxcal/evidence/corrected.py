@@ -11,23 +11,23 @@ from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
 from triaxcal.estimate.caution import BirgeRatio, ExcessVariance
 from triaxcal.estimate.problem import State, linearise
 from triaxcal.evidence.average import Average, average, linear_alone, refusal
+from triaxcal.evidence.mixture import components
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.rows import Rows
 from triaxcal.evidence.shapes import shapes_of
-from triaxcal.evidence.solved import solved_cells
 from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof
 from triaxcal.uncertainty.extrapolation import extrapolated
-from triaxcal.uncertainty.linearised import held_gain
+from triaxcal.uncertainty.linearised import gain_given_prior
 
 
-def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
+def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibration:
     """With the likely effects at their mean coefficients. ``before`` is the linear calibration of all poses that were
     given: where no effect is to be corrected (`refusal`), it stays, with the errors that all likely sets make of it."""
-    solved = solved_cells(seen)
-    made = None if refusal(seen) else average(seen, at, solved)
+    solved = components(posterior)
+    made = None if refusal(posterior) else average(posterior, at, solved)
     if made is None or not made.sensor.effects:
-        made = linear_alone(seen, at, before.sensor, solved)
-    rows = seen.evidence.rows
+        made = linear_alone(posterior, at, before.sensor, solved)
+    rows = posterior.evidence.rows
     needed = dict.fromkeys(name for effect, _ in made.sensor.effects for name in effect.needs)
     after = replace(
         before,
@@ -36,7 +36,7 @@ def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
         thermal=made.thermal,
         spread=made.spread,
         weights=made.weights,
-        shape_errors=_shape_errors(seen, made),
+        shape_errors=_shape_errors(posterior, made),
         channel_reference={name: rows.problem.channel_reference[name] for name in needed},
         birge_ratio=1.0,
         excess_g=0.0,
@@ -50,15 +50,15 @@ def corrected(before: Calibration, seen: Posterior, at: HoldsAt) -> Calibration:
     if not made.sensor.effects:
         return after
     beyond = extrapolated(after)
-    told = after if beyond is None else replace(after, cautions=(*after.cautions, beyond))
-    return _with_residuals(told, rows, made)
+    after = after if beyond is None else replace(after, cautions=(*after.cautions, beyond))
+    return _with_residuals(after, rows, made)
 
 
-def _shape_errors(seen: Posterior, made: Average) -> dict[str, float]:
+def _shape_errors(posterior: Posterior, made: Average) -> dict[str, float]:
     """Of the shapes that stand for the effects, about what the posterior has of them."""
     out = {}
     for effect, _ in made.sensor.effects:
-        for name, shape in shapes_of(seen, effect.name).items():
+        for name, shape in shapes_of(posterior, effect.name).items():
             if shape.standard_error is not None:
                 off = shape.value - effect.shape[name][0]
                 out[f"{effect.name}.{name}"] = float(np.hypot(shape.standard_error, off))
@@ -79,9 +79,9 @@ def _with_residuals(c: Calibration, rows: Rows, made: Average) -> Calibration:
 
 def _with_known_residuals(c: Calibration, rows: Rows, made: Average, places: list[int]) -> Calibration:
     poses = [p.pose for p in c.poses]
-    u, held = np.array([p.mean for p in poses]), c.covariates_of(poses)
-    length, by_u = c.sensor.magnitude(u, held)
-    direction = c.sensor.specific_force(u, held)
+    u, covariates = np.array([p.mean for p in poses]), c.covariates_of(poses)
+    length, by_u = c.sensor.magnitude(u, covariates)
+    direction = c.sensor.specific_force(u, covariates)
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     r = length - c.reference
     error = np.sqrt(np.einsum("ni,nij,nj->n", by_u, np.array([p.covariance for p in poses]), by_u))
@@ -120,4 +120,4 @@ def _leverage(rows: Rows, used: list[int], made: Average) -> Floats:
     problem = replace(rows.problem.only(np.array(used)), slopes=None)
     _, J, error = linearise(problem, State.of(problem, made.sensor))
     weighted = J / error[:, None]
-    return np.asarray(np.clip(np.einsum("np,pn->n", weighted, held_gain(weighted, made.spread)), 0.0, 1.0))
+    return np.asarray(np.clip(np.einsum("np,pn->n", weighted, gain_given_prior(weighted, made.spread)), 0.0, 1.0))

@@ -33,7 +33,7 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class _Turned:
+class _Diagonal:
     """The projected data in the axes of one kind: ``variance`` (m,) there, terms' columns (m,C), misfits (m,)."""
 
     variance: Floats
@@ -74,12 +74,12 @@ class Evidence:
         self.log_prior = np.array([term.log_prior for term in terms])
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
         self.columns = np.concatenate([np.empty((len(rows.y), 0)), *(term.columns for term in terms)], axis=1)
-        projected = rows.beside.T @ self.columns
+        projected = rows.complement.T @ self.columns
         kinds = list(dict.fromkeys(part.kind for part in self.parts))
-        self._turned = [_turned(kind, projected, rows.z) for kind in kinds]
+        self._diagonal = [_diagonal(kind, projected, rows.z) for kind in kinds]
         self._which = [kinds.index(part.kind) for part in self.parts]
-        turned = (self._turned[which] for which in self._which)
-        self._weight = [1 / (1 + part.tau**2 * t.variance) for part, t in zip(self.parts, turned, strict=True)]
+        diagonal = (self._diagonal[which] for which in self._which)
+        self._weight = [1 / (1 + part.tau**2 * t.variance) for part, t in zip(self.parts, diagonal, strict=True)]
         ranks = np.array([term.rank for term in terms], dtype=int)
         self._by_rank: list[tuple[Ints, Ints]] = []
         for rank in np.unique(ranks):
@@ -112,12 +112,12 @@ class Evidence:
     def each_with(self, part: int, members: Sequence[int] = (), sizes: Sequence[float] = ()) -> tuple[Floats, float]:
         """Logarithms (T,R) of the evidence of each term at each size beside ``members`` of given sizes, and that of
         these alone; with the priors of the part and of the term's size, without those of names."""
-        turned, weight = self._turned[self._which[part]], self._weight[part]
-        score, chi2, shared, log_det = self._beside(part, members, sizes)
+        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
+        score, chi2, shared, log_det = self._given(part, members, sizes)
         base = self.parts[part].log_prior + 0.5 * float(np.log(weight).sum()) - log_det
         out = np.empty((len(self.terms), len(self.sizes)))
         for index, places in self._by_rank:
-            information, along = self._in_own_axes(turned, weight, shared, places, score)
+            information, along = self._in_own_axes(diagonal, weight, shared, places, score)
             squared = self._sizes_of[index][:, :, None] ** 2
             spread = 1 + squared * information[:, None, :]
             gain = np.sum(squared / spread * along[:, None, :], axis=2)
@@ -126,10 +126,10 @@ class Evidence:
         return out + base - np.log(len(self.sizes)), alone
 
     def _in_own_axes(
-        self, turned: _Turned, weight: Floats, shared: Floats, places: Ints, score: Floats
+        self, diagonal: _Diagonal, weight: Floats, shared: Floats, places: Ints, score: Floats
     ) -> tuple[Floats, Floats]:
         """Eigenvalues (t,q) of the information of each term's coefficients, and the squared scores along its axes."""
-        columns = turned.columns[:, places]
+        columns = diagonal.columns[:, places]
         if places.shape[1] == 1:
             information = weight @ columns[:, :, 0] ** 2 - np.sum(shared[:, places[:, 0]] ** 2, axis=0)
             return np.maximum(information, 0.0)[:, None], score[places] ** 2
@@ -144,30 +144,30 @@ class Evidence:
     ) -> tuple[dict[int, tuple[Floats, Floats]], float]:
         """Of ``each`` term the information (q,q) and score (q,) of its scaled coefficients beside ``members`` of these
         sizes, and the sum of squares that these leave."""
-        turned, weight = self._turned[self._which[part]], self._weight[part]
-        score, chi2, shared, _ = self._beside(part, members, sizes)
+        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
+        score, chi2, shared, _ = self._given(part, members, sizes)
         out: dict[int, tuple[Floats, Floats]] = {}
         for i in each:
             own = slice(self._ends[i], self._ends[i + 1])
-            columns, taken = turned.columns[:, own], shared[:, own]
+            columns, taken = diagonal.columns[:, own], shared[:, own]
             out[i] = columns.T @ (weight[:, None] * columns) - taken.T @ taken, score[own]
         return out, chi2
 
-    def _beside(self, part: int, members: Sequence[int], sizes: Sequence[float]) -> tuple[Floats, float, Floats, float]:
+    def _given(self, part: int, members: Sequence[int], sizes: Sequence[float]) -> tuple[Floats, float, Floats, float]:
         """What ``members`` of these sizes leave: the score (C,) of all terms and the sum of squares; (k,C) whose square
         is the information that they take; and half the logarithm of the determinant of their precision."""
-        turned, weight = self._turned[self._which[part]], self._weight[part]
+        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
         index = self.places(members)
         scale = np.repeat(np.asarray(sizes, dtype=float), [self.terms[i].rank for i in members])
-        own = turned.columns[:, index] * scale
+        own = diagonal.columns[:, index] * scale
         lower = np.linalg.cholesky(np.eye(len(index)) + own.T @ (weight[:, None] * own))
-        shared = np.linalg.solve(lower, (own * weight[:, None]).T @ turned.columns)
-        absorbed = np.linalg.solve(lower, own.T @ (weight * turned.z))
-        score = turned.columns.T @ (weight * turned.z) - shared.T @ absorbed
-        chi2 = float(turned.z @ (weight * turned.z)) - float(absorbed @ absorbed)
+        shared = np.linalg.solve(lower, (own * weight[:, None]).T @ diagonal.columns)
+        absorbed = np.linalg.solve(lower, own.T @ (weight * diagonal.z))
+        score = diagonal.columns.T @ (weight * diagonal.z) - shared.T @ absorbed
+        chi2 = float(diagonal.z @ (weight * diagonal.z)) - float(absorbed @ absorbed)
         return score, chi2, shared, float(np.log(np.diag(lower)).sum())
 
-    def with_further(self, found: SetEvidence, row: int, cells: int) -> Floats:
+    def with_each_further(self, found: SetEvidence, row: int, cells: int) -> Floats:
         """(T,R) about the logarithm of the evidence of a set with each further term at each size, under the part in
         this ``row`` of it: at those ``cells`` of the members' sizes that are best without the term."""
         best = np.argsort(-found.log[row])[:cells]
@@ -189,11 +189,11 @@ class Evidence:
         score = np.empty((len(parts), len(index)))
         chi2, base = np.empty((2, len(parts), 1))
         for row, part in enumerate(parts):
-            turned, weight = self._turned[self._which[part]], self._weight[part]
-            own = turned.columns[:, index]
+            diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
+            own = diagonal.columns[:, index]
             weighted = (weight[:, None] * own).T
-            information[row], score[row] = weighted @ own, weighted @ turned.z
-            chi2[row] = turned.z @ (weight * turned.z)
+            information[row], score[row] = weighted @ own, weighted @ diagonal.z
+            chi2[row] = diagonal.z @ (weight * diagonal.z)
             base[row] = self.parts[part].log_prior + 0.5 * np.log(weight).sum() + prior
         gain, log_det, mean = _absorbed(information, score, [self.terms[i].rank for i in members], grids)
         log = self.rows.log_likelihood(chi2 - gain) - 0.5 * log_det + base
@@ -248,7 +248,7 @@ def _parts(rows: Rows, odds: Odds) -> list[Part]:
     return [none, *(Part(kind, float(tau), share) for kind in kinds for tau in sizes)]
 
 
-def _turned(kind: Kind | None, projected: Floats, z: Floats) -> _Turned:
+def _diagonal(kind: Kind | None, projected: Floats, z: Floats) -> _Diagonal:
     if kind is None:
-        return _Turned(np.zeros(len(z)), projected, z)
-    return _Turned(kind.variance, kind.axes.T @ projected, kind.axes.T @ z)
+        return _Diagonal(np.zeros(len(z)), projected, z)
+    return _Diagonal(kind.variance, kind.axes.T @ projected, kind.axes.T @ z)

@@ -62,36 +62,39 @@ class Findings:
     nothing: float
 
 
-def findings(seen: Posterior) -> Findings:
-    odds = seen.evidence.odds
-    certain = {name for group in seen.certain for name in group}
-    places = seen.evidence.rows.places
-    outliers = {int(places[i]): float(p) for i, p in enumerate(seen.of_outliers) if p >= odds.reported}
-    another = int(places[int(np.argmax(seen.of_another))])
-    from_there_on = float(seen.of_another.sum())
+def findings(posterior: Posterior) -> Findings:
+    odds = posterior.evidence.odds
+    certain = {name for group in posterior.certain for name in group}
+    places = posterior.evidence.rows.places
+    outliers = {int(places[i]): float(p) for i, p in enumerate(posterior.of_outliers) if p >= odds.reported}
+    another = int(places[int(np.argmax(posterior.of_another))])
+    from_there_on = float(posterior.of_another.sum())
     return Findings(
-        named=tuple(Named({name: seen.of_names[name] for name in group}, seen.any_of(group)) for group in seen.certain),
-        candidates={n: p for n, p in seen.of_names.items() if p >= odds.reported and n not in certain},
+        named=tuple(
+            Named({name: posterior.of_names[name] for name in group}, posterior.any_of(group))
+            for group in posterior.certain
+        ),
+        candidates={n: p for n, p in posterior.of_names.items() if p >= odds.reported and n not in certain},
         outliers=dict(sorted(outliers.items(), key=lambda item: -item[1])),
-        unexplained=_unexplained(seen),
+        unexplained=_unexplained(posterior),
         another=Another(another, from_there_on) if from_there_on >= odds.reported else None,
-        nothing=_nothing(seen),
+        nothing=_nothing(posterior),
     )
 
 
-def _unexplained(seen: Posterior) -> Unexplained:
-    rows, total = seen.evidence.rows, seen.of_unmodelled
+def _unexplained(posterior: Posterior) -> Unexplained:
+    rows, total = posterior.evidence.rows, posterior.of_unmodelled
     variance = 0.0
-    for p, part in zip(seen.of_parts, seen.evidence.parts, strict=True):
+    for p, part in zip(posterior.of_parts, posterior.evidence.parts, strict=True):
         if part.kind is not None and part.kind.what is not What.INSIDE:
             squares = np.diag(part.kind.covariance)[: rows.n] * rows.error[: rows.n] ** 2
             variance += float(p) * part.tau**2 * float(np.mean(squares))
-    likeliest = next((what for what in seen.of_kinds if what is not What.INSIDE), None)
+    likeliest = next((what for what in posterior.of_kinds if what is not What.INSIDE), None)
     rms = float(np.sqrt(variance / total)) if total > 0 else 0.0
-    return Unexplained(total, likeliest, rms, total >= seen.evidence.odds.reported)
+    return Unexplained(total, likeliest, rms, total >= posterior.evidence.odds.reported)
 
 
-def _nothing(seen: Posterior) -> float:
+def _nothing(posterior: Posterior) -> float:
     """The empty set is always among the sets, and no unmodelled part always among its parts (`likely_sets`)."""
-    weight, empty = next(pair for pair in zip(seen.weight, seen.sets, strict=True) if not pair[1].members)
+    weight, empty = next(pair for pair in zip(posterior.weight, posterior.sets, strict=True) if not pair[1].members)
     return float(weight * np.exp(empty.by_part[empty.parts.index(0)] - empty.total))

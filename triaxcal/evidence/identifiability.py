@@ -38,7 +38,7 @@ class NotIdentifiable:
     channel: str = ""
 
 
-def blind_to(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping[str, NotIdentifiable]:
+def not_identifiable(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping[str, NotIdentifiable]:
     """By name, in the order of the ``catalogue``."""
     shown = {name for name in {term.name for term in evidence.terms} if name and _in_full(evidence, name)}
     return {effect.name: _why(evidence, effect) for effect in catalogue if effect.name not in shown}
@@ -46,11 +46,11 @@ def blind_to(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping[str, No
 
 def _in_full(evidence: Evidence, name: str) -> bool:
     """Whether no combination of all the coefficients of some shape looks like the nine parameters."""
-    beside = evidence.rows.beside.T
+    complement = evidence.rows.complement.T
     for term in evidence.terms:
         if term.name == name and term.effect is not None and len(term.kept) == len(term.effect.coefficients):
             columns = term.columns / np.maximum(np.linalg.norm(term.columns, axis=0), 1e-300)
-            left = beside @ columns
+            left = complement @ columns
             if min(left.shape) == term.rank and np.linalg.svd(left, compute_uv=False)[-1] > VISIBLE:
                 return True
     return False

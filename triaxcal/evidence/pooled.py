@@ -84,11 +84,11 @@ def pool(units: Sequence[Posterior]) -> Pooled:
         given, acting = [unit.given(name) for unit in given], [*acting, name]
         if not all(unit.sets for unit in given):
             break
-        found = _beside(found, _asked(given, frozenset(acting)), found.probability[name])
+        found = _given(found, _asked(given, frozenset(acting)), found.probability[name])
     return found
 
 
-def _beside(found: Pooled, more: Pooled, p: float) -> Pooled:
+def _given(found: Pooled, more: Pooled, p: float) -> Pooled:
     """With what was asked beside an effect that acts in all with probability ``p``."""
     better = {n: p * q for n, q in more.probability.items() if p * q > found.probability[n]}
     of_names = dict(found.probability) | better
@@ -211,7 +211,7 @@ def _bases(unit: Posterior, acting: frozenset[str]) -> list[_Base]:
     for members in sets:
         found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
         rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE).tolist()}
-        whole = log_sum_exp([evidence.with_further(found, row, cells=1) for row in sorted(rows)], axis=0)
+        whole = log_sum_exp([evidence.with_each_further(found, row, cells=1) for row in sorted(rows)], axis=0)
         whole = whole + np.log(len(evidence.sizes))
         out.append(_Base(found, unit.names_of(found), np.asarray(whole)))
     return out

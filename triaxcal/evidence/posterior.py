@@ -60,7 +60,7 @@ class Posterior:
         return frozenset(pose for pose in poses if pose >= 0)
 
     def resized(self, smallest_g: float) -> Posterior:
-        """The same sets with sizes that begin elsewhere, as `posterior` has them."""
+        """The same sets with sizes that begin elsewhere, as `posterior_of` has them."""
         evidence = self.evidence.resized(smallest_g)
         sets = [evidence.of_set(found.members, found.parts) for found in self.sets]
         return Posterior(evidence, sorted(sets, key=lambda found: -found.total))
@@ -138,7 +138,7 @@ class Posterior:
     def any_of(self, names: Collection[str]) -> float:
         """The probability that at least one of these effects acts."""
         wanted = frozenset(names)
-        return float(sum(p for held, p in self.of_sets_of_names.items() if held & wanted))
+        return float(sum(p for acting, p in self.of_sets_of_names.items() if acting & wanted))
 
     @cached_property
     def certain(self) -> tuple[tuple[str, ...], ...]:
@@ -196,11 +196,13 @@ class Posterior:
             if term.pose < 0 or i in rest:
                 continue
             members = tuple(sorted((*rest, i)))
-            beside = evidence.of_set(members, parts)
+            base = evidence.of_set(members, parts)
             others = [other.kind not in {evidence.terms[k].kind for k in members} for other in evidence.terms]
-            each = log_sum_exp([evidence.with_further(beside, row, cells=1) for row in range(len(parts))], axis=(0, 2))
+            each = log_sum_exp(
+                [evidence.with_each_further(base, row, cells=1) for row in range(len(parts))], axis=(0, 2)
+            )
             each = np.where(others, each + evidence.log_prior, -np.inf)
-            acts, none = log_sum_exp(each[mine]), log_sum_exp([beside.total, *each[~mine]])
+            acts, none = log_sum_exp(each[mine]), log_sum_exp([base.total, *each[~mine]])
             out[term.pose] = np.exp(acts - np.logaddexp(acts, none))
         return out
 
@@ -209,7 +211,7 @@ class Posterior:
         return float(log_sum_exp([found.total for found in self.sets]))
 
 
-def looked_for(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None) -> tuple[Effect, ...]:
+def considered(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None) -> tuple[Effect, ...]:
     """The effects of a ``catalogue``, run by run where there are several; where it is None, of all that are known for
     the channels that move in these poses."""
     sound = [p for p in poses if not p.fault]
@@ -218,7 +220,7 @@ def looked_for(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None)
     return by_run(catalogue, sound)
 
 
-def posterior(
+def posterior_of(
     poses: Sequence[Pose],
     linear: Calibration,
     *,
@@ -230,32 +232,32 @@ def posterior(
     """Of what acts beside the ``linear`` fit of these poses. ``smallest_g`` is the least size of an effect that is
     asked about; several units that are compared have one."""
     odds = odds or Odds()
-    effects = looked_for(poses, catalogue)
+    effects = considered(poses, catalogue)
     rows, finer = Rows.of(poses, linear, signs, effects), list[Finer]()
     for _ in range(ROUNDS):
         evidence = Evidence(rows, terms_of(rows, effects, odds, finer), odds, smallest_g)
-        seen = Posterior(evidence, likely_sets(evidence))
-        point, split = _point_of(seen), finer_shapes(seen)
+        posterior = Posterior(evidence, likely_sets(evidence))
+        point, split = _point_of(posterior), finer_shapes(posterior)
         if point is None and not split:
             break
         rows, finer = rows if point is None else rows.about(point), [*finer, split]
-    return seen
+    return posterior
 
 
-def finer_shapes(seen: Posterior) -> Finer:
+def finer_shapes(posterior: Posterior) -> Finer:
     """Where two neighbouring values of a shape hold nearly all of the probability of a likely effect, what to divide
     each into: where the effect is strong, the values of the grid are further apart than the poses tell them."""
     out: dict[Variant, Sequence[Effect]] = {}
-    terms, odds = seen.evidence.terms, seen.evidence.odds
-    for name in (name for name, p in seen.of_names.items() if p >= odds.reported):
+    terms, odds = posterior.evidence.terms, posterior.evidence.odds
+    for name in (name for name, p in posterior.of_names.items() if p >= odds.reported):
         forms: dict[tuple[str, ...], dict[Variant, list[int]]] = defaultdict(lambda: defaultdict(list))
         for i, term in enumerate(terms):
             if term.effect is not None and term.name == name and len(term.effect.shape) == 1:
                 key = variant_of(term.effect)
                 forms[key[1]][key].append(i)
         for of_form in forms.values():
-            shapes = [(terms[index[0]].effect, float(seen.of_terms[index].sum())) for index in of_form.values()]
-            if sum(share for _, share in shapes) >= odds.reported * seen.of_names[name]:
+            shapes = [(terms[index[0]].effect, float(posterior.of_terms[index].sum())) for index in of_form.values()]
+            if sum(share for _, share in shapes) >= odds.reported * posterior.of_names[name]:
                 out |= _divided([(effect, share) for effect, share in shapes if effect is not None], odds)
     return out
 
@@ -285,11 +287,11 @@ def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
     return out
 
 
-def _point_of(seen: Posterior) -> State | None:
+def _point_of(posterior: Posterior) -> State | None:
     """Where the likeliest set says that the unit is; None where the linearisation holds there, or nothing does."""
-    evidence, best = seen.evidence, seen.sets[0]
+    evidence, best = posterior.evidence, posterior.sets[0]
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
-    if any(term.another >= 0 for term in terms) or not seen.names_of(best):
+    if any(term.another >= 0 for term in terms) or not posterior.names_of(best):
         return None
     scaled = np.exp(best.by_part - best.total) @ best.mean
     inverse = np.linalg.inv(evidence.covariance(best.parts[int(np.argmax(best.by_part))]))
@@ -309,5 +311,5 @@ def _point_of(seen: Posterior) -> State | None:
         found, _, _ = linearise_all(rows.problem, point, jacobian=False)
     except Refused:
         return None
-    curved = rows.beside.T @ (found / rows.error - predicted)
+    curved = rows.complement.T @ (found / rows.error - predicted)
     return point if curved @ curved > evidence.odds.curved else None

@@ -15,11 +15,11 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.evidence.evidence import Evidence, SetEvidence
+from triaxcal.evidence.mixture import Components, components
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.rows import Rows
-from triaxcal.evidence.solved import Solved, solved_cells
 from triaxcal.evidence.terms import Term
-from triaxcal.evidence.unmodelled import Held, Kind, What
+from triaxcal.evidence.unmodelled import Kind, Sites, What
 
 
 @dataclass(frozen=True)
@@ -34,29 +34,29 @@ class Hypothesis:
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class Predictive:
     """The likeliest sets, each with one part of the evidence and one choice of sizes: C of them, of H hypotheses.
     ``weight`` (C,) adds up to one and gives each hypothesis its share of the probability of all that have a cell here;
     ``of`` (C,) is the place of each cell's hypothesis among the ``hypotheses``."""
 
-    seen: Posterior
-    solved: Sequence[Solved]
+    posterior: Posterior
+    solved: Sequence[Components]
     weight: Floats
     hypotheses: Sequence[Hypothesis]
     of: Ints
 
     @classmethod
-    def likeliest(cls, seen: Posterior, share: float) -> Cells:
+    def likeliest(cls, posterior: Posterior, share: float) -> Predictive:
         """Those that hold this share of the probability, or as many as there are."""
-        solved = solved_cells(seen, share)
-        each = [_hypothesis(seen, cells.found, cells.part) for cells in solved]
+        solved = components(posterior, share)
+        each = [_hypothesis(posterior, cells.found, cells.part) for cells in solved]
         hypotheses = list(dict.fromkeys(each))
         of = np.repeat([hypotheses.index(h) for h in each], [len(cells.share) for cells in solved])
         weight = np.concatenate([cells.share for cells in solved])
-        whole = probabilities(seen)
+        whole = probabilities(posterior)
         wanted = np.array([whole[h] for h in hypotheses])
         weight = weight * (wanted / np.bincount(of, weight))[of]
-        return cls(seen, solved, weight / weight.sum(), hypotheses, of)
+        return cls(posterior, solved, weight / weight.sum(), hypotheses, of)
 
     def with_name(self, name: str) -> Floats:
         """(C,) one where the effect acts, else zero."""
@@ -64,9 +64,9 @@ class Cells:
 
     def predicted(self, rows: Rows) -> tuple[Floats, Floats]:
         """Mean (C,M) and covariance (C,M,M) of M rows to come, over their errors."""
-        evidence = self.seen.evidence
+        evidence = self.posterior.evidence
         columns = _columns(evidence, sorted({i for cells in self.solved for i in cells.found.members}), rows)
-        here, there = Held.of(evidence.rows), Held.of(rows)
+        here, there = Sites.of(evidence.rows), Sites.of(rows)
         of_parts: dict[int, tuple[Floats, Floats]] = {}
         mean, covariance = [], []
         for cells in self.solved:
@@ -80,7 +80,7 @@ class Cells:
         return np.concatenate(mean), np.concatenate(covariance)
 
 
-def _unmodelled(kind: Kind | None, tau: float, here: Held, there: Held, inverse: Floats) -> tuple[Floats, Floats]:
+def _unmodelled(kind: Kind | None, tau: float, here: Sites, there: Sites, inverse: Floats) -> tuple[Floats, Floats]:
     """Of the rows to come, noise and what no term describes: the best linear prediction (M,N) by the rows seen, of
     whose covariance this is the ``inverse``, and the covariance (M,M) of its error."""
     k, n = len(there.error), len(here.error)
@@ -91,28 +91,28 @@ def _unmodelled(kind: Kind | None, tau: float, here: Held, there: Held, inverse:
     return to, np.eye(k) + tau**2 * kind.covariance_of(there, there) - to @ crossed.T
 
 
-def probabilities(seen: Posterior) -> Mapping[Hypothesis, float]:
+def probabilities(posterior: Posterior) -> Mapping[Hypothesis, float]:
     """Of every hypothesis."""
     out: dict[Hypothesis, float] = defaultdict(float)
-    for weight, found in zip(seen.weight, seen.sets, strict=True):
+    for weight, found in zip(posterior.weight, posterior.sets, strict=True):
         share = weight * np.exp(found.by_part - found.total)
         by_what: dict[What | None, float] = defaultdict(float)
         for part, p in zip(found.parts, share, strict=True):
-            by_what[_what(seen, part)] += float(p)
-        any_of = _hypothesis(seen, found, 0)
+            by_what[_what(posterior, part)] += float(p)
+        any_of = _hypothesis(posterior, found, 0)
         for what, p in by_what.items():
             out[replace(any_of, unmodelled=what)] += p
     return out
 
 
-def _hypothesis(seen: Posterior, found: SetEvidence, part: int) -> Hypothesis:
-    terms = (seen.evidence.terms[i] for i in found.members)
+def _hypothesis(posterior: Posterior, found: SetEvidence, part: int) -> Hypothesis:
+    terms = (posterior.evidence.terms[i] for i in found.members)
     another = max((term.another for term in terms), default=-1)
-    return Hypothesis(seen.names_of(found), seen.poses_of(found), another, _what(seen, part))
+    return Hypothesis(posterior.names_of(found), posterior.poses_of(found), another, _what(posterior, part))
 
 
-def _what(seen: Posterior, part: int) -> What | None:
-    kind = seen.evidence.parts[part].kind
+def _what(posterior: Posterior, part: int) -> What | None:
+    kind = posterior.evidence.parts[part].kind
     return None if kind is None or kind.what is What.INSIDE else kind.what
 
 

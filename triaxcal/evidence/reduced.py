@@ -43,15 +43,15 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
     kept = [(effect, q) for effect, q in c.sensor.effects if keep(effect)]
     if len(kept) == len(c.sensor.effects):
         return Reduced(c, 0.0)
-    up, held = _readings(c, logged or {})
-    u = c.sensor.output(up, held)
+    up, covariates = _readings(c, logged or {})
+    u = c.sensor.output(up, covariates)
     sensor = Sensor(c.sensor.scale_factor, c.sensor.misalignment, c.sensor.bias, tuple(kept))
     for _ in range(STEPS):
-        off = np.linalg.norm(sensor.specific_force(u, held), axis=1) - c.reference
-        sensor = sensor.moved(-_gain(_by_parameters(sensor, u, held)) @ off)
-    off = np.linalg.norm(sensor.specific_force(u, held), axis=1) - c.reference
+        off = np.linalg.norm(sensor.specific_force(u, covariates), axis=1) - c.reference
+        sensor = sensor.moved(-_gain(_by_parameters(sensor, u, covariates)) @ off)
+    off = np.linalg.norm(sensor.specific_force(u, covariates), axis=1) - c.reference
     # What an error of the whole calibration becomes: the kept parameters follow |a| as nearly as they can.
-    through = _gain(_by_parameters(sensor, u, held)) @ _by_parameters(c.sensor, u, held)
+    through = _gain(_by_parameters(sensor, u, covariates)) @ _by_parameters(c.sensor, u, covariates)
     own = np.concatenate([np.ones(9, bool), *(np.full(len(q), keep(e)) for e, q in c.sensor.effects)])
     names = {effect.name for effect, _ in kept}
     needed = {name for effect, _ in kept for name in effect.needs}
@@ -89,16 +89,16 @@ def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Map
         logged = {n: np.asarray(v) - c.channel_reference[n] for n, v in logged.items() if n in c.channel_reference}
     by_first = np.argsort(next(iter(logged.values())), kind="stable") if logged else np.zeros(1, dtype=int)
     some = by_first[np.linspace(0, len(by_first) - 1, COVARIATES).astype(int)] if logged else by_first
-    held = {n: logged[n][some] if n in logged else np.repeat(v, len(some)) for n, v in in_use.items()}
-    return np.tile(up, (len(some), 1)), {n: np.repeat(v, len(up)) for n, v in held.items()}
+    covariates = {n: logged[n][some] if n in logged else np.repeat(v, len(some)) for n, v in in_use.items()}
+    return np.tile(up, (len(some), 1)), {n: np.repeat(v, len(up)) for n, v in covariates.items()}
 
 
-def _by_parameters(sensor: Sensor, u: Floats, held: Mapping[str, Floats]) -> Floats:
+def _by_parameters(sensor: Sensor, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
     """(m,9+p) derivatives of |a| by scale factors, misalignments, biases and coefficients."""
-    found = sensor.radius(u, held)
+    found = sensor.radius(u, covariates)
     s, a, by_s, by_v = found.s, found.a, found.by_s, found.by_v
     angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
-    effects = [-np.einsum("ni,nip->np", by_v, e.basis(s, held)) for e, _ in sensor.effects]
+    effects = [-np.einsum("ni,nip->np", by_v, e.basis(s, covariates)) for e, _ in sensor.effects]
     return np.concatenate([-by_v * u / sensor.scale_factor**2, angles, -by_v, *effects], axis=1)
 
 

@@ -35,7 +35,7 @@ class Rows:
 
     ``places`` (n,) are those of the poses among all that were given. ``y`` (N,) misfits, ``linear`` (N,9)
     derivatives by the nine parameters with columns of length one, ``lengths`` (9,) what they were divided by,
-    ``error`` (N,) standard errors in units of the reference. ``beside`` (N,m) is an orthonormal basis of what the
+    ``error`` (N,) standard errors in units of the reference. ``complement`` (N,m) is an orthonormal basis of what the
     nine leave, m = N − 9, and ``z`` (m,) the misfits in it. ``run`` (n,) is the recording that each pose is of.
     ``point`` is where all was linearised, with effects where these are large, and ``state`` its nine parameters.
     """
@@ -49,7 +49,7 @@ class Rows:
     linear: Floats
     lengths: Floats
     error: Floats
-    beside: Floats
+    complement: Floats
     z: Floats
     noise: NoiseLevels
     likelihood: Floats
@@ -83,15 +83,15 @@ class Rows:
         columns = J / error[:, None]
         lengths = np.linalg.norm(columns, axis=0)
         columns = columns / lengths
-        beside = np.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
+        complement = np.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
         y, noise = -r / error, noise_levels(poses)
-        likelihood = noise.log_likelihood(np.exp(CHI2_LOG), beside.shape[1])
-        run, z = np.array([p.run.index for p in poses]), beside.T @ y
-        return cls(poses, places, run, problem, point, y, columns, lengths, error, beside, z, noise, likelihood)
+        likelihood = noise.log_likelihood(np.exp(CHI2_LOG), complement.shape[1])
+        run, z = np.array([p.run.index for p in poses]), complement.T @ y
+        return cls(poses, places, run, problem, point, y, columns, lengths, error, complement, z, noise, likelihood)
 
     def to_come(self, poses: Sequence[Pose]) -> Rows:
         """Of poses that nobody has taken, about the same point and in the same units: misfits are not known, and
-        nothing is ``beside``."""
+        nothing is ``complement``."""
         sensor = self.state.sensor(self.problem)
         every = channels_of([*self.poses, *poses], self.problem.channel_reference)
         channels = {name: values[self.n :] for name, values in every.items()}
@@ -114,7 +114,7 @@ class Rows:
             y=np.full(len(error), np.nan),
             linear=J[:, :LINEAR] / error[:, None] / self.lengths,
             error=error,
-            beside=nothing,
+            complement=nothing,
             z=np.empty(0),
         )
 
@@ -162,7 +162,7 @@ class Rows:
         return np.array([p.t_s for p in self.poses])
 
     @property
-    def held_s(self) -> Floats:
+    def duration_s(self) -> Floats:
         """(n,)"""
         return np.array([p.end_s - p.start_s for p in self.poses])
 

@@ -46,7 +46,7 @@ def _grown(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: in
     """Sets of one more term, each with its rough score."""
     out: Scores = {}
     for members in _leaders(evidence, level, depth):
-        scores = _beside(evidence, members)
+        scores = _given(evidence, members)
         for other in np.argsort(-scores)[:GROWN]:
             if _go_together(evidence, members, int(other)):
                 grown = tuple(sorted((*members, int(other))))
@@ -57,24 +57,24 @@ def _grown(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: in
 def _leaders(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: int) -> Iterator[tuple[int, ...]]:
     """The best of this size, within the window of the best of it."""
     best = max(level.values(), default=0.0) - np.log(evidence.odds.window)
-    seen: dict[tuple[str, ...], int] = {}
+    posterior: dict[tuple[str, ...], int] = {}
     most, alike = (LEADERS[0], 2) if depth == 1 else (LEADERS[1], 1)
     for members in sorted(level, key=lambda m: -level[m]):
-        if level[members] < best - ROUGH or sum(seen.values()) == most:
+        if level[members] < best - ROUGH or sum(posterior.values()) == most:
             return
         kinds = tuple(sorted(evidence.terms[i].kind for i in members))
-        if seen.get(kinds, 0) < alike:
-            seen[kinds] = seen.get(kinds, 0) + 1
+        if posterior.get(kinds, 0) < alike:
+            posterior[kinds] = posterior.get(kinds, 0) + 1
             yield members
 
 
-def _beside(evidence: Evidence, members: tuple[int, ...]) -> Floats:
+def _given(evidence: Evidence, members: tuple[int, ...]) -> Floats:
     """(T,) about the logarithm of the evidence of the members with each term, with all priors: at the sizes that are
     best for the members, without an unmodelled part and with the three that are likeliest beside the members."""
     alone = evidence.of_set(members, range(len(evidence.parts)))
     likely = np.argsort(-alone.by_part)[:3]
     rows = dict.fromkeys([0, *map(int, likely)])
-    each = [log_sum_exp(evidence.with_further(alone, row, cells=1), axis=1) for row in rows]
+    each = [log_sum_exp(evidence.with_each_further(alone, row, cells=1), axis=1) for row in rows]
     return np.asarray(log_sum_exp(each, axis=0) + evidence.log_prior)
 
 

@@ -25,9 +25,9 @@ class Shape:
     unit: str
 
 
-def shapes_of(seen: Posterior, name: str) -> Mapping[str, Shape]:
+def shapes_of(posterior: Posterior, name: str) -> Mapping[str, Shape]:
     """Of an effect, by the name of the shape, if that effect acts; none where it has none."""
-    terms, weights = seen.evidence.terms, seen.of_terms
+    terms, weights = posterior.evidence.terms, posterior.of_terms
     mine = [i for i, term in enumerate(terms) if term.effect is not None and term.name == name]
     return shapes_by([terms[i] for i in mine], weights[mine]) if weights[mine].any() else {}
 

@@ -76,14 +76,14 @@ def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequenc
 def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
     """Effects of other packages that cannot be used in these poses, though they could be loaded: name → reason."""
     found = {}
-    known, held = rows.problem.channel_reference, rows.problem.covariates
-    s = rows.state.sensor(rows.problem).along_axes(rows.problem.u, held)
+    known, covariates = rows.problem.channel_reference, rows.problem.covariates
+    s = rows.state.sensor(rows.problem).along_axes(rows.problem.u, covariates)
     for effect in catalogue:
         if is_foreign(effect) and all(n in known for n in effect.needs):
             try:
-                for variant in effect.variants(held):
-                    variant.basis(s, held)
-                    variant.slope(s, held)
+                for variant in effect.variants(covariates):
+                    variant.basis(s, covariates)
+                    variant.slope(s, covariates)
                     rows.by_coefficients(variant)
             except EffectFault as e:
                 found[effect.name] = e.reason
@@ -111,7 +111,7 @@ def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds, finer: Sequ
                     continue
                 combination = 1 / (size[index] * np.sqrt(len(index)))
                 own = columns[:, index] * combination
-                if np.linalg.norm(rows.beside.T @ own) < ABSORBED * np.linalg.norm(own):
+                if np.linalg.norm(rows.complement.T @ own) < ABSORBED * np.linalg.norm(own):
                     continue
                 prior = share + np.log(of_axes * of_shape / len(forms))
                 yield Term(effect.name, effect.name, own, combination, prior, shape, kept)
@@ -151,11 +151,11 @@ def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
     one adds over the sphere and over the poses' covariates, about its mean over these. None where it cannot be told."""
     try:
         columns = rows.by_coefficients(effect)
-        held = rows.problem.covariates
+        covariates = rows.problem.covariates
         if is_foreign(effect):  # it may not know its slope
-            effect.slope(rows.state.sensor(rows.problem).along_axes(rows.problem.u, held), held)
+            effect.slope(rows.state.sensor(rows.problem).along_axes(rows.problem.u, covariates), covariates)
         up = spiral(SPHERE) * rows.problem.reference
-        every: Mapping[str, Floats] = {name: np.repeat(values, len(up)) for name, values in held.items()}
+        every: Mapping[str, Floats] = {name: np.repeat(values, len(up)) for name, values in covariates.items()}
         basis = effect.basis(np.tile(up, (rows.n, 1)), every).reshape(rows.n, len(up), AXES, -1)
     except (EffectFault, Refused):
         return None

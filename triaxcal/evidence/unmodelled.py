@@ -58,24 +58,24 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class Sites:
     """k poses as a covariance sees them, taken or to come: ``place``, the specific force in the pose ``before`` (k,3)
-    over the reference, ``t_s``, ``held_s`` and ``run`` (k,); the standard ``error`` of their rows (K,), K = 2 k where
-    these have ``slopes``."""
+    over the reference, ``t_s``, ``duration_s`` and ``run`` (k,); the standard ``error`` of their rows (K,), K = 2 k
+    where these have ``slopes``."""
 
     place: Place
     before: Floats
     t_s: Floats
-    held_s: Floats
+    duration_s: Floats
     run: Ints
     error: Floats
     slopes: bool
 
     @classmethod
-    def of(cls, rows: Rows) -> Held:
-        held = rows.problem.covariates
-        before = np.stack([held[name] for name in BEFORE], axis=1) / rows.problem.reference
-        return cls(place(rows, rows.problem.u), before, rows.t_s, rows.held_s, rows.run, rows.error, rows.slopes)
+    def of(cls, rows: Rows) -> Sites:
+        covariates = rows.problem.covariates
+        before = np.stack([covariates[name] for name in BEFORE], axis=1) / rows.problem.reference
+        return cls(place(rows, rows.problem.u), before, rows.t_s, rows.duration_s, rows.run, rows.error, rows.slopes)
 
     @property
     def k(self) -> int:
@@ -85,7 +85,7 @@ class Held:
 class _Between(Protocol):
     """(K,L) covariance of the rows of k poses and of l poses, in units of the reference squared, but for a factor."""
 
-    def __call__(self, p: Held, q: Held) -> Floats: ...
+    def __call__(self, p: Sites, q: Sites) -> Floats: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class Kind:
     scale: float
     between: _Between
 
-    def covariance_of(self, p: Held, q: Held) -> Floats:
+    def covariance_of(self, p: Sites, q: Sites) -> Floats:
         """(K,L) of the rows of poses, over their errors."""
         return np.asarray(self.scale * self.between(p, q) / p.error[:, None] / q.error)
 
@@ -113,7 +113,7 @@ class Kind:
         length = self.length * duration_of(rows)
         apart = t_s - rows.t_s
         near = np.exp(-(apart**2) / 2 / length**2) * (rows.run == rows.run.max())
-        both = [near] if not rows.slopes else [near, near * apart / length**2 * rows.held_s]
+        both = [near] if not rows.slopes else [near, near * apart / length**2 * rows.duration_s]
         by_v = place(rows, rows.problem.u).by_v
         return np.asarray(self.scale * np.concatenate([each[:, None] * by_v for each in both]).T / rows.error)
 
@@ -125,10 +125,10 @@ def duration_of(rows: Rows) -> float:
 
 def kinds_of(rows: Rows) -> list[Kind]:
     found = []
-    here = Held.of(rows)
+    here = Sites.of(rows)
     for what, length, between in _covariances(rows):
         weighted = between(here, here) / rows.error[:, None] / rows.error
-        inner = rows.beside.T @ weighted @ rows.beside
+        inner = rows.complement.T @ weighted @ rows.complement
         total = float(np.trace(inner))
         if total <= ABSORBED * np.trace(weighted):
             continue
@@ -153,29 +153,29 @@ def _covariances(rows: Rows) -> Iterator[tuple[What, float, _Between]]:
         yield What.INSIDE, 0.0, lambda p, q: _of_slopes(p, q, _same(p, q))
 
 
-def _same(p: Held, q: Held) -> Floats:
+def _same(p: Sites, q: Sites) -> Floats:
     """(k,l): what is each pose's own is shared with no other pose."""
     return np.eye(p.k) if p is q else np.zeros((p.k, q.k))
 
 
-def _of_means(p: Held, q: Held, covariance: Floats) -> Floats:
+def _of_means(p: Sites, q: Sites, covariance: Floats) -> Floats:
     whole = np.zeros((len(p.error), len(q.error)))
     whole[: p.k, : q.k] = covariance
     return whole
 
 
-def _of_slopes(p: Held, q: Held, covariance: Floats) -> Floats:
+def _of_slopes(p: Sites, q: Sites, covariance: Floats) -> Floats:
     whole = np.zeros((len(p.error), len(q.error)))
     whole[p.k :, q.k :] = covariance
     return whole
 
 
-def _by_the_pose_before(p: Held, q: Held) -> Floats:
+def _by_the_pose_before(p: Sites, q: Sites) -> Floats:
     near = np.exp(-np.sum((p.before[:, None] - q.before[None]) ** 2, axis=2) / 2 / MEMORY**2)
     return _of_means(p, q, near * (p.place.by_v @ q.place.by_v.T))
 
 
-def _in_time(p: Held, q: Held, length: float) -> Floats:
+def _in_time(p: Sites, q: Sites, length: float) -> Floats:
     """A bias of each axis that wanders smoothly, in each recording anew: one process for means and slopes, or slow
     drift is paid twice."""
     apart = p.t_s[:, None] - q.t_s[None]
@@ -183,9 +183,9 @@ def _in_time(p: Held, q: Held, length: float) -> Floats:
     near = np.exp(-(apart**2) / 2 / length**2) * together
     if not p.slopes:
         return np.asarray(near)
-    mean_slope = near * apart / length**2 * q.held_s[None]
-    slope_mean = -near * apart / length**2 * p.held_s[:, None]
-    inside = near * (1 / length**2 - apart**2 / length**4) * p.held_s[:, None] * q.held_s[None]
+    mean_slope = near * apart / length**2 * q.duration_s[None]
+    slope_mean = -near * apart / length**2 * p.duration_s[:, None]
+    inside = near * (1 / length**2 - apart**2 / length**4) * p.duration_s[:, None] * q.duration_s[None]
     return np.block([[near, mean_slope], [slope_mean, inside]])
 
 
@@ -211,7 +211,7 @@ class _Sphere:
         """Of a function of direction, less its linear part over the sphere."""
         inner = of(self.everywhere, self.everywhere)
 
-        def between(p: Held, q: Held) -> Floats:
+        def between(p: Sites, q: Sites) -> Floats:
             here, there = p.place.linear @ self.fit, q.place.linear @ self.fit
             crossed = of(p.place, self.everywhere) @ there.T
             mirrored = here @ of(self.everywhere, q.place)

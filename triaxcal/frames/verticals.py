@@ -67,15 +67,15 @@ def verticals_under(
     Raises InvalidData where a channel that the calibration needs is missing.
     """
     used = np.ones(len(poses), dtype=bool)
-    held = covariates_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
-    direction, V = _directions(sensor, poses, held, reference, covariance, used)
+    covariates = covariates_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
+    direction, V = _directions(sensor, poses, covariates, reference, covariance, used)
     return Verticals(tuple(poses), direction, V, used, 1e6)
 
 
 def _directions(
     sensor: Sensor,
     poses: Sequence[Pose],
-    held: Mapping[str, Floats],
+    covariates: Mapping[str, Floats],
     reference: float,
     P: Floats,
     used: Bools,
@@ -89,7 +89,7 @@ def _directions(
     fitted to the same poses.
     """
     u = np.array([p.mean for p in poses])
-    a, by_u, by_parameter = _derivatives(sensor, u, held)
+    a, by_u, by_parameter = _derivatives(sensor, u, covariates)
     length = np.linalg.norm(a, axis=1)
     if not np.all(length > 0):
         raise InvalidData("a pose reads no specific force at all under the calibration")
@@ -112,14 +112,14 @@ def _directions(
     return direction, across @ V @ across
 
 
-def _derivatives(sensor: Sensor, u: Floats, held: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats]:
+def _derivatives(sensor: Sensor, u: Floats, covariates: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats]:
     """a (n,3), and its derivatives by the outputs (n,3,3) and by scale factor, misalignment, bias, effects (n,3,p)."""
-    s = sensor.along_axes(u, held)
+    s = sensor.along_axes(u, covariates)
     inverse = np.linalg.inv(sensor.axes)
     a = s @ inverse.T
-    by_v = inverse @ np.linalg.inv(np.eye(3) + sensor.departure_slope(s, held))
+    by_v = inverse @ np.linalg.inv(np.eye(3) + sensor.departure_slope(s, covariates))
     by_u = by_v / sensor.scale_factor
     angles = -np.stack([inverse[:, 1] * a[:, 2:3], inverse[:, 0] * a[:, 2:3], inverse[:, 0] * a[:, 1:2]], axis=2)
-    effects = [-by_v @ effect.basis(s, held) for effect, _ in sensor.effects]
+    effects = [-by_v @ effect.basis(s, covariates) for effect, _ in sensor.effects]
     by_scale_factor = -by_u * (u / sensor.scale_factor)[:, None, :]
     return a, by_u, np.concatenate([by_scale_factor, angles, -by_v, *effects], axis=2)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import HELD, SINCE_START, TIME, Effect
+from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect
 from triaxcal.effects.in_run import of_clocks
 from triaxcal.effects.wrapped import Wrapped
 
@@ -38,4 +38,4 @@ def in_plan(effect: Effect) -> Effect:
 
 
 def _clocks(time: Floats) -> dict[str, Floats]:
-    return {TIME: time, SINCE_START: time + 1, HELD: np.full(len(time), HELD_SHARE)}
+    return {TIME: time, SINCE_START: time + 1, DURATION: np.full(len(time), HELD_SHARE)}

@@ -1,4 +1,4 @@
-"""What held in each pose beside its attitude: the logged channels, the time, and what follows from the poses.
+"""Covariates of the poses: the logged channels, the time, and what follows from the poses.
 
 Time and rates come with any poses; the specific force in the pose before, and the scatter in g², need the scale of the
 outputs, and are added once a fit knows it (`with_scale`).
@@ -15,7 +15,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import (
     BEFORE,
     CHANGE,
-    HELD,
+    DURATION,
     LAGS_S,
     RUN,
     SCATTER,
@@ -54,7 +54,7 @@ def channels_of(poses: Sequence[Pose], wanted: Iterable[str] = ()) -> dict[str, 
             out[rate_of(name)] = np.array([p.rates[channel] for p in poses])
     out[SINCE_START] = np.array([p.t_s for p in poses])
     out[TIME] = out[SINCE_START] - np.array([p.run.middle_s for p in poses])
-    out[HELD] = np.array([p.end_s - p.start_s for p in poses])
+    out[DURATION] = np.array([p.end_s - p.start_s for p in poses])
     if any(p.run.of > 1 for p in poses):
         out[RUN] = np.array([float(p.run.index) for p in poses])
     out |= _lags(out, poses, wanted)
@@ -195,7 +195,7 @@ def of_readings(
         name: np.broadcast_to(np.asarray(known[name], dtype=float), (n,)) - value if name in known else default[name]
         for name, value in reference.items()
     }
-    return held, tuple(name for name in reference if name not in known and name != HELD)
+    return held, tuple(name for name in reference if name not in known and name != DURATION)
 
 
 def static_covariates(poses: Sequence[Pose]) -> set[str]:

@@ -108,7 +108,7 @@ class Pose:
         return np.outer(self.creep, self.creep) / 12
 
 
-class Held(Protocol):
+class StillSpan(Protocol):
     """Where and when a unit was still: all of a pose but its noise. ``mean`` (3,) output units; times in seconds."""
 
     @property
@@ -120,17 +120,17 @@ class Held(Protocol):
 
 
 @dataclass(frozen=True)
-class _Held:
+class _StillSpan:
     start_s: float
     end_s: float
     mean: Floats
 
 
-def held_of(w: Windows, spans: Sequence[Span]) -> list[Held]:
+def still_spans_of(w: Windows, spans: Sequence[Span]) -> list[StillSpan]:
     """The still spans, in order of time."""
     begin = int(w.start_ns[0])
     return [
-        _Held(
+        _StillSpan(
             (int(w.start_ns[s.first]) - begin) * 1e-9,
             (int(w.end_ns[s.last]) - begin) * 1e-9,
             w.mean[s.used].mean(axis=0),
@@ -153,7 +153,7 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
         return []
     tracks = [_track(w, s) for s in spans]
     recording = float(w.end_ns[spans[-1].last] - w.start_ns[spans[0].first]) / w.period_ns
-    held = held_of(w, spans)
+    held = still_spans_of(w, spans)
     mean = np.array([h.mean for h in held])
     noise = pose_noise(tracks, recording)
     creeping = np.asarray(noise.creeping.any(axis=1))

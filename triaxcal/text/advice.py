@@ -67,7 +67,7 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
             f"in the check recording the linear calibration is better ({before}, with what was found {after}): "
             "diagnose both recordings together"
         )
-    reasons = {name: blind(why) for name, why in loop.blind.items()}
+    reasons = {name: blind(why) for name, why in loop.not_identifiable.items()}
     for reason in dict.fromkeys(reasons.values()):
         yield f"these poses cannot show in full {', '.join(n for n, r in reasons.items() if r == reason)}: {reason}"
     for name, reason in loop.faulty.items():
@@ -91,9 +91,9 @@ def _apart(loop: Loop) -> Iterator[str]:
 
 def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
     actions = loop.advice.actions
-    if beside := [_beside(action) for action in actions if action.do in (ActionKind.LOG, ActionKind.HOLD)]:
+    if beside := [_beside(action) for action in actions if action.kind in (ActionKind.LOG, ActionKind.HOLD)]:
         yield "; ".join(beside)
-    if poses := [_pose(action, loop) for action in actions if action.do not in (ActionKind.LOG, ActionKind.HOLD)]:
+    if poses := [_pose(action, loop) for action in actions if action.kind not in (ActionKind.LOG, ActionKind.HOLD)]:
         yield f"record next, in this order: {', then '.join(poses)}"
     if loop.too_uncertain:
         following = loop.next_recording
@@ -105,7 +105,7 @@ def _next(loop: Loop, small: ErrorUnit) -> Iterator[str]:
 
 
 def _beside(action: Action) -> str:
-    if action.do is ActionKind.HOLD:
+    if action.kind is ActionKind.HOLD:
         return f"hold each pose for {action.hold_s:.0f} s, since each has an error of its own"
     return f"log {action.channel or 'what else may go with the time: the supply, a second temperature'}"
 
@@ -114,9 +114,9 @@ def _pose(action: Action, loop: Loop) -> str:
     again = None if action.again is None else moment(loop.after.poses[action.again].pose.began)
     where = _direction(action)
     pose = where if again is None else f"{where} as at {again}"
-    if action.do is ActionKind.CHANNEL:
+    if action.kind is ActionKind.CHANNEL:
         return f"{pose} with {action.channel} moved by {plain(action.by, sign='+')} and settled"
-    return f"{pose} after {action.pause_s:.0f} s of rest" if action.do is ActionKind.PAUSE else pose
+    return f"{pose} after {action.pause_s:.0f} s of rest" if action.kind is ActionKind.PAUSE else pose
 
 
 def _direction(action: Action) -> str:

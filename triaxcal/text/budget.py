@@ -20,7 +20,7 @@ def basis(b: of.Basis) -> str:
 
 @basis.register
 def _(b: of.WithinPoseScatter) -> str:
-    return f"scatter inside {b.poses} poses of {b.held_s:.3g} s, with its autocorrelation"
+    return f"scatter inside {b.poses} poses of {b.duration_s:.3g} s, with its autocorrelation"
 
 
 @basis.register

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import (
     DERIVED,
-    HELD,
+    DURATION,
     RUN,
     SINCE_START,
     TIME,
@@ -52,7 +52,7 @@ def _at(name: str, value: float, several: bool) -> str:
     if name == TIME and several:
         return "at the middle of each recording's poses"
     if name in DERIVED:
-        unit = {TIME: " s", HELD: " s"}.get(name, "")
+        unit = {TIME: " s", DURATION: " s"}.get(name, "")
         return f"at {name} = {plain(value, 6)}{unit}"
     if is_derived(name):
         lag = lag_in(name)

@@ -12,10 +12,10 @@ class Basis:
 
 @dataclass(frozen=True)
 class WithinPoseScatter(Basis):
-    """With its autocorrelation; the poses were held for ``held_s`` in the median."""
+    """With its autocorrelation; the poses were held for ``duration_s`` in the median."""
 
     poses: int
-    held_s: float
+    duration_s: float
 
 
 @dataclass(frozen=True)

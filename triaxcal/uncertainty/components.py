@@ -89,7 +89,7 @@ def statistical(calibration: Calibration, linearised: Linearised, share: float) 
             "A",
             pure_error_dof(poses),
             (S * noise) @ S.T,
-            WithinPoseScatter(len(poses), _held_s(poses)),
+            WithinPoseScatter(len(poses), _median_duration_s(poses)),
             half_the_noise(poses),
         )
     ]
@@ -125,10 +125,10 @@ def positive(covariance: Floats) -> Floats:
 
 def half_the_noise(poses: Sequence[Pose]) -> Remedy:
     """What would halve a component that is the noise of the poses."""
-    return LongerOrMorePoses(4 * _held_s(poses), 4 * len(poses))
+    return LongerOrMorePoses(4 * _median_duration_s(poses), 4 * len(poses))
 
 
-def _held_s(poses: Sequence[Pose]) -> float:
+def _median_duration_s(poses: Sequence[Pose]) -> float:
     return float(np.median([p.end_s - p.start_s for p in poses]))
 
 

@@ -43,7 +43,7 @@ class Linearised:
         _, J, self.error = linearise_all(self.problem, self.state)
         # What the shapes of effects were chosen by blurs the parameters too.
         self.weighted = np.concatenate([J, by_shape(self.problem, self.state)], axis=1) / self.error[:, None]
-        self.gain = held_gain(self.weighted, calibration.spread)
+        self.gain = gain_given_prior(self.weighted, calibration.spread)
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
         """(p,n): shift of the parameters for an error of each residual (`triaxcal.estimate.problem.linearise_all`)."""
@@ -57,9 +57,9 @@ class Linearised:
     def _sphere(self, calibration: Calibration, shift: Mapping[str, float]) -> Problem:
         """Outputs of the unit all over the sphere, under the conditions of its use but for ``shift``."""
         reference = self.problem.channel_reference
-        held = at_moment(reference, len(self.up), calibration.moment)
-        u = calibration.sensor.output(self.up, held)
-        channels = {n: held[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
+        covariates = at_moment(reference, len(self.up), calibration.moment)
+        u = calibration.sensor.output(self.up, covariates)
+        channels = {n: covariates[n] + v + shift.get(n, 0.0) for n, v in reference.items()}
         none = np.zeros((len(u), 3, 3))
         return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, slopes=None)
 
@@ -77,12 +77,12 @@ class Linearised:
         return np.concatenate([-np.linalg.lstsq(nine, r, rcond=None)[0], np.zeros(len(self.G) - 9)])
 
 
-def held_gain(weighted: Floats, spread: Floats | None) -> Floats:
+def gain_given_prior(weighted: Floats, spread: Floats | None) -> Floats:
     """(p,n) of parameters by weighted residuals, where coefficients are held by their ``spread``. Columns are scaled
     first: those of a temperature and of a cube are decades apart."""
     norms = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
     rows = weighted / norms
     if spread is not None and len(spread):
-        held = np.eye(len(norms))[9 : 9 + len(spread)] / np.maximum(spread, 1e-300)[:, None]
-        rows = np.concatenate([rows, held / norms])
+        covariates = np.eye(len(norms))[9 : 9 + len(spread)] / np.maximum(spread, 1e-300)[:, None]
+        rows = np.concatenate([rows, covariates / norms])
     return np.asarray(np.linalg.pinv(rows, rcond=1e-13)[:, : len(weighted)] / norms[:, None])

@@ -14,7 +14,7 @@ from triaxcal.documents import Calibration as Document
 from triaxcal.effects.contract import RUN, SINCE_START, TIME
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.creep import with_creep_left
+from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import magnitude_errors
 from triaxcal.rounding import error
 from triaxcal.units import ErrorUnit
@@ -126,7 +126,7 @@ def _verified(measured: Measured, model: Calibration, *, where: str) -> Verifica
     with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
         errors, noise = magnitude_errors(
             model.sensor,
-            with_creep_left(measured.poses, model, elsewhere=True),
+            with_unexplained_creep(measured.poses, model, elsewhere=True),
             channel_reference=model.channel_reference,
             reference=model.reference,
             moment=model.moment,

@@ -9,7 +9,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.model.directions import Direction, directions, elsewhere
-from triaxcal.poses.pose import Held
+from triaxcal.poses.pose import StillSpan
 
 COVERED_DEG = 25.0
 """A pose covers the direction of the plan that it is nearest to, up to this far off."""
@@ -42,7 +42,7 @@ class Guide:
 
 
 def guide(
-    poses: Sequence[Held],
+    poses: Sequence[StillSpan],
     *,
     wanted: int,
     hold_s: float,
@@ -130,7 +130,7 @@ def _said(label: str, targets: Sequence[Direction]) -> str:
     return f"{label} up (x {x:+.2f}, y {y:+.2f}, z {z:+.2f})"
 
 
-def ups(poses: Sequence[Held], nominal: Sequence[float] | None) -> Floats:
+def ups(poses: Sequence[StillSpan], nominal: Sequence[float] | None) -> Floats:
     """Up in the unit's frame, roughly: by the nominal scale factor, else by the range of the outputs so far."""
     if not poses:
         return np.zeros((0, 3))

@@ -10,7 +10,7 @@ import pytest
 
 from triaxcal.effects import CATALOGUE, effect_named
 from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, LAGS_S, RUN, SCATTER, SINCE_START, Effect, lag_of
+from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, LAGS_S, RUN, SCATTER, SINCE_START, Effect, lag_of
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.in_run import InRuns
@@ -24,10 +24,10 @@ RNG = np.random.default_rng(11)
 S = RNG.uniform(-1, 1, (5, 3))
 COVARIATES = {
     name: RNG.uniform(0.5, 2.0, 5)
-    for name in {*(n for e in FORMS for n in e.needs), *BEFORE, *CHANGE, *SCATTER, SINCE_START, HELD}
+    for name in {*(n for e in FORMS for n in e.needs), *BEFORE, *CHANGE, *SCATTER, SINCE_START, DURATION}
 }
 COVARIATES |= {lag_of("temp_c", constant_s): RNG.uniform(-1, 1, 5) for constant_s in LAGS_S}
-COVARIATES[HELD] = np.zeros(5)
+COVARIATES[DURATION] = np.zeros(5)
 COVARIATES[SINCE_START] = np.arange(5.0)
 
 

@@ -106,4 +106,4 @@ def test_poses_in_few_directions_say_that_they_cannot_show_it(
     poses = noisy_poses(with_effect(Compression(), [0, 0, 0]), ups, 1.5e-5, np.random.default_rng(0))
     loop = diagnose(poses, signs=MINUS, catalogue=[Compression()])
     assert loop.after.blind_to == ("compression",)
-    assert loop.blind["compression"] == NotIdentifiable(Why.FEW_DIRECTIONS)
+    assert loop.not_identifiable["compression"] == NotIdentifiable(Why.FEW_DIRECTIONS)

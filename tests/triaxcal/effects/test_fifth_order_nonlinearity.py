@@ -56,4 +56,4 @@ def test_poses_without_edges_say_that_they_show_its_sum_alone(
     poses = noisy_poses(with_effect(effect, [0, 0, 0]), fourteen, 1.5e-5, np.random.default_rng(0))
     loop = diagnose(poses, signs=MINUS, catalogue=[effect])
     assert loop.after.blind_to == (effect.name,)
-    assert loop.blind[effect.name] == NotIdentifiable(Why.FEW_DIRECTIONS)
+    assert loop.not_identifiable[effect.name] == NotIdentifiable(Why.FEW_DIRECTIONS)

@@ -75,4 +75,4 @@ def test_poses_that_all_follow_the_same_one_say_that_they_cannot_show_it(
     poses = noisy_poses(with_effect(effect, [0, 0, 0]), twenty_six, 1.5e-5, np.random.default_rng(0))
     loop = diagnose([replace(p, before=rest) for p in poses], signs=MINUS, catalogue=[effect])
     assert loop.after.blind_to == (effect.name,)
-    assert loop.blind[effect.name] == NotIdentifiable(Why.MOVED_ALONG)
+    assert loop.not_identifiable[effect.name] == NotIdentifiable(Why.MOVED_ALONG)

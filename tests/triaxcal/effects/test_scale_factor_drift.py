@@ -57,4 +57,4 @@ def test_poses_all_taken_at_one_moment_say_that_they_cannot_show_it(
     poses = noisy_poses(with_effect(effect, [0, 0, 0]), fourteen, 1.5e-5, np.random.default_rng(0), hold_s=0.0)
     loop = diagnose(poses, signs=MINUS, catalogue=[effect])
     assert loop.after.blind_to == (effect.name,)
-    assert loop.blind[effect.name] == NotIdentifiable(Why.MOVED_ALONG)
+    assert loop.not_identifiable[effect.name] == NotIdentifiable(Why.MOVED_ALONG)

@@ -14,7 +14,7 @@ from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.contract import LAGS_S, RUN, SINCE_START, lag_in, lag_of
 from triaxcal.effects.temperature_lag import TemperatureLag
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.creep import with_creep_left
+from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor
@@ -200,7 +200,7 @@ def test_inside_a_pose_it_explains_the_creep_of_the_lagging_temperature(
                 rates={"temp_c": float(rate[i])})
         for i, p in enumerate(swinging(sensor, twenty_six[rng.permutation(26)], rng))
     ]  # fmt: skip
-    left = with_creep_left(poses, fit(poses, signs=MINUS, effects=[effect], excluded=()))
+    left = with_unexplained_creep(poses, fit(poses, signs=MINUS, effects=[effect], excluded=()))
     for before, after in zip(poses, left, strict=True):
         assert np.linalg.norm(after.creep) <= 0.2 * np.linalg.norm(before.creep) + 1e-12
 
@@ -214,6 +214,6 @@ def test_poses_whose_temperature_stands_still_or_is_not_known_say_so(
     for poses, why in ((still, Why.STOOD_STILL), (plain, Why.NOT_LOGGED)):
         loop = diagnose(poses, signs=MINUS, catalogue=[effect])
         assert loop.after.blind_to == (effect.name,)
-        assert loop.blind[effect.name] == NotIdentifiable(why, "temp_c")
+        assert loop.not_identifiable[effect.name] == NotIdentifiable(why, "temp_c")
     with pytest.raises(InvalidData, match="no channel temp_c, which the effects need"):
         fit(plain, signs=MINUS, effects=[effect])

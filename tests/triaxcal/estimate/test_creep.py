@@ -10,7 +10,7 @@ import pytest
 from triaxcal.diagnosis import Verdict, diagnose
 from triaxcal.effects import effect_named
 from triaxcal.effects.bias_drift import BiasDrift
-from triaxcal.estimate.creep import with_creep_left, without_creep
+from triaxcal.estimate.creep import with_unexplained_creep, without_creep
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -81,18 +81,18 @@ def test_poses_that_do_not_creep_stay_the_same(paper_unit: Sensor, twenty_six: n
     poses = noisy_poses(paper_unit, twenty_six, SIGMA_G, np.random.default_rng(0))
     assert all(a is b for a, b in zip(without_creep(poses), poses, strict=True))
     model = fit(poses, signs=MINUS, effects=[BiasDrift()])
-    assert all(a is b for a, b in zip(with_creep_left(poses, model), poses, strict=True))
+    assert all(a is b for a, b in zip(with_unexplained_creep(poses, model), poses, strict=True))
 
 
 def test_a_model_without_the_effect_leaves_all_of_the_creep(warm: list[Pose]) -> None:
-    left = with_creep_left(warm, fit(without_creep(warm), signs=MINUS))
+    left = with_unexplained_creep(warm, fit(without_creep(warm), signs=MINUS))
     assert all(np.array_equal(a.covariance, b.covariance) for a, b in zip(left, warm, strict=True))
 
 
 def test_creep_that_the_effect_explains_is_taken_off_the_covariance(warm: list[Pose], paper_unit: Sensor) -> None:
     effects = [effect_named("temperature_bias")]
     model = fit(without_creep(warm), signs=MINUS, effects=effects)
-    left = with_creep_left(warm, model)
+    left = with_unexplained_creep(warm, model)
     clean = np.diag((SIGMA_G * paper_unit.scale_factor) ** 2)
     for before, after in zip(warm, left, strict=True):
         # The sensitivities are known to some per cent, of which what is left of the creep is as much.
@@ -107,7 +107,7 @@ def test_creep_that_goes_against_the_effect_stays(
     """A stand that settles while the temperature moves: the effect explains none of it."""
     against = creeping(paper_unit, twenty_six, 0, -rates[:, None] * HOLD_S * SENSITIVITY, rates)
     model = fit(without_creep(against), signs=MINUS, effects=[effect_named("temperature_bias")])
-    left = with_creep_left(against, model)
+    left = with_unexplained_creep(against, model)
     assert all(np.array_equal(a.covariance, b.covariance) for a, b in zip(left, against, strict=True))
 
 
@@ -121,7 +121,7 @@ def test_drift_explains_the_creep_of_its_own_slope(paper_unit: Sensor, twenty_si
         for p in noisy_poses(sensor, twenty_six[rng.permutation(26)], SIGMA_G, rng, hold_s=HOLD_S)
     ]
     model = fit(without_creep(poses), signs=MINUS, effects=[BiasDrift()])
-    for p in with_creep_left(poses, model):
+    for p in with_unexplained_creep(poses, model):
         assert np.linalg.norm(p.creep) < 0.1 * np.linalg.norm(creep)
 
 
@@ -198,11 +198,11 @@ def test_in_another_recording_the_channel_explains_creep_and_the_clock_does_not(
     warmth = effect_named("temperature_bias")
     model = fit(without_creep(warm), signs=MINUS, effects=[warmth, BiasDrift()])
     other = creeping(paper_unit, twenty_six, 7, rates[:, None] * HOLD_S * SENSITIVITY, rates)
-    for before, after in zip(other, with_creep_left(other, model, elsewhere=True), strict=True):
+    for before, after in zip(other, with_unexplained_creep(other, model, elsewhere=True), strict=True):
         assert np.linalg.norm(after.creep) < 0.1 * np.linalg.norm(before.creep)
     drift = ((BiasDrift(), np.full(3, 1e-3)),)
     steep = replace(model, holds_at=None, sensor=replace(model.sensor, effects=drift))
-    assert with_creep_left(other, steep, elsewhere=True) == other
+    assert with_unexplained_creep(other, steep, elsewhere=True) == other
 
 
 def test_the_noise_floor_of_held_out_poses_has_only_the_creep_that_the_model_does_not_explain(
@@ -223,7 +223,7 @@ def test_a_step_between_two_poses_explains_no_creep_inside_them(paper_unit: Sens
     creep = 0.5 * paper_unit.scale_factor * np.array([2e-3, -1e-3, 3e-3])
     creeps = [replace(p, creep=creep, covariance=p.covariance + np.outer(creep, creep) / 12) for p in turned]
     model = fit(turned, signs=MINUS, effects=[step])
-    for p in with_creep_left(creeps, model):
+    for p in with_unexplained_creep(creeps, model):
         assert p.creep == pytest.approx(creep, abs=0.05 * np.linalg.norm(creep))
 
 
@@ -243,7 +243,7 @@ def test_of_a_pose_that_only_turns_an_effect_makes_no_creep_along_the_measured_v
             )
         )
     model = fit(quiet, signs=MINUS, effects=[effect_named("temperature_bias")], excluded=())
-    left = with_creep_left(turning, model)
+    left = with_unexplained_creep(turning, model)
     for before, after, still, g in zip(turning, left, quiet, out, strict=True):
         assert g @ after.covariance @ g < 1.1 * g @ still.covariance @ g
         assert np.trace(after.covariance) <= np.trace(before.covariance)

@@ -14,7 +14,7 @@ from triaxcal.diagnosis import diagnose
 from triaxcal.effects import CATALOGUE, Effect, effect_named, effect_of
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.bias_step import BiasStep
-from triaxcal.effects.contract import HELD, RUN, SINCE_START, TIME
+from triaxcal.effects.contract import DURATION, RUN, SINCE_START, TIME
 from triaxcal.effects.in_run import InRuns
 from triaxcal.effects.run_bias import RunBias
 from triaxcal.effects.warm_up import WarmUp
@@ -164,7 +164,7 @@ def test_effects_of_the_clocks_are_tried_alike_in_each_alone_and_by_run(three: l
 
 
 def test_elsewhere_everything_that_was_a_runs_own_is_zero(three: list[Pose]) -> None:
-    reference = {TIME: 0.0, SINCE_START: 0.0, HELD: 0.0, RUN: 0.0}
+    reference = {TIME: 0.0, SINCE_START: 0.0, DURATION: 0.0, RUN: 0.0}
     for poses in (recording(np.random.default_rng(9)), three):
         away = covariates_elsewhere(poses, reference, K, BIAS)
         for effect in tried(three):

@@ -20,7 +20,7 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.estimate.problem import State, linearise, linearise_all, solve
 from triaxcal.estimate.slopes import PoseSlopes, left_by_slopes, slopes_p, with_slopes
 from triaxcal.estimate.start import problem_of, start
-from triaxcal.evidence import Posterior, Refusal, posterior
+from triaxcal.evidence import Posterior, Refusal, posterior_of
 from triaxcal.evidence.unmodelled import What
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose, poses_of
@@ -85,7 +85,7 @@ def blind(poses: list[Pose]) -> list[Pose]:
 
 
 def seen_in(poses: list[Pose]) -> Posterior:
-    return posterior(poses, fit(poses, signs=MINUS), signs=MINUS)
+    return posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS)
 
 
 @pytest.mark.parametrize("effects", [(), (TEMPERATURE,), (TEMPERATURE, SQUARE)], ids=str)

@@ -12,9 +12,9 @@ import pytest
 from tests.triaxcal.evidence.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.effects import CATALOGUE
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, SINCE_START, TIME
+from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, SINCE_START, TIME
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence import Action, ActionKind, Advice, Posterior, advice, posterior
+from triaxcal.evidence import Action, ActionKind, Advice, Posterior, advice, posterior_of
 from triaxcal.evidence.advice import LEAST
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
@@ -32,7 +32,7 @@ HOLD_S = 10.0
 
 
 def seen_in(poses: list[Pose]) -> Posterior:
-    return posterior(poses, fit(poses, signs=MINUS), signs=MINUS, catalogue=FEW)
+    return posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS, catalogue=FEW)
 
 
 def gone_on(unit: Sensor, poses: list[Pose], last: np.ndarray, actions: Sequence[Action], seed: int) -> list[Pose]:
@@ -44,7 +44,7 @@ def gone_on(unit: Sensor, poses: list[Pose], last: np.ndarray, actions: Sequence
         start_s = out[-1].end_s + action.pause_s
         temp_c = out[-1].channels["temp_c"] + (action.by if action.channel == "temp_c" else 0.0)
         s, before = unit.axes @ action.up, unit.axes @ last
-        held = {TIME: start_s + HOLD_S / 2, SINCE_START: start_s + HOLD_S / 2, HELD: HOLD_S, "temp_c": temp_c - 25}
+        held = {TIME: start_s + HOLD_S / 2, SINCE_START: start_s + HOLD_S / 2, DURATION: HOLD_S, "temp_c": temp_c - 25}
         held |= dict(zip((*BEFORE, *CHANGE), (*before, *(s - before)), strict=True))
         error = SIGMA_G * np.abs(unit.scale_factor)
         mean = unit.output(action.up[None], {name: np.array([v]) for name, v in held.items()})[0]
@@ -89,8 +89,8 @@ def followed(with_effects: Callable[..., Sensor]) -> list[Followed]:
         unit = with_effects(**{name: coefficients})
         for seed in SEEDS:
             poses, last = taken(unit, count, seed)
-            seen = seen_in(poses)
-            made = advice(seen)
+            posterior = seen_in(poses)
+            made = advice(posterior)
             count_made = sum(action.up is not None for action in made.actions)
             if name not in made.expected or not count_made:
                 continue
@@ -98,7 +98,7 @@ def followed(with_effects: Callable[..., Sensor]) -> list[Followed]:
             after, at_random = (
                 seen_in(gone_on(unit, poses, last, way, seed + 5)).of_names.get(name, 1e-4) for way in ways
             )
-            out.append(Followed(made, seen.of_names[name], made.expected[name].if_it_acts, after, at_random))
+            out.append(Followed(made, posterior.of_names[name], made.expected[name].if_it_acts, after, at_random))
     assert len(out) >= 2 * len(SEEDS)
     return out
 
@@ -138,7 +138,7 @@ def test_a_unit_is_turned_from_each_pose_to_the_next(followed: list[Followed]) -
 
 def test_functions_that_agree_on_the_cube_are_told_apart_in_directions_between(followed: list[Followed]) -> None:
     for made in (f.made for f in followed[: len(SEEDS)]):
-        assert made.actions[0].do is ActionKind.POSE
+        assert made.actions[0].kind is ActionKind.POSE
         assert "2" in made.actions[0].label
 
 
@@ -154,12 +154,12 @@ def test_a_pose_that_may_be_an_outlier_is_taken_again_and_then_is_one(
     """Among 14 a knock may be a function of direction, too."""
     poses, last = taken(paper_unit, 14, seed)
     poses = knocked(poses, 5, by_g)
-    seen = seen_in(poses)
-    assert 0.1 < seen.of_outliers[5] < 0.99
-    made = advice(seen)
-    assert (made.actions[0].do, made.actions[0].again, made.actions[0].label) == (ActionKind.REPEAT, 5, "+X+Y+Z")
+    posterior = seen_in(poses)
+    assert 0.1 < posterior.of_outliers[5] < 0.99
+    made = advice(posterior)
+    assert (made.actions[0].kind, made.actions[0].again, made.actions[0].label) == (ActionKind.REPEAT, 5, "+X+Y+Z")
     after = seen_in(gone_on(paper_unit, poses, last, made.actions, seed))
-    assert after.of_outliers[5] > seen.of_outliers[5]
+    assert after.of_outliers[5] > posterior.of_outliers[5]
     # Counted among all that were given.
     faulty = [replace(poses[0], fault="saturation"), *poses]
     assert advice(seen_in(faulty)).actions[0].again == 6
@@ -168,12 +168,12 @@ def test_a_pose_that_may_be_an_outlier_is_taken_again_and_then_is_one(
 def test_a_pose_on_which_a_certain_name_hangs_is_taken_again(
     monkeypatch: pytest.MonkeyPatch, poses_with: Poses
 ) -> None:
-    seen = seen_in(poses_with(11, temperature_bias=[5e-4, -4e-4, 6e-4]))
+    posterior = seen_in(poses_with(11, temperature_bias=[5e-4, -4e-4, 6e-4]))
     without = np.full(30, 0.999)
     without[4] = 0.5
-    monkeypatch.setattr(type(seen), "without_each_pose", lambda self, name: without)
-    made = advice(seen)
-    assert [(action.do, action.again) for action in made.actions] == [(ActionKind.REPEAT, 4)]
+    monkeypatch.setattr(type(posterior), "without_each_pose", lambda self, name: without)
+    made = advice(posterior)
+    assert [(action.kind, action.again) for action in made.actions] == [(ActionKind.REPEAT, 4)]
 
 
 def swinging(poses: list[Pose], unit: Sensor) -> list[Pose]:
@@ -185,16 +185,16 @@ def swinging(poses: list[Pose], unit: Sensor) -> list[Pose]:
 def test_what_goes_with_time_goes_with_something_to_be_logged(poses_with: Poses, paper_unit: Sensor) -> None:
     poses = swinging(poses_with(3), paper_unit)
     for logged, channel in ((True, ""), (False, "temp_c")):
-        seen = seen_in([replace(p, channels=p.channels if logged else {}) for p in poses])
-        first = advice(seen).actions[0]
-        assert (first.do, first.channel) == (ActionKind.LOG, channel)
+        posterior = seen_in([replace(p, channels=p.channels if logged else {}) for p in poses])
+        first = advice(posterior).actions[0]
+        assert (first.kind, first.channel) == (ActionKind.LOG, channel)
 
 
 def test_poses_with_an_error_of_their_own_are_held_longer(poses_with: Poses) -> None:
     off_g = 20 * SIGMA_G * np.random.default_rng(6).standard_normal(30)
     poses = [replace(p, mean=p.mean * (1 + d)) for p, d in zip(poses_with(6), off_g, strict=True)]
     first = advice(seen_in(poses)).actions[0]
-    assert (first.do, first.hold_s) == (ActionKind.HOLD, 4 * HOLD_S)
+    assert (first.kind, first.hold_s) == (ActionKind.HOLD, 4 * HOLD_S)
 
 
 def test_a_temperature_that_went_with_time_is_moved_or_time_goes_without_it(
@@ -203,33 +203,33 @@ def test_a_temperature_that_went_with_time_is_moved_or_time_goes_without_it(
     poses = [replace(p, channels={"temp_c": 20 + p.t_s / 60}) for p in poses_with(4)]
     drift = np.array([4e-7, -3e-7, 5e-7])
     moved_along = [replace(p, mean=p.mean + paper_unit.scale_factor * drift * p.t_s) for p in poses]
-    made = advice(posterior(moved_along, fit(moved_along, signs=MINUS), signs=MINUS, catalogue=CATALOGUE))
-    (moved,) = (action for action in made.actions if action.do is ActionKind.CHANNEL)
+    made = advice(posterior_of(moved_along, fit(moved_along, signs=MINUS), signs=MINUS, catalogue=CATALOGUE))
+    (moved,) = (action for action in made.actions if action.kind is ActionKind.CHANNEL)
     assert moved.channel == "temp_c"
     assert abs(moved.by) == pytest.approx(np.ptp([p.channels["temp_c"] for p in poses]))
-    (paused,) = (action for action in made.actions if action.do is ActionKind.PAUSE)
+    (paused,) = (action for action in made.actions if action.kind is ActionKind.PAUSE)
     assert paused.pause_s == pytest.approx(poses[-1].end_s)
     assert made.expected["temperature_bias"].if_it_acts > 0.8 > 0.4 > made.expected["temperature_bias"].now
 
 
 def test_no_more_poses_are_advised_than_were_asked_for(poses_with: Poses) -> None:
-    seen = seen_in(poses_with(4, warm_up=[4e-4, 3e-4, -5e-4])[:16])
-    assert len(advice(seen, most=1).actions) == 1
-    assert len(advice(seen, most=6).actions) > 3
+    posterior = seen_in(poses_with(4, warm_up=[4e-4, 3e-4, -5e-4])[:16])
+    assert len(advice(posterior, most=1).actions) == 1
+    assert len(advice(posterior, most=6).actions) > 3
 
 
 def test_poses_are_advised_where_nobody_knows_when_they_were_taken(with_effects: Callable[..., Sensor]) -> None:
     poses, _ = taken(with_effects(second_order_nonlinearity=[6e-4, -4e-4, 5e-4]), 26, 0)
     made = advice(seen_in([replace(p, start_s=0.0, end_s=0.0, channels={}) for p in poses]))
     assert made.actions
-    assert {action.do for action in made.actions} <= {ActionKind.POSE, ActionKind.REPEAT}
+    assert {action.kind for action in made.actions} <= {ActionKind.POSE, ActionKind.REPEAT}
 
 
 def test_slopes_inside_the_poses_count_in_what_is_to_come() -> None:
     recording = Case("warm_up", 1, (5.0, 10.0), 14, "white").make()
     poses = still_poses(recording.samples())
-    seen = posterior(poses, fit(poses, signs=recording.signs), signs=recording.signs)
-    assert seen.evidence.rows.slopes
-    made = advice(seen)
+    posterior = posterior_of(poses, fit(poses, signs=recording.signs), signs=recording.signs)
+    assert posterior.evidence.rows.slopes
+    made = advice(posterior)
     assert made.entropy_after < made.entropy - 3 * LEAST
     assert made.expected["warm_up"].if_it_acts > 1.5 * made.expected["warm_up"].now

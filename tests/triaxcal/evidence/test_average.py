@@ -12,7 +12,7 @@ from tests.triaxcal.evidence.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence import Average, Posterior, Refusal, average, posterior, refusal
+from triaxcal.evidence import Average, Posterior, Refusal, average, posterior_of, refusal
 from triaxcal.evidence.unmodelled import What
 from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
@@ -20,7 +20,7 @@ from triaxcal.poses.pose import Pose
 
 
 def seen_in(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> Posterior:
-    return posterior(poses, fit(poses, signs=signs), signs=signs, catalogue=FEW)
+    return posterior_of(poses, fit(poses, signs=signs), signs=signs, catalogue=FEW)
 
 
 def at(t_s: float) -> HoldsAt:
@@ -117,10 +117,10 @@ def test_a_process_in_time_says_where_the_bias_is_at_the_moment_asked_for(
         return np.sin(2 * np.pi * t_s / 400) * np.array([6e-4, -4e-4, 5e-4])
 
     poses = [replace(p, mean=p.mean + paper_unit.scale_factor * bias_g(p.t_s)) for p in poses_with(3)]
-    seen = posterior(poses, fit(poses, signs=MINUS), signs=MINUS, catalogue=())
-    assert next(iter(seen.of_kinds)) is What.TIME
+    posterior = posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS, catalogue=())
+    assert next(iter(posterior.of_kinds)) is What.TIME
     moments = np.linspace(0, poses[-1].end_s, 7)
-    told = np.array([average(seen, at(t)).wander for t in moments])
+    told = np.array([average(posterior, at(t)).process_bias for t in moments])
     # What is constant all along is the sensor's bias.
     told, truth = (b - b.mean(axis=0) for b in (told, np.array([bias_g(t) for t in moments])))
     assert np.sqrt(np.mean((told - truth) ** 2)) < 0.2 * np.sqrt(np.mean(truth**2))
@@ -138,7 +138,7 @@ def test_the_bias_at_a_moment_is_as_sure_as_a_process_in_time_leaves_it(
         rng = np.random.default_rng(seed)
         bias_g = np.linalg.cholesky(near + 1e-9 * np.eye(len(near))) @ rng.normal(0, 4e-4, (len(t_s), 3))
         moved = [replace(p, mean=p.mean + paper_unit.scale_factor * b) for p, b in zip(poses, bias_g, strict=False)]
-        made = average(posterior(moved, fit(moved, signs=MINUS), signs=MINUS, catalogue=()), at(float(t_s[-1])))
+        made = average(posterior_of(moved, fit(moved, signs=MINUS), signs=MINUS, catalogue=()), at(float(t_s[-1])))
         truth = paper_unit.bias + bias_g[-1]
         off.append((made.sensor.bias - truth) / np.sqrt(np.diag(made.covariance)[6:9]))
     assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.5

@@ -11,7 +11,7 @@ from tests.triaxcal.evidence.conftest import FEW, MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.estimate.calibration import Calibration, HoldsAt
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence import posterior
+from triaxcal.evidence import posterior_of
 from triaxcal.evidence.corrected import corrected
 from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
@@ -26,7 +26,7 @@ START = HoldsAt(Moment.SECONDS, 0.0, 0.0)
 
 def of(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> tuple[Calibration, Calibration]:
     before = fit(poses, signs=signs)
-    return before, corrected(before, posterior(poses, before, signs=signs, catalogue=FEW), START)
+    return before, corrected(before, posterior_of(poses, before, signs=signs, catalogue=FEW), START)
 
 
 def test_coefficients_are_as_uncertain_as_the_budget_says(
@@ -95,9 +95,10 @@ def test_beyond_the_last_pose_the_error_of_the_extrapolation_is_told(
     for seed in range(6):
         poses = poses_with(seed, **drift)
         before = fit(poses, signs=MINUS)
-        seen = posterior(poses, before, signs=MINUS, catalogue=FEW)
+        posterior = posterior_of(poses, before, signs=MINUS, catalogue=FEW)
         inside, after = (
-            corrected(before, seen, HoldsAt(Moment.SECONDS, t_s, t_s)) for t_s in (poses[-1].end_s, 2 * poses[-1].end_s)
+            corrected(before, posterior, HoldsAt(Moment.SECONDS, t_s, t_s))
+            for t_s in (poses[-1].end_s, 2 * poses[-1].end_s)
         )
         assert not [c for c in inside.cautions if isinstance(c, Extrapolated)]
         (told,) = (c for c in after.cautions if isinstance(c, Extrapolated))

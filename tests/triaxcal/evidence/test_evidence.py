@@ -32,7 +32,7 @@ def density(evidence: Evidence, part: int, members: tuple[int, ...], sizes: np.n
     if assumed.kind is not None:
         covariance += assumed.tau**2 * (assumed.kind.axes * assumed.kind.variance) @ assumed.kind.axes.T
     for i, size in zip(members, sizes, strict=True):
-        columns = size * rows.beside.T @ evidence.terms[i].columns
+        columns = size * rows.complement.T @ evidence.terms[i].columns
         covariance += columns @ columns.T
     return float(stats.multivariate_normal(cov=covariance).logpdf(rows.z))
 
@@ -81,7 +81,7 @@ def test_each_term_beside_others_has_the_evidence_of_the_set_of_both(evidence: E
 def test_coefficients_are_those_of_ridge_regression_over_all_sizes(evidence: Evidence) -> None:
     cubic = of(evidence, "third_order_nonlinearity", 3)
     found = evidence.of_set((cubic,), [0])
-    columns = evidence.rows.beside.T @ evidence.terms[cubic].columns
+    columns = evidence.rows.complement.T @ evidence.terms[cubic].columns
     expected = np.zeros(3)
     for size, log in zip(found.sizes[:, 0], found.log[0], strict=True):
         ridge = np.concatenate([columns, np.eye(3) / size]), np.concatenate([evidence.rows.z, np.zeros(3)])

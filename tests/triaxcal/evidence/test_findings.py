@@ -10,7 +10,7 @@ import pytest
 
 from tests.triaxcal.evidence.conftest import MINUS, SIGMA_G
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence import Findings, findings, posterior
+from triaxcal.evidence import Findings, findings, posterior_of
 from triaxcal.evidence.unmodelled import What
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -19,7 +19,7 @@ Poses = Callable[..., list[Pose]]
 
 
 def told(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> Findings:
-    return findings(posterior(poses, fit(poses, signs=signs), signs=signs))
+    return findings(posterior_of(poses, fit(poses, signs=signs), signs=signs))
 
 
 def test_where_nothing_acts_that_is_the_likeliest(poses_with: Poses) -> None:
@@ -90,8 +90,8 @@ def test_a_name_that_hangs_on_one_pose_is_a_candidate_and_no_finding(
     monkeypatch: pytest.MonkeyPatch, poses_with: Poses
 ) -> None:
     poses = poses_with(11, temperature_bias=[5e-4, -4e-4, 6e-4])
-    seen = posterior(poses, fit(poses, signs=MINUS), signs=MINUS)
-    monkeypatch.setattr(type(seen), "without_any_pose", lambda self, name: 0.5)
-    found = findings(seen)
+    posterior = posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS)
+    monkeypatch.setattr(type(posterior), "without_any_pose", lambda self, name: 0.5)
+    found = findings(posterior)
     assert found.named == ()
     assert "temperature_bias" in found.candidates

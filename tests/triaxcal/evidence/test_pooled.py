@@ -10,7 +10,7 @@ import numpy as np
 from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence import Posterior, posterior
+from triaxcal.evidence import Posterior, posterior_of
 from triaxcal.evidence.pooled import pool
 from triaxcal.poses.pose import Pose
 
@@ -25,7 +25,7 @@ FEW = [
 
 
 def of_units(poses: Sequence[list[Pose]]) -> list[Posterior]:
-    return [posterior(p, fit(p, signs=MINUS), signs=MINUS, catalogue=FEW, smallest_g=LEAST_G) for p in poses]
+    return [posterior_of(p, fit(p, signs=MINUS), signs=MINUS, catalogue=FEW, smallest_g=LEAST_G) for p in poses]
 
 
 def test_an_effect_with_common_values_is_certain_in_all_and_in_none_alone(

@@ -11,7 +11,7 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence import Posterior, Refusal, posterior, refusal
+from triaxcal.evidence import Posterior, Refusal, posterior_of, refusal
 from triaxcal.evidence.unmodelled import What
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
@@ -22,15 +22,15 @@ Poses = Callable[..., list[Pose]]
 
 
 def found(poses: list[Pose]) -> Posterior:
-    return posterior(poses, fit(poses, signs=MINUS), signs=MINUS)
+    return posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_is_named_where_nothing_acts(poses_with: Poses, seed: int) -> None:
-    seen = found(poses_with(seed))
-    assert max(seen.of_names.values(), default=0.0) < 0.3
-    assert max(seen.of_outliers) < 0.3
-    assert seen.of_unmodelled < 0.3
+    posterior = found(poses_with(seed))
+    assert max(posterior.of_names.values(), default=0.0) < 0.3
+    assert max(posterior.of_outliers) < 0.3
+    assert posterior.of_unmodelled < 0.3
 
 
 @pytest.mark.parametrize(
@@ -46,16 +46,16 @@ def test_nothing_is_named_where_nothing_acts(poses_with: Poses, seed: int) -> No
     ],
 )
 def test_what_acts_is_named(poses_with: Poses, name: str, coefficients: list[float]) -> None:
-    seen = found(poses_with(11, **{name: coefficients}))
-    assert next(iter(seen.of_names)) == name
-    assert seen.of_names[name] > 0.99
-    assert seen.without_any_pose(name) > 0.99
-    assert seen.of_unmodelled < 0.2
+    posterior = found(poses_with(11, **{name: coefficients}))
+    assert next(iter(posterior.of_names)) == name
+    assert posterior.of_names[name] > 0.99
+    assert posterior.without_any_pose(name) > 0.99
+    assert posterior.of_unmodelled < 0.2
 
 
 def test_two_effects_at_once_are_both_named(poses_with: Poses) -> None:
-    seen = found(poses_with(5, hysteresis=[8e-4, -7e-4, 9e-4], temperature_bias=[5e-4, -4e-4, 6e-4]))
-    names, probability = next(iter(seen.of_sets_of_names.items()))
+    posterior = found(poses_with(5, hysteresis=[8e-4, -7e-4, 9e-4], temperature_bias=[5e-4, -4e-4, 6e-4]))
+    names, probability = next(iter(posterior.of_sets_of_names.items()))
     assert names == {"hysteresis", "temperature_bias"}
     assert probability > 0.9
 
@@ -63,10 +63,10 @@ def test_two_effects_at_once_are_both_named(poses_with: Poses) -> None:
 def test_a_knocked_pose_is_an_outlier_and_nothing_else(
     poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]]
 ) -> None:
-    seen = found(knocked(poses_with(2), 7, 5e-4))
-    assert seen.of_outliers[7] > 0.99
-    assert np.delete(seen.of_outliers, 7).max() < 0.2
-    assert max(seen.of_names.values(), default=0.0) < 0.3
+    posterior = found(knocked(poses_with(2), 7, 5e-4))
+    assert posterior.of_outliers[7] > 0.99
+    assert np.delete(posterior.of_outliers, 7).max() < 0.2
+    assert max(posterior.of_names.values(), default=0.0) < 0.3
 
 
 def test_a_name_that_one_pose_decides_does_not_survive_its_loss(
@@ -74,25 +74,25 @@ def test_a_name_that_one_pose_decides_does_not_survive_its_loss(
 ) -> None:
     """A single knock looks like many things; whatever is made of it, nothing is certain without that pose."""
     for seed in range(3):
-        seen = found(knocked(poses_with(seed), 12, 3e-4))
-        assert all(seen.without_any_pose(name) < 0.5 for name in seen.of_names)
+        posterior = found(knocked(poses_with(seed), 12, 3e-4))
+        assert all(posterior.without_any_pose(name) < 0.5 for name in posterior.of_names)
 
 
 @pytest.mark.parametrize("kind", ["dead_zone", "random_walk", "magnetic_field"])
 def test_what_is_in_no_catalogue_is_unmodelled(kind: str) -> None:
     recording = Case(kind, 1, (100.0, 200.0), 26, "white").make()
     poses = still_poses(recording.samples())
-    seen = posterior(poses, fit(poses, signs=recording.signs), signs=recording.signs)
-    assert seen.of_unmodelled > 0.5
-    assert all(seen.without_any_pose(name) < 0.99 for name in seen.of_names)
+    posterior = posterior_of(poses, fit(poses, signs=recording.signs), signs=recording.signs)
+    assert posterior.of_unmodelled > 0.5
+    assert all(posterior.without_any_pose(name) < 0.99 for name in posterior.of_names)
 
 
 def test_probabilities_are_those_of_a_partition(poses_with: Poses) -> None:
-    seen = found(poses_with(1, warm_up=[2e-4, 3e-4, -2e-4]))
-    assert seen.weight.sum() == pytest.approx(1.0)
-    assert seen.of_parts.sum() == pytest.approx(1.0)
-    assert sum(seen.of_sets_of_names.values()) == pytest.approx(1.0)
-    assert seen.of_unmodelled <= sum(seen.of_kinds.values()) + 1e-12
+    posterior = found(poses_with(1, warm_up=[2e-4, 3e-4, -2e-4]))
+    assert posterior.weight.sum() == pytest.approx(1.0)
+    assert posterior.of_parts.sum() == pytest.approx(1.0)
+    assert sum(posterior.of_sets_of_names.values()) == pytest.approx(1.0)
+    assert posterior.of_unmodelled <= sum(posterior.of_kinds.values()) + 1e-12
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -100,17 +100,17 @@ def test_channels_that_were_exchanged_on_the_way_are_seen_with_the_pose(poses_wi
     first = 9 + 4 * seed
     poses = poses_with(seed)
     late = [replace(p, mean=p.mean[[1, 0, 2]]) for p in poses[first:]]
-    seen = found([*poses[:first], *late])
-    assert int(np.argmax(seen.of_another)) == first
-    assert seen.of_another[first] > 0.9
-    assert refusal(seen) is Refusal.ANOTHER
+    posterior = found([*poses[:first], *late])
+    assert int(np.argmax(posterior.of_another)) == first
+    assert posterior.of_another[first] > 0.9
+    assert refusal(posterior) is Refusal.ANOTHER
 
 
 def test_another_unit_from_some_pose_on_is_seen(poses_with: Poses) -> None:
     poses = poses_with(3)
     scale = np.array([1.004, 0.995, 1.002])
-    seen = found([*poses[:14], *(replace(p, mean=p.mean * scale) for p in poses[14:])])
-    assert seen.of_another[12:17].sum() > 0.9
+    posterior = found([*poses[:14], *(replace(p, mean=p.mean * scale) for p in poses[14:])])
+    assert posterior.of_another[12:17].sum() > 0.9
 
 
 def test_one_unit_all_through_is_no_other(poses_with: Poses) -> None:
@@ -121,7 +121,7 @@ def test_one_unit_all_through_is_no_other(poses_with: Poses) -> None:
 def test_the_unit_of_the_reference_changes_no_probability(poses_with: Poses) -> None:
     """A tenth of g: effects that go by the sign of a force know its size by its order of magnitude alone."""
     poses = poses_with(9, second_order_nonlinearity=[2e-4, 1e-4, -2e-4], hysteresis=[6e-5, -5e-5, 4e-5])
-    in_g, in_si = (posterior(poses, fit(poses, signs=MINUS, reference=r), signs=MINUS).of_names for r in (1.0, 10.0))
+    in_g, in_si = (posterior_of(poses, fit(poses, signs=MINUS, reference=r), signs=MINUS).of_names for r in (1.0, 10.0))
     assert {n: p for n, p in in_si.items() if p > 1e-3} == pytest.approx(
         {n: p for n, p in in_g.items() if p > 1e-3}, rel=1e-3, abs=1e-6
     )
@@ -131,26 +131,26 @@ def test_the_unit_of_the_reference_changes_no_probability(poses_with: Poses) -> 
 @pytest.mark.parametrize("name", ["second_order_nonlinearity", "third_order_nonlinearity", "temperature_bias"])
 def test_a_strong_effect_is_as_certain_as_a_weak_one(poses_with: Poses, name: str, mg: float) -> None:
     """At several mg the linear fit is too far off for one linearisation about it."""
-    seen = found(poses_with(12, **{name: [mg * 1e-3, -0.7e-3 * mg, 0.5e-3 * mg]}))
-    assert seen.certain == ((name,),)
-    assert refusal(seen) is None
+    posterior = found(poses_with(12, **{name: [mg * 1e-3, -0.7e-3 * mg, 0.5e-3 * mg]}))
+    assert posterior.certain == ((name,),)
+    assert refusal(posterior) is None
 
 
 @pytest.mark.parametrize("by_g", [0.01, 0.4, 0.9])
 def test_a_pose_is_an_outlier_however_far_it_is_off(
     poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]], by_g: float
 ) -> None:
-    seen = found(knocked(poses_with(2), 7, by_g))
-    assert seen.of_outliers[7] > 0.99
-    assert seen.of_unmodelled < 0.3
+    posterior = found(knocked(poses_with(2), 7, by_g))
+    assert posterior.of_outliers[7] > 0.99
+    assert posterior.of_unmodelled < 0.3
 
 
 def test_a_unit_turned_in_its_socket_is_seen_with_the_pose(poses_with: Poses) -> None:
     """As a connector plugged in the other way round: two channels change their signs."""
     poses = poses_with(7)
-    seen = found([*poses[:17], *(replace(p, mean=p.mean * [-1, -1, 1]) for p in poses[17:])])
-    assert seen.of_another[17] > 0.9
-    assert refusal(seen) is Refusal.ANOTHER
+    posterior = found([*poses[:17], *(replace(p, mean=p.mean * [-1, -1, 1]) for p in poses[17:])])
+    assert posterior.of_another[17] > 0.9
+    assert refusal(posterior) is Refusal.ANOTHER
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -167,8 +167,10 @@ def test_a_repeat_that_contradicts_is_time_or_memory_and_no_outlier(
     along = rng.standard_normal(3)
     share = np.linspace(0, 1, len(poses))
     drift_g = 450e-6 * along / abs(along @ ups[3]) / (share[-1] - share[3])
-    seen = found([replace(p, mean=p.mean + unit.scale_factor * drift_g * x) for p, x in zip(poses, share, strict=True)])
+    posterior = found(
+        [replace(p, mean=p.mean + unit.scale_factor * drift_g * x) for p, x in zip(poses, share, strict=True)]
+    )
     moves = {"bias_drift", "warm_up", "bias_step", "scale_factor_drift", "hysteresis", "remanence"}
-    assert seen.any_of(moves) + seen.of_kinds[What.TIME] + seen.of_kinds[What.BEFORE] > 0.99
-    assert max(seen.of_outliers[3], seen.of_outliers[-1]) < 0.5
-    assert all(seen.without_any_pose(name) >= 0.99 for (name, *others) in seen.certain if not others)
+    assert posterior.any_of(moves) + posterior.of_kinds[What.TIME] + posterior.of_kinds[What.BEFORE] > 0.99
+    assert max(posterior.of_outliers[3], posterior.of_outliers[-1]) < 0.5
+    assert all(posterior.without_any_pose(name) >= 0.99 for (name, *others) in posterior.certain if not others)

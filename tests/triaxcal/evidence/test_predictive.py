@@ -14,10 +14,10 @@ from triaxcal.effects import CATALOGUE
 from triaxcal.evidence.evidence import Evidence
 from triaxcal.evidence.odds import Odds
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.predictive import Cells
+from triaxcal.evidence.predictive import Predictive
 from triaxcal.evidence.rows import Rows
 from triaxcal.evidence.terms import terms_of
-from triaxcal.evidence.unmodelled import Held, What
+from triaxcal.evidence.unmodelled import Sites, What
 from triaxcal.poses.pose import Pose
 
 Poses = Callable[..., list[Pose]]
@@ -49,7 +49,7 @@ def test_poses_that_were_taken_are_to_come_as_they_were(poses_with: Poses) -> No
 def test_a_covariance_with_poses_to_come_is_that_of_the_rows_where_they_are_the_same() -> None:
     _, rows = recorded()
     evidence = Evidence(rows, terms_of(rows, [], Odds()), Odds())
-    here, there = Held.of(rows), Held.of(rows.to_come(rows.poses))
+    here, there = Sites.of(rows), Sites.of(rows.to_come(rows.poses))
     for kind in {part.kind for part in evidence.parts if part.kind is not None}:
         crossed = kind.covariance_of(there, here)
         own = kind.what in (What.NOTHING, What.INSIDE)
@@ -72,7 +72,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
     cell = int(np.argmax(found.log[0]))
     ahead = rows.to_come(poses_with(8)[:5])
     one = replace(found, sizes=found.sizes[[cell]], log=found.log[:, [cell]])
-    mean, covariance = Cells.likeliest(Posterior(evidence, [one]), 1.0).predicted(ahead)
+    mean, covariance = Predictive.likeliest(Posterior(evidence, [one]), 1.0).predicted(ahead)
 
     def design(of_rows: Rows) -> np.ndarray:
         columns = []
@@ -86,7 +86,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
     joint = np.eye(len(both)) + both @ both.T
     assumed = evidence.parts[part]
     if assumed.kind is not None:
-        here, there = Held.of(rows), Held.of(ahead)
+        here, there = Sites.of(rows), Sites.of(ahead)
         crossed = assumed.kind.covariance_of(here, there)
         joint += assumed.tau**2 * np.block(
             [[assumed.kind.covariance, crossed], [crossed.T, assumed.kind.covariance_of(there, there)]]

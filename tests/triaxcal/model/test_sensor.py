@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from triaxcal.effects import CATALOGUE, TIME, effect_named
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, LAGS_S, SCATTER, SINCE_START, lag_of, rate_of
+from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, LAGS_S, SCATTER, SINCE_START, lag_of, rate_of
 from triaxcal.errors import Refused
 from triaxcal.model.sensor import Sensor
 
@@ -42,7 +42,7 @@ def covariates(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     there = {"temp_c": rng.uniform(-15, 15, n), rate_of("temp_c"): rng.uniform(-0.1, 0.1, n)}
     there |= {lag_of("temp_c", constant_s): rng.uniform(-3, 3, n) for constant_s in LAGS_S}
     # The step of the catalogue is at 0 s: poses on either side of it.
-    times = {TIME: rng.uniform(-300, 300, n), SINCE_START: rng.uniform(-10, 300, n), HELD: np.full(n, 10.0)}
+    times = {TIME: rng.uniform(-300, 300, n), SINCE_START: rng.uniform(-10, 300, n), DURATION: np.full(n, 10.0)}
     return within | there | times
 
 

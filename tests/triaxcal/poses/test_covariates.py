@@ -11,7 +11,7 @@ import pytest
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.channel import ChannelBias
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME
+from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, RUN, SCATTER, SINCE_START, TIME
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.temperature_bias import TemperatureBias
 from triaxcal.errors import InvalidData
@@ -66,10 +66,10 @@ def three() -> list[Pose]:
 def test_time_is_the_middle_of_a_pose_and_rates_stand_beside_their_channels(three: list[Pose]) -> None:
     found = channels_of(three)
     assert found[TIME].tolist() == found[SINCE_START].tolist() == [7.0, 18.0, 50.0]
-    assert found[HELD].tolist() == [10.0, 6.0, 20.0]
+    assert found[DURATION].tolist() == [10.0, 6.0, 20.0]
     assert found["temp_c"].tolist() == [24.0, 25.0, 26.3]
     assert found["temp_c.rate"].tolist() == [0.024, 0.025, 0.0263]
-    assert set(found) == {TIME, SINCE_START, HELD, "temp_c", "temp_c.rate", "supply_v"}
+    assert set(found) == {TIME, SINCE_START, DURATION, "temp_c", "temp_c.rate", "supply_v"}
 
 
 def test_a_channel_that_one_pose_lacks_is_none_at_all(three: list[Pose]) -> None:
@@ -78,7 +78,7 @@ def test_a_channel_that_one_pose_lacks_is_none_at_all(three: list[Pose]) -> None
     assert "temp_c.rate" not in channels_of([*three[:2], replace(three[2], rates={})])
 
 
-@pytest.mark.parametrize("name", [TIME, SINCE_START, HELD, RUN, "before_x", "change_x", "scatter_x", "temp_c.rate"])
+@pytest.mark.parametrize("name", [TIME, SINCE_START, DURATION, RUN, "before_x", "change_x", "scatter_x", "temp_c.rate"])
 def test_a_logged_channel_stands_beside_the_derived_condition_of_its_name(name: str, three: list[Pose]) -> None:
     logged = [4.0, 7.0, 5.5]
     poses = [replace(p, channels=p.channels | {name: v}) for p, v in zip(three, logged, strict=True)]
@@ -102,7 +102,7 @@ def test_an_effect_of_a_channel_is_found_whatever_the_channel_is_called(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
     rng = np.random.default_rng(0)
-    names = [HELD, SINCE_START, "before_y", "scatter_z", "supply.rate", "temp_c.rate"]
+    names = [DURATION, SINCE_START, "before_y", "scatter_z", "supply.rate", "temp_c.rate"]
     for name in names:
         logged = 5 + rng.standard_normal(26)
         sensor = replace(paper_unit, effects=((ChannelBias("c"), np.array([2e-4, 0.0, -1e-4])),))
@@ -168,7 +168,7 @@ CLOCKS = {SINCE_START: np.inf, TIME: 0.0}
 def test_poses_of_another_recording_count_their_time_as_at_the_reference_and_long_after_the_start(
     three: list[Pose],
 ) -> None:
-    reference = {"temp_c": 20.0, TIME: 130.0, SINCE_START: 0.0, HELD: 0.0, "before_x": 0.0, "temp_c.rate": 0.0}
+    reference = {"temp_c": 20.0, TIME: 130.0, SINCE_START: 0.0, DURATION: 0.0, "before_x": 0.0, "temp_c.rate": 0.0}
     found = covariates_elsewhere(three, reference, K, B)
     assert set(found) == set(reference)
     assert found[TIME].tolist() == [0.0, 0.0, 0.0]
@@ -184,11 +184,11 @@ def test_poses_of_another_recording_without_the_channel_are_refused_by_its_name(
 
 
 def test_single_readings_need_no_condition_that_nobody_logs() -> None:
-    reference = {"temp_c": 25.0, SINCE_START: 0.0, HELD: 0.0, "change_y": 0.0, "scatter_z": 0.0, "temp_c.rate": 0.0}
+    reference = {"temp_c": 25.0, SINCE_START: 0.0, DURATION: 0.0, "change_y": 0.0, "scatter_z": 0.0, "temp_c.rate": 0.0}
     found, missing = of_readings({"temp_c": np.array([26.0, 27.5])}, reference, 2, CLOCKS)
     assert found["temp_c"].tolist() == [1.0, 2.5]
     assert np.all(np.isposinf(found[SINCE_START]))
-    assert all(found[n].tolist() == [0.0, 0.0] for n in (HELD, "change_y", "scatter_z", "temp_c.rate"))
+    assert all(found[n].tolist() == [0.0, 0.0] for n in (DURATION, "change_y", "scatter_z", "temp_c.rate"))
     assert missing == ("change_y", "scatter_z", "temp_c.rate")
     # What is given counts.
     given = {"temp_c": np.zeros(1), "temp_c.rate": np.array([0.01])}

@@ -9,7 +9,7 @@ from triaxcal.effects import CATALOGUE
 from triaxcal.effects.bias_drift import BiasDrift
 from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.channel import ChannelBias
-from triaxcal.effects.contract import BEFORE, CHANGE, HELD, RUN, SCATTER, SINCE_START, TIME, Effect
+from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, RUN, SCATTER, SINCE_START, TIME, Effect
 from triaxcal.effects.cross_coupling import CrossCoupling
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.effects.in_run import InRuns
@@ -29,16 +29,16 @@ HOLDING: list[tuple[Effect, str, dict[str, list[float]]]] = [
     (ThermalGradient(), "while temp_c does not change", {"temp_c.rate": [0.0, 0.0]}),
     (BiasDrift(3), "at t_s = 90 s", {TIME: [0.0, 0.0]}),
     (WarmUp(60.0), "long after the start", {SINCE_START: [3000.0, 4000.0]}),
-    (BiasStep(83.5), "after the step at 83.5 s", {SINCE_START: [90.0, 1e5], HELD: [0.0, 5.0]}),
+    (BiasStep(83.5), "after the step at 83.5 s", {SINCE_START: [90.0, 1e5], DURATION: [0.0, 5.0]}),
     (InRuns(BiasStep(83.5), (1,)), "after the step at 83.5 s of recording 2",
-     {SINCE_START: [90.0, 0.0], HELD: [0.0, 5.0], RUN: [1.0, 2.0]}),
+     {SINCE_START: [90.0, 0.0], DURATION: [0.0, 5.0], RUN: [1.0, 2.0]}),
     (RunBias(3, alone=1), "in all recordings but recording 2", {RUN: [0.0, 2.0]}),
     (Hysteresis("memory"), "after a pose with no specific force along the axis", {n: [0.0, 0.0] for n in BEFORE}),
     (Hysteresis("reversal"), "with no change along the axis since the pose before", {n: [0.0, 0.0] for n in CHANGE}),
     (VibrationRectification(), "with readings that do not scatter", {n: [0.0, 0.0] for n in SCATTER}),
 ]  # fmt: skip
 REFERENCE = {
-    "temp_c": 24.5, "supply_v": 5.0, TIME: 90.0, SINCE_START: 0.0, HELD: 0.0, RUN: 0.0,
+    "temp_c": 24.5, "supply_v": 5.0, TIME: 90.0, SINCE_START: 0.0, DURATION: 0.0, RUN: 0.0,
     **dict.fromkeys((*BEFORE, *CHANGE, *SCATTER, "temp_c.rate"), 0.0),
 }  # fmt: skip
 
@@ -75,7 +75,7 @@ def test_each_condition_is_told_once_and_effects_of_directions_have_none() -> No
 
 def test_no_effect_of_the_catalogue_is_said_to_hold_at_a_derived_conditions_zero() -> None:
     said = " ".join(holds(CATALOGUE, REFERENCE))
-    derived = (SINCE_START, HELD, RUN, "before_", "change_", "scatter_", ".rate", ".lag")
+    derived = (SINCE_START, DURATION, RUN, "before_", "change_", "scatter_", ".rate", ".lag")
     assert not [name for name in derived if name in said]
 
 

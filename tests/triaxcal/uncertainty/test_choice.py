@@ -14,12 +14,12 @@ from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.basis import AveragedModels
 
 
-def one_after_the_other(poses: list[Pose], every_s: float, held_s: float) -> list[Pose]:
+def one_after_the_other(poses: list[Pose], every_s: float, duration_s: float) -> list[Pose]:
     """Taken in this order, so that each knows the pose before it."""
     out: list[Pose] = []
     for i, p in enumerate(poses):
         before = out[-1].mean if out else None
-        out.append(replace(p, start_s=every_s * i, end_s=every_s * i + held_s, before=before))
+        out.append(replace(p, start_s=every_s * i, end_s=every_s * i + duration_s, before=before))
     return out
 
 

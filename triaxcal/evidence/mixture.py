@@ -21,7 +21,7 @@ are."""
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class Components:
     """A likely set, with one ``part`` of the evidence, under k choices of ``sizes`` (k,q) of its q scaled coefficients.
     ``share`` (k,) is the probability of each. Of the linear parameters and the coefficients, d = 9 + q, ``here`` (k,d)
     are the means and ``within`` (k,d,d) the covariances but for the ``noise`` (k,); ``left`` (k,N) the rows that are
@@ -41,13 +41,13 @@ class Solved:
     inverse: Floats
 
 
-def solved_cells(seen: Posterior, share: float = 1.0) -> list[Solved]:
+def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
     """Of the likeliest cells that hold this ``share`` of the probability, those of one set and part together."""
-    evidence = seen.evidence
+    evidence = posterior.evidence
     rows = evidence.rows
     together: dict[tuple[int, int], list[tuple[float, int]]] = defaultdict(list)
     sets: dict[int, SetEvidence] = {}
-    for log_share, found, row, cell in _likely_cells(seen, share):
+    for log_share, found, row, cell in _likely_cells(posterior, share):
         sets[id(found)] = found
         together[id(found), row].append((np.exp(log_share), cell))
     inverse: dict[int, Floats] = {}
@@ -68,16 +68,16 @@ def solved_cells(seen: Posterior, share: float = 1.0) -> list[Solved]:
         here = within @ (weighted @ rows.y)
         left = rows.y - here @ design.T
         noise = np.array([rows.noise_given(float(chi2)) for chi2 in left @ (inverse[part] @ rows.y)])
-        names = seen.names_of(found)
-        out.append(Solved(found, names, places, part, of, sizes, here, within, noise, left, design, inverse[part]))
+        names = posterior.names_of(found)
+        out.append(Components(found, names, places, part, of, sizes, here, within, noise, left, design, inverse[part]))
     return out
 
 
-def _likely_cells(seen: Posterior, share: float) -> list[tuple[float, SetEvidence, int, int]]:
+def _likely_cells(posterior: Posterior, share: float) -> list[tuple[float, SetEvidence, int, int]]:
     """The logarithm of its probability, the set, and the places of part and sizes."""
-    total = float(log_sum_exp([found.total for found in seen.sets]))
+    total = float(log_sum_exp([found.total for found in posterior.sets]))
     log, of_set, where = [], [], []
-    for k, found in enumerate(seen.sets):
+    for k, found in enumerate(posterior.sets):
         if found.total - total < np.log(NEGLIGIBLE):
             break
         flat = found.log.ravel()
@@ -89,4 +89,4 @@ def _likely_cells(seen: Posterior, share: float) -> list[tuple[float, SetEvidenc
     best = np.argsort(-every, kind="stable")[:CELLS]
     best = best[: int(np.searchsorted(np.cumsum(np.exp(every[best])), share)) + 1]
     chosen = zip(every[best], np.concatenate(of_set)[best], np.concatenate(where)[best], strict=True)
-    return [(float(p), seen.sets[k], *divmod(int(i), seen.sets[k].log.shape[1])) for p, k, i in chosen]
+    return [(float(p), posterior.sets[k], *divmod(int(i), posterior.sets[k].log.shape[1])) for p, k, i in chosen]
