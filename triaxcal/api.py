@@ -40,7 +40,7 @@ class PlannedPose(NamedTuple):
 
 class Poses(tuple[Pose, ...]):
     """Still poses, in order of time. ``data_quality`` has a line for everything that the raw stream is to be blamed
-    for; ``output_unit`` is what `find_poses` was told."""
+    for; ``output_unit`` is what `find_poses` was given."""
 
     data_quality: tuple[str, ...] = ()
     output_unit: str = ""
@@ -59,7 +59,7 @@ class Poses(tuple[Pose, ...]):
         time_unit: str | None = None,
     ) -> Poses:
         """One pose a row, where only means are known: ``u`` (n,3) in output units, ``standard_errors`` (n,3) of them,
-        ``t`` (n,) as in `find_poses`, ``channels`` (n,) each. Without standard errors the noise is told from the
+        ``t`` (n,) as in `find_poses`, ``channels`` (n,) each. Without standard errors the noise is estimated from the
         residuals of the linear model, so that no lack of fit can show. Raises Refused, InvalidData."""
         readings = tables.readings_of(u)
         if readings.ndim != 2:
@@ -289,7 +289,7 @@ def budget(calibration: Calibration, stated: uncertainty.Stated | None = None) -
 
 
 def _unit_of(poses: Any) -> str:
-    """What `find_poses` was told, where the poses are still as it gave them."""
+    """What `find_poses` was given, where the poses are still as it gave them."""
     return poses.output_unit if isinstance(poses, Poses) else ""
 
 
@@ -330,7 +330,7 @@ def _poses(
 ) -> Sequence[Pose]:
     if u is None and isinstance(poses, Sequence) and all(isinstance(p, Pose) for p in poses):
         given = {"channels": channels, "time_unit": time_unit, "columns": columns}
-        if told := next((name for name, value in given.items() if value is not None), None):
-            raise InvalidData(f"{told}: the poses are found already; give it to find_poses")
+        if needless := next((name for name, value in given.items() if value is not None), None):
+            raise InvalidData(f"{needless}: the poses are found already; give it to find_poses")
         return list(poses)
     return find_poses(poses, u, channels=channels, time_unit=time_unit, columns=columns, output_unit=output_unit)

@@ -154,13 +154,13 @@ def holds_at_of(part: Mapping[str, Any], *, where: str) -> HoldsAt | None:
 
 def _residual(part: Mapping[str, Any]) -> Residual:
     held = part.get("residual")
-    told = held if isinstance(held, Mapping) else {}
-    crossed, p = (_number(told.get(name)) for name in ("cross_validated_rms_g", "lack_of_fit_p"))
+    found = held if isinstance(held, Mapping) else {}
+    crossed, p = (_number(found.get(name)) for name in ("cross_validated_rms_g", "lack_of_fit_p"))
     return Residual(
-        rms_g=_number(told.get("rms_g")),
-        max_abs_g=_number(told.get("max_abs_g")),
+        rms_g=_number(found.get("rms_g")),
+        max_abs_g=_number(found.get("max_abs_g")),
         cross_validated_rms_g=None if math.isnan(crossed) else crossed,
-        noise_floor_g=_number(told.get("noise_floor_g")),
+        noise_floor_g=_number(found.get("noise_floor_g")),
         lack_of_fit_p=None if math.isnan(p) else p,
     )
 

@@ -100,7 +100,7 @@ class Loop:
 
     @cached_property
     def advice(self) -> Advice:
-        """What to record next; nothing where that cannot be told."""
+        """What to record next; nothing where that cannot be determined."""
         try:
             return advice(self.posterior)
         except Refused:  # the model has no inverse in poses to come
@@ -188,7 +188,7 @@ def _without_outliers(
 
 @dataclass(frozen=True)
 class _Report:
-    """What is told of an effect of this name: as it is in ``after``, or as it would be if it acted."""
+    """What is reported of an effect of this name: as it is in ``after``, or as it would be if it acted."""
 
     posterior: Posterior
     moment: HoldsAt

@@ -138,8 +138,8 @@ class Calibration:
         """Every reason not to trust it in full."""
         if self._document is not None:
             part = calibration_part(self._document, where="document")
-            told = part.get("warnings")
-            return tuple(map(str, told)) if isinstance(told, list) else ()
+            kept = part.get("warnings")
+            return tuple(map(str, kept)) if isinstance(kept, list) else ()
         return tuple(map(text.caution, self._fitted.cautions))
 
     @property

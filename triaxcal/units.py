@@ -19,8 +19,9 @@ _G = re.compile(r"(?<![A-Za-zµ_])g(?![A-Za-z_])")
 
 @dataclass(frozen=True)
 class ErrorUnit:
-    """The unit in which errors of the magnitude are told to people: ``unit``, that of the reference vector, times ten
-    to the ``exponent``. µg as it is; where nobody named the unit, ppm of the reference, whose magnitude is ``whole``.
+    """The unit in which errors of the magnitude are reported to people: ``unit``, that of the reference vector, times
+    ten to the ``exponent``. µg as it is; where nobody named the unit, ppm of the reference, whose magnitude is
+    ``whole``.
     """
 
     unit: str = "g"
@@ -48,11 +49,11 @@ class ErrorUnit:
         """A ``value`` in the reference's unit as a number of these."""
         return value / self.whole * 10.0**-self.exponent
 
-    def told(self, value: float | None) -> str:
+    def written(self, value: float | None) -> str:
         return "—" if value is None else f"{self.count(value):.1f}"
 
     def in_full(self, value: float | None) -> str:
-        return self._behind(self.told(value))
+        return self._behind(self.written(value))
 
     def figure(self, value: float) -> str:
         """A ``value`` in the reference's unit as sentences have it."""

@@ -48,8 +48,8 @@ def test_errors_are_told_in_about_millionths_of_the_reference(
 ) -> None:
     small = ErrorUnit.of(unit, reference)
     assert str(small) == text
-    assert number is None or small.told(2e-6) == number
-    assert small.told(None) == "—"
+    assert number is None or small.written(2e-6) == number
+    assert small.written(None) == "—"
 
 
 def test_a_sentence_has_the_unit_of_the_reference_behind_numbers_alone() -> None:

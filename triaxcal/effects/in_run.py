@@ -39,7 +39,7 @@ class InRuns(Wrapped):
 
     @property
     def absent(self) -> str:
-        # What lasts begins in one run, by whose clock its moment is told.
+        # What lasts begins in one run, by whose clock its moment is reckoned.
         return self.whole.absent + (f" of recording {self.runs[0] + 1}" if self.whole.lasting else "")
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:

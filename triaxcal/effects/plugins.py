@@ -94,7 +94,7 @@ class Foreign(Wrapped):
         try:
             with np.errstate(all="ignore"):  # what comes of it is looked at
                 return ask()
-        except Exception as e:  # whatever somebody else's code raises is the reason that is told
+        except Exception as e:  # whatever somebody else's code raises is the reason that is reported
             raise EffectFault(self.name, self.package, _reason(e)) from e
 
 
@@ -129,7 +129,7 @@ def _loaded(point: EntryPoint, others: Collection[str]) -> tuple[Effect | None, 
             raise ValueError(f"the name {effect.name} is taken by another effect of another package")
     except EffectFault as e:
         return None, e.reason
-    except Exception as e:  # noqa: BLE001 - whatever somebody else's code raises is the reason that is told
+    except Exception as e:  # noqa: BLE001 - whatever somebody else's code raises is the reason that is reported
         return None, _reason(e)
     return Foreign(effect, _package(point)), ""
 

@@ -168,8 +168,8 @@ def _changes(problem: Problem, poses: Sequence[Pose], length: Floats) -> tuple[d
         channel = channel_of(name)
         if is_derived(name) or any(channel not in p.bends for p in poses):
             continue
-        told = [(p.rates[channel], p.rate_errors[channel], p.bends[channel], p.bend_errors[channel]) for p in poses]
-        if not np.isfinite(told).all():
+        known = [(p.rates[channel], p.rate_errors[channel], p.bends[channel], p.bend_errors[channel]) for p in poses]
+        if not np.isfinite(known).all():
             continue
         change[name] = length * np.array([p.rates[channel] for p in poses])
         errors[name] = length * np.array([p.rate_errors[channel] for p in poses])

@@ -23,8 +23,8 @@ NOISE_LIMIT = 0.05
 """Poses are refused where noise alone, times the dilution, is this share of the reference."""
 POSES_LEAST = 9
 ROUGH_LEAST, ROUGH_APART_DEG, ROUGH_LIMIT_RAD, TRIAD_UNLIKE_SPHERE = 6, 10.0, 0.2, 0.03
-"""Directions are told without a fit from so many poses so far apart, where they are not less sure than this; and by how
-much at least scale factors of the axes are taken to differ."""
+"""Directions are determined without a fit from so many poses so far apart, where they are not less sure than this; and
+by how much at least scale factors of the axes are taken to differ."""
 
 
 class Uncarried(Refused):
@@ -121,7 +121,7 @@ def begun(
 
 
 def wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]:
-    """The poses that would mend a set, as far as its directions can be told without a fit.
+    """The poses that would mend a set, as far as its directions can be determined without a fit.
 
     Where they cannot, a whole set is wanted, which carries nine parameters whatever the poses there are.
     """
@@ -130,7 +130,7 @@ def wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]
 
 
 def rough_directions(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[Floats, float]:
-    """Up (n,3) in poses that need not carry a fit, and how unsure it is; (0,3) where it cannot be told.
+    """Up (n,3) in poses that need not carry a fit, and how unsure it is; (0,3) where it cannot be determined.
 
     By a sphere through the outputs. How far a triad is from a sphere shows in the residual, given poses to spare.
     """

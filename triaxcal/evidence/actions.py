@@ -32,7 +32,7 @@ FACES = 6
 factor of an axis, and a face shows either best."""
 BETWEEN = 24
 """Directions farthest from all that were taken and from the cube's, on whose faces, vertices and edges an axis reads
-four values alone: two functions of that reading which agree there are told apart between them."""
+four values alone: two functions of that reading which agree there are distinguished between them."""
 LONGER = 4.0
 """Times as long a pose is to be held where each has an error of its own: half of what averages out is left."""
 

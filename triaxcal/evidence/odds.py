@@ -39,7 +39,7 @@ class Odds:
     certain: float = 0.99
     """A name of this probability is adopted, and has to keep it without any one pose."""
     reported: float = 0.5
-    """Outliers, and names that are not certain, are told from this probability on."""
+    """Outliers, and names that are not certain, are reported from this probability on."""
     refused: float = 0.5
     """Where an unmodelled part is likelier than not, or a name would be unlikelier than not without some one pose, no
     effect is corrected."""

@@ -148,7 +148,8 @@ def _axes(parts: Sequence[str], odds: Odds) -> Iterator[tuple[tuple[int, ...], f
 
 def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
     """Derivatives of the rows by the coefficients (N,p), and the size of each (p,): the rms of what a coefficient of
-    one adds over the sphere and over the poses' covariates, about its mean over these. None where it cannot be told."""
+    one adds over the sphere and over the poses' covariates, about its mean over these. None where it cannot be
+    determined."""
     try:
         columns = rows.by_coefficients(effect)
         covariates = rows.problem.covariates

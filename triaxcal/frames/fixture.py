@@ -1,4 +1,4 @@
-"""The errors of a fixture's own faces, and which of them do not depend on the frame they are told in."""
+"""The errors of a fixture's own faces, and which of them do not depend on the frame they are expressed in."""
 
 from __future__ import annotations
 

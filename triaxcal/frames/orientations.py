@@ -197,8 +197,8 @@ def tilt_of_others(faces: Sequence[Face], found: Verticals) -> float:
         raise Refused(
             f"{have} of {len(faces)} stood in two orientations half a turn apart"
             f"{', which show no tilt' if len(pairs) >= PAIRS_LEAST else ''}: on the others the table's tilt enters the "
-            "rotation and cannot be told from it: record the second orientations, or say by --table-tilt how large it "
-            "may be",
+            "rotation and cannot be distinguished from it: record the second orientations, or say by --table-tilt "
+            "how large it may be",
             wanted=[f.label for f in faces if not f.resolved],
         )
     return float(np.sqrt(np.mean([m**2 for _, m, _ in pairs])))

@@ -3,7 +3,7 @@
 A fixture that stands on face k at heading ψ has up at ``cos τ m + B d`` in its own frame: m the inward normal of that
 face, B (3,2) two axes at right angles to it, d (2,) the tilt of the table as the fixture feels it, |d| = sin τ. Half a
 turn about the normal turns d into −d and leaves m: the sum of two such poses is along m, however large the tilt. Of a
-face that stood one way only, d is not told from m.
+face that stood one way only, d is not distinguished from m.
 """
 
 from __future__ import annotations
@@ -136,7 +136,8 @@ def basis_of(label: str, up: Floats, mounting: Floats) -> Floats:
 
 
 def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None) -> Standing:
-    """Normals of the faces and the table's tilt. Raises Refused where the tilt cannot be told from the faces."""
+    """Normals of the faces and the table's tilt. Raises Refused where the tilt is confounded
+    with the faces."""
     assumed = assumed or Assumed()
     faces = [Face.of(found, labelling, label) for label in labelling.faces]
     faces, of_faces = turned(faces, found)

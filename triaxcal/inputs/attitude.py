@@ -142,9 +142,9 @@ def fit_attitudes(
     rows = np.arange(len(poses))
     wrong = wrong_by_magnitude(poses, ups, reference)
     if len(wrong) > WRONG_MOST * len(poses):
-        told = ", ".join(f"{called[i]} ({the_poses([poses[i].began])})" for i in wrong[:4])
+        given = ", ".join(f"{called[i]} ({the_poses([poses[i].began])})" for i in wrong[:4])
         raise Refused(
-            f"{len(wrong)} of {len(poses)} attitudes contradict the angles between the poses, beginning with {told}; "
+            f"{len(wrong)} of {len(poses)} attitudes contradict the angles between the poses, beginning with {given}; "
             "are the rows in the order of the poses?"
         )
     while True:

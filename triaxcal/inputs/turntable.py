@@ -28,7 +28,7 @@ ERROR_MOST = 0.3
 """Attitudes that are off by more, in rad, carry nothing."""
 PAIRS_MOST = 400
 TIED = 0.02
-"""Rows that take out of the sum of squares within this share of each other cannot be told apart."""
+"""Rows that take out of the sum of squares within this share of each other cannot be distinguished."""
 
 
 class AttitudesContradictReadings(Refused):
@@ -209,7 +209,7 @@ def _off_most(a: Floats, ups: Floats) -> Floats:
 def wrong_by_residual(s: TurntableSolution) -> Ints:
     """The row whose residual stands out from the noise and from all others, as if it had not been in the fit.
 
-    None where no row does, several where these cannot be told from each other.
+    None where no row does, several where these cannot be distinguished.
     """
     n, left = len(s.data.u), s.left - 3
     if left < 3:

@@ -14,8 +14,8 @@ from triaxcal.arrays import Floats, Ints
 
 PRIOR = np.repeat([10.0, 1.0, 10.0, 0.3, 0.3, 0.3], 3)
 """Prior standard deviations, in standard errors of one pose: of second order, third order, steady drift, drift that
-bends, scale factors that drift, and hysteresis. Second order and steady drift are to be told apart whatever they are,
-since one fakes the other in real recordings; the rest where poses are left to do it with."""
+bends, scale factors that drift, and hysteresis. Second order and steady drift are to be distinguished whatever they
+are, since one fakes the other in real recordings; the rest where poses are left to do it with."""
 STARTS, ROWS_MOST, STEPS_MOST = 4, 12000, 80
 """Searches from different orders (one for a large plan); rows of trial orders that one step of a search looks at."""
 SURE = 1e-9

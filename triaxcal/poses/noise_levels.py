@@ -55,7 +55,7 @@ class NoiseLevels:
     @cached_property
     def students_dof(self) -> float:
         """Degrees of freedom of Student's t that reaches as far as the mixture of such, at `DOF_LEVEL`, when both are
-        told in units of the mixture's own standard deviation.
+        expressed in units of the mixture's own standard deviation.
 
         By moments a model of small share and large variance would count as much as if every interval had to allow for
         it.

@@ -15,7 +15,7 @@ from triaxcal.poses.when import moment, the_poses
 from triaxcal.units import ErrorUnit
 
 ALMOST = 0.999
-"""Probabilities beyond are told as such: by which model they were reckoned matters more."""
+"""Probabilities beyond are written as such: by which model they were reckoned matters more."""
 GOES_WITH = {
     What.NOTHING: "each pose by itself",
     What.DIRECTION: "the direction",

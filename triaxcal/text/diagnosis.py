@@ -18,7 +18,7 @@ __all__ = ["advice", "call", "cause", "chance", "errors", "lines", "reason", "un
 
 EVEN = 0.5
 LIKELIEST = 3
-"""Effects that are told where none is likely."""
+"""Effects that are named where none is likely."""
 CALLS = {
     Call.USABLE: "usable",
     Call.RECORD_MORE: "record more",

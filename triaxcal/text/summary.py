@@ -25,8 +25,8 @@ def summary(c: Calibration, output_unit: str, reference_unit: str, warnings: Ite
     """The same with the effects' coefficients, all standard errors, and the warnings."""
     lines = [f"Calibration: {', '.join(c.terms)}"]
     lines += [
-        f"  {name:<34}{value:>+16.9g} {told:<14} {unit}"
-        for name, value, told, unit in _all(c, output_unit, reference_unit)
+        f"  {name:<34}{value:>+16.9g} {error:<14} {unit}"
+        for name, value, error, unit in _all(c, output_unit, reference_unit)
     ]
     lines += [f"  {line}" for line in _quality(c, reference_unit)]
     lines += [f"  warning: {line}" for line in warnings]
@@ -54,8 +54,8 @@ def verification(poses: str, rms: float, noise_floor: float, expected: float, re
 def html(c: Calibration, output_unit: str, reference_unit: str, warnings: Iterable[str]) -> str:
     """The same as a table for a notebook."""
     rows = "".join(
-        f"<tr><td>{markup.escape(name)}</td><td>{value:+.9g}</td><td>{told}</td><td>{markup.escape(unit)}</td></tr>"
-        for name, value, told, unit in _all(c, output_unit, reference_unit)
+        f"<tr><td>{markup.escape(name)}</td><td>{value:+.9g}</td><td>{error}</td><td>{markup.escape(unit)}</td></tr>"
+        for name, value, error, unit in _all(c, output_unit, reference_unit)
     )
     lines = [*_quality(c, reference_unit), *(f"warning: {w}" for w in warnings)]
     below = "".join(f"<li>{markup.escape(line)}</li>" for line in lines)

@@ -69,8 +69,8 @@ def temperature(calibration: Calibration, linearised: Linearised, stated: Stated
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
     names = tuple(e.name for e in missing)
     by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
-    told = not isinstance(by, PosesAtOtherTemperatures)
-    basis = UnmodelledTemperature(names, moved, told, stated=stated.thermal_sensitivity is not None)
+    identifiable = not isinstance(by, PosesAtOtherTemperatures)
+    basis = UnmodelledTemperature(names, moved, identifiable, stated=stated.thermal_sensitivity is not None)
     return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)], excess
 
 
@@ -100,12 +100,12 @@ def _halved_by(
 ) -> Remedy:
     """As magnitudes: what the ``prior`` makes, what the data leave of it, what they would leave were the parameters
     known (so that nothing takes an effect for them), and the ``whole`` component, which has the effects' means too."""
-    told, p = 2 * left < prior, calibration.residual.lack_of_fit_p
-    if told and 2 * left < whole and p is not None and p < LACK_OF_FIT:
+    identifiable, p = 2 * left < prior, calibration.residual.lack_of_fit_p
+    if identifiable and 2 * left < whole and p is not None and p < LACK_OF_FIT:
         return TemperatureModelled(names)
     if 2 * apart < left:
         return PosesAtOtherTemperatures(names)
-    if told:
+    if identifiable:
         return half_the_noise([p.pose for p in calibration.poses if p.used])
     return SteadierTemperature(names)
 

@@ -143,7 +143,7 @@ def _show_verified(found: Verification, title: str, small: ErrorUnit) -> None:
         title,
         ["start s", f"error {small}", f"standard error {small}"],
         [
-            [f"{p.start_s:.2f}", f"{small.count(e):+.1f}", small.told(s)]
+            [f"{p.start_s:.2f}", f"{small.count(e):+.1f}", small.written(s)]
             for p, e, s in zip(found.poses, found.error_g, found.standard_error_g, strict=True)
         ],
         found.poses,

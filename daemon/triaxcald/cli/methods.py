@@ -110,7 +110,7 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
                 f"{pose.pose.start_s:.1f}",
                 micro(row.off_rad),
                 f"{row.off:.1f}",
-                choice.small.told(pose.residual_g),
+                choice.small.written(pose.residual_g),
                 "yes" if pose.used else "no",
             ]
             for row, pose in zip(found.attitudes, c.poses, strict=True)

@@ -85,12 +85,12 @@ def _percent(share: float) -> str:
 def show_budget(b: Budget, choice: Choice) -> None:
     small = choice.small
     rows = [
-        [line.source, line.evaluation, small.told(line.magnitude), _percent(b.share(line))] for line in b.components
+        [line.source, line.evaluation, small.written(line.magnitude), _percent(b.share(line))] for line in b.components
     ]
     whole = b.magnitude
-    rows.append(["combined", "", small.told(float(whole.standard)), ""])
+    rows.append(["combined", "", small.written(float(whole.standard)), ""])
     rows.append(
-        [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", small.told(float(whole.expanded)), ""]
+        [f"expanded ({whole.level:.0%}, k = {float(whole.coverage):.2f})", "", small.written(float(whole.expanded)), ""]
     )
     table(f"uncertainty of the magnitude, {small}", ["source", "type", "standard", "share"], rows)
     by = text.remedy(b.dominant.halved_by, small.figure)
@@ -116,12 +116,14 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     """Errors, what acts with which probability, and the advice in full."""
     b, f, small = loop.before.residual, loop.after.residual, choice.small
     rows = [
-        ["residual rms", small.told(b.rms_g), small.told(f.rms_g)],
-        ["cross-validated rms", small.told(b.cross_validated_rms_g), small.told(f.cross_validated_rms_g)],
+        ["residual rms", small.written(b.rms_g), small.written(f.rms_g)],
+        ["cross-validated rms", small.written(b.cross_validated_rms_g), small.written(f.cross_validated_rms_g)],
     ]
     if loop.held_out:
-        rows.append(["held-out rms", small.told(loop.held_out.before_rms_g), small.told(loop.held_out.after_rms_g)])
-    rows.append(["noise floor", small.told(b.noise_floor_g), small.told(f.noise_floor_g)])
+        rows.append(
+            ["held-out rms", small.written(loop.held_out.before_rms_g), small.written(loop.held_out.after_rms_g)]
+        )
+    rows.append(["noise floor", small.written(b.noise_floor_g), small.written(f.noise_floor_g)])
     table(f"error of the magnitude, {small}", ["", "before", "after"], rows)
     likely = [[name, diagnosis.chance(p)] for name, p in loop.probabilities.items() if p >= WORTH_A_LINE]
     rest = [["nothing", diagnosis.chance(loop.found.nothing)]]

@@ -145,7 +145,7 @@ def show_by_recording(loop: Loop, names: Sequence[str], choice: Choice) -> None:
         f"by recording, {small} rms",
         ["", "poses", "before", "after", "noise floor"],
         [
-            [name, r.poses, *(small.told(v) for v in (r.before_rms_g, r.after_rms_g, r.noise_floor_g))]
+            [name, r.poses, *(small.written(v) for v in (r.before_rms_g, r.after_rms_g, r.noise_floor_g))]
             for name, r in zip(names, residuals_by_run(loop.before, loop.after), strict=True)
         ],
     )
@@ -164,9 +164,9 @@ def show_agreement(
                 "\n".join(f.effect for f in loop.findings) or "none",
                 "\n".join(diagnosis.chance(f.probability) for f in loop.findings),
                 "\n".join(", ".join(f.alternatives) for f in loop.findings),
-                small.told(loop.before.residual.rms_g),
-                small.told(loop.after.residual.rms_g),
-                small.told(loop.after.residual.noise_floor_g),
+                small.written(loop.before.residual.rms_g),
+                small.written(loop.after.residual.rms_g),
+                small.written(loop.after.residual.noise_floor_g),
             ]
             for name, loop in zip(names, loops, strict=True)
         ],

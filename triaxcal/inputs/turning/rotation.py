@@ -291,7 +291,7 @@ class _Judged:
 
 
 def _wanted(held: Summary, signs: Floats, refusal: Refused) -> tuple[str, ...]:
-    """Sides that were never up, as far as the directions can be told without a fit."""
+    """Sides that were never up, as far as the directions can be determined without a fit."""
     # Without one scale for all, an axis that hardly moved would look like one that swung from end to end.
     u = (held.sampled - np.median(held.sampled, axis=0)) / np.max(held.half) * signs
     wanted = most_wanted(u + 1e-12)

@@ -126,7 +126,7 @@ def left_in_means(w: Windows, scatter: Floats, count: Ints) -> Floats:
 
 
 def _left_by_poses(variance: Floats, count: Ints) -> float:
-    """`left_in_mean` over all noise that poses of such ``variance`` (k,), in steps squared, may have, told from
+    """`left_in_mean` over all noise that poses of such ``variance`` (k,), in steps squared, may have, estimated from
     ``count`` (k,) windows: where the poses lie between two steps is chance, so that the mean of few of their variances
     says little, and what is left goes with the square of the noise in an exponent.
     """

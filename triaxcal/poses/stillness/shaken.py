@@ -55,7 +55,7 @@ def _share(scale: int, size: int) -> float:
 def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]:
     """Runs, trimmed, among the windows outside the quiet runs ``taken``, in which the mean stands still.
 
-    Only what is small beside the differences of poses can be told from a hand that shakes the unit.
+    Only what is small beside the differences of poses can be distinguished from a hand that shakes the unit.
     """
     if len(taken) < 2:
         return []
