@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from triaxcal import tables, text, uncertainty
+from triaxcal import text, uncertainty
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Call, Candidate, Finding
 from triaxcal.diagnosis import diagnose as diagnosed
@@ -20,6 +20,7 @@ from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
 from triaxcal.estimate.means import poses_of_means
 from triaxcal.evidence.findings import Unexplained
+from triaxcal.interchange import tables
 from triaxcal.model.directions import FULL, closed, directions
 from triaxcal.model.moment import Moment
 from triaxcal.model.samples import Samples

@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from triaxcal import tables, text
+from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.calibration_document import LINEAR, Document, calibration_document
-from triaxcal.calibration_reading import calibration_of, calibration_part
 from triaxcal.effects.contract import TIME, channel_of, covariate_of, is_derived
 from triaxcal.errors import InvalidData, MissingChannel, Refused
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.calibration import HoldsAt, PoseResult, Residual
+from triaxcal.interchange import tables
+from triaxcal.interchange.calibration_document import LINEAR, Document, calibration_document
+from triaxcal.interchange.calibration_reading import calibration_of, calibration_part
 from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.in_streams import InStream, followed
 from triaxcal.poses.pose import Pose

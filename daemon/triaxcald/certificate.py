@@ -18,13 +18,13 @@ import numpy as np
 
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.calibration_document import Document, budget_document, holds_of
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.in_run import of_clocks
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.evidence.reduced import Reduced, reduced
 from triaxcal.figures import micro_g
+from triaxcal.interchange.calibration_document import Document, budget_document, holds_of
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import channels_of, with_scale
 from triaxcal.poses.pose import Pose

@@ -6,18 +6,18 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from triaxcal.calibration_document import (
+from triaxcal.diagnosis import Finding, Loop, Verdict
+from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.hold_out import HoldOut
+from triaxcal.evidence.average import Refusal
+from triaxcal.evidence.findings import Unexplained
+from triaxcal.interchange.calibration_document import (
     WEIGHT,
     Document,
     calibration_document,
     coefficients_document,
     residual_document,
 )
-from triaxcal.diagnosis import Finding, Loop, Verdict
-from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.hold_out import HoldOut
-from triaxcal.evidence.average import Refusal
-from triaxcal.evidence.findings import Unexplained
 from triaxcal.rounding import chance, error, number
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty import Stated, budget

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.calibration_document import LINEAR, Document, by_parameter, calibration_document
-from triaxcal.calibration_reading import calibration_part, holds_at_of, sensor_of
-from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.inputs.attitude import AttitudeFit
 from triaxcal.inputs.datasheet import Datasheet, Refinement
 from triaxcal.inputs.turning.rotation import RotationFit
+from triaxcal.interchange.calibration_document import LINEAR, Document, by_parameter, calibration_document
+from triaxcal.interchange.calibration_reading import calibration_part, holds_at_of, sensor_of
+from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
 from triaxcald.errors import InputError
 

@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from triaxcal.calibration_document import Document
+from triaxcal.interchange.calibration_document import Document
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
 

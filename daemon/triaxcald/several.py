@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from triaxcal.calibration_document import Document
 from triaxcal.diagnosis import Loop
 from triaxcal.estimate.runs import residuals_by_run
 from triaxcal.evidence.shapes import Shape
+from triaxcal.interchange.calibration_document import Document
 from triaxcal.pooling import Answer, Common, PooledAnalysis, SharedShape
 from triaxcal.rounding import chance, error, number, uncertainty
 from triaxcal.text.pooling import verdict

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.calibration_reading import calibration_of
 from triaxcal.errors import Refused
+from triaxcal.interchange.calibration_reading import calibration_of
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.profile import BUILT_IN, Bundle, parse_bundle
 from triaxcald.certificate import Certified, certify, held_by_device, roles

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.calibration_document import calibration_document, poses_document
-from triaxcal.calibration_reading import calibration_of, calibration_part, sensor_of
 from triaxcal.diagnosis import diagnose
 from triaxcal.effects import Effect, effect_named
 from triaxcal.effects.bias_step import BiasStep
@@ -19,6 +17,8 @@ from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.interchange.calibration_document import calibration_document, poses_document
+from triaxcal.interchange.calibration_reading import calibration_of, calibration_part, sensor_of
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

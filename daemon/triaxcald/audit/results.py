@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from triaxcal.calibration_document import Document
 from triaxcal.errors import TriaxcalError
+from triaxcal.interchange.calibration_document import Document
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.audit.previews import Previews, Thinned

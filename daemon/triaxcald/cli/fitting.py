@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from triaxcal import text
-from triaxcal.calibration_document import Document, calibration_document
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.interchange.calibration_document import Document, calibration_document
 from triaxcal.model.moment import Moment
 from triaxcal.pooling import pooled_analysis
 from triaxcal.poses.pose import Pose

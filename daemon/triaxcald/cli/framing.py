@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.calibration_reading import sensor_of
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.frames.faces import LABELS, Labelling, labelled, opposite, recognise
 from triaxcal.frames.frames import Datum, Frames, frames
 from triaxcal.frames.orientations import Assumed
 from triaxcal.frames.standing import Standing, stand
+from triaxcal.interchange.calibration_reading import sensor_of
 from triaxcal.model.directions import directions
 from triaxcal.units import reference_unit_of
 from triaxcald import documents

@@ -8,14 +8,14 @@ import math
 import numpy as np
 
 from triaxcal import text
-from triaxcal.calibration_document import poses_document
-from triaxcal.calibration_reading import calibration_part, reference_unit_in
 from triaxcal.documents import Calibration as Document
 from triaxcal.effects.contract import RUN, SINCE_START, TIME
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import magnitude_errors
+from triaxcal.interchange.calibration_document import poses_document
+from triaxcal.interchange.calibration_reading import calibration_part, reference_unit_in
 from triaxcal.rounding import error
 from triaxcal.units import ErrorUnit
 from triaxcald.cli.console import emit

@@ -9,10 +9,10 @@ from itertools import groupby
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration_document import Document
 from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
 from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER, lag_in
 from triaxcal.errors import InvalidData
+from triaxcal.interchange.calibration_document import Document
 from triaxcal.model.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
 from triaxcal.planning.addition import Addition
 from triaxcal.planning.clock import in_plan

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from triaxcal.calibration_document import WEIGHT
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.evidence.odds import Odds
+from triaxcal.interchange.calibration_document import WEIGHT
 from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number
 from triaxcald.report.recordings import OfRecording, by_recording, file_names

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration_document import Document
+from triaxcal.interchange.calibration_document import Document
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text

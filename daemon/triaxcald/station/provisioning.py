@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from triaxcal.calibration_document import Document
+from triaxcal.interchange.calibration_document import Document
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Profile

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration_document import Document
 from triaxcal.errors import Refused, TriaxcalError
+from triaxcal.interchange.calibration_document import Document
 from triaxcal.poses.pose import Pose
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device

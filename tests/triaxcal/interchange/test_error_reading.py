@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.calibration_document import calibration_document
 from triaxcal.effects import effect_named
-from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.interchange.calibration_document import calibration_document
+from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import noisy_poses

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration_document import LINEAR
 from triaxcal.errors import InvalidData
+from triaxcal.interchange.calibration_document import LINEAR
 from triaxcal.model.sensor import Sensor
 
 ROUNDED = 1e-4

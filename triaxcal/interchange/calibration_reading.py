@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.calibration_document import WEIGHT
 from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.contract import covariate_of
-from triaxcal.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
+from triaxcal.interchange.calibration_document import WEIGHT
+from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
 from triaxcal.units import reference_unit_of
