@@ -254,7 +254,7 @@ def diagnose(
 def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> Verification:
     """The errors of the magnitude in still poses of another recording, as `find_poses` gives them or takes samples.
 
-    Poses whose samples have a fault are left out. Raises Refused where none is left, InvalidData.
+    Poses whose samples have a fault are excluded. Raises Refused where none is left, InvalidData.
     """
     found = [p for p in _poses(poses, u, **how) if not p.fault]
     if not found:

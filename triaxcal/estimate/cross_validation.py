@@ -24,7 +24,7 @@ def cross_validated(problem: Problem, state: State) -> float | None:
     norms = np.maximum(np.linalg.norm(J / s[:, None], axis=0), 1e-300)
     weighted = J / s[:, None] / norms
     gain = np.linalg.pinv(weighted, rcond=1e-14)
-    # By pose (n,k): its mean, and what else it tells, which is left out with it.
+    # By pose (n,k): its mean, and what else it tells, which is excluded with it.
     of_pose = np.arange(len(r)).reshape(-1, n).T
     hat = np.einsum("nkp,pnl->nkl", weighted[of_pose], gain[:, of_pose])
     free = np.eye(of_pose.shape[1]) - hat

@@ -1,4 +1,4 @@
-"""The poses that a fit leaves out: which these are, and what the calibration of the others says of them."""
+"""The poses that a fit excludes: which these are, and what the calibration of the others says of them."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ OUTLIER_ROUNDS = 4
 
 
 def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> OutlierSet:
-    """Indices of spoiled poses, from the fit to all. Sought anew without those found, until the same are found again:
-    a pose spoiled by a thousand times its noise bends the fit so far that linear reckoning is off.
+    """Indices of outliers, from the fit to all. Sought anew without those found, until the same are found again:
+    a pose off by a thousand times its noise bends the fit so far that linear reckoning is off.
 
-    What the others show beside their noise, all are taken to have: by the noise alone the quietest would look spoiled.
+    What the others show beside their noise, all are taken to have: by the noise alone the quietest would look like outliers.
     """
     own, together = pose_dof(poses), pure_error_dof(poses)
     dof, pure, judged, found = own, together, problem, OutlierSet()
@@ -78,7 +78,7 @@ def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
 def _among(
     calibration: Calibration, poses: Sequence[Pose], reasons: Mapping[int, Exclusion]
 ) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
-    """The results of a calibration with those of further poses left out among them, by rows of all; and these."""
+    """The results of a calibration with those of further, excluded poses among them, by rows of all; and these."""
     u = np.array([p.mean for p in poses])
     covariates = calibration.covariates_of(poses)
     length, by_u = calibration.sensor.magnitude(u, covariates)
@@ -96,7 +96,7 @@ def _among(
 def with_excluded(
     calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: OutlierSet, why: Exclusion
 ) -> Calibration:
-    """The calibration with the poses left out among its results, in order of time, and cautions that name them: those
+    """The calibration with the excluded poses among its results, in order of time, and cautions that name them: those
     that an effect knows no history of, and else as ``why`` says."""
     unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects]) if why != Exclusion.CALLER else ()
     results, added = _among(calibration, poses, {i: Exclusion.UNKNOWN_HISTORY if i in unknown else why for i in rows})
@@ -115,7 +115,7 @@ def with_excluded(
 
 
 def with_tied_sets(calibration: Calibration, poses: Sequence[Pose], verdict: OutlierSet) -> Calibration:
-    """The calibration with a caution of sets of poses one of which may be spoiled, where nobody can tell which."""
+    """The calibration with a caution of sets of poses one of which may hold the outliers, where the data do not tell which."""
     if not verdict.tied:
         return calibration
     tied = OutlierSetsTied(tuple(tuple(poses[i].began for i in rows) for rows in verdict.tied))

@@ -1,10 +1,10 @@
-"""Poses that something spoiled: a knock, a hand on the table, a unit that was not at rest.
+"""Outliers among the poses: a knock, a hand on the table, a unit that was not at rest.
 
-A pose's own weight in the fit is high (9/14 on average for the paper's plan), so a spoiled one bends the fit towards
+A pose's own weight in the fit is high (9/14 on average for the paper's plan), so an outlier bends the fit towards
 itself, and its plain residual shrinks to a third. What a set of poses S takes out of the sum of squares when it is left
 out is, exactly for a linear problem, ``r_Sᵀ (1 − H)_SS⁻¹ r_S``; that is compared with the noise inside the poses, and
 with what is left of the residuals where that is more than noise. Every pose and every pair is tried, because two
-spoiled poses can hide each other. Where other sets explain it as well, none is named.
+outliers can hide each other. Where other sets explain it as well, none is named.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FREE_LEAST = 1e-6
 
 @dataclass(frozen=True)
 class OutlierSet:
-    """``rows`` were spoiled. Besides, one of ``tied`` was: sets of rows that explain it as well as each other.
+    """``rows`` are outliers. Besides, one of ``tied`` is: sets of rows that explain it as well as each other.
 
     Where only the noise inside the poses says so, because the rows do not stand out from the other residuals, it is
     ``doubtful``: it may be that the poses come back less well than that.
@@ -117,7 +117,7 @@ class _Judge:
 
 
 def outlier_set(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> OutlierSet:
-    """Rows that were spoiled, at most two; often none.
+    """Rows that are outliers, at most two; often none.
 
     ``r`` (n,) residuals and ``J`` (n,p) their derivatives, both in units of each pose's standard error; ``dof`` (n,)
     degrees of freedom behind each of these, ``pure_dof`` behind them together.

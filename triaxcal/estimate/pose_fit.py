@@ -65,10 +65,10 @@ def fit(
 ) -> Calibration:
     """Fit the linear model, and the effects given, to still poses.
 
-    ``signs`` (3,) of the scale factors, which |a| does not show. ``excluded`` are indices of poses to leave out, and
-    ``why``; where it is None, poses that something spoiled are found and left out (`triaxcal.estimate.outliers`), and
+    ``signs`` (3,) of the scale factors, which |a| does not show. ``excluded`` are indices of poses to exclude, and
+    ``why``; where it is None, outliers are found and excluded (`triaxcal.estimate.outliers`), and
     where an effect goes with the pose before, a first pose in which the unit had not rested before. Poses with a fault
-    are left out in any case.
+    are excluded in any case.
     Raises Refused where the poses cannot carry the parameters, InvalidData where a channel that an effect needs is not
     there.
     """
@@ -133,7 +133,7 @@ def _solved(
 @dataclass(frozen=True)
 class _Left:
     """``chi2``, in units of the noise inside the poses, that a fit leaves in ``left`` degrees of freedom;
-    ``with_doubtful`` the same with poses left out whose residuals tell how well all come back, and what these show
+    ``with_doubtful`` the same with excluded poses whose residuals tell how well all come back, and what these show
     ``excess`` noise."""
 
     chi2: float

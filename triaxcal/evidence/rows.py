@@ -58,8 +58,8 @@ class Rows:
     def of(
         cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], effects: Sequence[Effect] = ()
     ) -> Rows:
-        """About the ``linear`` fit of these poses, which leaves outliers out, with the covariates that these
-        ``effects`` need. Poses with a fault are left out. Raises
+        """About the ``linear`` fit of these poses, which excludes outliers, with the covariates that these
+        ``effects`` need. Poses with a fault are excluded. Raises
         as `triaxcal.estimate.start.begun` does; Refused where no degree of freedom is left."""
         places = np.array([i for i, p in enumerate(poses) if not p.fault], dtype=int)
         sound = [poses[i] for i in places]

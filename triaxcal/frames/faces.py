@@ -66,7 +66,7 @@ class SeveralCubes(Caution):
 
 @dataclass(frozen=True)
 class Labelling:
-    """``labels`` and ``headings`` (rad, or None) of each pose, None where it stands on no face or is left out.
+    """``labels`` and ``headings`` (rad, or None) of each pose, None where it stands on no face or is excluded.
 
     ``assumed``: the axes of the sensor were taken to lie near those of the body, which nothing in the data shows.
     """

@@ -22,7 +22,7 @@ class Verticals:
     """``direction`` (n,3) of up in each pose, unit vectors, sensor frame; ``covariance`` (3n,3n) of all, rad².
 
     The covariance holds the noise of the poses and what the uncertainty of the calibration adds, which is common to
-    all poses. ``used`` (n,): poses that nothing spoiled. ``dof`` behind the covariance.
+    all poses. ``used`` (n,): poses that are no outliers. ``dof`` behind the covariance.
     """
 
     poses: tuple[Pose, ...]

@@ -1,4 +1,4 @@
-"""What the noise inside the poses is worth beside the residuals: degrees of freedom, and which of the two to believe.
+"""What the noise inside the poses counts beside the residuals: degrees of freedom, and which of the two to believe.
 
 The scatter inside a pose gives its standard error without any model (pure error). Residuals beyond it come from what
 is not the same in every pose: an effect the model lacks, a stand that does not come back, a drift.

@@ -56,7 +56,7 @@ STRETCHES_LEAST = 30
 """With fewer, the scatter between stretches says too little for nine parameters."""
 OUTLIER_SIGMA = 6.0
 OUTLIERS_MOST = 0.05
-"""Stretches that stand out so far from the others are left out, if they are no more than this share."""
+"""Stretches that stand out so far from the others are excluded, if they are no more than this share."""
 OUTLIER_ROUNDS = 4
 SPIKE = 10.0
 """How many times farther than nine tenths of all others a stretch may reach."""
@@ -171,7 +171,7 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
 
 
 def _without_outliers(held: Summary) -> tuple[Summary, Ellipsoid, float]:
-    """Without stretches that a knock or a lost word spoiled, which stand out from all the others."""
+    """Without stretches that a knock or a lost word makes outliers, which stand out from all the others."""
     spikes = _spiky(held)
     if spikes.any() and spikes.sum() <= max(OUTLIERS_MOST * len(spikes), 1):
         held = held.only(~spikes)

@@ -199,7 +199,7 @@ def _limit_within(variance: Floats, most: int) -> Floats:
 
 
 def _inside(w: Windows, pieces: list[Ints]) -> Bools:
-    """Windows from the first to the last of each span, those that were left out as well."""
+    """Windows from the first to the last of each span, those that were excluded as well."""
     inside = np.zeros(len(w), dtype=bool)
     for piece in pieces:
         inside[piece] = True
