@@ -32,7 +32,8 @@ def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> Out
     """Indices of outliers, from the fit to all. Sought anew without those found, until the same are found again:
     a pose off by a thousand times its noise bends the fit so far that linear reckoning is off.
 
-    What the others show beside their noise, all are taken to have: by the noise alone the quietest would look like outliers.
+    What the others show beside their noise, all are taken to have: by the noise alone the quietest would look like
+    outliers.
     """
     own, together = pose_dof(poses), pure_error_dof(poses)
     dof, pure, judged, found = own, together, problem, OutlierSet()
@@ -115,7 +116,8 @@ def with_excluded(
 
 
 def with_tied_sets(calibration: Calibration, poses: Sequence[Pose], verdict: OutlierSet) -> Calibration:
-    """The calibration with a caution of sets of poses one of which may hold the outliers, where the data do not tell which."""
+    """The calibration with a caution of sets of poses one of which may hold the outliers, where the data do not tell
+    which."""
     if not verdict.tied:
         return calibration
     tied = OutlierSetsTied(tuple(tuple(poses[i].began for i in rows) for rows in verdict.tied))
