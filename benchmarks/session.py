@@ -24,8 +24,8 @@ from benchmarks.processes import one_thread
 from benchmarks.table import Table
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, diagnose
-from triaxcal.estimate.runs import together
-from triaxcal.pooling import Common, pooled_analysis
+from triaxcal.estimate.recordings import together
+from triaxcal.pooling import PooledEffect, pooled_analysis
 from triaxcal.text.diagnosis import chance
 from triaxcal.text.pooling import verdict
 from triaxcal.uncertainty import budget
@@ -102,7 +102,7 @@ def agree() -> Table:
     return Table(f"All eight sensors, by five runs each: {verdict(found)}", head, rows)
 
 
-def _shared(c: Common) -> str:
+def _shared(c: PooledEffect) -> str:
     of_all = (shape.shared for shape in c.shapes.values())
     return ", ".join(f"{s.value:.0f} ± {s.standard_error or float('nan'):.0f} {s.unit}" for s in of_all)
 

@@ -23,8 +23,8 @@ from benchmarks.table import Table
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import posterior_of
+from triaxcal.evidence.linearised_data import Rows
 from triaxcal.evidence.pooled import together
-from triaxcal.evidence.rows import Rows
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

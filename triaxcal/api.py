@@ -10,7 +10,7 @@ import numpy as np
 
 from triaxcal import text, uncertainty
 from triaxcal.arrays import Floats
-from triaxcal.diagnosis import Call, Candidate, Finding
+from triaxcal.diagnosis import Candidate, Finding, Recommendation
 from triaxcal.diagnosis import diagnose as diagnosed
 from triaxcal.documents import Calibration
 from triaxcal.effects import effect_named
@@ -18,7 +18,7 @@ from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate import pose_fit
 from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.hold_out import HoldOut, magnitude_errors
-from triaxcal.estimate.means import poses_of_means
+from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.evidence.findings import Unexplained
 from triaxcal.interchange import tables
 from triaxcal.model.directions import FULL, closed, directions
@@ -84,7 +84,7 @@ class Diagnosis:
 
     before: Calibration
     calibration: Calibration
-    call: Call
+    call: Recommendation
     findings: tuple[Finding, ...]
     candidates: tuple[Candidate, ...]
     probabilities: Mapping[str, float]

@@ -16,13 +16,13 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
 from triaxcal.estimate.hold_out import HoldOut, held_out
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.advice import Advice, advice, decided
-from triaxcal.evidence.average import Refusal, average, refusal
-from triaxcal.evidence.corrected import corrected
+from triaxcal.evidence.corrected_calibration import corrected
 from triaxcal.evidence.findings import Findings, Named, findings
 from triaxcal.evidence.identifiability import NotIdentifiable, not_identifiable
-from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.information_gain import Advice, advice, decided
+from triaxcal.evidence.model_average import Refusal, average, refusal
 from triaxcal.evidence.posterior import Posterior, considered, posterior_of
+from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import faults_of
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
@@ -40,7 +40,7 @@ class Verdict(StrEnum):
     """One of several acts; or it is known, and no effect is corrected (`Loop.refusal`)."""
 
 
-class Call(StrEnum):
+class Recommendation(StrEnum):
     """What to do with the calibration."""
 
     USABLE = "usable"
@@ -96,7 +96,7 @@ class Loop:
     @property
     def probabilities(self) -> Mapping[str, float]:
         """That each effect acts, whatever else does, the likeliest first."""
-        return self.posterior.of_names
+        return self.posterior.effect_probabilities
 
     @cached_property
     def advice(self) -> Advice:
@@ -119,12 +119,12 @@ class Loop:
         return bool(self.next_recording.standard > np.sqrt(2) * known)
 
     @cached_property
-    def call(self) -> Call:
-        if self.refusal in (Refusal.UNMODELLED, Refusal.ANOTHER):
-            return Call.INVESTIGATE
+    def call(self) -> Recommendation:
+        if self.refusal in (Refusal.UNMODELLED, Refusal.CHANGE_POINT):
+            return Recommendation.INVESTIGATE
         known = decided(self.posterior) and not self.candidates
         more = self.too_uncertain or self.found.outliers or (not known and self.advice.actions)
-        return Call.RECORD_MORE if more else Call.USABLE
+        return Recommendation.RECORD_MORE if more else Recommendation.USABLE
 
 
 def diagnose(
@@ -163,7 +163,7 @@ def diagnose(
         after=after,
         found=found,
         findings=tuple(report.finding(named, refused) for named in found.named),
-        candidates=tuple(Candidate(name, p, report.given(name)[0]) for name, p in found.candidates.items()),
+        candidates=tuple(Candidate(name, p, report.conditional_on(name)[0]) for name, p in found.candidates.items()),
         refusal=refused,
         held_out=None if sound_check is None else held_out(before, after, sound_check),
         not_identifiable=hidden,
@@ -176,7 +176,9 @@ def _without_outliers(
     poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], posterior: Posterior
 ) -> Calibration:
     """The linear calibration without the poses that are outliers whatever else acts, and with all others."""
-    likely = {int(i): float(p) for i, p in zip(posterior.evidence.rows.places, posterior.of_outliers, strict=True)}
+    likely = {
+        int(i): float(p) for i, p in zip(posterior.evidence.rows.places, posterior.outlier_probabilities, strict=True)
+    }
     outliers = [i for i, p in likely.items() if p >= posterior.evidence.odds.reported]
     if outliers != [i for i, p in enumerate(linear.poses) if p.excluded == Exclusion.OUTLIER]:
         with suppress(Refused):  # the others may not carry a fit
@@ -198,7 +200,7 @@ class _Report:
         probabilities = named.probabilities
         name, *others = probabilities
         adopted = not others and refused is None
-        coefficients, remedy = self._corrected(name) if adopted else self.given(name)
+        coefficients, remedy = self._corrected(name) if adopted else self.conditional_on(name)
         return Finding(
             effect=name,
             verdict=Verdict.ADOPTED if adopted else Verdict.CONFOUNDED,
@@ -209,9 +211,9 @@ class _Report:
             together=named.together,
         )
 
-    def given(self, name: str) -> tuple[Coefficients, str]:
+    def conditional_on(self, name: str) -> tuple[Coefficients, str]:
         """If it acts."""
-        made = average(self.posterior.given(name), self.moment)
+        made = average(self.posterior.conditional_on(name), self.moment)
         reference = self.posterior.evidence.rows.problem.channel_reference
         c = replace(self.after, sensor=made.sensor, covariance=made.covariance, channel_reference=reference)
         return self._of(c, name)

@@ -26,8 +26,8 @@ from triaxcal.interchange import tables
 from triaxcal.interchange.calibration_document import LINEAR, Document, calibration_document
 from triaxcal.interchange.calibration_reading import calibration_of, calibration_part
 from triaxcal.poses.covariates import covariates_elsewhere
-from triaxcal.poses.in_streams import InStream, followed
 from triaxcal.poses.pose import Pose
+from triaxcal.poses.stream_covariates import InStream, followed
 from triaxcal.uncertainty import Stated
 
 if TYPE_CHECKING:

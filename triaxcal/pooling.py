@@ -13,7 +13,7 @@ from enum import StrEnum
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import InvalidData
 from triaxcal.evidence.pooled import Pooled, pool
-from triaxcal.evidence.shapes import Shape, shapes_of
+from triaxcal.evidence.shape_posterior import Shape, shapes_of
 
 
 class Answer(StrEnum):
@@ -36,7 +36,7 @@ class SharedShape:
 
 
 @dataclass(frozen=True)
-class Common:
+class PooledEffect:
     """An effect: the ``probability`` that it acts in every unit, and ``common`` that its values are the same in all, if
     it does. ``units`` is the probability that it acts in each, by that unit alone. ``named`` are the units (indices) in
     which it is a finding by itself, ``listed`` those in which it is among others of which one acts."""
@@ -59,7 +59,7 @@ class PooledAnalysis:
     answer: Answer
     agreed: tuple[tuple[str, ...], ...]
     probability: float
-    effects: tuple[Common, ...]
+    effects: tuple[PooledEffect, ...]
     nothing: float
 
 
@@ -93,7 +93,7 @@ def _probability(group: tuple[str, ...], found: Pooled) -> float:
     return found.probability[group[0]] if len(group) == 1 else found.one_of(group)
 
 
-def _common(name: str, found: Pooled, loops: Sequence[Loop]) -> Common:
+def _common(name: str, found: Pooled, loops: Sequence[Loop]) -> PooledEffect:
     named, listed = [], []
     for i, loop in enumerate(loops):
         for finding in loop.findings:
@@ -106,5 +106,7 @@ def _common(name: str, found: Pooled, loops: Sequence[Loop]) -> Common:
         shape: SharedShape(shared, {i: of_unit[shape] for i, of_unit in own.items() if shape in of_unit})
         for shape, shared in found.shapes[name].items()
     }
-    of_units = tuple(unit.of_names.get(name, 0.0) for unit in found.units)
-    return Common(name, found.probability[name], found.common[name], of_units, tuple(named), tuple(listed), shapes)
+    of_units = tuple(unit.effect_probabilities.get(name, 0.0) for unit in found.units)
+    return PooledEffect(
+        name, found.probability[name], found.common[name], of_units, tuple(named), tuple(listed), shapes
+    )

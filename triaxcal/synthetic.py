@@ -12,7 +12,7 @@ from triaxcal.effects import TEMPERATURE
 from triaxcal.effects.contract import BEFORE, CHANGE, DURATION, LAGS_S, SINCE_START, TIME, lag_in, lag_of, rate_of
 from triaxcal.model.gravity import STANDARD_GRAVITY
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.covariates import behind
+from triaxcal.poses.covariates import lag_deviation
 from triaxcal.poses.pose import Pose
 
 LAGS = {lag_of(TEMPERATURE, constant_s): constant_s for constant_s in LAGS_S}
@@ -167,7 +167,7 @@ def noisy_poses(
     }
     needs = {name for effect, _ in sensor.effects for name in effect.needs} - held.keys()
     lags = {name: lag for name in needs if (lag := lag_in(name)) and lag[0] in held}
-    own |= {name: behind(t_s, held[channel], constant_s) for name, (channel, constant_s) in lags.items()}
+    own |= {name: lag_deviation(t_s, held[channel], constant_s) for name, (channel, constant_s) in lags.items()}
     covariates = {name: v - reference.get(name, 0.0) for name, v in {**held, **own}.items()}
     u = sensor.output(directions, covariates) + rng.standard_normal((n, 3)) * error
     return [

@@ -12,7 +12,7 @@ import numpy as np
 
 from triaxcal.documents import OUT, UNCERTAINTY, Calibration
 from triaxcal.errors import MissingChannel
-from triaxcal.poses.in_streams import InStream
+from triaxcal.poses.stream_covariates import InStream
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs

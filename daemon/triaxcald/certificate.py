@@ -22,7 +22,7 @@ from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.in_run import of_clocks
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.evidence.reduced import Reduced, reduced
+from triaxcal.estimate.reduced_calibration import Reduced, reduced
 from triaxcal.figures import micro_g
 from triaxcal.interchange.calibration_document import Document, budget_document, holds_of
 from triaxcal.model.sensor import Sensor
@@ -160,8 +160,8 @@ class HeldByDevice:
 def held_by_device(
     profile: Profile, full: Calibration, logged: Mapping[str, Floats] | None = None
 ) -> HeldByDevice | None:
-    """None where the device cannot take a calibration at all. ``logged`` as `triaxcal.evidence.reduced.reduced` has
-    it."""
+    """None where the device cannot take a calibration at all. ``logged`` as
+    `triaxcal.estimate.reduced_calibration.reduced` has it."""
     if why_not_written(profile):
         return None
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.prior import Odds
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import INTERRUPTED
 from triaxcald.files import write_text

@@ -9,8 +9,8 @@ from typing import Any
 from triaxcal.diagnosis import Finding, Loop, Verdict
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.hold_out import HoldOut
-from triaxcal.evidence.average import Refusal
 from triaxcal.evidence.findings import Unexplained
+from triaxcal.evidence.model_average import Refusal
 from triaxcal.interchange.calibration_document import (
     WEIGHT,
     Document,
@@ -89,7 +89,7 @@ def loop_document(
             for choice in choices_of(loop, held_by_device)
         ],
         "unexplained": _unexplained(loop.found.unexplained, small, reference),
-        **({"doubts": [UNIT]} if unit_in_doubt or loop.found.another else {}),
+        **({"doubts": [UNIT]} if unit_in_doubt or loop.found.change_point else {}),
         "data_quality": list(data_quality),
         "advice": list(diagnosis.advice(loop, small)),
         "calibration": calibration,
@@ -123,7 +123,7 @@ def _unexplained(part: Unexplained, small: ErrorUnit, reference: float) -> Docum
 
 def _another(loop: Loop) -> Document | None:
     """From which pose on there is another unit, or another mounting; None where that is unlikely."""
-    found = loop.found.another
+    found = loop.found.change_point
     if found is None:
         return None
     began = loop.after.poses[found.pose].pose.began

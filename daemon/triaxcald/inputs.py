@@ -13,7 +13,7 @@ import numpy as np
 
 from triaxcal.documents import Calibration
 from triaxcal.errors import InvalidData
-from triaxcal.estimate.means import poses_of_means
+from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose, poses_of

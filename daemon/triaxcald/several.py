@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from triaxcal.diagnosis import Loop
-from triaxcal.estimate.runs import residuals_by_run
-from triaxcal.evidence.shapes import Shape
+from triaxcal.estimate.recordings import residuals_by_run
+from triaxcal.evidence.shape_posterior import Shape
 from triaxcal.interchange.calibration_document import Document
-from triaxcal.pooling import Answer, Common, PooledAnalysis, SharedShape
+from triaxcal.pooling import Answer, PooledAnalysis, PooledEffect, SharedShape
 from triaxcal.rounding import chance, error, number, uncertainty
 from triaxcal.text.pooling import verdict
 from triaxcal.units import in_units_of
@@ -52,7 +52,7 @@ def agreement_document(
     }
 
 
-def _effect(c: Common, names: Sequence[str], reference_unit: str) -> Document:
+def _effect(c: PooledEffect, names: Sequence[str], reference_unit: str) -> Document:
     def recordings(indices: Sequence[int]) -> list[str]:
         return [names[i] for i in indices]
 

@@ -85,14 +85,17 @@ def test_poses_have_the_keys_of_the_contract(poses: list[Pose]) -> None:
 
 
 def test_a_pose_that_was_left_out_says_why(poses: list[Pose]) -> None:
-    begun = [replace(poses[0], before=None), *(replace(p, before=poses[i].mean) for i, p in enumerate(poses[1:]))]
-    begun[3] = replace(begun[3], fault="saturation")
+    started_problem = [
+        replace(poses[0], before=None),
+        *(replace(p, before=poses[i].mean) for i, p in enumerate(poses[1:])),
+    ]
+    started_problem[3] = replace(started_problem[3], fault="saturation")
     for effects, why, before in (
         ((), Exclusion.CALLER, "caller"),
         ((), Exclusion.OUTLIER, "spoiled"),
         ((effect_named("hysteresis"),), Exclusion.OUTLIER, "unknown_history"),
     ):
-        c = fit(begun, effects=effects, excluded=[0], why=why)
+        c = fit(started_problem, effects=effects, excluded=[0], why=why)
         poses_of_document = calibration_document(c, output_unit="V", reference_unit="g", stated=None)["poses"]
         assert poses_of_document[0]["excluded"] == ("unknown_history" if effects else why)
         assert poses_of_document[0]["left_out"] == before  # as documents of 0.1 have it

@@ -96,15 +96,15 @@ def test_what_is_meant_as_an_output_is_no_channel(recorded: Recorded) -> None:
 
 def test_times_may_be_seconds_datetimes_or_integers_of_a_unit(recorded: Recorded, poses: Any) -> None:
     ns = np.round(recorded.t * 1e9).astype(np.int64)
-    begun = np.datetime64("2026-03-01T08:00:00", "ns")
+    started_problem = np.datetime64("2026-03-01T08:00:00", "ns")
     zoned = pd.date_range("2026-03-01 10:00", periods=len(ns), freq="10ms", tz="Europe/Kyiv")
-    for times in (zoned, pd.Series(zoned), zoned.to_pydatetime().tolist(), [str(t) for t in begun + ns]):
+    for times in (zoned, pd.Series(zoned), zoned.to_pydatetime().tolist(), [str(t) for t in started_problem + ns]):
         found = tc.find_poses(times, recorded.u)
         assert [p.start_s for p in found] == pytest.approx([p.start_s for p in poses], abs=1e-6)
     for t, unit in (
         (ns, "ns"),
         (ns // 1000, "us"),
-        (begun + ns, None),
+        (started_problem + ns, None),
         (recorded.t * 1e3, "ms"),
         (recorded.t + 1.7e9, None),
     ):

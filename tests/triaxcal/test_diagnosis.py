@@ -9,10 +9,10 @@ import pytest
 
 from tests.triaxcal.evidence.conftest import MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
-from triaxcal.diagnosis import Call, Loop, Verdict, diagnose
+from triaxcal.diagnosis import Loop, Recommendation, Verdict, diagnose
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.runs import together
+from triaxcal.estimate.recordings import together
 from triaxcal.evidence import Refusal, posterior_of
 from triaxcal.evidence.identifiability import Why
 from triaxcal.model.moment import Moment
@@ -58,7 +58,7 @@ def test_a_likely_name_is_a_candidate_with_what_it_would_be(poses_with: Poses) -
         (candidate,) = loop.candidates
         assert candidate.effect == "second_order_nonlinearity"
         # Where no pose is expected to tell more, there is none to record.
-        assert loop.call is (Call.RECORD_MORE if loop.advice.actions else Call.USABLE)
+        assert loop.call is (Recommendation.RECORD_MORE if loop.advice.actions else Recommendation.USABLE)
         assert loop.advice.expected["second_order_nonlinearity"].if_it_acts > candidate.probability
         assert 0.5 <= candidate.probability < 0.99
         value, error, _ = candidate.coefficients["x"]
@@ -72,7 +72,7 @@ def test_where_nothing_acts_nothing_is_told(poses_with: Poses) -> None:
         assert loop.findings == loop.candidates == ()
         assert loop.after.terms == ("linear",)
         assert loop.refusal is None
-        assert loop.call is Call.USABLE
+        assert loop.call is Recommendation.USABLE
         assert loop.advice.actions == ()
 
 
@@ -80,7 +80,7 @@ def test_where_something_has_no_name_nothing_is_corrected() -> None:
     recording = Case("dead_zone", 1, (100.0, 200.0), 26, "white").make()
     loop = diagnose(still_poses(recording.samples()), signs=recording.signs)
     assert loop.refusal is Refusal.UNMODELLED
-    assert loop.call is Call.INVESTIGATE
+    assert loop.call is Recommendation.INVESTIGATE
     assert loop.found.unexplained.probability > 0.5
     assert loop.after.terms == ("linear",)
     assert all(f.verdict is Verdict.CONFOUNDED for f in loop.findings)
@@ -99,7 +99,7 @@ def test_an_outlier_is_left_out_before_and_after(poses_with: Poses, knocked: Kno
 def test_poses_that_an_effect_explains_are_no_outliers(poses_with: Poses) -> None:
     loop = closed(poses_with(8, bias_step=[3e-3, -2e-3, 3e-3]))
     assert all(p.used for p in loop.before.poses)
-    assert max(loop.posterior.of_outliers) < 0.5
+    assert max(loop.posterior.outlier_probabilities) < 0.5
 
 
 def test_a_faulty_pose_has_no_part_and_stays_in_the_list(poses_with: Poses) -> None:

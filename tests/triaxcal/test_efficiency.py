@@ -8,8 +8,8 @@ from scipy import stats
 
 from benchmarks.efficiency import measure
 from benchmarks.truth import Condition, bound_and_best, covariates, hard, information
-from triaxcal.estimate.problem import linearise, solve
-from triaxcal.estimate.start import problem_of, start
+from triaxcal.estimate.initial_estimate import problem_of, start
+from triaxcal.estimate.likelihood import linearise, solve
 
 FAMILYWISE = 1e-4
 COVARIATES = {c.name: c for c in covariates()}

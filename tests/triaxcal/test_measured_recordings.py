@@ -18,7 +18,7 @@ from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.errors import Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Refusal
-from triaxcal.evidence.unmodelled import What
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.stillness.detector import StillnessDetector
 
@@ -143,12 +143,12 @@ def test_run_6_holds_a_drift_and_the_residual_falls_threefold_with_it(
     sensor: int, diagnosed: Callable[[str], Loop]
 ) -> None:
     loop = diagnosed(f"mimu4444/run6_sensor{sensor}")
-    assert loop.seen.any_of(OF_TIME) + loop.seen.of_kinds[What.TIME] > 0.99
+    assert loop.seen.any_of(OF_TIME) + loop.seen.unmodelled_kind_probabilities[UnmodelledKind.TIME] > 0.99
     told = {name for f in loop.findings for name in (f.effect, *f.alternatives)} | {c.effect for c in loop.candidates}
     assert told <= OF_TIME
     if sensor == NOT_CORRECTED:
         assert loop.refusal is Refusal.UNMODELLED
-        assert loop.found.unexplained.kind is What.TIME
+        assert loop.found.unexplained.kind is UnmodelledKind.TIME
     else:
         assert told
         assert set(loop.after.terms) <= {"linear", *OF_TIME}

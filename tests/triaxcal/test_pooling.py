@@ -15,7 +15,7 @@ from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.model.directions import directions
-from triaxcal.pooling import Answer, Common, PooledAnalysis, pooled_analysis
+from triaxcal.pooling import Answer, PooledAnalysis, PooledEffect, pooled_analysis
 from triaxcal.poses.pose import Pose
 
 SIGMA_G, HOLD_S, COUNT = 1e-5, 10.0, 26
@@ -65,7 +65,7 @@ def alike(time_constants_s: Sequence[float], size_g: float = 1e-4) -> list[Calla
     return [lambda rng, tau=tau: warming(rng, tau, size_g) for tau in time_constants_s]  # type: ignore[misc]
 
 
-def named(found: PooledAnalysis, name: str) -> Common:
+def named(found: PooledAnalysis, name: str) -> PooledEffect:
     return next(c for c in found.effects if c.effect == name)
 
 

@@ -10,8 +10,8 @@ from scipy import stats
 
 from triaxcal.errors import Refused
 from triaxcal.estimate.caution import FewPoses, PoorSpread
+from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.start import problem_of, start
 from triaxcal.model.directions import cube_directions, dilution
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose

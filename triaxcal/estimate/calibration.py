@@ -86,7 +86,8 @@ class Exclusion(StrEnum):
 @dataclass(frozen=True)
 class PoseResult:
     """One pose under the fit. ``direction`` (3,) is up in the sensor's frame; ``residual_g`` is |a| − reference;
-    ``standard_error_g`` that of its noise, ``raised_g`` with what residuals show beyond noise, where that is known.
+    ``standard_error_g`` that of its noise, ``total_standard_error_g`` with what residuals show beyond noise, where that
+    is known.
     """
 
     pose: Pose
@@ -96,7 +97,7 @@ class PoseResult:
     studentized: float
     leverage: float
     excluded: Exclusion | None = None
-    raised_g: float | None = None
+    total_standard_error_g: float | None = None
     largest_leverage: float = 0.0
     """0…1: how much of some combination of its mean and its slope the pose determines by itself."""
     outlier_probability: float | None = None
@@ -105,7 +106,7 @@ class PoseResult:
     @property
     def error_g(self) -> float:
         """The standard error by all that is known."""
-        return self.standard_error_g if self.raised_g is None else self.raised_g
+        return self.standard_error_g if self.total_standard_error_g is None else self.total_standard_error_g
 
     @property
     def used(self) -> bool:
@@ -123,7 +124,7 @@ class Calibration:
     effective degrees of freedom behind the standard errors. ``shape_errors`` are standard errors of the effects'
     shapes, by "effect.name". ``slopes``: how |a| goes inside the poses was fitted along with their means.
     ``weights`` is the probability of each effect where the coefficients are means over all that may act. Then
-    ``spread`` (p,) are the standard deviations of the coefficients before the poses were seen, and ``thermal``
+    ``prior_sd`` (p,) are the standard deviations of the coefficients before the poses were seen, and ``thermal``
     (9+p,9+p) is the part of the covariance that thermal effects make which the model has not.
     ``holds_at`` None: effects of time count as long after the start, as in documents of 0.1. ``linear_only`` is the
     linear model fitted by itself, where there are effects and somebody asked for it.
@@ -145,7 +146,7 @@ class Calibration:
     blind_to: tuple[str, ...] = ()
     cautions: tuple[Caution, ...] = ()
     weights: Mapping[str, float] = field(default_factory=dict)
-    spread: Floats | None = field(default=None, repr=False)
+    prior_sd: Floats | None = field(default=None, repr=False)
     thermal: Floats | None = field(default=None, repr=False)
     holds_at: HoldsAt | None = None
     linear_only: Calibration | None = field(default=None, repr=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from triaxcal.poses.pose import Began
+from triaxcal.poses.pose import PoseStart
 
 
 @dataclass(frozen=True)
@@ -16,10 +16,10 @@ class Caution:
 
 
 @dataclass(frozen=True)
-class Outlier:
+class ExcludedPose:
     """A pose that a fit excludes, when it began and how many standard errors off it is."""
 
-    began: Began
+    began: PoseStart
     studentized: float
 
 
@@ -27,19 +27,19 @@ class Outlier:
 class FaultyPosesExcluded(Caution):
     """The outputs did not follow the acceleration; ``faults`` by data-quality name."""
 
-    faults: tuple[tuple[Began, str], ...]
+    faults: tuple[tuple[PoseStart, str], ...]
 
 
 @dataclass(frozen=True)
 class UnknownHistoryExcluded(Caution):
     """An effect goes with the pose before, which nobody knows."""
 
-    poses: tuple[Outlier, ...]
+    poses: tuple[ExcludedPose, ...]
 
 
 @dataclass(frozen=True)
 class PosesExcludedByCaller(Caution):
-    poses: tuple[Outlier, ...]
+    poses: tuple[ExcludedPose, ...]
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class OutliersExcluded(Caution):
     """``doubtful``: the other residuals leave it open whether all poses repeat less well than their noise says, and the
     standard errors allow for that, by ``excess`` (in the reference) where it is not 0."""
 
-    poses: tuple[Outlier, ...]
+    poses: tuple[ExcludedPose, ...]
     doubtful: bool
     excess: float
 
@@ -56,7 +56,7 @@ class OutliersExcluded(Caution):
 class OutlierSetsTied(Caution):
     """Any of these sets of poses may be outliers, or something else acts; none is excluded."""
 
-    sets: tuple[tuple[Began, ...], ...]
+    sets: tuple[tuple[PoseStart, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class FewPoses(Caution):
 class HighLeverage(Caution):
     """One pose alone determines a parameter."""
 
-    began: Began
+    began: PoseStart
     leverage: float
 
 

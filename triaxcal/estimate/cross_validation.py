@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from triaxcal.arrays import Ints
-from triaxcal.estimate.problem import Problem, State, linearise, linearise_all, solve
+from triaxcal.estimate.likelihood import Problem, State, linearise, linearise_all, solve
 
 STRAIGHT = 1e-4
 """Steps of the scaled parameters up to which the fit is straight, to about this share of the step."""

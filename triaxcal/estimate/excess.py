@@ -17,8 +17,8 @@ import scipy
 
 from triaxcal.arrays import Floats
 from triaxcal.errors import NotStill
-from triaxcal.estimate.problem import Linearised, Problem, State, linearise
-from triaxcal.estimate.slopes import left_of
+from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise
+from triaxcal.estimate.pose_slopes import residual_chi2
 from triaxcal.poses.pure_error import lack_of_fit_p
 
 NO_CHANCE = 1e-4
@@ -37,7 +37,7 @@ class Excess:
     excess_g: float = 0.0
 
     @classmethod
-    def shown(cls, left_by: Linearised, n: int, left: int, pure_dof: float) -> Excess:
+    def estimated(cls, left_by: Linearised, n: int, left: int, pure_dof: float) -> Excess:
         """That with which the sum of squares that a fit leaves is its ``left`` degrees of freedom, in linear reckoning
         from residuals, derivatives and errors near its minimum, of which the first ``n`` are the means of the poses.
         ``pure_dof`` are the degrees of freedom of the noise inside the poses.
@@ -50,7 +50,7 @@ class Excess:
 
         def ratio(excess: float) -> float:
             error = s * np.tile(_widened(s[:n], excess), len(s) // n)
-            return left_of((r, J, error)) / left
+            return residual_chi2((r, J, error)) / left
 
         whole = ratio(0.0) if left > 0 else 1.0
         if not np.isfinite(whole):
@@ -63,7 +63,7 @@ class Excess:
             high *= 2
         return cls(excess_g=float(scipy.optimize.brentq(lambda e: ratio(e) - 1, 0.0, high, xtol=EXACT * high)))
 
-    def beside(self, problem: Problem, state: State) -> Problem:
+    def added_to(self, problem: Problem, state: State) -> Problem:
         """The problem with the excess; ``state`` is near its minimum. What else a pose tells is widened as its
         mean is: what acts between poses may act inside them as well."""
         if not self.excess_g:

@@ -11,19 +11,19 @@ from triaxcal.arrays import Ints
 from triaxcal.estimate.calibration import Calibration, Exclusion, PoseResult
 from triaxcal.estimate.caution import (
     Caution,
+    ExcludedPose,
     FaultyPosesExcluded,
-    Outlier,
     OutlierSetsTied,
     OutliersExcluded,
     PosesExcludedByCaller,
     UnknownHistoryExcluded,
 )
 from triaxcal.estimate.excess import Excess
+from triaxcal.estimate.likelihood import Problem, State, linearise, solve
 from triaxcal.estimate.outliers import OutlierSet, not_as_predicted, outlier_set
-from triaxcal.estimate.problem import Problem, State, linearise, solve
 from triaxcal.poses.covariates import of_unknown_history
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import of_both, pose_dof, pure_error_dof
+from triaxcal.poses.pure_error import combined_dof, pose_dof, pure_error_dof
 
 OUTLIER_ROUNDS = 4
 
@@ -46,9 +46,9 @@ def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> Out
         rest: Ints = np.delete(np.arange(len(poses)), found.rows)
         others, left = problem.only(rest), len(rest) - len(state.theta)
         state = solve(others, state, state.effects)
-        judged = replace(problem, excess=Excess.shown(linearise(others, state), len(rest), left, together).excess_g)
+        judged = replace(problem, excess=Excess.estimated(linearise(others, state), len(rest), left, together).excess_g)
         share = judged.excess**2 / linearise(judged, state)[2] ** 2
-        dof, pure = of_both(share, left, own), float(of_both(share.mean(), left, together))
+        dof, pure = combined_dof(share, left, own), float(combined_dof(share.mean(), left, together))
     return found
 
 
@@ -102,8 +102,8 @@ def with_excluded(
     unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects]) if why != Exclusion.CALLER else ()
     results, added = _among(calibration, poses, {i: Exclusion.UNKNOWN_HISTORY if i in unknown else why for i in rows})
 
-    def those(reason: Exclusion) -> tuple[Outlier, ...]:
-        return tuple(Outlier(p.pose.began, p.studentized) for p in added if p.excluded == reason)
+    def those(reason: Exclusion) -> tuple[ExcludedPose, ...]:
+        return tuple(ExcludedPose(p.pose.began, p.studentized) for p in added if p.excluded == reason)
 
     cautions: list[Caution] = []
     if excused := those(Exclusion.UNKNOWN_HISTORY):

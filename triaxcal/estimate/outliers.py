@@ -50,28 +50,28 @@ class OutlierSet:
 
 
 @dataclass(frozen=True)
-class _Judge:
-    """Residuals ``rest`` (n,) after the fit in units of the poses' standard errors, ``q`` (n,p) whose product with its
-    transpose is the hat matrix H.
+class _DeletionDiagnostics:
+    """Residuals ``residuals`` (n,) after the fit in units of the poses' standard errors, ``q`` (n,p) whose product with
+    its transpose is the hat matrix H.
 
     ``dof`` (n,) behind each standard error, ``pure_dof`` behind them together; zero where the noise is not known.
     """
 
-    rest: Floats
+    residuals: Floats
     q: Floats
-    left: int
+    residual_dof: int
     dof: Floats
     pure_dof: float
 
     @property
     def chi2(self) -> float:
-        return float(self.rest @ self.rest)
+        return float(self.residuals @ self.residuals)
 
     def singles(self) -> tuple[Ints, Floats]:
         """Rows (n,1), and what each takes out of the sum of squares."""
         share = 1 - (self.q**2).sum(axis=1)
-        taken = np.where(share > FREE_LEAST, self.rest**2 / np.maximum(share, FREE_LEAST), 0.0)
-        return np.arange(len(self.rest))[:, None], taken
+        taken = np.where(share > FREE_LEAST, self.residuals**2 / np.maximum(share, FREE_LEAST), 0.0)
+        return np.arange(len(self.residuals))[:, None], taken
 
     def pairs(self) -> tuple[Ints, Floats]:
         """Likewise for pairs of rows, (m,2), among those that take most alone."""
@@ -80,28 +80,28 @@ class _Judge:
         first, second = np.triu_indices(len(rows), 1)
         a, b, c = free[first, first], free[second, second], free[first, second]
         i, j = rows[first], rows[second]
-        r, s = self.rest[i], self.rest[j]
+        r, s = self.residuals[i], self.residuals[j]
         determinant = a * b - c**2
         sound = determinant > FREE_LEAST * np.maximum(a, b)
         taken = (b * r**2 - 2 * c * r * s + a * s**2) / np.where(sound, determinant, 1.0)
         return np.stack([i, j], axis=1), np.where(sound, taken, 0.0)
 
-    def off(self, rows: Ints) -> Floats:
+    def deleted_residuals(self, rows: Ints) -> Floats:
         """By how much the poses in ``rows`` are off, from the fit to the others."""
-        return np.linalg.solve(self.free(rows), self.rest[rows])
+        return np.linalg.solve(self.free(rows), self.residuals[rows])
 
     def free(self, rows: Ints) -> Floats:
         """(1 − H) among ``rows``."""
         return np.eye(len(rows)) - self.q[rows] @ self.q[rows].T
 
     def excess(self, after: float, left: int) -> float:
-        """What is left, ``after`` in ``left`` degrees of freedom, over the noise; 1 where that explains it."""
+        """What is left, ``after`` in ``residual_dof`` degrees of freedom, over the noise; 1 where that explains it."""
         known = self.pure_dof >= 1
         return 1.0 if known and f_sf(after / left, left, self.pure_dof) >= EXCESS else after / left
 
     def by_rest(self, taken: float, size: int) -> float:
         """Probability that ``size`` rows take so much, against what is left without them alone."""
-        after, left = max(self.chi2 - taken, 1e-300), self.left - size
+        after, left = max(self.chi2 - taken, 1e-300), self.residual_dof - size
         return float(f_sf(taken / size / (after / left), size, left))
 
     def p(self, taken: float, rows: Ints, before: float, left: int) -> float:
@@ -125,7 +125,7 @@ def outlier_set(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> OutlierSe
     n, parameters = J.shape
     left = n - parameters
     q, _ = np.linalg.qr(J)
-    judge = _Judge(r - q @ (q.T @ r), q, left, dof, pure_dof)
+    judge = _DeletionDiagnostics(r - q @ (q.T @ r), q, left, dof, pure_dof)
     best, best_p = OutlierSet(), ALARM
     for size, (rows, taken) in enumerate((judge.singles(), judge.pairs()), 1):
         if left - size < LEFT_LEAST:
@@ -142,17 +142,17 @@ def not_as_predicted(r: Floats, J: Floats, pure_dof: float, rows: Sequence[int])
     out of the sum of squares than a coefficient of its own costs. Arguments are those of `outlier_set`."""
     n, parameters = J.shape
     q, _ = np.linalg.qr(J)
-    judge = _Judge(r - q @ (q.T @ r), q, n - parameters, np.zeros(n), pure_dof)
+    judge = _DeletionDiagnostics(r - q @ (q.T @ r), q, n - parameters, np.zeros(n), pure_dof)
     _, taken = judge.singles()
-    if judge.left < 2:
+    if judge.residual_dof < 2:
         return ()
-    return tuple(i for i in rows if taken[i] > np.log(n) * judge.excess(judge.chi2 - taken[i], judge.left - 1))
+    return tuple(i for i in rows if taken[i] > np.log(n) * judge.excess(judge.chi2 - taken[i], judge.residual_dof - 1))
 
 
-def _unless_tied(judge: _Judge, rows: Ints, taken: Floats) -> OutlierSet:
+def _unless_tied(judge: _DeletionDiagnostics, rows: Ints, taken: Floats) -> OutlierSet:
     size = rows.shape[1]
     most = float(taken.max())
-    excess = judge.excess(max(judge.chi2 - most, 0.0), judge.left - size)
+    excess = judge.excess(max(judge.chi2 - most, 0.0), judge.residual_dof - size)
     near = rows[taken >= most - TIED * size * excess]
     sets = tuple(tuple(int(i) for i in row) for row in near)
     certain = tuple(sorted(set.intersection(*map(set, sets))))
@@ -161,16 +161,16 @@ def _unless_tied(judge: _Judge, rows: Ints, taken: Floats) -> OutlierSet:
     return OutlierSet(certain, tied, bool(certain) and doubtful)
 
 
-def _each_stands_alone(judge: _Judge, rows: Ints, both: float) -> bool:
+def _each_stands_alone(judge: _DeletionDiagnostics, rows: Ints, both: float) -> bool:
     """Whether each is off by enough, and either of a pair would be suspect if the other had never been there."""
-    excess = judge.excess(max(judge.chi2 - both, 0.0), judge.left - len(rows))
-    if np.min(np.abs(judge.off(rows))) < LEAST * np.sqrt(excess):
+    excess = judge.excess(max(judge.chi2 - both, 0.0), judge.residual_dof - len(rows))
+    if np.min(np.abs(judge.deleted_residuals(rows))) < LEAST * np.sqrt(excess):
         return False
     if len(rows) == 1:
         return True
     _, singles = judge.singles()
     for one, other in (rows, rows[::-1]):
         alone = float(singles[other])
-        if judge.p(both - alone, np.array([one]), judge.chi2 - alone, judge.left - 1) * len(singles) > ALARM:
+        if judge.p(both - alone, np.array([one]), judge.chi2 - alone, judge.residual_dof - 1) * len(singles) > ALARM:
             return False
     return True

@@ -24,8 +24,8 @@ from triaxcal.estimate.caution import (
 from triaxcal.estimate.cross_validation import cross_validated
 from triaxcal.estimate.excess import Excess
 from triaxcal.estimate.exclusion import outliers_among, with_excluded, with_faulty, with_tied_sets, with_unknown_history
-from triaxcal.estimate.outliers import OutlierSet
-from triaxcal.estimate.problem import (
+from triaxcal.estimate.initial_estimate import DILUTION_LIMIT, started_problem
+from triaxcal.estimate.likelihood import (
     Linearised,
     Problem,
     State,
@@ -35,9 +35,9 @@ from triaxcal.estimate.problem import (
     parameters_by_theta,
     solve,
 )
-from triaxcal.estimate.shapes import shape_errors
-from triaxcal.estimate.slopes import left_of, slopes_p, with_slopes
-from triaxcal.estimate.start import DILUTION_LIMIT, begun
+from triaxcal.estimate.outliers import OutlierSet
+from triaxcal.estimate.pose_slopes import residual_chi2, slopes_p, with_slopes
+from triaxcal.estimate.shape_errors import shape_errors
 from triaxcal.model.directions import dilution, linear_design, most_wanted
 from triaxcal.poses.covariates import of_unknown_history
 from triaxcal.poses.pose import Pose
@@ -76,9 +76,9 @@ def fit(
     if len(sound) < len(poses):
         among = None if excluded is None else [k for k, i in enumerate(sound) if i in excluded]
         kept = [poses[i] for i in sound]
-        found_of = fit(kept, signs=signs, reference=reference, effects=effects, excluded=among, why=why)
-        return replace(with_faulty(found_of, poses), holds_at=HoldsAt.of(poses))
-    whole, begin = begun(poses, signs=signs, reference=reference, effects=effects)
+        sound_fit = fit(kept, signs=signs, reference=reference, effects=effects, excluded=among, why=why)
+        return replace(with_faulty(sound_fit, poses), holds_at=HoldsAt.of(poses))
+    whole, begin = started_problem(poses, signs=signs, reference=reference, effects=effects)
     missing = {n for e in effects for n in e.needs if n not in whole.channel_reference and lag_in(n) is None}
     if missing:
         raise InvalidData(f"the poses have no channel {', '.join(sorted(missing))}, which the effects need")
@@ -95,7 +95,7 @@ def fit(
     kept, problem = list(poses), whole
     if found:
         kept = [p for i, p in enumerate(poses) if i not in found]
-        problem, begin = begun(kept, signs=signs, reference=reference, effects=effects)
+        problem, begin = started_problem(kept, signs=signs, reference=reference, effects=effects)
         by_means = None
     # What may be no worse than the others shows by how much all come back less well than their noise.
     judged = whole.only(np.setdiff1d(np.arange(len(poses)), unknown)) if verdict.doubtful else None
@@ -131,7 +131,7 @@ def _solved(
 
 
 @dataclass(frozen=True)
-class _Left:
+class _ResidualChi2:
     """``chi2``, in units of the noise inside the poses, that a fit leaves in ``left`` degrees of freedom;
     ``with_doubtful`` the same with excluded poses whose residuals tell how well all come back, and what these show
     ``excess`` noise."""
@@ -144,7 +144,7 @@ class _Left:
     @classmethod
     def of(
         cls, everything_left: Linearised, problem: Problem, state: State, judged: Problem | None, pure: float
-    ) -> _Left:
+    ) -> _ResidualChi2:
         """``judged`` are the means of all those poses where they are more; ``pure`` the degrees of freedom of the noise
         inside them."""
         n = len(problem.u)
@@ -153,12 +153,12 @@ class _Left:
         by_means = problem.slopes is None or n > spent
         r, J, s = everything_left
         own = (r[:n], J[:n], s[:n]) if by_means else everything_left
-        chi2, left = left_of(own), len(own[0]) - spent
+        chi2, left = residual_chi2(own), len(own[0]) - spent
         if judged is None or not by_means:
-            return cls(chi2, left, (chi2, left), Excess.shown(own, n, left, pure))
+            return cls(chi2, left, (chi2, left), Excess.estimated(own, n, left, pure))
         others = linearise(judged, State.of(judged, state.sensor(problem)))
-        with_doubtful = left_of(others), left + len(judged.u) - n
-        return cls(chi2, left, with_doubtful, Excess.shown(others, len(judged.u), with_doubtful[1], pure))
+        with_doubtful = residual_chi2(others), left + len(judged.u) - n
+        return cls(chi2, left, with_doubtful, Excess.estimated(others, len(judged.u), with_doubtful[1], pure))
 
 
 def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Problem | None) -> Calibration:
@@ -167,10 +167,10 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
     if not (np.isfinite(J).all() and np.isfinite(every_r).all()):
         raise NotStill("the fit ran away")
     n, p = len(poses), J.shape[1]
-    found = _Left.of((every_r, J, every_s), problem, state, judged, pure_error_dof(poses))
+    found = _ResidualChi2.of((every_r, J, every_s), problem, state, judged, pure_error_dof(poses))
     noise, birge_ratio = every_s[:n], found.excess.birge_ratio
     if found.excess.excess_g:
-        problem = found.excess.beside(problem, state)
+        problem = found.excess.added_to(problem, state)
         state = solve(problem, state, state.effects)
         every_r, J, every_s = linearise_all(problem, state)
     r, s = every_r[:n], every_s[:n]
@@ -214,7 +214,7 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
                 float(noise[i]),
                 float(studentized[i]),
                 float(leverage[i]),
-                raised_g=float(s[i]) * birge_ratio,
+                total_standard_error_g=float(s[i]) * birge_ratio,
                 largest_leverage=float(largest_leverage[i]),
             )
             for i, pose in enumerate(poses)

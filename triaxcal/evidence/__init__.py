@@ -3,20 +3,20 @@
 `triaxcal.diagnosis` tells what follows from it; `benchmarks.frozen` holds it against what went before.
 """
 
-from triaxcal.evidence.actions import Action, ActionKind
-from triaxcal.evidence.advice import Advice, Expected, advice
-from triaxcal.evidence.average import Average, Refusal, average, refusal
-from triaxcal.evidence.findings import Another, Findings, Named, Unexplained, findings
-from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.candidate_actions import Action, ActionKind
+from triaxcal.evidence.findings import ChangePoint, Findings, Named, Unexplained, findings
+from triaxcal.evidence.information_gain import Advice, Expected, advice
+from triaxcal.evidence.model_average import Average, Refusal, average, refusal
 from triaxcal.evidence.pooled import Pooled, pool
 from triaxcal.evidence.posterior import Posterior, posterior_of
+from triaxcal.evidence.prior import Odds
 
 __all__ = [
     "Action",
     "ActionKind",
     "Advice",
-    "Another",
     "Average",
+    "ChangePoint",
     "Expected",
     "Findings",
     "Named",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.unmodelled import What
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ class Unexplained:
     large it then is, as an rms of |a| over the poses, in the unit of the reference."""
 
     probability: float
-    kind: What | None
+    kind: UnmodelledKind | None
     rms_g: float
     significant: bool
     """Whether it is likelier than not."""
 
 
 @dataclass(frozen=True)
-class Another:
+class ChangePoint:
     """From this pose on there is another unit, or another mounting."""
 
     pose: int
@@ -58,7 +58,7 @@ class Findings:
     candidates: Mapping[str, float]
     outliers: Mapping[int, float]
     unexplained: Unexplained
-    another: Another | None
+    change_point: ChangePoint | None
     nothing: float
 
 
@@ -66,30 +66,32 @@ def findings(posterior: Posterior) -> Findings:
     odds = posterior.evidence.odds
     certain = {name for group in posterior.certain for name in group}
     places = posterior.evidence.rows.places
-    outliers = {int(places[i]): float(p) for i, p in enumerate(posterior.of_outliers) if p >= odds.reported}
-    another = int(places[int(np.argmax(posterior.of_another))])
-    from_there_on = float(posterior.of_another.sum())
+    outliers = {int(places[i]): float(p) for i, p in enumerate(posterior.outlier_probabilities) if p >= odds.reported}
+    another = int(places[int(np.argmax(posterior.change_point_probabilities))])
+    from_there_on = float(posterior.change_point_probabilities.sum())
     return Findings(
         named=tuple(
-            Named({name: posterior.of_names[name] for name in group}, posterior.any_of(group))
+            Named({name: posterior.effect_probabilities[name] for name in group}, posterior.any_of(group))
             for group in posterior.certain
         ),
-        candidates={n: p for n, p in posterior.of_names.items() if p >= odds.reported and n not in certain},
+        candidates={n: p for n, p in posterior.effect_probabilities.items() if p >= odds.reported and n not in certain},
         outliers=dict(sorted(outliers.items(), key=lambda item: -item[1])),
         unexplained=_unexplained(posterior),
-        another=Another(another, from_there_on) if from_there_on >= odds.reported else None,
+        change_point=ChangePoint(another, from_there_on) if from_there_on >= odds.reported else None,
         nothing=_nothing(posterior),
     )
 
 
 def _unexplained(posterior: Posterior) -> Unexplained:
-    rows, total = posterior.evidence.rows, posterior.of_unmodelled
+    rows, total = posterior.evidence.rows, posterior.unmodelled_probability
     variance = 0.0
-    for p, part in zip(posterior.of_parts, posterior.evidence.parts, strict=True):
-        if part.kind is not None and part.kind.what is not What.INSIDE:
+    for p, part in zip(posterior.part_probabilities, posterior.evidence.parts, strict=True):
+        if part.kind is not None and part.kind.what is not UnmodelledKind.WITHIN_POSE:
             squares = np.diag(part.kind.covariance)[: rows.n] * rows.error[: rows.n] ** 2
             variance += float(p) * part.tau**2 * float(np.mean(squares))
-    likeliest = next((what for what in posterior.of_kinds if what is not What.INSIDE), None)
+    likeliest = next(
+        (what for what in posterior.unmodelled_kind_probabilities if what is not UnmodelledKind.WITHIN_POSE), None
+    )
     rms = float(np.sqrt(variance / total)) if total > 0 else 0.0
     return Unexplained(total, likeliest, rms, total >= posterior.evidence.odds.reported)
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import log_sum_exp
-from triaxcal.evidence.evidence import Evidence, SetEvidence
+from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.shapes import Shape, shapes_by
+from triaxcal.evidence.shape_posterior import Shape, shapes_by
 from triaxcal.evidence.terms import Term
 
 LIKELY = 3
@@ -35,14 +35,14 @@ Form = tuple[str, tuple[str, ...], tuple[int, ...]]
 class Pooled:
     """Hypotheses are that one effect acts in every unit, of one form, shape and size, or that each unit is for itself.
 
-    ``shared`` is the probability of the first by name, ``apart`` that of the second. ``probability`` is that each
-    effect acts in every unit, whatever else does, the likeliest first; ``common`` that its values then are one for all,
-    and ``shapes`` has what its shape is. ``nothing`` is the probability that no effect acts in any unit.
+    ``shared`` is the probability of the first by name, ``independent_probability`` that of the second. ``probability``
+    is that each effect acts in every unit, whatever else does, the likeliest first; ``common`` that its values then are
+    one for all, and ``shapes`` has what its shape is. ``nothing`` is the probability that no effect acts in any unit.
     """
 
     units: Sequence[Posterior]
     shared: Mapping[str, float]
-    apart: float
+    independent_probability: float
     probability: Mapping[str, float]
     common: Mapping[str, float]
     shapes: Mapping[str, Mapping[str, Shape]]
@@ -51,7 +51,9 @@ class Pooled:
     def one_of(self, names: Sequence[str]) -> float:
         """The probability that one of these effects, the same, acts in every unit; at least, where units that share
         nothing may have several of them."""
-        total = self.apart * max(_product(unit.of_names.get(name, 0.0) for unit in self.units) for name in names)
+        total = self.independent_probability * max(
+            _product(unit.effect_probabilities.get(name, 0.0) for unit in self.units) for name in names
+        )
         for other, p in self.shared.items():
             if other in names:
                 total += p
@@ -75,16 +77,16 @@ class Pooled:
 def pool(units: Sequence[Posterior]) -> Pooled:
     """Of units whose posteriors are of one catalogue and one grid of sizes (`Posterior.resized`). Names that some unit
     cannot show are left out. Where an effect acts in all, another is asked about beside it."""
-    found, given = _asked(units, frozenset()), units
+    found, given = _pooled_conditional_on(units, frozenset()), units
     odds, acting = units[0].evidence.odds, list[str]()
     while len(acting) < odds.together - 1:
         name = next((n for n, p in found.probability.items() if p >= odds.certain and n not in acting), None)
         if name is None:
             break
-        given, acting = [unit.given(name) for unit in given], [*acting, name]
+        given, acting = [unit.conditional_on(name) for unit in given], [*acting, name]
         if not all(unit.sets for unit in given):
             break
-        found = _given(found, _asked(given, frozenset(acting)), found.probability[name])
+        found = _given(found, _pooled_conditional_on(given, frozenset(acting)), found.probability[name])
     return found
 
 
@@ -100,7 +102,7 @@ def _given(found: Pooled, more: Pooled, p: float) -> Pooled:
     )
 
 
-def _asked(units: Sequence[Posterior], acting: frozenset[str]) -> Pooled:
+def _pooled_conditional_on(units: Sequence[Posterior], acting: frozenset[str]) -> Pooled:
     """Beside effects that are ``acting`` in all sets of every unit."""
     first = units[0].evidence
     terms = [_terms(unit.evidence) for unit in units]
@@ -135,7 +137,7 @@ def _asked(units: Sequence[Posterior], acting: frozenset[str]) -> Pooled:
         for name in own
     }
     alone = float(np.exp(apart - total))
-    none = _product(unit.of_sets_of_names.get(frozenset(), 0.0) for unit in units)
+    none = _product(unit.effect_set_probabilities.get(frozenset(), 0.0) for unit in units)
     found = Pooled(units, shared, alone, {}, of_values, shapes, alone * none)
     acts = {name: found.one_of((name,)) for name in shared}
     return replace(found, probability=dict(sorted(acts.items(), key=lambda item: -item[1])))
@@ -147,7 +149,7 @@ def _product(probabilities: Iterable[float]) -> float:
 
 def _acts_beside(unit: Posterior, name: str, other: str) -> float:
     """The probability that an effect acts in a unit in which the other does."""
-    with_other = {names: p for names, p in unit.of_sets_of_names.items() if other in names}
+    with_other = {names: p for names, p in unit.effect_set_probabilities.items() if other in names}
     total = sum(with_other.values())
     return sum(p for names, p in with_other.items() if name in names) / total if total > 0 else 0.0
 
@@ -206,7 +208,7 @@ def _bases(unit: Posterior, acting: frozenset[str]) -> list[_Base]:
     sets = [m for m in dict.fromkeys(some) if acting <= {evidence.terms[i].name for i in m}]
     known = {found.members: found for found in unit.sets}
     # Whatever part is likely beside some set: an effect may take the place of a part.
-    likely = [row for row, part in enumerate(unit.sets[0].parts) if unit.of_parts[part] > np.exp(-NEGLIGIBLE)]
+    likely = [row for row, part in enumerate(unit.sets[0].parts) if unit.part_probabilities[part] > np.exp(-NEGLIGIBLE)]
     out = []
     for members in sets:
         found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
@@ -256,7 +258,7 @@ def _equations(unit: Posterior, bases: Sequence[_Base], name: str, none: bool) -
     share = float(found.by_part[row]) - without + _log_without(unit, bases, name)
     of_terms, chi2 = evidence.normal_equations(found.parts[row], found.members, found.sizes[cell], mine)
     explained = max(_explained(*equations) for equations in of_terms.values())
-    return _Equations(of_terms, chi2, evidence.rows.noise_given(chi2 - explained), share)
+    return _Equations(of_terms, chi2, evidence.rows.noise_variance_given(chi2 - explained), share)
 
 
 def _explained(information: Floats, score: Floats) -> float:
@@ -280,12 +282,14 @@ def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations
         np.array([of_unit.chi2 for of_unit in equations]),
     )
     explained = np.array([of_unit.variance for of_unit in equations])
-    noisy = np.array([u.evidence.rows.noise_given(e.chi2) for u, e in zip(units, equations, strict=True)])
-    found = [_about(units, *shared, start) for start in (explained, noisy)]
+    noisy = np.array([u.evidence.rows.noise_variance_given(e.chi2) for u, e in zip(units, equations, strict=True)])
+    found = [_laplace_log_evidence(units, *shared, start) for start in (explained, noisy)]
     return np.asarray(np.max(found, axis=0) + sum(of_unit.log_share for of_unit in equations))
 
 
-def _about(units: Sequence[Posterior], information: Floats, score: Floats, chi2: Floats, start: Floats) -> Floats:
+def _laplace_log_evidence(
+    units: Sequence[Posterior], information: Floats, score: Floats, chi2: Floats, start: Floats
+) -> Floats:
     """(R,) the logarithm of the evidence of coefficients that U units share over that of none, for each size. Of each
     unit ``information`` (U,q,q), ``score`` (U,q) and ``chi2`` (U,) without them; ``start`` (U,) are variances of the
     noise."""
@@ -298,7 +302,7 @@ def _about(units: Sequence[Posterior], information: Floats, score: Floats, chi2:
         squares = np.einsum("rq,uqp,rp->ru", values, information, values)
         left = np.maximum(chi2 - 2 * values @ score.T + squares, 0.0)
         variance = np.array(
-            [[u.evidence.rows.noise_given(float(x)) for u, x in zip(units, row, strict=True)] for row in left]
+            [[u.evidence.rows.noise_variance_given(float(x)) for u, x in zip(units, row, strict=True)] for row in left]
         )
     gain = np.zeros(len(size))
     for k, unit in enumerate(units):

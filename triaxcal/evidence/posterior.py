@@ -17,14 +17,14 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.problem import State, linearise_all
-from triaxcal.estimate.runs import by_run
-from triaxcal.evidence.evidence import Evidence, SetEvidence
-from triaxcal.evidence.odds import Odds
-from triaxcal.evidence.rows import Rows
-from triaxcal.evidence.sets import likely_sets
+from triaxcal.estimate.likelihood import State, linearise_all
+from triaxcal.estimate.recordings import by_run
+from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
+from triaxcal.evidence.model_search import likely_sets
+from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import Finer, Variant, terms_of, variant_of
-from triaxcal.evidence.unmodelled import What
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
 
@@ -65,12 +65,12 @@ class Posterior:
         sets = [evidence.of_set(found.members, found.parts) for found in self.sets]
         return Posterior(evidence, sorted(sets, key=lambda found: -found.total))
 
-    def given(self, name: str) -> Posterior:
+    def conditional_on(self, name: str) -> Posterior:
         """If this effect acts."""
         return Posterior(self.evidence, [found for found in self.sets if name in self.names_of(found)])
 
     @cached_property
-    def of_names(self) -> Mapping[str, float]:
+    def effect_probabilities(self) -> Mapping[str, float]:
         """The probability that each effect acts, whatever acts beside it, the likeliest first."""
         out: dict[str, float] = defaultdict(float)
         for w, found in zip(self.weight, self.sets, strict=True):
@@ -79,7 +79,7 @@ class Posterior:
         return dict(sorted(out.items(), key=lambda item: -item[1]))
 
     @cached_property
-    def of_sets_of_names(self) -> Mapping[frozenset[str], float]:
+    def effect_set_probabilities(self) -> Mapping[frozenset[str], float]:
         """The probability that these effects act and no other, the likeliest first."""
         out: dict[frozenset[str], float] = defaultdict(float)
         for w, found in zip(self.weight, self.sets, strict=True):
@@ -95,7 +95,7 @@ class Posterior:
         return out
 
     @cached_property
-    def of_outliers(self) -> Floats:
+    def outlier_probabilities(self) -> Floats:
         """(n,) the probability that each pose is an outlier."""
         out = np.zeros(self.evidence.rows.n)
         for p, term in zip(self.of_terms, self.evidence.terms, strict=True):
@@ -104,16 +104,16 @@ class Posterior:
         return out
 
     @cached_property
-    def of_another(self) -> Floats:
+    def change_point_probabilities(self) -> Floats:
         """(n,) the probability that from each pose on there is another unit, or another mounting."""
         out = np.zeros(self.evidence.rows.n)
         for p, term in zip(self.of_terms, self.evidence.terms, strict=True):
-            if term.another >= 0:
-                out[term.another] = p
+            if term.change_point >= 0:
+                out[term.change_point] = p
         return out
 
     @cached_property
-    def of_parts(self) -> Floats:
+    def part_probabilities(self) -> Floats:
         """(P,) the probability of each part of the evidence, the first that there is none."""
         out = np.zeros(len(self.evidence.parts))
         for found in self.sets:
@@ -121,16 +121,18 @@ class Posterior:
         return out
 
     @property
-    def of_unmodelled(self) -> float:
+    def unmodelled_probability(self) -> float:
         """The probability that something acts on the means which no name describes."""
-        parts = zip(self.of_parts, self.evidence.parts, strict=True)
-        return float(sum(p for p, part in parts if part.kind is not None and part.kind.what != What.INSIDE))
+        parts = zip(self.part_probabilities, self.evidence.parts, strict=True)
+        return float(
+            sum(p for p, part in parts if part.kind is not None and part.kind.what != UnmodelledKind.WITHIN_POSE)
+        )
 
     @property
-    def of_kinds(self) -> Mapping[What, float]:
+    def unmodelled_kind_probabilities(self) -> Mapping[UnmodelledKind, float]:
         """The probability of each kind of unmodelled part, the likeliest first."""
-        out: dict[What, float] = defaultdict(float)
-        for p, part in zip(self.of_parts, self.evidence.parts, strict=True):
+        out: dict[UnmodelledKind, float] = defaultdict(float)
+        for p, part in zip(self.part_probabilities, self.evidence.parts, strict=True):
             if part.kind is not None:
                 out[part.kind.what] += float(p)
         return dict(sorted(out.items(), key=lambda item: -item[1]))
@@ -138,7 +140,7 @@ class Posterior:
     def any_of(self, names: Collection[str]) -> float:
         """The probability that at least one of these effects acts."""
         wanted = frozenset(names)
-        return float(sum(p for acting, p in self.of_sets_of_names.items() if acting & wanted))
+        return float(sum(p for acting, p in self.effect_set_probabilities.items() if acting & wanted))
 
     @cached_property
     def certain(self) -> tuple[tuple[str, ...], ...]:
@@ -147,8 +149,8 @@ class Posterior:
         level = self.evidence.odds.certain
         out: list[tuple[str, ...]] = []
         rest: list[str] = []
-        for name, p in self.of_names.items():
-            if p >= level and self.without_any_pose(name) >= level:
+        for name, p in self.effect_probabilities.items():
+            if p >= level and self.least_leave_one_out(name) >= level:
                 out.append((name,))
             elif 1 - level <= p < level:
                 rest.append(name)
@@ -166,15 +168,15 @@ class Posterior:
                 return best
         return ()
 
-    def without_any_pose(self, name: str) -> float:
+    def least_leave_one_out(self, name: str) -> float:
         """The probability of a name if that pose were an outlier which it takes most to explain."""
-        return float(self.without_each_pose(name).min())
+        return float(self.leave_one_out(name).min())
 
-    def without_each_pose(self, name: str) -> Floats:
+    def leave_one_out(self, name: str) -> Floats:
         """(n,) the probability of a name if that pose were an outlier: beside the likeliest set with the name, less the
         name. As it is, where the pose is one of that set's outliers."""
         if name not in self._without:
-            self._without[name] = self._asked_without(name)
+            self._without[name] = self._leave_one_out_of(name)
         return self._without[name]
 
     @cached_property
@@ -182,9 +184,9 @@ class Posterior:
         """What was asked before."""
         return {}
 
-    def _asked_without(self, name: str) -> Floats:
+    def _leave_one_out_of(self, name: str) -> Floats:
         evidence = self.evidence
-        out = np.full(evidence.rows.n, self.of_names.get(name, 0.0))
+        out = np.full(evidence.rows.n, self.effect_probabilities.get(name, 0.0))
         best = next((found for found in self.sets if name in self.names_of(found)), None)
         if best is None:
             return out
@@ -240,7 +242,7 @@ def posterior_of(
         point, split = _point_of(posterior), finer_shapes(posterior)
         if point is None and not split:
             break
-        rows, finer = rows if point is None else rows.about(point), [*finer, split]
+        rows, finer = rows if point is None else rows.relinearised_at(point), [*finer, split]
     return posterior
 
 
@@ -249,7 +251,7 @@ def finer_shapes(posterior: Posterior) -> Finer:
     each into: where the effect is strong, the values of the grid are further apart than the poses tell them."""
     out: dict[Variant, Sequence[Effect]] = {}
     terms, odds = posterior.evidence.terms, posterior.evidence.odds
-    for name in (name for name, p in posterior.of_names.items() if p >= odds.reported):
+    for name in (name for name, p in posterior.effect_probabilities.items() if p >= odds.reported):
         forms: dict[tuple[str, ...], dict[Variant, list[int]]] = defaultdict(lambda: defaultdict(list))
         for i, term in enumerate(terms):
             if term.effect is not None and term.name == name and len(term.effect.shape) == 1:
@@ -257,7 +259,7 @@ def finer_shapes(posterior: Posterior) -> Finer:
                 forms[key[1]][key].append(i)
         for of_form in forms.values():
             shapes = [(terms[index[0]].effect, float(posterior.of_terms[index].sum())) for index in of_form.values()]
-            if sum(share for _, share in shapes) >= odds.reported * posterior.of_names[name]:
+            if sum(share for _, share in shapes) >= odds.reported * posterior.effect_probabilities[name]:
                 out |= _divided([(effect, share) for effect, share in shapes if effect is not None], odds)
     return out
 
@@ -271,13 +273,13 @@ def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
     value = np.array([effect.shape[shape][0] for effect, _ in ascending])
     share = np.array([p for _, p in ascending])
     first = int(np.argmax(share[1:] + share[:-1]))
-    if share[first : first + 2].sum() < odds.narrow * share.sum():
+    if share[first : first + 2].sum() < odds.refine_share * share.sum():
         return {}
     edges = np.concatenate([[1.5 * value[0] - 0.5 * value[1]], (value[1:] + value[:-1]) / 2, [value[-1]]])
     out: dict[Variant, Sequence[Effect]] = {}
     for k in (first, first + 1):
         effect = ascending[k][0]
-        inside = edges[k] + (edges[k + 1] - edges[k]) * (np.arange(odds.divided) + 0.5) / odds.divided
+        inside = edges[k] + (edges[k + 1] - edges[k]) * (np.arange(odds.refine_count) + 0.5) / odds.refine_count
         try:
             made = [effect.shaped({shape: float(v)}) for v in inside if v > 0 or value[0] <= 0]
         except EffectFault:  # one of another package knows no values but its own
@@ -291,7 +293,7 @@ def _point_of(posterior: Posterior) -> State | None:
     """Where the likeliest set says that the unit is; None where the linearisation holds there, or nothing does."""
     evidence, best = posterior.evidence, posterior.sets[0]
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
-    if any(term.another >= 0 for term in terms) or not posterior.names_of(best):
+    if any(term.change_point >= 0 for term in terms) or not posterior.names_of(best):
         return None
     scaled = np.exp(best.by_part - best.total) @ best.mean
     inverse = np.linalg.inv(evidence.covariance(best.parts[int(np.argmax(best.by_part))]))
@@ -312,4 +314,4 @@ def _point_of(posterior: Posterior) -> State | None:
     except Refused:
         return None
     curved = rows.complement.T @ (found / rows.error - predicted)
-    return point if curved @ curved > evidence.odds.curved else None
+    return point if curved @ curved > evidence.odds.relinearise_chi2 else None

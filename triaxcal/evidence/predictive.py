@@ -14,12 +14,12 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.plugins import EffectFault
-from triaxcal.evidence.evidence import Evidence, SetEvidence
-from triaxcal.evidence.mixture import Components, components
+from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
+from triaxcal.evidence.mixture_components import Components, components
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.rows import Rows
 from triaxcal.evidence.terms import Term
-from triaxcal.evidence.unmodelled import Kind, Sites, What
+from triaxcal.evidence.unmodelled_kernels import PoseInputs, UnmodelledCovariance, UnmodelledKind
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Hypothesis:
 
     names: frozenset[str]
     outliers: frozenset[int]
-    another: int
-    unmodelled: What | None
+    change_point: int
+    unmodelled: UnmodelledKind | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Predictive:
         """Mean (C,M) and covariance (C,M,M) of M rows to come, over their errors."""
         evidence = self.posterior.evidence
         columns = _columns(evidence, sorted({i for cells in self.solved for i in cells.found.members}), rows)
-        here, there = Sites.of(evidence.rows), Sites.of(rows)
+        here, there = PoseInputs.of(evidence.rows), PoseInputs.of(rows)
         of_parts: dict[int, tuple[Floats, Floats]] = {}
         mean, covariance = [], []
         for cells in self.solved:
@@ -75,12 +75,14 @@ class Predictive:
                 of_parts[cells.part] = _unmodelled(kind, tau, here, there, cells.inverse)
             to, error = of_parts[cells.part]
             design = np.concatenate([rows.linear, columns[:, cells.places]], axis=1) - to @ cells.design
-            mean.append(to @ evidence.rows.y + cells.here @ design.T)
-            covariance.append(cells.noise[:, None, None] * (error + design @ cells.within @ design.T))
+            mean.append(to @ evidence.rows.y + cells.conditional_mean @ design.T)
+            covariance.append(cells.noise[:, None, None] * (error + design @ cells.conditional_covariance @ design.T))
         return np.concatenate(mean), np.concatenate(covariance)
 
 
-def _unmodelled(kind: Kind | None, tau: float, here: Sites, there: Sites, inverse: Floats) -> tuple[Floats, Floats]:
+def _unmodelled(
+    kind: UnmodelledCovariance | None, tau: float, here: PoseInputs, there: PoseInputs, inverse: Floats
+) -> tuple[Floats, Floats]:
     """Of the rows to come, noise and what no term describes: the best linear prediction (M,N) by the rows seen, of
     whose covariance this is the ``inverse``, and the covariance (M,M) of its error."""
     k, n = len(there.error), len(here.error)
@@ -96,7 +98,7 @@ def probabilities(posterior: Posterior) -> Mapping[Hypothesis, float]:
     out: dict[Hypothesis, float] = defaultdict(float)
     for weight, found in zip(posterior.weight, posterior.sets, strict=True):
         share = weight * np.exp(found.by_part - found.total)
-        by_what: dict[What | None, float] = defaultdict(float)
+        by_what: dict[UnmodelledKind | None, float] = defaultdict(float)
         for part, p in zip(found.parts, share, strict=True):
             by_what[_what(posterior, part)] += float(p)
         any_of = _hypothesis(posterior, found, 0)
@@ -107,13 +109,13 @@ def probabilities(posterior: Posterior) -> Mapping[Hypothesis, float]:
 
 def _hypothesis(posterior: Posterior, found: SetEvidence, part: int) -> Hypothesis:
     terms = (posterior.evidence.terms[i] for i in found.members)
-    another = max((term.another for term in terms), default=-1)
+    another = max((term.change_point for term in terms), default=-1)
     return Hypothesis(posterior.names_of(found), posterior.poses_of(found), another, _what(posterior, part))
 
 
-def _what(posterior: Posterior, part: int) -> What | None:
+def _what(posterior: Posterior, part: int) -> UnmodelledKind | None:
     kind = posterior.evidence.parts[part].kind
-    return None if kind is None or kind.what is What.INSIDE else kind.what
+    return None if kind is None or kind.what is UnmodelledKind.WITHIN_POSE else kind.what
 
 
 def _columns(evidence: Evidence, members: Sequence[int], rows: Rows) -> Floats:
@@ -128,7 +130,7 @@ def _columns(evidence: Evidence, members: Sequence[int], rows: Rows) -> Floats:
 
 
 def _of_term(term: Term, rows: Rows, known: dict[int, Floats]) -> Floats:
-    if term.another >= 0:
+    if term.change_point >= 0:
         return np.asarray(rows.linear * term.combination)
     if term.effect is None:
         return np.zeros((len(rows.y), term.rank))

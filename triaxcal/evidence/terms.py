@@ -13,8 +13,8 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
 from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.errors import Refused
-from triaxcal.evidence.odds import Odds
-from triaxcal.evidence.rows import Rows
+from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.prior import Odds
 from triaxcal.model.directions import spiral
 from triaxcal.poses.covariates import static_covariates
 
@@ -32,8 +32,8 @@ AXES = 3
 class Term:
     """``columns`` (N,q) are those of coefficients of size one, so that ρ times them has the rms ρ; ``combination`` (q,)
     what they were multiplied by. ``kind`` is the same for terms that exclude each other; ``pose`` is the outlier's, or
-    −1; ``another`` is the pose from which on there is another unit or mounting, or −1; ``kept`` are those coefficients
-    of the ``effect`` that are free."""
+    −1; ``change_point`` is the pose from which on there is another unit or mounting, or −1; ``kept`` are those
+    coefficients of the ``effect`` that are free."""
 
     name: str
     kind: str
@@ -43,7 +43,7 @@ class Term:
     effect: Effect | None = None
     kept: tuple[int, ...] = ()
     pose: int = -1
-    another: int = -1
+    change_point: int = -1
 
     @property
     def rank(self) -> int:
@@ -187,5 +187,5 @@ def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
         late = np.zeros(rows.n, dtype=bool)
         late[order[cut:]] = True
         columns = rows.linear * np.resize(late, len(rows.y))[:, None] * combination
-        prior = float(np.log(odds.another / len(cuts)))
-        yield Term("", "another", columns, combination, prior, another=int(order[cut]))
+        prior = float(np.log(odds.change_point / len(cuts)))
+        yield Term("", "another", columns, combination, prior, change_point=int(order[cut]))

@@ -16,7 +16,7 @@ from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.caution import Caution
 from triaxcal.frames.faces import Labelling
 from triaxcal.frames.verticals import Verticals
-from triaxcal.poses.pose import Began
+from triaxcal.poses.pose import PoseStart
 
 FLOOR_RAD = 1e-12
 SHOWS = 1e-4
@@ -35,7 +35,7 @@ class NotTurned(Caution):
     """The poses with a face up differ less than half a turn makes them on the others: taken as not turned by that."""
 
     face: str
-    began: Began
+    began: PoseStart
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class NotFlush(Caution):
     """The poses with a face up differ by ``angle_rad``, far more than on the other faces."""
 
     face: str
-    began: Began
+    began: PoseStart
     angle_rad: float
 
 

@@ -31,9 +31,9 @@ from triaxcal.inputs.turntable import (
 )
 from triaxcal.model.directions import most_wanted
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.pose import Began, Pose
+from triaxcal.poses.pose import Pose, PoseStart
+from triaxcal.poses.pose_labels import the_poses
 from triaxcal.poses.pure_error import LACK_OF_FIT, pure_error_dof
-from triaxcal.poses.when import the_poses
 
 DILUTION_MOST = 100.0
 SECOND_ORDER = 0.2
@@ -62,7 +62,7 @@ class Row:
     """One of the attitudes that were given, by its name, and when its pose began."""
 
     name: str
-    began: Began
+    began: PoseStart
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from triaxcal.arrays import Floats
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration, HoldsAt, PoseResult, Residual
 from triaxcal.estimate.caution import Caution
-from triaxcal.estimate.problem import Problem, State, linearise, parameters_by_theta
+from triaxcal.estimate.likelihood import Problem, State, linearise, parameters_by_theta
 from triaxcal.model.directions import dilution, linear_design
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import covariates_elsewhere

@@ -11,7 +11,7 @@ import scipy
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
 from triaxcal.errors import Refused
-from triaxcal.estimate.start import problem_of, start
+from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.frames.faces import nearest_rotation
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import lack_of_fit_p

@@ -21,7 +21,7 @@ from triaxcal.rounding import (
     uncertainty,
 )
 from triaxcal.uncertainty import Budget, Stated, budget
-from triaxcal.uncertainty.basis import Basis, UnmodelledTemperature
+from triaxcal.uncertainty.budget_statements import Basis, UnmodelledTemperature
 from triaxcal.uncertainty.next_recording import NextRecording, next_recording
 from triaxcal.units import ErrorUnit, grouped, in_units_of
 

@@ -75,13 +75,13 @@ def _lags(channels: Mapping[str, Floats], poses: Sequence[Pose], wanted: Iterabl
             rows = np.flatnonzero(runs == run)
             rows = rows[np.argsort(t_s[rows], kind="stable")]
             first, values = poses[rows[0]], channels[lag[0]][rows]
-            begun = values[0] - (first.t_s - first.start_s) * first.rates.get(channel_of(lag[0]), 0.0)
-            since = behind(np.insert(t_s[rows], 0, first.start_s), np.insert(values, 0, begun), lag[1])
+            started_problem = values[0] - (first.t_s - first.start_s) * first.rates.get(channel_of(lag[0]), 0.0)
+            since = lag_deviation(np.insert(t_s[rows], 0, first.start_s), np.insert(values, 0, started_problem), lag[1])
             out[name][rows] = since[1:]
     return out
 
 
-def behind(t_s: Floats, values: Floats, constant_s: float) -> Floats:
+def lag_deviation(t_s: Floats, values: Floats, constant_s: float) -> Floats:
     """(n,) how far a first-order lag, τ y′ = c − y, is from the channel c that it follows: y − c at ascending times
     (n,), where c has the values (n,). In between c goes straight, and before the first it had long stood still."""
     out = np.zeros(len(values))
@@ -93,7 +93,7 @@ def behind(t_s: Floats, values: Floats, constant_s: float) -> Floats:
 
 
 def rate_of_lag(behind_by: Floats, rate: Floats, constant_s: float) -> Floats:
-    """(n,) the rate of what `behind` gives, per second, where its channel has the ``rate``."""
+    """(n,) the rate of what `lag_deviation` gives, per second, where its channel has the ``rate``."""
     return -behind_by / constant_s - rate
 
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.errors import InvalidData
-from triaxcal.poses.noise_levels import NoiseLevels
+from triaxcal.poses.noise_mixture import NoiseLevels
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose_noise import PoseNoise, pose_noise
 from triaxcal.poses.stillness.detector import Span
-from triaxcal.poses.stillness.rounded import left_in_means, resolution
+from triaxcal.poses.stillness.quantization import left_in_means, resolution
 from triaxcal.poses.stillness.windows import Windows
 
 SHAKEN, QUIET = 2.0, 0.1
@@ -33,7 +33,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Began:
+class PoseStart:
     """When a pose began: seconds from the first sample of its recording, and which of several (0-based)."""
 
     start_s: float
@@ -92,8 +92,8 @@ class Pose:
         return (self.start_s + self.end_s) / 2
 
     @property
-    def began(self) -> Began:
-        return Began(self.start_s, self.run.index if self.run.of > 1 else None)
+    def began(self) -> PoseStart:
+        return PoseStart(self.start_s, self.run.index if self.run.of > 1 else None)
 
     @property
     def standard_error(self) -> Floats:

@@ -12,7 +12,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import DOF_MOST, f_sf
-from triaxcal.poses.noise_levels import NoiseLevels
+from triaxcal.poses.noise_mixture import NoiseLevels
 from triaxcal.poses.pose import Pose
 
 LACK_OF_FIT = 0.01
@@ -41,7 +41,7 @@ def pure_error_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
     return min(float(1 / (np.sum(w**2 * own) + (w @ np.sqrt(common)) ** 2 + 1e-300)), DOF_MOST)
 
 
-def of_both(share: Floats, left: int, dof: Floats | float) -> Floats:
+def combined_dof(share: Floats, left: int, dof: Floats | float) -> Floats:
     """Degrees of freedom of variances of which a ``share`` is what residuals show beyond noise, in ``left`` degrees of
     freedom, and the rest noise known by ``dof``, zero where it is not."""
     with np.errstate(divide="ignore"):

@@ -4,29 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from triaxcal.diagnosis import Call, Loop, Verdict
+from triaxcal.diagnosis import Loop, Recommendation, Verdict
 from triaxcal.effects.plugins import package_of
-from triaxcal.evidence.actions import Action, ActionKind
-from triaxcal.evidence.average import Refusal
+from triaxcal.evidence.candidate_actions import Action, ActionKind
 from triaxcal.evidence.identifiability import NotIdentifiable, Why
-from triaxcal.evidence.unmodelled import What
+from triaxcal.evidence.model_average import Refusal
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.figures import plain
-from triaxcal.poses.when import moment, the_poses
+from triaxcal.poses.pose_labels import moment, the_poses
 from triaxcal.units import ErrorUnit
 
 ALMOST = 0.999
 """Probabilities beyond are written as such: by which model they were reckoned matters more."""
 GOES_WITH = {
-    What.NOTHING: "each pose by itself",
-    What.DIRECTION: "the direction",
-    What.ODD: "the sign and the size of an axis's reading",
-    What.EVEN: "the size of an axis's reading",
-    What.BEFORE: "the pose before",
-    What.TIME: "the time",
+    UnmodelledKind.EACH_POSE: "each pose by itself",
+    UnmodelledKind.DIRECTION: "the direction",
+    UnmodelledKind.ODD: "the sign and the size of an axis's reading",
+    UnmodelledKind.EVEN: "the size of an axis's reading",
+    UnmodelledKind.POSE_BEFORE: "the pose before",
+    UnmodelledKind.TIME: "the time",
 }
 REFUSED = {
     Refusal.UNMODELLED: "something that no effect describes acts as well",
-    Refusal.ANOTHER: "one calibration does not hold in all poses",
+    Refusal.CHANGE_POINT: "one calibration does not hold in all poses",
     Refusal.ONE_POSE: "what was found hangs on a single pose",
 }
 
@@ -43,7 +43,7 @@ def to_do(loop: Loop, small: ErrorUnit) -> str:
     first = [*_poses_again(loop), *_apart(loop), *_next(loop, small)]
     if first:
         return "; ".join(first)
-    if loop.call is Call.INVESTIGATE:
+    if loop.call is Recommendation.INVESTIGATE:
         return "find out what acts before the calibration is used; no further pose is expected to tell"
     known = all(f.verdict is Verdict.ADOPTED for f in loop.findings) and not loop.candidates
     return "use the calibration" + ("" if known else "; no further pose is expected to tell more")
@@ -84,8 +84,8 @@ def _poses_again(loop: Loop) -> Iterator[str]:
 
 
 def _apart(loop: Loop) -> Iterator[str]:
-    if loop.found.another is not None:
-        since = moment(loop.after.poses[loop.found.another.pose].pose.began)
+    if loop.found.change_point is not None:
+        since = moment(loop.after.poses[loop.found.change_point.pose].pose.began)
         yield f"check the mounting and the connector, and which unit it is, from the pose at {since} on"
 
 
@@ -111,7 +111,7 @@ def _beside(action: Action) -> str:
 
 
 def _pose(action: Action, loop: Loop) -> str:
-    again = None if action.again is None else moment(loop.after.poses[action.again].pose.began)
+    again = None if action.repeat_of is None else moment(loop.after.poses[action.repeat_of].pose.began)
     where = _direction(action)
     pose = where if again is None else f"{where} as at {again}"
     if action.kind is ActionKind.CHANNEL:

@@ -7,7 +7,7 @@ from functools import singledispatch
 
 from triaxcal.figures import micro_g
 from triaxcal.text.cautions import excess
-from triaxcal.uncertainty import basis as of
+from triaxcal.uncertainty import budget_statements as of
 
 AS_STATED = "as stated"
 
@@ -100,7 +100,7 @@ def remedy(r: of.Remedy, small: Callable[[float], str] = micro_g) -> str:
             return "correct in the host what the registers cannot hold"
         case of.FinerRegisters():
             return "registers with one bit more"
-        case of.ModelsToldApart():
+        case of.ModelsDistinguished():
             return "record what tells them apart, as advised"
         case of.TemperatureModelled(effects):
             return f"take into the model what the residuals come from: {_both(effects)}, or another effect"

@@ -12,7 +12,7 @@ from triaxcal.figures import micro_g
 from triaxcal.frames import faces, frames, orientations, standing
 from triaxcal.inputs import attitude, datasheet
 from triaxcal.inputs.turning import rotation
-from triaxcal.poses.when import moment, the_poses
+from triaxcal.poses.pose_labels import moment, the_poses
 from triaxcal.uncertainty import extrapolation
 
 RAISED = "the standard errors are raised by that"
@@ -292,7 +292,7 @@ def excess(value: float) -> str:
     return f"{micro_g(value)} beside the noise of each pose"
 
 
-def _outliers(poses: Iterable[of_fit.Outlier]) -> str:
+def _outliers(poses: Iterable[of_fit.ExcludedPose]) -> str:
     return ", ".join(f"{the_poses([p.began])} ({p.studentized:+.0f} standard errors)" for p in poses)
 
 

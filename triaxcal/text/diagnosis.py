@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from triaxcal.diagnosis import Call, Candidate, Finding, Loop, Verdict
-from triaxcal.evidence.average import Refusal
+from triaxcal.diagnosis import Candidate, Finding, Loop, Recommendation, Verdict
 from triaxcal.evidence.findings import Findings, Unexplained
-from triaxcal.evidence.odds import Odds
-from triaxcal.poses.pose import Began
-from triaxcal.poses.when import moment
+from triaxcal.evidence.model_average import Refusal
+from triaxcal.evidence.prior import Odds
+from triaxcal.poses.pose import PoseStart
+from triaxcal.poses.pose_labels import moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
 from triaxcal.uncertainty.next_recording import NextRecording, Source
 from triaxcal.units import ErrorUnit
@@ -20,9 +20,9 @@ EVEN = 0.5
 LIKELIEST = 3
 """Effects that are named where none is likely."""
 CALLS = {
-    Call.USABLE: "usable",
-    Call.RECORD_MORE: "record more",
-    Call.INVESTIGATE: "investigate",
+    Recommendation.USABLE: "usable",
+    Recommendation.RECORD_MORE: "record more",
+    Recommendation.INVESTIGATE: "investigate",
 }
 
 
@@ -39,7 +39,7 @@ def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) 
     )
 
 
-def call(found: Call) -> str:
+def call(found: Recommendation) -> str:
     return CALLS[found]
 
 
@@ -47,7 +47,7 @@ def cause(
     found: Findings,
     findings: Sequence[Finding],
     candidates: Sequence[Candidate],
-    began: Mapping[int, Began],
+    began: Mapping[int, PoseStart],
     small: ErrorUnit,
     probabilities: Mapping[str, float],
 ) -> str:
@@ -67,14 +67,14 @@ def _causes(
     found: Findings,
     findings: Sequence[Finding],
     candidates: Sequence[Candidate],
-    began: Mapping[int, Began],
+    began: Mapping[int, PoseStart],
     small: ErrorUnit,
 ) -> Iterator[str]:
-    if found.another is not None:
-        since = moment(began[found.another.pose])
+    if found.change_point is not None:
+        since = moment(began[found.change_point.pose])
         yield (
             f"from the pose at {since} on one calibration does not hold: another unit, or channels that were exchanged "
-            f"(probability {chance(found.another.probability)})"
+            f"(probability {chance(found.change_point.probability)})"
         )
     for finding in findings:
         yield f"{_named(finding)} acts"

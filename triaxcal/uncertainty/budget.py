@@ -12,7 +12,7 @@ from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects import TEMPERATURE
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.poses.pure_error import LACK_OF_FIT
-from triaxcal.uncertainty.basis import (
+from triaxcal.uncertainty.budget_statements import (
     NotEvaluated,
     PosesWithoutScatter,
     ReferenceTakenAsExact,
@@ -21,7 +21,7 @@ from triaxcal.uncertainty.basis import (
     ThermometerNotStated,
 )
 from triaxcal.uncertainty.components import Component, not_held, reference, rounding, statistical
-from triaxcal.uncertainty.linearised import Linearised
+from triaxcal.uncertainty.propagation import ErrorPropagation
 from triaxcal.uncertainty.stated import Stated
 from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
 
@@ -73,7 +73,7 @@ class Budget:
 def budget(calibration: Calibration, stated: Stated | None = None, level: float = LEVEL) -> Budget:
     """The budget of a calibration fitted to still poses (`triaxcal.estimate.pose_fit.fit`)."""
     stated = stated or Stated()
-    linearised = Linearised(calibration)
+    linearised = ErrorPropagation(calibration)
     thermal, excess = temperature(calibration, linearised, stated)
     found = [*statistical(calibration, linearised, excess), *reference(linearised, stated), *thermal]
     found += thermometer(calibration, linearised, stated)
@@ -100,7 +100,7 @@ def _combined(lines: list[tuple[Component, Floats]], dof: float, level: float, l
     return Combined(np.sqrt(variance), np.where(variance > 0, np.minimum(effective, DOF_MOST), DOF_MOST), level)
 
 
-def _not_evaluated(calibration: Calibration, linearised: Linearised, stated: Stated) -> Iterator[NotEvaluated]:
+def _not_evaluated(calibration: Calibration, linearised: ErrorPropagation, stated: Stated) -> Iterator[NotEvaluated]:
     if stated.reference is None:
         yield ReferenceTakenAsExact()
     if TEMPERATURE not in linearised.problem.channel_reference:

@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import pure_error_dof
-from triaxcal.uncertainty.basis import (
+from triaxcal.uncertainty.budget_statements import (
     AveragedModels,
     Basis,
     BirgeFactor,
@@ -22,14 +22,14 @@ from triaxcal.uncertainty.basis import (
     FinerRegisters,
     HostCorrects,
     LongerOrMorePoses,
-    ModelsToldApart,
+    ModelsDistinguished,
     NotHeld,
     ReferenceKnown,
     RegisterSteps,
     Remedy,
     WithinPoseScatter,
 )
-from triaxcal.uncertainty.linearised import Linearised
+from triaxcal.uncertainty.propagation import ErrorPropagation
 from triaxcal.uncertainty.stated import Stated
 
 CERTAIN = 0.99
@@ -57,7 +57,7 @@ class Component:
     @classmethod
     def of(
         cls,
-        linearised: Linearised,
+        linearised: ErrorPropagation,
         source: str,
         evaluation: str,
         dof: float,
@@ -70,7 +70,7 @@ class Component:
         return cls(source, evaluation, dof, parameters, linearised.magnitude(covariance), basis, by)
 
 
-def statistical(calibration: Calibration, linearised: Linearised, share: float) -> list[Component]:
+def statistical(calibration: Calibration, linearised: ErrorPropagation, share: float) -> list[Component]:
     """What the scatter inside the poses, their creep, and residuals beyond both say, of which thermal effects leave the
     ``share``."""
     poses = [p.pose for p in calibration.poses if p.used]
@@ -96,7 +96,7 @@ def statistical(calibration: Calibration, linearised: Linearised, share: float) 
     if creep.any():
         basis = Creep(int(np.count_nonzero(creep)))
         out.append(Component.of(linearised, "creep", "B", np.inf, (S * creep) @ S.T, basis, CreepHalved()))
-    if calibration.spread is not None:
+    if calibration.prior_sd is not None:
         return out + _between(calibration, linearised, (S * linearised.noise**2) @ S.T)
     excess = share * (calibration.covariance - (S * linearised.noise**2) @ S.T)
     if np.max(np.diag(excess) / np.diag(calibration.covariance)) > 1e-6:
@@ -107,17 +107,17 @@ def statistical(calibration: Calibration, linearised: Linearised, share: float) 
     return out
 
 
-def _between(calibration: Calibration, linearised: Linearised, noise: Floats) -> list[Component]:
+def _between(calibration: Calibration, linearised: ErrorPropagation, noise: Floats) -> list[Component]:
     """What the ``noise`` (p,p) of the poses leaves of a covariance that is one over all that may act; thermal effects
     have a line of their own."""
     thermal = 0.0 if calibration.thermal is None else calibration.thermal
-    rest = positive(calibration.covariance - noise - thermal)
+    rest = positive_semidefinite(calibration.covariance - noise - thermal)
     names = tuple(name for name, p in calibration.weights.items() if p < CERTAIN)
-    basis, by = AveragedModels(names), ModelsToldApart()
+    basis, by = AveragedModels(names), ModelsDistinguished()
     return [Component.of(linearised, "choice_of_effect", "B", np.inf, rest, basis, by)]
 
 
-def positive(covariance: Floats) -> Floats:
+def positive_semidefinite(covariance: Floats) -> Floats:
     """The nearest that is one: a difference of two may have lost that."""
     size, axes = np.linalg.eigh(covariance)
     return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
@@ -132,7 +132,7 @@ def _median_duration_s(poses: Sequence[Pose]) -> float:
     return float(np.median([p.end_s - p.start_s for p in poses]))
 
 
-def reference(linearised: Linearised, stated: Stated) -> list[Component]:
+def reference(linearised: ErrorPropagation, stated: Stated) -> list[Component]:
     if not stated.reference:
         return []
     # What |a| does inside the poses should be nothing, whatever the reference.
@@ -148,7 +148,7 @@ def not_held(calibration: Calibration, stated: Stated) -> list[Component]:
     return [Component("not_held", "B", np.inf, none, stated.not_held, NotHeld(), HostCorrects())]
 
 
-def rounding(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[Component]:
+def rounding(calibration: Calibration, linearised: ErrorPropagation, stated: Stated) -> list[Component]:
     if not stated.rounding:
         return []
     steps = np.array([stated.rounding.get(name, 0.0) for name in calibration.parameters])

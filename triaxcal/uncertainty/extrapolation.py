@@ -40,7 +40,7 @@ def extrapolated(c: Calibration) -> Extrapolated | None:
         if {TIME, SINCE_START} & set(effect.needs):
             B = _basis(effect, c)
             variance += np.einsum("ap,pq,aq->a", B, c.covariance[own, own], B)
-            if c.spread is None:  # what an average does not know of a shape is in its covariance
+            if c.prior_sd is None:  # what an average does not know of a shape is in its covariance
                 variance += _by_shapes(effect, q, c) ** 2
     if beyond_s <= 0 or not variance.any():
         return None

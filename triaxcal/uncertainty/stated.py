@@ -9,7 +9,7 @@ import numpy as np
 
 from triaxcal.errors import InvalidData
 from triaxcal.model.gravity import local_gravity_g
-from triaxcal.uncertainty.basis import StatedReference
+from triaxcal.uncertainty.budget_statements import StatedReference
 
 
 @dataclass(frozen=True)

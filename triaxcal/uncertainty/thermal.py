@@ -7,9 +7,9 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE, TEMPERATURE, Effect
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.problem import linearise_all
+from triaxcal.estimate.likelihood import linearise_all
 from triaxcal.poses.pure_error import LACK_OF_FIT
-from triaxcal.uncertainty.basis import (
+from triaxcal.uncertainty.budget_statements import (
     PosesAtOtherTemperatures,
     ProbableTemperature,
     Remedy,
@@ -19,8 +19,8 @@ from triaxcal.uncertainty.basis import (
     ThermometerAt,
     UnmodelledTemperature,
 )
-from triaxcal.uncertainty.components import Component, half_the_noise, positive
-from triaxcal.uncertainty.linearised import Linearised
+from triaxcal.uncertainty.components import Component, half_the_noise, positive_semidefinite
+from triaxcal.uncertainty.propagation import ErrorPropagation
 from triaxcal.uncertainty.stated import Stated
 
 SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
@@ -29,7 +29,9 @@ per kelvin. Typical of a mass-market MEMS accelerometer's data sheet; a navigati
 NO_SENSITIVITY = 1e-12
 
 
-def temperature(calibration: Calibration, linearised: Linearised, stated: Stated) -> tuple[list[Component], float]:
+def temperature(
+    calibration: Calibration, linearised: ErrorPropagation, stated: Stated
+) -> tuple[list[Component], float]:
     """What thermal effects that the fit has not taken up may have done to its parameters; and the share of the
     residuals' variance beyond noise that they do not explain, 0…1, lest it count twice.
 
@@ -37,7 +39,7 @@ def temperature(calibration: Calibration, linearised: Linearised, stated: Stated
     `SENSITIVITY_PER_K`, a mean and a spread by Bayes' rule. The parameters of a fit without it are off by what it does
     to them.
     """
-    if calibration.spread is not None:
+    if calibration.prior_sd is not None:
         return _as_probable(calibration, linearised), 1.0
     missing = _thermal_but(linearised.effects)
     if TEMPERATURE not in linearised.problem.channel_reference or not missing:
@@ -74,7 +76,7 @@ def temperature(calibration: Calibration, linearised: Linearised, stated: Stated
     return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)], excess
 
 
-def _as_probable(calibration: Calibration, linearised: Linearised) -> list[Component]:
+def _as_probable(calibration: Calibration, linearised: ErrorPropagation) -> list[Component]:
     """By the probability of each thermal effect and of its sizes, as the poses and what happens inside them tell."""
     if calibration.thermal is None or not calibration.thermal.any():
         return []
@@ -82,7 +84,7 @@ def _as_probable(calibration: Calibration, linearised: Linearised) -> list[Compo
     names = tuple(e.name for e in CATALOGUE if TEMPERATURE in e.needs and e.name not in present)
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
     basis, by = ProbableTemperature(names, moved), PosesAtOtherTemperatures(names)
-    return [Component.of(linearised, "temperature", "B", np.inf, positive(calibration.thermal), basis, by)]
+    return [Component.of(linearised, "temperature", "B", np.inf, positive_semidefinite(calibration.thermal), basis, by)]
 
 
 def _posterior(Z: Floats) -> Floats:
@@ -122,7 +124,7 @@ def _sensitivity(effect: Effect, reference: float, stated: Stated) -> float:
     return (SENSITIVITY_PER_K[effect.name] if known is None else max(known, NO_SENSITIVITY)) * per_reference
 
 
-def thermometer(calibration: Calibration, linearised: Linearised, stated: Stated) -> list[Component]:
+def thermometer(calibration: Calibration, linearised: ErrorPropagation, stated: Stated) -> list[Component]:
     """With thermal effects in the model its values hold at a temperature that somebody has to measure."""
     if not stated.thermometer_k or not needs_temperature(linearised.effects):
         return []

@@ -11,8 +11,8 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
+from triaxcal.estimate.initial_estimate import rough_directions, wanted_for
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.start import rough_directions, wanted_for
 from triaxcal.model.directions import FULL, cube_directions, most_wanted
 from triaxcal.planning.addition import ENOUGH, Addition, Had, additions
 from triaxcal.planning.design import ask, channels_needed, profile_times

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from triaxcal import text as of_metrology
-from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.prior import Odds
 from triaxcal.rounding import number
 from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal_drivers.extras import absent

@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import is_derived
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.evidence.reduced import Reduced
+from triaxcal.estimate.reduced_calibration import Reduced
 from triaxcal.figures import micro_g
 from triaxcal.interchange.calibration_reading import calibration_of, expanded_uncertainty_in, logged_in
 from triaxcal.rounding import REGISTER_DIGITS, number

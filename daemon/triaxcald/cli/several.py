@@ -10,7 +10,7 @@ from pathlib import Path
 
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import Refused
-from triaxcal.estimate.runs import residuals_by_run, together
+from triaxcal.estimate.recordings import residuals_by_run, together
 from triaxcal.figures import plain
 from triaxcal.pooling import Answer, PooledAnalysis
 from triaxcal.text import diagnosis

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from triaxcal.estimate.calibration import Exclusion
-from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.prior import Odds
 from triaxcal.interchange.calibration_document import WEIGHT
 from triaxcal.units import ErrorUnit
 from triaxcald.report.figures import clean, effect_title, number

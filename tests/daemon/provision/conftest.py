@@ -224,7 +224,7 @@ class Bench:
             where=where,
             **more,
         )
-        begun, returned = len(self.records), False
+        started_problem, returned = len(self.records), False
         await p.examine(restart=not dry_run)
         if not dry_run:
             try:
@@ -232,7 +232,7 @@ class Bench:
                 returned = True
             finally:
                 p.finish()
-                self.assert_traffic_shows(p, self.records[begun:], aborted=not returned)
+                self.assert_traffic_shows(p, self.records[started_problem:], aborted=not returned)
         return p
 
     def assert_traffic_shows(self, p: Provisioning, records: list[RegisterAccess], *, aborted: bool) -> None:

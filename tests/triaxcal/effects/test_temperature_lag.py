@@ -18,7 +18,7 @@ from triaxcal.estimate.creep import with_unexplained_creep
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.covariates import behind, channels_of, covariates_elsewhere, lags_for
+from triaxcal.poses.covariates import channels_of, covariates_elsewhere, lag_deviation, lags_for
 from triaxcal.poses.pose import Pose, Run
 from triaxcal.synthetic import Environment, SyntheticUnit, Tumble, noisy_poses
 
@@ -43,12 +43,14 @@ def test_the_fit_gives_it_back_as_far_off_as_it_says(constant_s: float, recovers
 def test_a_lag_is_the_solution_of_its_equation(constant_s: int) -> None:
     t = np.linspace(0, 1000, 4001)
     # A ramp and a swing from a standstill, in closed form; and by hand where the ramp has long been the same.
-    assert behind(t, ROOM.temperature(t), constant_s) == pytest.approx(ROOM.temperature_lag(t, constant_s), abs=2e-4)
+    assert lag_deviation(t, ROOM.temperature(t), constant_s) == pytest.approx(
+        ROOM.temperature_lag(t, constant_s), abs=2e-4
+    )
     step = 1e-3
     rate = (ROOM.temperature_lag(t[1:] + step, constant_s) - ROOM.temperature_lag(t[1:] - step, constant_s)) / 2e-3
     lagging = ROOM.temperature_lag(t[1:], constant_s)
     assert rate + ROOM.temperature_rate(t[1:]) == pytest.approx(-lagging / constant_s, abs=1e-7)
-    assert behind(np.array([0.0, 1e6]), np.array([20.0, 20.0 + 1e3]), constant_s)[-1] == pytest.approx(
+    assert lag_deviation(np.array([0.0, 1e6]), np.array([20.0, 20.0 + 1e3]), constant_s)[-1] == pytest.approx(
         -constant_s / 1e3
     )
 
@@ -57,9 +59,11 @@ def test_straight_from_pose_to_pose_a_lag_hardly_depends_on_how_many_poses_there
     """A step in one go, or in parts of the same straight line."""
     few, many = np.array([0.0, 10.0, 60.0]), np.linspace(0, 60, 25)
     line = np.interp(many, few, [20.0, 25.0, 25.0])
-    assert behind(few, np.array([20.0, 25.0, 25.0]), 33)[-1] == pytest.approx(behind(many, line, 33)[-1], rel=1e-12)
+    assert lag_deviation(few, np.array([20.0, 25.0, 25.0]), 33)[-1] == pytest.approx(
+        lag_deviation(many, line, 33)[-1], rel=1e-12
+    )
     # Two poses at one moment: a jump, of which nothing has been followed yet.
-    assert behind(np.zeros(2), np.array([20.0, 25.0]), 33).tolist() == [0.0, -5.0]
+    assert lag_deviation(np.zeros(2), np.array([20.0, 25.0]), 33).tolist() == [0.0, -5.0]
 
 
 def test_between_two_time_constants_the_lag_is_right_within_three_per_cent() -> None:
@@ -67,9 +71,9 @@ def test_between_two_time_constants_the_lag_is_right_within_three_per_cent() -> 
     for temp_c in (np.sin(t / 50), 0.01 * t, np.where(t > 200, 1.0, 0.0)):
         for constant_s in np.geomspace(LAGS_S[0], LAGS_S[-1], 60):
             effect = TemperatureLag(float(constant_s))
-            held = {"temp_c": temp_c} | {n: behind(t, temp_c, lag_in(n)[1]) for n in effect.needs[1:]}  # type: ignore[index]
+            held = {"temp_c": temp_c} | {n: lag_deviation(t, temp_c, lag_in(n)[1]) for n in effect.needs[1:]}  # type: ignore[index]
             found = effect.basis(np.zeros((200, 3)), held)[:, 0, 0] - temp_c
-            exact = behind(t, temp_c, float(constant_s))
+            exact = lag_deviation(t, temp_c, float(constant_s))
             assert np.abs(found - exact).max() < 0.03 * np.abs(exact).max()
 
 
@@ -96,7 +100,7 @@ def test_lags_are_derived_for_those_who_ask_and_for_nobody_else(paper_unit: Sens
     assert lags_for([effect_named("thermal_gradient")]) == ()
     found = channels_of(poses, [*wanted, "other.lag:33", "temp_c.rate"])
     assert {n for n in found if lag_in(n)} == set(wanted)
-    assert found["temp_c.lag:33"] == pytest.approx(behind(T_S, SWINGING["temp_c"], 33))
+    assert found["temp_c.lag:33"] == pytest.approx(lag_deviation(T_S, SWINGING["temp_c"], 33))
     # In whatever order the poses come.
     assert channels_of(poses[::-1], wanted)["temp_c.lag:33"][::-1] == pytest.approx(found["temp_c.lag:33"])
 
@@ -127,7 +131,7 @@ def test_poses_of_another_recording_have_the_lag_of_their_own_temperature(
     reference = {"temp_c": 20.0, "temp_c.lag:33": 0.0}
     held = covariates_elsewhere(poses, reference, paper_unit.scale_factor, paper_unit.bias)
     assert held["temp_c"] == pytest.approx(SWINGING["temp_c"] - 20)
-    assert held["temp_c.lag:33"] == pytest.approx(behind(T_S, SWINGING["temp_c"], 33))
+    assert held["temp_c.lag:33"] == pytest.approx(lag_deviation(T_S, SWINGING["temp_c"], 33))
 
 
 def test_it_is_told_from_a_bias_that_follows_at_once_and_from_one_by_the_rate(
@@ -191,7 +195,7 @@ def test_inside_a_pose_it_explains_the_creep_of_the_lagging_temperature(
     rng = np.random.default_rng(0)
     effect = TemperatureLag(33.0)
     sensor = with_effect(effect, TRUTH)
-    lag, rate = behind(T_S, SWINGING["temp_c"], 33), 3 / 20 * np.cos(T_S / 20) - np.sin(T_S / 7) / 7
+    lag, rate = lag_deviation(T_S, SWINGING["temp_c"], 33), 3 / 20 * np.cos(T_S / 20) - np.sin(T_S / 7) / 7
     rate[0] = 0.0  # before the first pose it stood still
     # By its equation it changes by −lag/τ a second, whatever the thermometer does.
     creep = sensor.scale_factor * np.array(TRUTH) * 10.0 * (-lag / 33)[:, None]

@@ -135,7 +135,7 @@ def test_where_all_poses_have_the_same_noise_an_excess_is_birge_s_factor_on_it()
     for after in (little, much):
         birge = np.sqrt(sum((p.residual_g / p.standard_error_g) ** 2 for p in after.poses) / (26 - 9))
         assert after.standard_errors == pytest.approx(birge * before.standard_errors / before.birge_ratio, rel=0.01)
-        assert [p.raised_g for p in after.poses] == pytest.approx(
+        assert [p.total_standard_error_g for p in after.poses] == pytest.approx(
             [birge * p.standard_error_g for p in after.poses], rel=0.01
         )
         assert [p.leverage for p in after.poses] == pytest.approx([p.leverage for p in before.poses], abs=2e-3)
@@ -147,6 +147,6 @@ def test_the_excess_is_paule_and_mandels_of_thirteen_trials_of_a_vaccine() -> No
     y = [-0.8893, -1.5854, -1.3481, -1.4416, -0.2175, -0.7861, -1.6209, 0.0120, -0.4694, -1.3713, -0.3394, 0.4459]
     y += [-0.0173]
     v = [0.3256, 0.1946, 0.4154, 0.0200, 0.0512, 0.0069, 0.2230, 0.0040, 0.0564, 0.0730, 0.0124, 0.5325, 0.0714]
-    shown = Excess.shown((np.array(y), np.ones((13, 1)), np.sqrt(v)), 13, 12, 1e6)
+    shown = Excess.estimated((np.array(y), np.ones((13, 1)), np.sqrt(v)), 13, 12, 1e6)
     assert shown.birge_ratio == 1
     assert shown.excess_g**2 == pytest.approx(0.3181, abs=1e-4)

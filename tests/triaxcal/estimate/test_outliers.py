@@ -7,13 +7,19 @@ from typing import TypeVar
 
 import numpy as np
 import pytest
-from benchmarks.outlier_set import clean_loses, measure
 from scipy import stats
 
+from benchmarks.outliers import clean_loses, measure
 from benchmarks.truth import plan
 from triaxcal.effects.hysteresis import Hysteresis
 from triaxcal.estimate.calibration import Calibration, Exclusion
-from triaxcal.estimate.caution import Caution, Outlier, OutliersExcluded, PosesExcludedByCaller, UnknownHistoryExcluded
+from triaxcal.estimate.caution import (
+    Caution,
+    ExcludedPose,
+    OutliersExcluded,
+    PosesExcludedByCaller,
+    UnknownHistoryExcluded,
+)
 from triaxcal.estimate.outliers import not_as_predicted, outlier_set
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.directions import linear_design
@@ -102,7 +108,7 @@ def test_a_spoiled_pose_is_named_in_a_warning_and_keeps_its_place_among_the_resu
     assert c.poses[7].studentized == pytest.approx(50, abs=5)
     assert c.poses[7].residual_g == pytest.approx(50 * SIGMA, rel=0.1)
     (outlier,) = caution_of(c, OutliersExcluded).poses
-    assert outlier == Outlier(poses[7].began, c.poses[7].studentized)
+    assert outlier == ExcludedPose(poses[7].began, c.poses[7].studentized)
     assert c.poses[7].excluded is Exclusion.OUTLIER
     assert c.residual.lack_of_fit_p is not None
     assert c.residual.lack_of_fit_p > 0.001

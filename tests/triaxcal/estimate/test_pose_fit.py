@@ -15,9 +15,9 @@ from triaxcal.effects.contract import SCATTER, rate_of
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Exclusion
 from triaxcal.estimate.caution import ExcessVariance, FaultyPosesExcluded
+from triaxcal.estimate.initial_estimate import problem_of, start, with_history
+from triaxcal.estimate.likelihood import Problem, State, linearise, solve
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.problem import Problem, State, linearise, solve
-from triaxcal.estimate.start import problem_of, start, with_history
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses

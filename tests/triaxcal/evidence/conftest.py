@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.rows import Rows
+from triaxcal.evidence.linearised_data import Rows
 from triaxcal.poses.pose import Pose
 
 SIGMA_G = 2e-5

@@ -11,7 +11,7 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS, SIGMA_G
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Findings, findings, posterior_of
-from triaxcal.evidence.unmodelled import What
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 
@@ -24,7 +24,7 @@ def told(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> Findings:
 
 def test_where_nothing_acts_that_is_the_likeliest(poses_with: Poses) -> None:
     found = told(poses_with(0))
-    assert (found.named, dict(found.candidates), dict(found.outliers), found.another) == ((), {}, {}, None)
+    assert (found.named, dict(found.candidates), dict(found.outliers), found.change_point) == ((), {}, {}, None)
     assert found.nothing > 0.3
 
 
@@ -65,7 +65,7 @@ def test_what_has_no_name_goes_with_what_it_went_with(poses_with: Poses, paper_u
     poses = poses_with(3)
     found = told([replace(p, mean=p.mean + paper_unit.scale_factor * bias_g(p.t_s)) for p in poses])
     assert found.unexplained.probability > 0.9
-    assert found.unexplained.kind is What.TIME
+    assert found.unexplained.kind is UnmodelledKind.TIME
 
 
 def test_a_size_is_that_of_what_was_put_in(poses_with: Poses) -> None:

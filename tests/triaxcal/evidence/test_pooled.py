@@ -33,7 +33,7 @@ def test_an_effect_with_common_values_is_certain_in_all_and_in_none_alone(
 ) -> None:
     weak = {"temperature_bias": [1.4e-5, -1.2e-5, 1e-5]}
     units = of_units([poses_with(seed, **weak) for seed in range(UNITS)])
-    assert max(unit.of_names.get("temperature_bias", 0.0) for unit in units) < 0.9
+    assert max(unit.effect_probabilities.get("temperature_bias", 0.0) for unit in units) < 0.9
     found = pool(units)
     assert next(iter(found.probability)) == "temperature_bias"
     assert found.probability["temperature_bias"] > 0.9  # that it is a little bent cannot be excluded
@@ -53,7 +53,7 @@ def test_values_of_their_own_are_not_called_common(poses_with: Callable[..., lis
 def test_where_nothing_acts_nothing_is_found_together(poses_with: Callable[..., list[Pose]]) -> None:
     found = pool(of_units([poses_with(seed + 50) for seed in range(UNITS)]))
     assert max(found.probability.values()) < 0.5
-    assert found.apart > 0.5
+    assert found.independent_probability > 0.5
     assert found.nothing > 0.3
     assert found.certain(0.99) == ()
 
@@ -63,7 +63,7 @@ def test_what_one_unit_has_alone_is_no_effect_of_all(poses_with: Callable[..., l
     poses = [poses_with(seed + 70) for seed in range(UNITS)]
     poses[2] = poses_with(72, hysteresis=[8e-4, -7e-4, 9e-4])
     units = of_units(poses)
-    assert units[2].of_names["hysteresis"] > 0.99
+    assert units[2].effect_probabilities["hysteresis"] > 0.99
     found = pool(units)
     assert found.probability["hysteresis"] < 0.01
     assert found.nothing < 0.01
@@ -77,7 +77,7 @@ def test_what_takes_the_place_of_an_unmodelled_part_in_each_is_an_effect_of_all(
     poses = [poses_with(i, second_order_nonlinearity=list(1.5e-4 * rng.standard_normal(3))) for i in range(UNITS)]
     units = of_units(poses)
     found = pool(units)
-    assert min(unit.of_names["second_order_nonlinearity"] for unit in units) < 0.95
+    assert min(unit.effect_probabilities["second_order_nonlinearity"] for unit in units) < 0.95
     assert found.probability["second_order_nonlinearity"] > 0.99
 
 

@@ -12,7 +12,7 @@ from tests.triaxcal.evidence.conftest import MINUS, SIGMA_G
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import Posterior, Refusal, posterior_of, refusal
-from triaxcal.evidence.unmodelled import What
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -28,9 +28,9 @@ def found(poses: list[Pose]) -> Posterior:
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_is_named_where_nothing_acts(poses_with: Poses, seed: int) -> None:
     posterior = found(poses_with(seed))
-    assert max(posterior.of_names.values(), default=0.0) < 0.3
-    assert max(posterior.of_outliers) < 0.3
-    assert posterior.of_unmodelled < 0.3
+    assert max(posterior.effect_probabilities.values(), default=0.0) < 0.3
+    assert max(posterior.outlier_probabilities) < 0.3
+    assert posterior.unmodelled_probability < 0.3
 
 
 @pytest.mark.parametrize(
@@ -47,15 +47,15 @@ def test_nothing_is_named_where_nothing_acts(poses_with: Poses, seed: int) -> No
 )
 def test_what_acts_is_named(poses_with: Poses, name: str, coefficients: list[float]) -> None:
     posterior = found(poses_with(11, **{name: coefficients}))
-    assert next(iter(posterior.of_names)) == name
-    assert posterior.of_names[name] > 0.99
-    assert posterior.without_any_pose(name) > 0.99
-    assert posterior.of_unmodelled < 0.2
+    assert next(iter(posterior.effect_probabilities)) == name
+    assert posterior.effect_probabilities[name] > 0.99
+    assert posterior.least_leave_one_out(name) > 0.99
+    assert posterior.unmodelled_probability < 0.2
 
 
 def test_two_effects_at_once_are_both_named(poses_with: Poses) -> None:
     posterior = found(poses_with(5, hysteresis=[8e-4, -7e-4, 9e-4], temperature_bias=[5e-4, -4e-4, 6e-4]))
-    names, probability = next(iter(posterior.of_sets_of_names.items()))
+    names, probability = next(iter(posterior.effect_set_probabilities.items()))
     assert names == {"hysteresis", "temperature_bias"}
     assert probability > 0.9
 
@@ -64,9 +64,9 @@ def test_a_knocked_pose_is_an_outlier_and_nothing_else(
     poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]]
 ) -> None:
     posterior = found(knocked(poses_with(2), 7, 5e-4))
-    assert posterior.of_outliers[7] > 0.99
-    assert np.delete(posterior.of_outliers, 7).max() < 0.2
-    assert max(posterior.of_names.values(), default=0.0) < 0.3
+    assert posterior.outlier_probabilities[7] > 0.99
+    assert np.delete(posterior.outlier_probabilities, 7).max() < 0.2
+    assert max(posterior.effect_probabilities.values(), default=0.0) < 0.3
 
 
 def test_a_name_that_one_pose_decides_does_not_survive_its_loss(
@@ -75,7 +75,7 @@ def test_a_name_that_one_pose_decides_does_not_survive_its_loss(
     """A single knock looks like many things; whatever is made of it, nothing is certain without that pose."""
     for seed in range(3):
         posterior = found(knocked(poses_with(seed), 12, 3e-4))
-        assert all(posterior.without_any_pose(name) < 0.5 for name in posterior.of_names)
+        assert all(posterior.least_leave_one_out(name) < 0.5 for name in posterior.effect_probabilities)
 
 
 @pytest.mark.parametrize("kind", ["dead_zone", "random_walk", "magnetic_field"])
@@ -83,16 +83,16 @@ def test_what_is_in_no_catalogue_is_unmodelled(kind: str) -> None:
     recording = Case(kind, 1, (100.0, 200.0), 26, "white").make()
     poses = still_poses(recording.samples())
     posterior = posterior_of(poses, fit(poses, signs=recording.signs), signs=recording.signs)
-    assert posterior.of_unmodelled > 0.5
-    assert all(posterior.without_any_pose(name) < 0.99 for name in posterior.of_names)
+    assert posterior.unmodelled_probability > 0.5
+    assert all(posterior.least_leave_one_out(name) < 0.99 for name in posterior.effect_probabilities)
 
 
 def test_probabilities_are_those_of_a_partition(poses_with: Poses) -> None:
     posterior = found(poses_with(1, warm_up=[2e-4, 3e-4, -2e-4]))
     assert posterior.weight.sum() == pytest.approx(1.0)
-    assert posterior.of_parts.sum() == pytest.approx(1.0)
-    assert sum(posterior.of_sets_of_names.values()) == pytest.approx(1.0)
-    assert posterior.of_unmodelled <= sum(posterior.of_kinds.values()) + 1e-12
+    assert posterior.part_probabilities.sum() == pytest.approx(1.0)
+    assert sum(posterior.effect_set_probabilities.values()) == pytest.approx(1.0)
+    assert posterior.unmodelled_probability <= sum(posterior.unmodelled_kind_probabilities.values()) + 1e-12
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -101,27 +101,29 @@ def test_channels_that_were_exchanged_on_the_way_are_seen_with_the_pose(poses_wi
     poses = poses_with(seed)
     late = [replace(p, mean=p.mean[[1, 0, 2]]) for p in poses[first:]]
     posterior = found([*poses[:first], *late])
-    assert int(np.argmax(posterior.of_another)) == first
-    assert posterior.of_another[first] > 0.9
-    assert refusal(posterior) is Refusal.ANOTHER
+    assert int(np.argmax(posterior.change_point_probabilities)) == first
+    assert posterior.change_point_probabilities[first] > 0.9
+    assert refusal(posterior) is Refusal.CHANGE_POINT
 
 
 def test_another_unit_from_some_pose_on_is_seen(poses_with: Poses) -> None:
     poses = poses_with(3)
     scale = np.array([1.004, 0.995, 1.002])
     posterior = found([*poses[:14], *(replace(p, mean=p.mean * scale) for p in poses[14:])])
-    assert posterior.of_another[12:17].sum() > 0.9
+    assert posterior.change_point_probabilities[12:17].sum() > 0.9
 
 
 def test_one_unit_all_through_is_no_other(poses_with: Poses) -> None:
     for effects in ({}, {"bias_step": [4e-4, 3e-4, -5e-4]}, {"warm_up": [4e-4, 3e-4, -5e-4]}):
-        assert found(poses_with(6, **effects)).of_another.sum() < 0.05
+        assert found(poses_with(6, **effects)).change_point_probabilities.sum() < 0.05
 
 
 def test_the_unit_of_the_reference_changes_no_probability(poses_with: Poses) -> None:
     """A tenth of g: effects that go by the sign of a force know its size by its order of magnitude alone."""
     poses = poses_with(9, second_order_nonlinearity=[2e-4, 1e-4, -2e-4], hysteresis=[6e-5, -5e-5, 4e-5])
-    in_g, in_si = (posterior_of(poses, fit(poses, signs=MINUS, reference=r), signs=MINUS).of_names for r in (1.0, 10.0))
+    in_g, in_si = (
+        posterior_of(poses, fit(poses, signs=MINUS, reference=r), signs=MINUS).effect_probabilities for r in (1.0, 10.0)
+    )
     assert {n: p for n, p in in_si.items() if p > 1e-3} == pytest.approx(
         {n: p for n, p in in_g.items() if p > 1e-3}, rel=1e-3, abs=1e-6
     )
@@ -141,16 +143,16 @@ def test_a_pose_is_an_outlier_however_far_it_is_off(
     poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]], by_g: float
 ) -> None:
     posterior = found(knocked(poses_with(2), 7, by_g))
-    assert posterior.of_outliers[7] > 0.99
-    assert posterior.of_unmodelled < 0.3
+    assert posterior.outlier_probabilities[7] > 0.99
+    assert posterior.unmodelled_probability < 0.3
 
 
 def test_a_unit_turned_in_its_socket_is_seen_with_the_pose(poses_with: Poses) -> None:
     """As a connector plugged in the other way round: two channels change their signs."""
     poses = poses_with(7)
     posterior = found([*poses[:17], *(replace(p, mean=p.mean * [-1, -1, 1]) for p in poses[17:])])
-    assert posterior.of_another[17] > 0.9
-    assert refusal(posterior) is Refusal.ANOTHER
+    assert posterior.change_point_probabilities[17] > 0.9
+    assert refusal(posterior) is Refusal.CHANGE_POINT
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -171,6 +173,11 @@ def test_a_repeat_that_contradicts_is_time_or_memory_and_no_outlier(
         [replace(p, mean=p.mean + unit.scale_factor * drift_g * x) for p, x in zip(poses, share, strict=True)]
     )
     moves = {"bias_drift", "warm_up", "bias_step", "scale_factor_drift", "hysteresis", "remanence"}
-    assert posterior.any_of(moves) + posterior.of_kinds[What.TIME] + posterior.of_kinds[What.BEFORE] > 0.99
-    assert max(posterior.of_outliers[3], posterior.of_outliers[-1]) < 0.5
-    assert all(posterior.without_any_pose(name) >= 0.99 for (name, *others) in posterior.certain if not others)
+    assert (
+        posterior.any_of(moves)
+        + posterior.unmodelled_kind_probabilities[UnmodelledKind.TIME]
+        + posterior.unmodelled_kind_probabilities[UnmodelledKind.POSE_BEFORE]
+        > 0.99
+    )
+    assert max(posterior.outlier_probabilities[3], posterior.outlier_probabilities[-1]) < 0.5
+    assert all(posterior.least_leave_one_out(name) >= 0.99 for (name, *others) in posterior.certain if not others)

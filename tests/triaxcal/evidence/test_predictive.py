@@ -11,13 +11,13 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS, rows_of
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.effects import CATALOGUE
-from triaxcal.evidence.evidence import Evidence
-from triaxcal.evidence.odds import Odds
+from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.predictive import Predictive
-from triaxcal.evidence.rows import Rows
+from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import terms_of
-from triaxcal.evidence.unmodelled import Sites, What
+from triaxcal.evidence.unmodelled_kernels import PoseInputs, UnmodelledKind
 from triaxcal.poses.pose import Pose
 
 Poses = Callable[..., list[Pose]]
@@ -34,7 +34,7 @@ def recorded() -> tuple[list[Pose], Rows]:
 def test_poses_that_were_taken_are_to_come_as_they_were(poses_with: Poses) -> None:
     means = poses_with(1)
     for poses, rows in (recorded(), (means, rows_of(means, MINUS))):
-        again = rows.to_come(rows.poses)
+        again = rows.of_future_poses(rows.poses)
         assert again.slopes == rows.slopes
         assert len(rows.poses) == len(poses)
         assert again.linear == pytest.approx(rows.linear, abs=1e-9)
@@ -49,10 +49,10 @@ def test_poses_that_were_taken_are_to_come_as_they_were(poses_with: Poses) -> No
 def test_a_covariance_with_poses_to_come_is_that_of_the_rows_where_they_are_the_same() -> None:
     _, rows = recorded()
     evidence = Evidence(rows, terms_of(rows, [], Odds()), Odds())
-    here, there = Sites.of(rows), Sites.of(rows.to_come(rows.poses))
+    here, there = PoseInputs.of(rows), PoseInputs.of(rows.of_future_poses(rows.poses))
     for kind in {part.kind for part in evidence.parts if part.kind is not None}:
         crossed = kind.covariance_of(there, here)
-        own = kind.what in (What.NOTHING, What.INSIDE)
+        own = kind.what in (UnmodelledKind.EACH_POSE, UnmodelledKind.WITHIN_POSE)
         expected = np.zeros_like(kind.covariance) if own else kind.covariance
         assert crossed == pytest.approx(expected, abs=1e-6 * np.abs(kind.covariance).max()), kind.what
         assert pytest.approx(crossed, abs=1e-9) == kind.covariance_of(here, there).T
@@ -70,7 +70,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
     members = tuple(sorted((of(evidence, "third_order_nonlinearity"), of(evidence, "hysteresis"))))
     found = evidence.of_set(members, [part])
     cell = int(np.argmax(found.log[0]))
-    ahead = rows.to_come(poses_with(8)[:5])
+    ahead = rows.of_future_poses(poses_with(8)[:5])
     one = replace(found, sizes=found.sizes[[cell]], log=found.log[:, [cell]])
     mean, covariance = Predictive.likeliest(Posterior(evidence, [one]), 1.0).predicted(ahead)
 
@@ -86,7 +86,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
     joint = np.eye(len(both)) + both @ both.T
     assumed = evidence.parts[part]
     if assumed.kind is not None:
-        here, there = Sites.of(rows), Sites.of(ahead)
+        here, there = PoseInputs.of(rows), PoseInputs.of(ahead)
         crossed = assumed.kind.covariance_of(here, there)
         joint += assumed.tau**2 * np.block(
             [[assumed.kind.covariance, crossed], [crossed.T, assumed.kind.covariance_of(there, there)]]

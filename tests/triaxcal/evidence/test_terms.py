@@ -9,8 +9,8 @@ import pytest
 
 from tests.triaxcal.evidence.conftest import MINUS, rows_of
 from triaxcal.effects import CATALOGUE, effect_named
-from triaxcal.evidence.odds import Odds
-from triaxcal.evidence.rows import Rows
+from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import terms_of
 from triaxcal.poses.pose import Pose
 

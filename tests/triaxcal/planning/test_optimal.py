@@ -13,8 +13,8 @@ from scipy import stats
 from triaxcal.effects import CATALOGUE, Coefficient, Effect, effect_named
 from triaxcal.effects.contract import per_axis, per_axis_slope
 from triaxcal.errors import Refused
-from triaxcal.estimate.problem import solve
-from triaxcal.estimate.start import problem_of, start
+from triaxcal.estimate.initial_estimate import problem_of, start
+from triaxcal.estimate.likelihood import solve
 from triaxcal.model.directions import cube_directions, dilution, directions, distinct
 from triaxcal.model.sensor import Sensor
 from triaxcal.planning.design import ask

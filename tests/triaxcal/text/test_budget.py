@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from triaxcal.text import basis, not_evaluated, remedy
-from triaxcal.uncertainty import basis as of
+from triaxcal.uncertainty import budget_statements as of
 
 THERMAL = ("temperature_bias", "temperature_scale_factor")
 BASES: list[tuple[of.Basis, str]] = [
@@ -52,7 +52,7 @@ REMEDIES: list[tuple[of.Remedy, str]] = [
     (of.ReferenceKnown(5e-5), "know the reference to 50.0 µg"),
     (of.FinerRegisters(), "registers with one bit more"),
     (of.HostCorrects(), "correct in the host what the registers cannot hold"),
-    (of.ModelsToldApart(), "record what tells them apart, as advised"),
+    (of.ModelsDistinguished(), "record what tells them apart, as advised"),
     (
         of.TemperatureModelled(THERMAL[:1]),
         "take into the model what the residuals come from: temperature_bias, or another effect",

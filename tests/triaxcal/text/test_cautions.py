@@ -12,10 +12,10 @@ from triaxcal.estimate.caution import (
     BirgeRatio,
     Caution,
     ExcessVariance,
+    ExcludedPose,
     FaultyPosesExcluded,
     FewPoses,
     HighLeverage,
-    Outlier,
     OutlierSetsTied,
     OutliersExcluded,
     PoorSpread,
@@ -27,10 +27,10 @@ from triaxcal.frames.standing import SingleOrientation
 from triaxcal.inputs.attitude import AttitudeExcluded, AttitudesTied, MagnitudeContradicts, Row
 from triaxcal.inputs.datasheet import DatasheetContradicted, StillOfDatasheet
 from triaxcal.inputs.turning.rotation import StretchesDiffer
-from triaxcal.poses.pose import Began
+from triaxcal.poses.pose import PoseStart
 from triaxcal.text import caution
 
-FIRST, SECOND = Began(10.0), Began(70.04, recording=1)
+FIRST, SECOND = PoseStart(10.0), PoseStart(70.04, recording=1)
 SENTENCES: list[tuple[Caution, str]] = [
     (FewPoses(9, 9), "9 poses for 9 parameters: the residual proves little"),
     (
@@ -39,25 +39,25 @@ SENTENCES: list[tuple[Caution, str]] = [
         "70.0 s of recording 2 (stuck_output)",
     ),
     (
-        UnknownHistoryExcluded((Outlier(FIRST, -12.3),)),
+        UnknownHistoryExcluded((ExcludedPose(FIRST, -12.3),)),
         "excluded, because the pose before is not known: the pose at 10.0 s (-12 standard errors)",
     ),
     (
-        PosesExcludedByCaller((Outlier(FIRST, 2.0),)),
+        PosesExcludedByCaller((ExcludedPose(FIRST, 2.0),)),
         "excluded, as asked for: the pose at 10.0 s (+2 standard errors)",
     ),
     (
-        OutliersExcluded((Outlier(SECOND, 50.2),), doubtful=False, excess=0.0),
+        OutliersExcluded((ExcludedPose(SECOND, 50.2),), doubtful=False, excess=0.0),
         "excluded as outliers: the pose at 70.0 s of recording 2 (+50 standard errors)",
     ),
     (
-        OutliersExcluded((Outlier(FIRST, 8.0),), doubtful=True, excess=1.5e-5),
+        OutliersExcluded((ExcludedPose(FIRST, 8.0),), doubtful=True, excess=1.5e-5),
         "excluded as outliers: the pose at 10.0 s (+8 standard errors); by the noise inside the poses they are, by the "
         "other residuals all poses may repeat less well than their noise, and the standard errors allow for both "
         "(15.0 µg beside the noise of each pose)",
     ),
     (
-        OutlierSetsTied(((FIRST, SECOND), (Began(20.0),))),
+        OutlierSetsTied(((FIRST, SECOND), (PoseStart(20.0),))),
         "some poses may be outliers (10.0 s and 70.0 s of recording 2 or 20.0 s: the residuals do not tell these sets "
         "apart), or something else acts; none is excluded",
     ),

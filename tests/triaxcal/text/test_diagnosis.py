@@ -6,20 +6,20 @@ from dataclasses import replace
 
 import pytest
 
-from triaxcal.diagnosis import Call, Candidate, Finding, Verdict
-from triaxcal.evidence.average import Refusal
-from triaxcal.evidence.findings import Another, Findings, Unexplained
-from triaxcal.evidence.unmodelled import What
-from triaxcal.poses.pose import Began
+from triaxcal.diagnosis import Candidate, Finding, Recommendation, Verdict
+from triaxcal.evidence.findings import ChangePoint, Findings, Unexplained
+from triaxcal.evidence.model_average import Refusal
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.poses.pose import PoseStart
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty.next_recording import NextRecording, Source
 from triaxcal.units import ErrorUnit
 
 SMALL = ErrorUnit.of("g", 1.0)
-NOTHING = Findings((), {}, {}, Unexplained(0.04, What.TIME, 1e-5, False), None, 0.91)
+NOTHING = Findings((), {}, {}, Unexplained(0.04, UnmodelledKind.TIME, 1e-5, False), None, 0.91)
 KNOWN = Finding("hysteresis", Verdict.ADOPTED, 0.99995, {}, {}, "Let it rest.", 0.99995)
 GROUP = Finding("warm_up", Verdict.CONFOUNDED, 0.72, {"bias_drift": 0.275}, {}, "Let it warm up.", 0.995)
-BEGAN = {4: Began(132.0, None), 9: Began(301.5, None)}
+BEGAN = {4: PoseStart(132.0, None), 9: PoseStart(301.5, None)}
 
 
 def cause(found: Findings, findings: tuple[Finding, ...] = (), candidates: tuple[Candidate, ...] = ()) -> str:
@@ -52,13 +52,13 @@ def test_the_cause_is_told_with_its_probability() -> None:
 
 
 def test_what_has_no_name_is_told_with_its_size_and_what_it_goes_with() -> None:
-    found = replace(NOTHING, unexplained=Unexplained(0.97, What.BEFORE, 240e-6, True))
+    found = replace(NOTHING, unexplained=Unexplained(0.97, UnmodelledKind.POSE_BEFORE, 240e-6, True))
     said = "something acts that no effect describes (probability 0.97), 240.0 µg rms; it goes with the pose before"
     assert cause(found) == said
 
 
 def test_another_unit_is_told_with_the_pose_it_begins_at() -> None:
-    said = cause(replace(NOTHING, another=Another(4, 0.998)))
+    said = cause(replace(NOTHING, change_point=ChangePoint(4, 0.998)))
     assert said.startswith("from the pose at 132.0 s on one calibration does not hold")
     assert "probability 0.998" in said
 
@@ -90,6 +90,6 @@ def test_every_refusal_has_words(refused: Refusal) -> None:
     assert diagnosis.reason(replace(KNOWN, verdict=Verdict.CONFOUNDED), refused).count(";") == 1
 
 
-@pytest.mark.parametrize("found", Call)
-def test_every_call_has_words(found: Call) -> None:
+@pytest.mark.parametrize("found", Recommendation)
+def test_every_call_has_words(found: Recommendation) -> None:
     assert diagnosis.call(found)

@@ -11,7 +11,7 @@ from triaxcal.diagnosis import diagnose
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
 from triaxcal.uncertainty import budget
-from triaxcal.uncertainty.basis import AveragedModels
+from triaxcal.uncertainty.budget_statements import AveragedModels
 
 
 def one_after_the_other(poses: list[Pose], every_s: float, duration_s: float) -> list[Pose]:

@@ -9,7 +9,7 @@ import pytest
 
 from triaxcal.effects import Effect, effect_named
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.runs import by_run, together
+from triaxcal.estimate.recordings import by_run, together
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import channels_of, covariates, references

@@ -13,7 +13,7 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 from triaxcal.uncertainty import Component, Stated, budget
-from triaxcal.uncertainty.basis import (
+from triaxcal.uncertainty.budget_statements import (
     LongerOrMorePoses,
     PosesAtOtherTemperatures,
     SteadierTemperature,

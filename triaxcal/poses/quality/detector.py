@@ -14,12 +14,12 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.poses.quality import faults, mains
-from triaxcal.poses.quality.cells import CellKeeper, Steps
-from triaxcal.poses.quality.finding import Finding, Holds, MissingSamples
-from triaxcal.poses.quality.repeats import RunLengths
+from triaxcal.poses.quality.extremes import CellKeeper, StepEstimator
+from triaxcal.poses.quality.finding import Finding, MissingSamples, StillIntervals
+from triaxcal.poses.quality.run_lengths import RunLengths
 from triaxcal.poses.quality.timing import Gaps
 from triaxcal.poses.stillness.detector import Span
-from triaxcal.poses.stillness.rounded import OTHERWISE, shown_step
+from triaxcal.poses.stillness.quantization import OTHERWISE, shown_step
 from triaxcal.poses.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, Windows
 
 CELL_S = 0.1
@@ -73,7 +73,7 @@ class QualityDetector:
         self._period_ns = max(float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag, 1.0)
         size = max(CELL_LEAST, round(CELL_S * 1e9 / self._period_ns))
         self._chunk = -(-CHUNK_LEAST // size) * size
-        self._cells, self._steps, self._runs = CellKeeper(size), Steps(), RunLengths()
+        self._cells, self._steps, self._runs = CellKeeper(size), StepEstimator(), RunLengths()
         self._gaps, self._spectra = Gaps(), mains.Spectra(self._period_ns)
 
     def _take_chunks(self, *, last: bool = False) -> None:
@@ -105,7 +105,7 @@ class QualityDetector:
         """One for each kind of fault, with the still ``spans`` that windows ``w`` of the same stream show."""
         if not self.samples or self._begin_ns is None:
             return []
-        holds = Holds.of(self._begin_ns, w, spans)
+        holds = StillIntervals.of(self._begin_ns, w, spans)
         step, roughness = self._steps.step(), self._steps.roughness()
         if w is not None:
             # Printed decimals that are no multiples of the step hide it from single differences.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats, Ints
-from triaxcal.poses.quality.cells import COARSE, Cells
+from triaxcal.poses.quality.extremes import COARSE, Cells
 from triaxcal.poses.quality.finding import (
     AXES,
     AtRail,
@@ -15,14 +15,14 @@ from triaxcal.poses.quality.finding import (
     DuplicateSamples,
     Finding,
     Freeze,
-    Holds,
     Saturation,
     SlowUpdate,
     Steps,
+    StillIntervals,
     StuckOutput,
 )
-from triaxcal.poses.quality.repeats import ROWS, Run, RunLengths
-from triaxcal.poses.stillness.rounded import noise_of
+from triaxcal.poses.quality.run_lengths import ROWS, EqualRun, RunLengths
+from triaxcal.poses.stillness.quantization import noise_of
 
 RAIL_LEAST = 10
 RAIL_TIMES = 3
@@ -41,7 +41,7 @@ REPEATED_SHARE = 0.002
 
 
 def saturation(
-    cells: Cells, runs: RunLengths, holds: Holds, step: Floats, scatter: Floats, noisy: Bools
+    cells: Cells, runs: RunLengths, holds: StillIntervals, step: Floats, scatter: Floats, noisy: Bools
 ) -> tuple[Finding | None, list[set[int]]]:
     """And the poses that lie at a rail, by axis."""
     rails: list[AtRail] = []
@@ -68,11 +68,11 @@ def _extremes(cells: Cells, axis: int) -> tuple[float, float]:
     return float(cells.high[:, axis].max()), float(cells.low[:, axis].min())
 
 
-def frozen_runs(cells: Cells, runs: RunLengths, noisy: Bools) -> list[list[Run]]:
+def frozen_runs(cells: Cells, runs: RunLengths, noisy: Bools) -> list[list[EqualRun]]:
     """By axis, and last of all axes at once, the runs that are longer than noise allows. Those of one axis at its
     extremes are rails.
     """
-    found: list[list[Run]] = [[], [], [], []]
+    found: list[list[EqualRun]] = [[], [], [], []]
     if not (len(cells) and noisy.any()):
         return found
     most = runs.allowed(ROWS - 1)
@@ -143,7 +143,7 @@ def _full_scale(rail: float, step: float, side: int) -> bool:
 
 
 def stuck_output(
-    frozen: Sequence[Sequence[Run]], slow: SlowUpdate | None, holds: Holds, dead: Sequence[str]
+    frozen: Sequence[Sequence[EqualRun]], slow: SlowUpdate | None, holds: StillIntervals, dead: Sequence[str]
 ) -> Finding | None:
     """``dead`` are axes that never change."""
     freezes = []
@@ -179,7 +179,7 @@ def repeated_samples(
     return None, DuplicateSamples(triple, samples)
 
 
-def coarse_quantization(holds: Holds, affected: Sequence[set[int]], step: Floats) -> Finding | None:
+def coarse_quantization(holds: StillIntervals, affected: Sequence[set[int]], step: Floats) -> Finding | None:
     """Where steps are wider than twice the scatter in the poses, so that a mean keeps part of its rounding error;
     ``affected`` are poses, by axis, that lack their scatter for another reason.
     """

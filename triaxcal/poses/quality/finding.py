@@ -152,7 +152,7 @@ def untrusted_poses(findings: Iterable[Finding]) -> dict[int, str]:
 
 
 @dataclass(frozen=True)
-class Holds:
+class StillIntervals:
     """The still spans of a stream: ``start_ns``, ``end_ns`` (k,); ``begin_ns`` is where its seconds begin. ``variance``
     (k,3) of the readings in each, slow noise included.
     """
@@ -163,7 +163,7 @@ class Holds:
     variance: Floats
 
     @classmethod
-    def of(cls, begin_ns: int, w: Windows | None, spans: Sequence[Span]) -> Holds:
+    def of(cls, begin_ns: int, w: Windows | None, spans: Sequence[Span]) -> StillIntervals:
         if w is None or not spans:
             none = np.zeros(0, dtype=np.int64)
             return cls(begin_ns, none, none, np.zeros((0, 3)))

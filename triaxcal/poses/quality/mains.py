@@ -14,7 +14,7 @@ from scipy import fft
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import gamma_sf
-from triaxcal.poses.quality.finding import Holds, MainsPickup, Tone
+from triaxcal.poses.quality.finding import MainsPickup, StillIntervals, Tone
 
 MAINS_HZ = (50.0, 60.0)
 HARMONICS = (1, 2, 3)
@@ -129,7 +129,7 @@ class Spectra:
         self._start_ns.append(int(time_ns[0]))
         self._end_ns.append(int(time_ns[-1]))
 
-    def lines(self, holds: Holds) -> list[Line]:
+    def lines(self, holds: StillIntervals) -> list[Line]:
         """The lines of the mains in the segments that lie in still spans."""
         if not self._power:
             return []

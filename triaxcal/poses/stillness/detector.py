@@ -16,10 +16,10 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
-from triaxcal.poses.stillness.edges import SPAN_LEAST_WINDOWS, trimmed
-from triaxcal.poses.stillness.noise_scales import SCALES, NoiseScales, contrasts
-from triaxcal.poses.stillness.rounded import Rounding, resolution
+from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrasts
+from triaxcal.poses.stillness.quantization import Rounding, resolution
 from triaxcal.poses.stillness.shaken import ALONE_S, runs, shaken_noise, shaken_runs
+from triaxcal.poses.stillness.trimming import SPAN_LEAST_WINDOWS, trimmed
 from triaxcal.poses.stillness.windows import WindowCutter, Windows
 
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 
 from triaxcal.arrays import Bools, Floats, Ints
-from triaxcal.poses.stillness.edges import trimmed
-from triaxcal.poses.stillness.noise_scales import SCALES, NoiseScales, contrasts
+from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrasts
+from triaxcal.poses.stillness.trimming import trimmed
 from triaxcal.poses.stillness.windows import Windows
 
 LEAST_S = 1.0

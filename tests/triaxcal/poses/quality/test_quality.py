@@ -10,24 +10,24 @@ import pytest
 from scipy import stats
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.poses.coloured_noise import first_order, flicker, white
 from triaxcal.poses.quality import Finding, QualityDetector
 from triaxcal.poses.quality.faults import coarse_quantization
 from triaxcal.poses.quality.finding import (
     AtRail,
     CoarseQuantization,
     DuplicateSamples,
-    Holds,
     MainsPickup,
     MissingSamples,
     Saturation,
     SlowUpdate,
+    StillIntervals,
     StuckOutput,
     Touched,
 )
 from triaxcal.poses.quality.mains import bands
 from triaxcal.poses.quality.timing import Gaps
 from triaxcal.poses.stillness.detector import StillnessDetector
+from triaxcal.poses.synthetic_noise import first_order, flicker, white
 
 NOISE = 3e-4
 HOLD_S, MOVE_S = 4.0, 1.0
@@ -349,7 +349,7 @@ def test_the_error_stated_for_coarse_steps_is_that_of_rounded_means(sigma: float
     mean = (codes * p).sum(axis=1)
     worst = float(np.abs(mean - place[:, 0]).max())
     variance = float((((codes - mean[:, None]) ** 2) * p).sum(axis=1).mean())
-    holds = Holds(0, np.arange(20), np.arange(20), np.full((20, 3), variance))
+    holds = StillIntervals(0, np.arange(20), np.arange(20), np.full((20, 3), variance))
     found = coarse_quantization(holds, [set(), set(), set()], np.ones(3))
     assert isinstance(found, CoarseQuantization)
     assert found.axes[0].mean_error == pytest.approx(worst, rel=0.15)

@@ -15,9 +15,9 @@ from scipy.ndimage import gaussian_filter1d
 from triaxcal.errors import InvalidData
 from triaxcal.model.samples import Samples
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.coloured_noise import first_order
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.synthetic_noise import first_order
 from triaxcal.synthetic import SyntheticUnit, Tumble
 
 Detect = Callable[..., tuple[Windows, list[Span], list[Pose]]]

@@ -1,0 +1,163 @@
+"""Where the fit begins: poses as a problem, its closed form, and the refusal of poses that cannot carry one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.distributions import chi2_ppf
+from triaxcal.effects.contract import Effect
+from triaxcal.errors import InvalidData, Refused
+from triaxcal.estimate.ellipsoid import closed_form, coefficients
+from triaxcal.estimate.likelihood import Problem, State, linearise
+from triaxcal.model.directions import dilution, distinct, linear_design, most_wanted
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.covariates import channels_of, lags_for, references, with_scale
+from triaxcal.poses.pose import Pose
+
+DILUTION_LIMIT = 100.0
+"""Above this a set of poses is refused: some combination of parameters is a hundred times worse than one pose."""
+NOISE_LIMIT = 0.05
+"""Poses are refused where noise alone, times the dilution, is this share of the reference."""
+POSES_LEAST = 9
+ROUGH_LEAST, ROUGH_APART_DEG, ROUGH_LIMIT_RAD, TRIAD_UNLIKE_SPHERE = 6, 10.0, 0.2, 0.03
+"""Directions are determined without a fit from so many poses so far apart, where they are not less sure than this; and
+by how much at least scale factors of the axes are taken to differ."""
+
+
+class Underdetermined(Refused):
+    """The poses cannot carry nine parameters; ``a`` (n,3) are what is known of their directions."""
+
+    def __init__(self, why: str, a: Floats, wanted: Sequence[str]) -> None:
+        super().__init__(f"{why}; {len(a)} poses in {distinct(a)} distinct directions", wanted=wanted)
+
+
+def problem_of(
+    poses: Sequence[Pose],
+    *,
+    signs: Sequence[float] = (1, 1, 1),
+    reference: float = 1.0,
+    effects: Sequence[Effect] = (),
+) -> Problem:
+    """With the lags of channels that the ``effects`` need. Raises InvalidData, Refused where there are fewer than nine
+    poses."""
+    if len(poses) < POSES_LEAST:
+        raise Refused(
+            f"{len(poses)} still pose{'s' * (len(poses) != 1)}; nine parameters need at least {POSES_LEAST}, "
+            "14 or 26 are better",
+            wanted=wanted_for(poses, signs),
+        )
+    u = np.array([p.mean for p in poses])
+    low, high = u.min(axis=0), u.max(axis=0)
+    flat = [axis for axis, same in zip("xyz", high - low <= 0, strict=True) if same]
+    if flat:
+        raise Refused(f"the output of axis {', '.join(flat)} never changes; it cannot be calibrated")
+    if not all(s in (1, -1) for s in signs):
+        raise InvalidData(f"signs must be +1 or −1, not {signs}")
+    if not (np.isfinite(reference) and reference > 0):
+        raise InvalidData(f"the reference must be a positive number, not {reference}")
+    channels = channels_of(poses, lags_for(effects))
+    return Problem(
+        u=u,
+        covariance=np.array([p.covariance for p in poses]),
+        channels=channels,
+        channel_reference=references(channels),
+        middle=(low + high) / 2,
+        half=(high - low) / 2,
+        signs=np.asarray(signs, dtype=float),
+        reference=reference,
+    )
+
+
+def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> State:
+    """The closed form as a starting point, after it is sure that the poses can carry nine parameters."""
+    x = (problem.u - problem.middle) / problem.half
+    rough = x / np.linalg.norm(x, axis=1, keepdims=True)
+    try:
+        A, c = closed_form(problem.u)
+        a = (problem.u - c) @ A.T
+        spread = dilution(a, linear_design(a / np.linalg.norm(a, axis=1, keepdims=True), x))
+    except Refused as e:
+        raise Underdetermined(str(e), rough, wanted_for(poses, signs)) from None
+    k, angles, b = coefficients(A * problem.reference, c)
+    ax, ay, az = angles
+    sx, sy, sz = problem.signs
+    D = problem.signs * problem.half / k
+    w = problem.signs * b - problem.middle * D / problem.half
+    state = State(np.concatenate([D, w, [ax * sy * sz, ay * sx * sz, az * sx * sy]]), ())
+    noise = float(np.sqrt(np.mean(linearise(problem, state)[2] ** 2))) / problem.reference
+    known = spread * noise < NOISE_LIMIT
+    if not spread < DILUTION_LIMIT:
+        raise Underdetermined(
+            f"the poses cannot carry nine parameters: some combination of them would be {spread:.3g} times as "
+            f"uncertain as one pose (limit {DILUTION_LIMIT:g})",
+            a,
+            wanted_for(poses, signs),
+        )
+    if not known:
+        raise Underdetermined(
+            "the poses cannot carry nine parameters: they differ by little more than their noise",
+            a,
+            wanted_for(poses, signs),
+        )
+    return state
+
+
+def with_history(problem: Problem, poses: Sequence[Pose], sensor: Sensor) -> Problem:
+    """The problem with the covariates that need the scale of the outputs: the pose before, the scatter."""
+    return problem.with_channels(with_scale(problem.channels, poses, sensor.scale_factor, sensor.bias))
+
+
+def started_problem(
+    poses: Sequence[Pose], *, signs: Sequence[float], reference: float, effects: Sequence[Effect] = ()
+) -> tuple[Problem, State]:
+    """The problem with the history of its poses and what the ``effects`` need, and where the fit begins. Raises as
+    `problem_of` and `start` do."""
+    problem = problem_of(poses, signs=signs, reference=reference, effects=effects)
+    state = start(problem, poses, signs)
+    return with_history(problem, poses, state.sensor(problem)), state
+
+
+def wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]:
+    """The poses that would mend a set, as far as its directions can be determined without a fit.
+
+    Where they cannot, a whole set is wanted, which carries nine parameters whatever the poses there are.
+    """
+    up, unsure_rad = rough_directions(poses, signs)
+    return _labels(up, unsure_rad)
+
+
+def rough_directions(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[Floats, float]:
+    """Up (n,3) in poses that need not carry a fit, and how unsure it is; (0,3) where it cannot be determined.
+
+    By a sphere through the outputs. How far a triad is from a sphere shows in the residual, given poses to spare.
+    """
+    nothing = np.zeros((0, 3)), 0.0
+    if len(poses) < ROUGH_LEAST:
+        return nothing
+    u = np.array([p.mean for p in poses])
+    error = float(np.sqrt(np.mean([np.trace(p.covariance) for p in poses])))
+    half = float(np.max(np.ptp(u, axis=0))) / 2
+    if half <= error / NOISE_LIMIT:
+        return nothing
+    v = (u - u.mean(axis=0)) / half
+    rows = np.concatenate([2 * v, np.ones((len(v), 1))], axis=1)
+    centre = np.linalg.lstsq(rows, (v**2).sum(axis=1), rcond=1e-9)[0][:3]
+    radii = np.linalg.norm(v - centre, axis=1)
+    a = (v - centre) / np.maximum(radii, 1e-300)[:, None]
+    smallest = float(np.linalg.svd(np.concatenate([a, np.ones((len(a), 1))], axis=1), compute_uv=False)[-1])
+    if (many := distinct(a, ROUGH_APART_DEG)) < ROUGH_LEAST:
+        return nothing
+    # With few degrees of freedom left a triad that is no sphere may pass for one: the least that 5 % of them show.
+    shown = float(np.sqrt(many / chi2_ppf(0.05, many - 4)))
+    unlike = max(TRIAD_UNLIKE_SPHERE, shown * float(np.std(radii) / np.mean(radii)))
+    unsure_rad = unlike / max(smallest, 1e-9)
+    return (a * np.asarray(signs), unsure_rad) if unsure_rad < ROUGH_LIMIT_RAD else nothing
+
+
+def _labels(a: Floats, unsure_rad: float = 0.0) -> tuple[str, ...]:
+    # Directions of a refused set that seem to want nothing are wrong.
+    wanted = most_wanted(a, unsure_rad=unsure_rad) or most_wanted(np.zeros((0, 3)))
+    return tuple(label for label, _ in wanted)

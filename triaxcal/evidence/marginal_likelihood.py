@@ -1,0 +1,258 @@
+"""How well a set of terms, beside an unmodelled part, accounts for the rows: the logarithm of its evidence.
+
+All is conjugate: coefficients are normal of a size ρ, sizes lie on a grid with even shares, the nine parameters are
+flat and projected out, and the size of the noise is integrated over what the poses tell of it. All evidences are
+of the same rows, linearised at the same point, and so compare.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.distributions import log_sum_exp
+from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.prior import Odds
+from triaxcal.evidence.terms import Term
+from triaxcal.evidence.unmodelled_kernels import UnmodelledCovariance, kinds_of
+
+
+@dataclass(frozen=True, eq=False)
+class UnmodelledPart:
+    """The assumption on what no term describes: nothing, or one ``kind`` of size ``tau`` standard errors."""
+
+    kind: UnmodelledCovariance | None
+    tau: float
+    log_prior: float
+
+
+@dataclass(frozen=True, eq=False)
+class _EigenBasis:
+    """The projected data in the axes of one kind: ``variance`` (m,) there, terms' columns (m,C), misfits (m,)."""
+
+    variance: Floats
+    columns: Floats
+    z: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class SetEvidence:
+    """Of one set, by the ``parts`` (P,) reckoned and sizes (S,k) of its k terms: ``log`` (P,S) joint with the priors of
+    part, sizes and members, ``mean`` (P,q) of the scaled coefficients of all members, over the sizes."""
+
+    members: tuple[int, ...]
+    parts: tuple[int, ...]
+    sizes: Floats
+    log: Floats
+    mean: Floats
+
+    @cached_property
+    def total(self) -> float:
+        return float(log_sum_exp(self.log))
+
+    @cached_property
+    def by_part(self) -> Floats:
+        """(P,) logarithms."""
+        return np.asarray(log_sum_exp(self.log, axis=1))
+
+
+class Evidence:
+    """The rows, the ``terms`` a set may have with the ``columns`` (N,C) of them all, the ``parts`` (the first is none),
+    and the grid of ``sizes`` (R,) of effects in g."""
+
+    def __init__(self, rows: Rows, terms: Sequence[Term], odds: Odds, smallest_g: float | None = None) -> None:
+        """Sizes begin at ``smallest_g``, by default at that share of the noise of a pose which the odds have."""
+        self.rows, self.terms, self.odds = rows, terms, odds
+        self.parts = _parts(rows, odds)
+        self._begin_sizes(odds.smallest * rows.median_standard_error if smallest_g is None else smallest_g)
+        self.log_prior = np.array([term.log_prior for term in terms])
+        self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
+        self.columns = np.concatenate([np.empty((len(rows.y), 0)), *(term.columns for term in terms)], axis=1)
+        projected = rows.complement.T @ self.columns
+        kinds = list(dict.fromkeys(part.kind for part in self.parts))
+        self._diagonal = [_diagonal(kind, projected, rows.z) for kind in kinds]
+        self._which = [kinds.index(part.kind) for part in self.parts]
+        diagonal = (self._diagonal[which] for which in self._which)
+        self._weight = [1 / (1 + part.tau**2 * t.variance) for part, t in zip(self.parts, diagonal, strict=True)]
+        ranks = np.array([term.rank for term in terms], dtype=int)
+        self._by_rank: list[tuple[Ints, Ints]] = []
+        for rank in np.unique(ranks):
+            index = np.flatnonzero(ranks == rank)
+            self._by_rank.append((index, self._ends[index][:, None] + np.arange(rank)))
+
+    def _begin_sizes(self, smallest_g: float) -> None:
+        odds, reference = self.odds, self.rows.problem.reference
+        self.sizes = np.geomspace(smallest_g, odds.largest_g * reference, odds.sizes)
+        gross = np.geomspace(smallest_g, odds.largest_outlier * reference, odds.sizes)
+        self._sizes_of = np.array([gross if term.effect is None else self.sizes for term in self.terms])
+
+    def resized(self, smallest_g: float) -> Evidence:
+        """The same, with sizes that begin elsewhere."""
+        other = copy(self)
+        other._begin_sizes(smallest_g)
+        return other
+
+    def covariance(self, part: int) -> Floats:
+        """(N,N) of the rows over their errors: noise and unmodelled part."""
+        assumed = self.parts[part]
+        noise = np.eye(len(self.rows.y))
+        return noise if assumed.kind is None else noise + assumed.tau**2 * assumed.kind.covariance
+
+    def places(self, members: Sequence[int]) -> Ints:
+        """Where the scaled coefficients of these terms stand among those of all, and their ``columns``."""
+        ranges = [np.arange(self._ends[i], self._ends[i + 1]) for i in members]
+        return np.concatenate([np.empty(0, dtype=int), *ranges])
+
+    def log_evidence_with_each(
+        self, part: int, members: Sequence[int] = (), sizes: Sequence[float] = ()
+    ) -> tuple[Floats, float]:
+        """Logarithms (T,R) of the evidence of each term at each size beside ``members`` of given sizes, and that of
+        these alone; with the priors of the part and of the term's size, without those of names."""
+        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
+        score, chi2, shared, log_det = self._conditional_on(part, members, sizes)
+        base = self.parts[part].log_prior + 0.5 * float(np.log(weight).sum()) - log_det
+        out = np.empty((len(self.terms), len(self.sizes)))
+        for index, places in self._by_rank:
+            information, along = self._in_own_axes(diagonal, weight, shared, places, score)
+            squared = self._sizes_of[index][:, :, None] ** 2
+            spread = 1 + squared * information[:, None, :]
+            gain = np.sum(squared / spread * along[:, None, :], axis=2)
+            out[index] = self.rows.log_likelihood(chi2 - gain) - 0.5 * np.log(spread).sum(axis=2)
+        alone = float(self.rows.log_likelihood(np.array(chi2))) + base
+        return out + base - np.log(len(self.sizes)), alone
+
+    def _in_own_axes(
+        self, diagonal: _EigenBasis, weight: Floats, shared: Floats, places: Ints, score: Floats
+    ) -> tuple[Floats, Floats]:
+        """Eigenvalues (t,q) of the information of each term's coefficients, and the squared scores along its axes."""
+        columns = diagonal.columns[:, places]
+        if places.shape[1] == 1:
+            information = weight @ columns[:, :, 0] ** 2 - np.sum(shared[:, places[:, 0]] ** 2, axis=0)
+            return np.maximum(information, 0.0)[:, None], score[places] ** 2
+        matrix = _squared(np.sqrt(weight)[:, None, None] * columns)
+        if len(shared):
+            matrix = matrix - _squared(shared[:, places])
+        information, axes = np.linalg.eigh(matrix)
+        return np.maximum(information, 0.0), np.einsum("tqr,tq->tr", axes, score[places]) ** 2
+
+    def normal_equations(
+        self, part: int, members: Sequence[int], sizes: Sequence[float], each: Sequence[int]
+    ) -> tuple[dict[int, tuple[Floats, Floats]], float]:
+        """Of ``each`` term the information (q,q) and score (q,) of its scaled coefficients beside ``members`` of these
+        sizes, and the sum of squares that these leave."""
+        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
+        score, chi2, shared, _ = self._conditional_on(part, members, sizes)
+        out: dict[int, tuple[Floats, Floats]] = {}
+        for i in each:
+            own = slice(self._ends[i], self._ends[i + 1])
+            columns, taken = diagonal.columns[:, own], shared[:, own]
+            out[i] = columns.T @ (weight[:, None] * columns) - taken.T @ taken, score[own]
+        return out, chi2
+
+    def _conditional_on(
+        self, part: int, members: Sequence[int], sizes: Sequence[float]
+    ) -> tuple[Floats, float, Floats, float]:
+        """What ``members`` of these sizes leave: the score (C,) of all terms and the sum of squares; (k,C) whose square
+        is the information that they take; and half the logarithm of the determinant of their precision."""
+        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
+        index = self.places(members)
+        scale = np.repeat(np.asarray(sizes, dtype=float), [self.terms[i].rank for i in members])
+        own = diagonal.columns[:, index] * scale
+        lower = np.linalg.cholesky(np.eye(len(index)) + own.T @ (weight[:, None] * own))
+        shared = np.linalg.solve(lower, (own * weight[:, None]).T @ diagonal.columns)
+        absorbed = np.linalg.solve(lower, own.T @ (weight * diagonal.z))
+        score = diagonal.columns.T @ (weight * diagonal.z) - shared.T @ absorbed
+        chi2 = float(diagonal.z @ (weight * diagonal.z)) - float(absorbed @ absorbed)
+        return score, chi2, shared, float(np.log(np.diag(lower)).sum())
+
+    def with_each_further(self, found: SetEvidence, row: int, cells: int) -> Floats:
+        """(T,R) about the logarithm of the evidence of a set with each further term at each size, under the part in
+        this ``row`` of it: at those ``cells`` of the members' sizes that are best without the term."""
+        best = np.argsort(-found.log[row])[:cells]
+        share = found.by_part[row] - log_sum_exp(found.log[row][best])
+        each = []
+        for cell in best:
+            with_each, without = self.log_evidence_with_each(found.parts[row], found.members, found.sizes[cell])
+            each.append(found.log[row][cell] + share + with_each - without)
+        return np.asarray(log_sum_exp(each, axis=0))
+
+    def of_set(self, members: tuple[int, ...], parts: Sequence[int]) -> SetEvidence:
+        """Sizes of three and more terms go by every second step of the grid."""
+        first, step = (0, 1) if len(members) < 3 else (1, 2)
+        grids = [self._sizes_of[i][first::step] for i in members]
+        sizes = np.array(list(itertools.product(*grids)), dtype=float)
+        index = self.places(members)
+        prior = float(self.log_prior[list(members)].sum()) - sum(np.log(len(grid)) for grid in grids)
+        information = np.empty((len(parts), len(index), len(index)))
+        score = np.empty((len(parts), len(index)))
+        chi2, base = np.empty((2, len(parts), 1))
+        for row, part in enumerate(parts):
+            diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
+            own = diagonal.columns[:, index]
+            weighted = (weight[:, None] * own).T
+            information[row], score[row] = weighted @ own, weighted @ diagonal.z
+            chi2[row] = diagonal.z @ (weight * diagonal.z)
+            base[row] = self.parts[part].log_prior + 0.5 * np.log(weight).sum() + prior
+        gain, log_det, mean = _marginalised(information, score, [self.terms[i].rank for i in members], grids)
+        log = self.rows.log_likelihood(chi2 - gain) - 0.5 * log_det + base
+        share = np.exp(log - log_sum_exp(log, axis=1)[:, None])
+        return SetEvidence(members, tuple(parts), sizes, log, np.einsum("ps,psq->pq", share, mean))
+
+
+def _squared(columns: Floats) -> Floats:
+    """(t,q,q) of (m,t,q): the products of each term's columns."""
+    return np.asarray(columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2))
+
+
+def _marginalised(
+    information: Floats, score: Floats, ranks: Sequence[int], grids: Sequence[Floats]
+) -> tuple[Floats, Floats, Floats]:
+    """Of coefficients in blocks of these ``ranks``, with ``information`` (P,q,q) and ``score`` (P,q), for every choice
+    S of one size for each block from its grid: by how much they lower the sum of squares (P,S), the logarithm of the
+    determinant of their precision over that of the prior (P,S), and their mean (P,S,q).
+
+    Block by block: in the axes of its own information every size is a division, and the rest is what it leaves.
+    """
+    if not ranks:
+        nothing = np.zeros((len(score), 1))
+        return nothing, nothing, np.zeros((len(score), 1, 0))
+    r, squared = ranks[0], grids[0][:, None] ** 2
+    value, axes = np.linalg.eigh(information[:, :r, :r])
+    spread = 1 + squared * np.maximum(value, 0.0)[:, None]
+    shrunk = squared / spread
+    along = np.einsum("pqr,pq->pr", axes, score[:, :r])
+    gain, log_det = np.sum(shrunk * along[:, None] ** 2, axis=2), np.log(spread).sum(axis=2)
+    if len(ranks) == 1:
+        return gain, log_det, (shrunk * along[:, None]) @ axes.transpose(0, 2, 1)
+    crossed = axes.transpose(0, 2, 1) @ information[:, :r, r:]
+    taken = shrunk[..., None] * crossed[:, None]
+    rest = information[:, None, r:, r:] - crossed.transpose(0, 2, 1)[:, None] @ taken
+    left = score[:, None, r:] - np.einsum("psrq,pr->psq", taken, along)
+    P, R, q = left.shape
+    more, more_det, others = _marginalised(rest.reshape(P * R, q, q), left.reshape(P * R, q), ranks[1:], grids[1:])
+    others = others.reshape(P, R, -1, q)
+    own = shrunk[:, :, None] * (along[:, None, None] - np.einsum("prq,pstq->pstr", crossed, others))
+    mean = np.concatenate([np.einsum("pqr,pstr->pstq", axes, own), others], axis=3)
+    gain = gain[..., None] + more.reshape(P, R, -1)
+    log_det = log_det[..., None] + more_det.reshape(P, R, -1)
+    return gain.reshape(P, -1), log_det.reshape(P, -1), mean.reshape(P, -1, r + q)
+
+
+def _parts(rows: Rows, odds: Odds) -> list[UnmodelledPart]:
+    kinds = kinds_of(rows)
+    sizes = np.geomspace(odds.unmodelled_smallest, odds.unmodelled_largest, odds.unmodelled_sizes)
+    share = float(np.log(odds.unmodelled / len(kinds) / len(sizes)))
+    none = UnmodelledPart(None, 0.0, float(np.log1p(-odds.unmodelled)))
+    return [none, *(UnmodelledPart(kind, float(tau), share) for kind in kinds for tau in sizes)]
+
+
+def _diagonal(kind: UnmodelledCovariance | None, projected: Floats, z: Floats) -> _EigenBasis:
+    if kind is None:
+        return _EigenBasis(np.zeros(len(z)), projected, z)
+    return _EigenBasis(kind.variance, kind.axes.T @ projected, kind.axes.T @ z)

@@ -1,0 +1,341 @@
+"""What is corrected: the linear parameters and the effects' coefficients, averaged over all likely sets.
+
+A document has one form and one shape for each effect. So every shape of a name is carried over to the likeliest one:
+the coefficients are those that come nearest, in the poses and in the next recording, to what all shapes together do.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects import CATALOGUE, TEMPERATURE
+from triaxcal.effects.contract import Effect
+from triaxcal.effects.plugins import EffectFault
+from triaxcal.estimate.calibration import HoldsAt
+from triaxcal.estimate.likelihood import State, linearise_all, parameters_by_theta
+from triaxcal.evidence.linearised_data import LINEAR
+from triaxcal.evidence.mixture_components import NEGLIGIBLE, Components, components
+from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind, reading_geometry
+from triaxcal.model.directions import cube_directions
+from triaxcal.model.sensor import Sensor
+from triaxcal.poses.covariates import at_moment
+
+NOTICEABLE = 0.1
+"""Of the standard error of a pose: a name that is unlikely and corrects less is not listed."""
+BIAS = slice(3, 6)
+"""Of the nine parameters as the fit has them: to one of these a bias adds as it is."""
+THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
+SELECTED_LEAST = 0.03
+"""Of the mean square of what an unlikely name may do: a name that corrects less only adds coefficients that nobody
+knows."""
+STEPS = 3
+"""Of Newton's method, for nine parameters a few parts in a thousand from where they go."""
+
+
+_NextReadings = tuple[Floats, Floats, Floats, dict[str, Floats]]
+"""As `_next_readings` has it."""
+
+
+class Refusal(StrEnum):
+    """Why no effect is corrected."""
+
+    UNMODELLED = "unmodelled"
+    """Something that no name describes probably acts: an average over names would go with it where it must not."""
+    CHANGE_POINT = "another"
+    """One calibration does not hold in all poses: a unit was exchanged on the way, or its channels."""
+    ONE_POSE = "one_pose"
+    """A name is certain, and without some single pose unlikelier than not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Average:
+    """``sensor`` has one entry for each likely name, by the mean of its coefficients: sets without the effect count,
+    with zero. ``covariance`` (9+p,9+p) is that of its scale factors, misalignments, biases and coefficients, within the
+    sets and between them, of which ``thermal`` is the part of sets with a thermal effect that is not listed;
+    ``prior_sd`` (p,) are the coefficients' standard deviations before the poses were seen, as the probabilities and
+    sizes after have them. ``weights`` has the probability of each name. ``process_bias`` (3,) g, which the biases hold,
+    is what a process in time adds to them at the moment for which all this holds."""
+
+    sensor: Sensor
+    covariance: Floats
+    thermal: Floats
+    prior_sd: Floats
+    weights: Mapping[str, float]
+    process_bias: Floats
+
+
+def refusal(posterior: Posterior) -> Refusal | None:
+    odds = posterior.evidence.odds
+    if posterior.change_point_probabilities.sum() >= odds.refused:
+        return Refusal.CHANGE_POINT
+    if posterior.unmodelled_probability >= odds.refused:
+        return Refusal.UNMODELLED
+    certain = [name for name, p in posterior.effect_probabilities.items() if p >= odds.certain]
+    if any(posterior.least_leave_one_out(name) < odds.refused for name in certain):
+        return Refusal.ONE_POSE
+    return None
+
+
+def average(posterior: Posterior, at: HoldsAt, solved: Sequence[Components] | None = None) -> Average:
+    """Over all sets, sizes and parts; it holds for another recording as at a moment of this one. ``solved`` are the
+    likeliest sets (`components`), where they are known."""
+    listed, solved = _likeliest(posterior), components(posterior) if solved is None else solved
+    made = _of_listed(posterior, at, listed, solved)
+    kept = [effect for effect in listed if _selected(posterior, made, effect)]
+    return made if len(kept) == len(listed) else _of_listed(posterior, at, kept, solved)
+
+
+def _of_listed(posterior: Posterior, at: HoldsAt, listed: Sequence[Effect], solved: Sequence[Components]) -> Average:
+    projection = _Projection.of(posterior, at, listed)
+    mean, left = _mean(posterior, projection)
+    state = _where_linearised(posterior, mean, projection)
+    sensor = state.sensor(posterior.evidence.rows.problem)
+    process_bias = _process_bias(posterior, left, at.t_s)
+    moved = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + process_bias, sensor.effects)
+    return _with_errors(posterior, at, projection, moved, state, mean, process_bias, solved)
+
+
+def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
+    """Whether a name is likely, or corrects a good part of what it may do."""
+    if posterior.effect_probabilities[effect.name] >= posterior.evidence.odds.reported:
+        return True
+    ends = np.cumsum([LINEAR, *(len(q) for _, q in made.sensor.effects)])
+    k = next(k for k, (other, _) in enumerate(made.sensor.effects) if other is effect)
+    own, q = slice(ends[k], ends[k + 1]), made.sensor.effects[k][1]
+    size = made.prior_sd[ends[k] - LINEAR : ends[k + 1] - LINEAR]
+    if not size.all():  # only in sets that are hardly likely
+        return False
+    corrects = float(np.sum((q / size) ** 2))
+    return corrects >= SELECTED_LEAST * (corrects + float(np.sum(np.diag(made.covariance)[own] / size**2)))
+
+
+def linear_alone(posterior: Posterior, at: HoldsAt, linear: Sensor, solved: Sequence[Components]) -> Average:
+    """The ``linear`` sensor with the errors that all likely sets make of it: what is handed on where no effect is
+    corrected."""
+    rows = posterior.evidence.rows
+    state = State.of(rows.problem, linear)
+    projection, mean = _Projection.of(posterior, at, []), state.theta - rows.state.theta
+    return _with_errors(posterior, at, projection, linear, state, mean, np.zeros(3), solved)
+
+
+def _with_errors(
+    posterior: Posterior,
+    at: HoldsAt,
+    projection: _Projection,
+    sensor: Sensor,
+    state: State,
+    mean: Floats,
+    process_bias: Floats,
+    solved: Sequence[Components],
+) -> Average:
+    G = parameters_by_theta(posterior.evidence.rows.problem, state)
+    spread = _Spread.of(posterior, solved, mean, projection, process_bias, at.t_s)
+    weights = {effect.name: posterior.effect_probabilities[effect.name] for effect in projection.effects}
+    return Average(
+        sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, process_bias
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """``effects`` in the form and the shape that stands for each name, ``columns`` (N,p) theirs. ``by_term`` (9+p,C)
+    are the parameters, as deviations, by the scaled coefficients of all terms; zero for outliers. What a name that is
+    not listed does goes into the nine parameters, as far as these can take it."""
+
+    effects: tuple[Effect, ...]
+    columns: Floats
+    by_term: Floats
+
+    @classmethod
+    def of(cls, posterior: Posterior, at: HoldsAt, likeliest: Sequence[Effect]) -> _Projection:
+        evidence = posterior.evidence
+        rows = evidence.rows
+        there = _next_readings(posterior, at)
+        each = [_derivatives(posterior, effect, there) for effect in likeliest]
+        ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
+        linear = np.concatenate([rows.linear, there[0]])
+        by_term = np.zeros((9 + ends[-1], evidence.columns.shape[1]))
+        of_name = {effect.name: k for k, effect in enumerate(likeliest)}
+        nothing = np.empty((len(linear), 0))
+        known: dict[int, Floats] = {}
+        for i in sorted({i for found in posterior.sets for i in found.members}):
+            term = evidence.terms[i]
+            if term.effect is None:
+                continue
+            k = of_name.get(term.name)
+            to = nothing if k is None else each[k]
+            if id(term.effect) not in known:
+                known[id(term.effect)] = _projected(linear, to, _derivatives(posterior, term.effect, there))
+            found = known[id(term.effect)][:, list(term.kept)] * term.combination
+            own = [] if k is None else [*range(9 + ends[k], 9 + ends[k + 1])]
+            by_term[np.ix_([*range(9), *own], evidence.places([i]))] = found
+        by_term[:9] /= rows.lengths[:, None]
+        columns = np.concatenate([np.empty((len(rows.y), 0)), *(c[: len(rows.y)] for c in each)], axis=1)
+        return cls(tuple(likeliest), columns, by_term)
+
+
+def _likeliest(posterior: Posterior) -> list[Effect]:
+    """Of each name that is listed the form and the shape of the greatest weight, the likeliest name first."""
+    weight: dict[int, float] = defaultdict(float)
+    effects: dict[int, Effect] = {}
+    corrects: dict[str, float] = defaultdict(float)
+    for w, found in zip(posterior.weight, posterior.sets, strict=True):
+        scaled = np.exp(found.by_part - found.total) @ found.mean
+        ends = np.cumsum([0, *(posterior.evidence.terms[i].rank for i in found.members)])
+        for i, first, last in zip(found.members, ends, ends[1:], strict=False):
+            term = posterior.evidence.terms[i]
+            if term.effect is not None:
+                weight[id(term.effect)] += float(w)
+                effects[id(term.effect)] = term.effect
+                corrects[term.name] += float(w) * float(np.sqrt(np.mean(scaled[first:last] ** 2)))
+    least = NOTICEABLE * posterior.evidence.rows.median_standard_error
+    out: dict[str, Effect] = {}
+    for key in sorted(weight, key=lambda key: -weight[key]):
+        out.setdefault(effects[key].name, effects[key])
+    return [
+        out[n]
+        for n, p in posterior.effect_probabilities.items()
+        if p >= posterior.evidence.odds.reported or corrects[n] > least
+    ]
+
+
+def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
+    """(9+p,q): the deviation of the linear parameters, and the coefficients, that come nearest to a unit of each."""
+    size = np.maximum(np.linalg.norm(to, axis=0), 1e-300)
+    found = np.linalg.lstsq(np.concatenate([linear, to / size], axis=1), of, rcond=1e-9)[0]
+    found[linear.shape[1] :] /= size[:, None]
+    return np.asarray(found)
+
+
+def _derivatives(posterior: Posterior, effect: Effect, next_readings: _NextReadings) -> Floats:
+    """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of |a| in the next recording."""
+    rows = posterior.evidence.rows
+    _, along, by_v, covariates = next_readings
+    try:
+        there = -np.einsum("ni,nip->np", by_v, effect.basis(along, covariates)) / rows.median_standard_error
+    except EffectFault:  # of another package, which does not say what it adds there
+        there = np.zeros((len(along), len(effect.coefficients)))
+    return np.concatenate([rows.by_coefficients(effect), there])
+
+
+def _next_readings(posterior: Posterior, at: HoldsAt) -> _NextReadings:
+    """Of M readings all over the sphere, as of the next recording: derivatives by the linear parameters (M,9) over the
+    error of a pose, readings along the axes and derivatives by the biases (M,3), and the covariates."""
+    rows = posterior.evidence.rows
+    up = np.array([v for _, v in cube_directions()]) * rows.problem.reference
+    found = reading_geometry(rows, rows.state.sensor(rows.problem).output(up, {}))
+    reference = rows.problem.channel_reference
+    covariates = at_moment(reference, len(up), at.clocks)
+    return found.linear / rows.median_standard_error, found.along, -found.by_v, covariates
+
+
+def _mean(posterior: Posterior, projection: _Projection) -> tuple[Floats, dict[int, Floats]]:
+    """(9+p,) deviations; and by part the rows that are left, weighted by the inverse of their covariance."""
+    evidence = posterior.evidence
+    rows = evidence.rows
+    scaled = np.zeros(evidence.columns.shape[1])
+    by_part: dict[int, Floats] = defaultdict(lambda: np.zeros(len(rows.y)))
+    for found, weight in zip(posterior.sets, posterior.weight, strict=True):
+        if weight < NEGLIGIBLE:
+            continue
+        share = np.exp(found.by_part - found.total) * weight
+        mean = share[:, None] * found.mean
+        places = evidence.places(found.members)
+        scaled[places] += mean.sum(axis=0)
+        for part, of_part, q in zip(found.parts, share, mean, strict=True):
+            by_part[part] += of_part * rows.y - evidence.columns[:, places] @ q
+    deviation = projection.by_term @ scaled
+    residuals: dict[int, Floats] = {}
+    for part, target in by_part.items():
+        inverse = np.linalg.inv(evidence.covariance(part))
+        solved = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ inverse @ target)
+        deviation[:9] += solved / rows.lengths
+        residuals[part] = inverse @ (target - rows.linear @ solved)
+    return deviation, residuals
+
+
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """As `Average` has it, of the parameters as deviations: ``whole`` and ``thermal`` (9+p,9+p), ``prior`` (p,)
+    variances."""
+
+    whole: Floats
+    thermal: Floats
+    prior: Floats
+
+    @classmethod
+    def of(
+        cls,
+        posterior: Posterior,
+        solved: Sequence[Components],
+        mean: Floats,
+        projection: _Projection,
+        process_bias: Floats,
+        t_s: float,
+    ) -> _Spread:
+        """Within each set, part and choice of sizes, and between them. The biases are those of the moment, with what a
+        process in time adds."""
+        listed = {effect.name for effect in projection.effects}
+        whole, thermal = np.zeros((2, len(mean), len(mean)))
+        prior, total = np.zeros(len(mean) - LINEAR), 0.0
+        for cells in solved:
+            size, here = _moments(cells, posterior, mean, projection, process_bias, t_s)
+            total += float(cells.share.sum())
+            whole += here
+            prior += size
+            if cells.names & (THERMAL - listed):
+                thermal += here
+        return cls(whole / total, thermal / total, prior / total)
+
+
+def _moments(
+    cells: Components, posterior: Posterior, mean: Floats, projection: _Projection, process_bias: Floats, t_s: float
+) -> tuple[Floats, Floats]:
+    """Sums over the choices, by their share: the variances (p,) that the sizes give the coefficients of an average,
+    and the second moments (9+p,9+p) about its mean."""
+    rows, assumed = posterior.evidence.rows, posterior.evidence.parts[cells.part]
+    to = np.concatenate([np.zeros((len(mean), LINEAR)), projection.by_term[:, cells.places]], axis=1)
+    size = cells.share @ (cells.sizes**2 @ (to[LINEAR:, LINEAR:] ** 2).T)
+    to[:LINEAR, :LINEAR] += np.diag(1 / rows.lengths)
+    off = cells.conditional_mean @ to.T - mean
+    off[:, BIAS] -= process_bias
+    wandering = np.zeros((3, 3))
+    if assumed.kind is not None and assumed.kind.what is UnmodelledKind.TIME:
+        there = assumed.tau**2 * assumed.kind.bias_at(rows, t_s) @ cells.inverse
+        off[:, BIAS] += cells.residuals @ there.T
+        wandering = assumed.tau**2 * (assumed.kind.scale * np.eye(3) - there @ assumed.kind.bias_at(rows, t_s).T)
+        to[BIAS] -= there @ cells.design
+    shared = cells.share * cells.noise
+    spread = to @ np.tensordot(shared, cells.conditional_covariance, axes=1) @ to.T
+    spread[BIAS, BIAS] += shared.sum() * wandering
+    return size, spread + (cells.share[:, None] * off).T @ off
+
+
+def _where_linearised(posterior: Posterior, deviation: Floats, projection: _Projection) -> State:
+    """Where residuals are those of the linearisation: the nine parameters take up what the effects are in truth beside
+    what they are to first order."""
+    rows = posterior.evidence.rows
+    wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + projection.columns @ deviation[9:]
+    state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), projection.effects)
+    for _ in range(STEPS):
+        r, _, _ = linearise_all(rows.problem, state, jacobian=False)
+        step = np.linalg.lstsq(rows.linear, wanted - r / rows.error, rcond=None)[0] / rows.lengths
+        state = State(state.theta + np.concatenate([step, np.zeros(len(deviation) - 9)]), projection.effects)
+    return state
+
+
+def _process_bias(posterior: Posterior, left: Mapping[int, Floats], t_s: float) -> Floats:
+    evidence = posterior.evidence
+    out = np.zeros(3)
+    for part, weighted in left.items():
+        assumed = evidence.parts[part]
+        if assumed.kind is not None and assumed.kind.what is UnmodelledKind.TIME:
+            out += assumed.tau**2 * assumed.kind.bias_at(evidence.rows, t_s) @ weighted
+    return out

@@ -1,0 +1,249 @@
+"""What no name describes: a random function of one kind or another, whose covariance is all that is said of it.
+
+Every function of direction is taken less what nine parameters absorb of it over the sphere, not at the poses: these
+would take half of it, and the linear part would come out two or three times worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from triaxcal.arrays import Floats, Ints
+from triaxcal.effects.contract import BEFORE
+from triaxcal.evidence.linearised_data import Rows
+from triaxcal.model.directions import spiral
+
+SPHERE = 300
+"""Directions over which the nine parameters absorb what they can."""
+SMOOTH = (0.4, 0.8)
+"""Correlation lengths on the sphere, of unit radius: bumps of a face's size, and of a hemisphere's."""
+BY_AXIS = 0.3
+"""Of the reference vector, along the reading of an axis: a function of that reading alone, odd or even."""
+MEMORY = 0.8
+"""Of the reference vector, by the pose before."""
+IN_TIME = (0.1, 0.3)
+"""Of the recording's duration."""
+ABSORBED = 1e-9
+"""A covariance of which the nine parameters leave no more is theirs: of time, where nobody knows when poses were."""
+
+
+class UnmodelledKind(StrEnum):
+    """What an unmodelled part goes with."""
+
+    EACH_POSE = "each_pose"
+    DIRECTION = "direction"
+    ODD = "odd_by_axis"
+    EVEN = "even_by_axis"
+    POSE_BEFORE = "pose_before"
+    TIME = "time"
+    WITHIN_POSE = "inside_poses"
+    """The slopes alone: noise of a logged channel does that."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingGeometry:
+    """k readings: ``up`` (k,3) unit vectors, ``by_v`` (k,3) how |a| goes with the bias of each axis, ``along`` (k,3)
+    the readings along the sensitive axes in g, ``linear`` (k,9) derivatives by the nine parameters."""
+
+    up: Floats
+    by_v: Floats
+    along: Floats
+    linear: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class PoseInputs:
+    """k poses as a covariance sees them, taken or to come: ``reading_geometry``, the specific force in the pose
+    ``before`` (k,3) over the reference, ``t_s``, ``duration_s`` and ``run`` (k,); the standard ``error`` of their rows
+    (K,), K = 2 k where these have ``slopes``."""
+
+    reading_geometry: ReadingGeometry
+    before: Floats
+    t_s: Floats
+    duration_s: Floats
+    run: Ints
+    error: Floats
+    slopes: bool
+
+    @classmethod
+    def of(cls, rows: Rows) -> PoseInputs:
+        covariates = rows.problem.covariates
+        before = np.stack([covariates[name] for name in BEFORE], axis=1) / rows.problem.reference
+        return cls(
+            reading_geometry(rows, rows.problem.u), before, rows.t_s, rows.duration_s, rows.run, rows.error, rows.slopes
+        )
+
+    @property
+    def k(self) -> int:
+        return len(self.t_s)
+
+
+class _Between(Protocol):
+    """(K,L) covariance of the rows of k poses and of l poses, in units of the reference squared, but for a factor."""
+
+    def __call__(self, p: PoseInputs, q: PoseInputs) -> Floats: ...
+
+
+@dataclass(frozen=True, eq=False)
+class UnmodelledCovariance:
+    """A covariance of the rows beside the nine parameters, in its own axes: ``variance`` (m,) along ``axes`` (m,m),
+    with mean 1, so that τ² is the mean variance in units of the noise. ``covariance`` (N,N) of the rows over their
+    errors, and ``between`` what makes it and that of any other poses; every covariance of this kind is to be multiplied
+    by ``scale``. ``length`` is that of its correlation."""
+
+    what: UnmodelledKind
+    length: float
+    variance: Floats
+    axes: Floats
+    covariance: Floats
+    scale: float
+    between: _Between
+
+    def covariance_of(self, p: PoseInputs, q: PoseInputs) -> Floats:
+        """(K,L) of the rows of poses, over their errors."""
+        return np.asarray(self.scale * self.between(p, q) / p.error[:, None] / q.error)
+
+    def bias_at(self, rows: Rows, t_s: float) -> Floats:
+        """(3,N) covariance of the bias at a moment of the last recording with the rows over their errors, of what goes
+        with time; a length is a share of the recording's duration. The bias itself has the variance ``scale``."""
+        length = self.length * duration_of(rows)
+        apart = t_s - rows.t_s
+        near = np.exp(-(apart**2) / 2 / length**2) * (rows.run == rows.run.max())
+        both = [near] if not rows.slopes else [near, near * apart / length**2 * rows.duration_s]
+        by_v = reading_geometry(rows, rows.problem.u).by_v
+        return np.asarray(self.scale * np.concatenate([each[:, None] * by_v for each in both]).T / rows.error)
+
+
+def duration_of(rows: Rows) -> float:
+    """Of the longest recording."""
+    return max(1e-9, *(float(np.ptp(rows.t_s[rows.run == run])) for run in np.unique(rows.run)))
+
+
+def kinds_of(rows: Rows) -> list[UnmodelledCovariance]:
+    found = []
+    here = PoseInputs.of(rows)
+    for what, length, between in _covariances(rows):
+        weighted = between(here, here) / rows.error[:, None] / rows.error
+        inner = rows.complement.T @ weighted @ rows.complement
+        total = float(np.trace(inner))
+        if total <= ABSORBED * np.trace(weighted):
+            continue
+        scale = len(inner) / total
+        variance, axes = np.linalg.eigh(inner * scale)
+        found.append(
+            UnmodelledCovariance(what, length, np.maximum(variance, 0.0), axes, weighted * scale, scale, between)
+        )
+    return found
+
+
+def _covariances(rows: Rows) -> Iterator[tuple[UnmodelledKind, float, _Between]]:
+    yield UnmodelledKind.EACH_POSE, 0.0, lambda p, q: _of_means(p, q, _same(p, q))
+    sphere = _Sphere.of(rows)
+    for length in SMOOTH:
+        yield UnmodelledKind.DIRECTION, length, sphere.covariance(partial(_smooth, length=length))
+    for what, sign in ((UnmodelledKind.ODD, -1), (UnmodelledKind.EVEN, 1)):
+        length = BY_AXIS * rows.problem.reference
+        yield what, length, sphere.covariance(partial(_by_axis, sign=sign, length=length))
+    yield UnmodelledKind.POSE_BEFORE, MEMORY, _by_the_pose_before
+    for share in IN_TIME:
+        yield UnmodelledKind.TIME, share, partial(_in_time, length=share * duration_of(rows))
+    if rows.slopes:
+        yield UnmodelledKind.WITHIN_POSE, 0.0, lambda p, q: _of_slopes(p, q, _same(p, q))
+
+
+def _same(p: PoseInputs, q: PoseInputs) -> Floats:
+    """(k,l): what is each pose's own is shared with no other pose."""
+    return np.eye(p.k) if p is q else np.zeros((p.k, q.k))
+
+
+def _of_means(p: PoseInputs, q: PoseInputs, covariance: Floats) -> Floats:
+    whole = np.zeros((len(p.error), len(q.error)))
+    whole[: p.k, : q.k] = covariance
+    return whole
+
+
+def _of_slopes(p: PoseInputs, q: PoseInputs, covariance: Floats) -> Floats:
+    whole = np.zeros((len(p.error), len(q.error)))
+    whole[p.k :, q.k :] = covariance
+    return whole
+
+
+def _by_the_pose_before(p: PoseInputs, q: PoseInputs) -> Floats:
+    near = np.exp(-np.sum((p.before[:, None] - q.before[None]) ** 2, axis=2) / 2 / MEMORY**2)
+    return _of_means(p, q, near * (p.reading_geometry.by_v @ q.reading_geometry.by_v.T))
+
+
+def _in_time(p: PoseInputs, q: PoseInputs, length: float) -> Floats:
+    """A bias of each axis that wanders smoothly, in each recording anew: one process for means and slopes, or slow
+    drift is paid twice."""
+    apart = p.t_s[:, None] - q.t_s[None]
+    together = (p.reading_geometry.by_v @ q.reading_geometry.by_v.T) * (p.run[:, None] == q.run)
+    near = np.exp(-(apart**2) / 2 / length**2) * together
+    if not p.slopes:
+        return np.asarray(near)
+    mean_slope = near * apart / length**2 * q.duration_s[None]
+    slope_mean = -near * apart / length**2 * p.duration_s[:, None]
+    inside = near * (1 / length**2 - apart**2 / length**4) * p.duration_s[:, None] * q.duration_s[None]
+    return np.block([[near, mean_slope], [slope_mean, inside]])
+
+
+class _Covariance(Protocol):
+    def __call__(self, p: ReadingGeometry, q: ReadingGeometry) -> Floats: ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Sphere:
+    """Directions all over the sphere, with what takes the nine parameters' part off a function there."""
+
+    everywhere: ReadingGeometry
+    fit: Floats
+
+    @classmethod
+    def of(cls, rows: Rows) -> _Sphere:
+        sensor = rows.state.sensor(rows.problem)
+        up = spiral(SPHERE) * rows.problem.reference
+        everywhere = reading_geometry(rows, sensor.output(up, {}))
+        return cls(everywhere, np.linalg.pinv(everywhere.linear))
+
+    def covariance(self, of: _Covariance) -> _Between:
+        """Of a function of direction, less its linear part over the sphere."""
+        inner = of(self.everywhere, self.everywhere)
+
+        def between(p: PoseInputs, q: PoseInputs) -> Floats:
+            here, there = p.reading_geometry.linear @ self.fit, q.reading_geometry.linear @ self.fit
+            crossed = of(p.reading_geometry, self.everywhere) @ there.T
+            mirrored = here @ of(self.everywhere, q.reading_geometry)
+            return _of_means(
+                p, q, of(p.reading_geometry, q.reading_geometry) - crossed - mirrored + here @ inner @ there.T
+            )
+
+        return between
+
+
+def reading_geometry(rows: Rows, u: Floats) -> ReadingGeometry:
+    sensor, problem = rows.state.sensor(rows.problem), rows.problem
+    radius = sensor.radius(u, {})
+    x = (u - problem.middle) / problem.half
+    a, by_s = radius.a, radius.by_s
+    angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
+    linear = np.concatenate([radius.by_v * x, -radius.by_v, angles], axis=1) / rows.lengths
+    return ReadingGeometry(a / radius.length[:, None], -radius.by_v, radius.s, linear)
+
+
+def _smooth(p: ReadingGeometry, q: ReadingGeometry, length: float) -> Floats:
+    return np.asarray(np.exp(-np.sum((p.up[:, None] - q.up[None]) ** 2, axis=2) / 2 / length**2))
+
+
+def _by_axis(p: ReadingGeometry, q: ReadingGeometry, sign: int, length: float) -> Floats:
+    total = np.zeros((len(p.up), len(q.up)))
+    for i in range(3):
+        same = np.exp(-((p.along[:, None, i] - q.along[None, :, i]) ** 2) / 2 / length**2)
+        mirrored = np.exp(-((p.along[:, None, i] + q.along[None, :, i]) ** 2) / 2 / length**2)
+        total += np.outer(p.by_v[:, i], q.by_v[:, i]) * (same + sign * mirrored)
+    return total
