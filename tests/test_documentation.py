@@ -500,6 +500,13 @@ def test_the_documentation_speaks_of_no_machine() -> None:
     assert not {page: found for page, found in spoken.items() if found}
 
 
+def test_the_pages_made_of_register_types_and_profile_models_are_theirs() -> None:
+    """To renew them: python docs/reference/profile.py."""
+    made = runpy.run_path(str(PROJECT / "docs/reference/profile.py"))["pages"]()
+    assert len(made) == 3
+    assert {p: p.read_text("utf-8") for p in made} == made
+
+
 def test_the_page_of_the_python_names_is_that_of_their_docstrings() -> None:
     script = PROJECT / "docs/reference/python.py"
     names = runpy.run_path(str(script))

@@ -20,6 +20,7 @@ from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.files import inside, read_whole, size
 from triaxcal_drivers.nearest import clipped, nearest
+from triaxcal_drivers.register_types import RawType
 from triaxcal_drivers.toml_text import SIZE_MOST
 from triaxcal_drivers.toml_text import parse_toml as parse_toml
 from triaxcal_drivers.validation import validate as validate
@@ -77,10 +78,6 @@ class Sampling(Strict):
     rate_hz: Annotated[float, Field(gt=0, description="samples a second that the device delivers")]
     silence_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 2.0
     reply_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 1.0
-
-
-RawType = Literal["int16", "uint16", "int24", "uint24", "int32", "uint32", "int64", "uint64", "float32", "float64"]
-"""Types of raw values. 24-bit ones take three bytes on CAN; on Modbus use int32."""
 
 
 class Register(Strict):

@@ -16,7 +16,7 @@ REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 
 @pytest.mark.parametrize("driver", ["can", "modbus"])
 def test_the_committed_schema_is_what_the_command_prints(driver):
-    """To renew it: python -m triaxcal_drivers.schema DRIVER > docs/reference/profile-DRIVER.schema.json"""
+    """To renew it: python docs/reference/profile.py"""
     printed = subprocess.run(
         [sys.executable, "-m", "triaxcal_drivers.schema", driver], capture_output=True, check=True, timeout=30
     ).stdout

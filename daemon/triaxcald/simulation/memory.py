@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from triaxcal_drivers.registers import SIZES, crc
+from triaxcal_drivers.register_types import TYPES
+from triaxcal_drivers.registers import crc
 
 Access = Literal["ro", "rw", "wo"]
 
@@ -23,7 +24,7 @@ class Entry:
 
     @property
     def size(self) -> int:
-        return SIZES[self.type]
+        return TYPES[self.type].size
 
     def encode(self, value: float) -> bytes:
         """Most significant byte first."""

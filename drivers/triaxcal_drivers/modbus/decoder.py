@@ -20,13 +20,9 @@ from triaxcal_drivers.modbus.model import (
     words_of,
 )
 from triaxcal_drivers.modbus.timeline import Arrivals, Clockwork, Timeline
-from triaxcal_drivers.registers import SIZES
+from triaxcal_drivers.register_types import TYPES
 
 Bytes = NDArray[np.uint8]
-_DTYPES = {
-    "int16": ">i2", "uint16": ">u2", "int32": ">i4", "uint32": ">u4", "int64": ">i8", "uint64": ">u8",
-    "float32": ">f4", "float64": ">f8",
-}  # fmt: skip
 
 
 class ModbusDecoder:
@@ -149,8 +145,8 @@ class ModbusDecoder:
         words = records[:, 2 * field.word : 2 * (field.word + words_of(field.type))]
         order = (field.word_order if isinstance(field, Channel) else None) or self._word_order
         if order == "little":
-            words = words.reshape(len(words), words_of(field.type), 2)[:, ::-1]
-        return np.frombuffer(words.tobytes(), dtype=_DTYPES[field.type])
+            words = words.reshape(len(words), words_of(field.type), 2)[:, ::-1].reshape(words.shape)
+        return TYPES[field.type].decode_all(words)
 
 
 def _clockwork(stream: PollStream | FifoStream, period_ns: float) -> Clockwork:
@@ -158,7 +154,7 @@ def _clockwork(stream: PollStream | FifoStream, period_ns: float) -> Clockwork:
     return Clockwork(
         period_ns,
         stream.counter.modulus_bits if stream.counter else None,
-        8 * SIZES[stream.time_stamp.type] if stream.time_stamp else None,
+        8 * TYPES[stream.time_stamp.type].size if stream.time_stamp else None,
         stream.time_stamp.unit_s * 1e9 if stream.time_stamp else 1.0,
         stream.record_capacity if isinstance(stream, FifoStream) else 1,
         counted=fifo,

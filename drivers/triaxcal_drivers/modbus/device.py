@@ -18,7 +18,7 @@ from triaxcal_drivers.errors import (
     RegisterValueError,
 )
 from triaxcal_drivers.interface import RawBatch, RawFlag
-from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream
+from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream, words_of
 from triaxcal_drivers.modbus.protocol import (
     READ_HOLDING,
     READ_INPUT,
@@ -27,7 +27,7 @@ from triaxcal_drivers.modbus.protocol import (
     SerialLine,
 )
 from triaxcal_drivers.modbus.stack import ModbusClient
-from triaxcal_drivers.registers import SIZES
+from triaxcal_drivers.register_types import TYPES
 
 _BATCH_REPLIES = 32
 """A stream hands out what it has after so many replies, though more may be waiting in the device."""
@@ -112,7 +112,7 @@ class ModbusDevice:
         for name in [n for n in names if n] + list(self._profile.registers):
             register = self._profile.registers[name]
             if register.access != "wo":
-                return _function(register), register.address, _words(register)
+                return _function(register), register.address, words_of(register.type)
         stream = self._profile.streams["readings"]
         return stream.function, stream.address, stream.record_start if isinstance(stream, FifoStream) else 1
 
@@ -217,7 +217,7 @@ class ModbusDevice:
     async def read(self, register: str) -> bytes:
         entry = self._register(register)
         try:
-            raw = await self._connected().read(_function(entry), entry.address, _words(entry))
+            raw = await self._connected().read(_function(entry), entry.address, words_of(entry.type))
         except ModbusRefusal as e:
             raise self._refused(register, "read", e.code, str(e)) from e
         except MalformedReply as e:
@@ -227,13 +227,12 @@ class ModbusDevice:
     async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
         """Raises RegisterValueError where ``raw`` is not as long as the register; nothing is sent then."""
         entry = self._register(register)
-        if len(raw) != SIZES[entry.type]:
-            raise RegisterValueError(
-                f"register {register}: {len(raw)} bytes, expected {SIZES[entry.type]} ({entry.type})"
-            )
+        size = TYPES[entry.type].size
+        if len(raw) != size:
+            raise RegisterValueError(f"register {register}: {len(raw)} bytes, expected {size} ({entry.type})")
         if entry.table == "input":
             raise RegisterValueError(f"register {register}: an input register cannot be written")
-        single = self._profile.single_write and _words(entry) == 1
+        single = self._profile.single_write and words_of(entry.type) == 1
         try:
             await self._connected().write(entry.address, self._ordered(entry, raw), single=single, timeout_s=timeout_s)
         except ModbusRefusal as e:
@@ -268,10 +267,6 @@ class ModbusDevice:
 
 def _function(register: ModbusRegister) -> int:
     return READ_INPUT if register.table == "input" else READ_HOLDING
-
-
-def _words(register: ModbusRegister) -> int:
-    return SIZES[register.type] // 2
 
 
 def _cause(e: DeviceSilent) -> str:

@@ -17,10 +17,9 @@ from triaxcal_drivers.modbus.protocol import (
     TcpAddress,
 )
 from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
-from triaxcal_drivers.registers import SIZES
+from triaxcal_drivers.register_types import TYPES, WORD, CounterType, TimeType, WordType, in_words, next_in_words
 
 READING_CHANNELS = tuple("u" + axis for axis in AXES)
-WordType = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 Order = Literal["big", "little"]
 Table = Literal["input", "holding"]
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
@@ -29,7 +28,7 @@ Word = Annotated[int, Field(ge=0, lt=MAX_READ_WORDS)]
 
 def words_of(type_: str) -> int:
     """Registers of 16 bits that a value of that type takes."""
-    return SIZES[type_] // 2
+    return TYPES[type_].size // WORD
 
 
 class Channel(Strict):
@@ -53,19 +52,19 @@ class Counter(Strict):
     """A sample counter; it wraps at 2^bits."""
 
     word: Word
-    type: Literal["uint16", "uint32"]
+    type: CounterType
     bits: Annotated[int | None, Field(ge=4, le=32, description="where fewer than the type has")] = None
 
     @property
     def modulus_bits(self) -> int:
-        return self.bits or 8 * SIZES[self.type]
+        return self.bits or 8 * TYPES[self.type].size
 
 
 class TimeStamp(Strict):
     """The device's time of a sample, in ticks of ``unit_s``; it wraps with its type."""
 
     word: Word
-    type: Literal["uint16", "uint32", "uint64"]
+    type: TimeType
     unit_s: Annotated[float, Field(gt=0, description="seconds a tick: 1e-6, 0.001…")]
 
 
@@ -160,10 +159,10 @@ class ModbusRegister(Register):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        if self.type not in ("int24", "uint24") and self.address + words_of(self.type) > 0x10000:
+        if not in_words(self.type):
+            raise ValueError(f"type {self.type} is none of Modbus: use {next_in_words(self.type)}")
+        if self.address + words_of(self.type) > 0x10000:
             raise ValueError(f"address {self.address} leaves no room for {self.type}")
-        if self.type in ("int24", "uint24"):
-            raise ValueError(f"type {self.type} is none of Modbus: use {self.type.replace('24', '32')}")
         if self.table == "input" and self.access != "ro":
             raise ValueError('an input register is read-only: set access = "ro"')
         return self

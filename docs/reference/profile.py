@@ -1,0 +1,36 @@
+"""Writes what stands here of the table of register types and the models of profiles: `python docs/reference/profile.py`."""  # noqa: E501
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from triaxcal_drivers.register_types import TYPES, Whole, in_words
+from triaxcal_drivers.schema import schema
+
+HERE = Path(__file__).parent
+DRIVERS = ("can", "modbus")
+HEAD = """# Register types
+
+What a profile may give as the `type` of a register or, on Modbus, of a channel. Made from the table in `drivers/triaxcal_drivers/register_types.py` by `docs/reference/profile.py`. Whole numbers are in two's complement, the others by IEEE 754. Most significant first or last is the profile's order, not the type's. A value goes to the nearest number; one beyond the range is refused.
+
+| type | bytes | lowest | highest | step near 1 | on Modbus |
+|---|---|---|---|---|---|
+"""  # noqa: E501
+
+
+def pages() -> dict[Path, str]:
+    """The text of each page by its path."""
+    made = {HERE / f"profile-{driver}.schema.json": schema(driver) for driver in DRIVERS}
+    return made | {HERE / "register-types.md": HEAD + "".join(map(_row, TYPES))}
+
+
+def _row(name: str) -> str:
+    type_ = TYPES[name]
+    words = "yes" if in_words(name) else "no"
+    ends = (str(e) if isinstance(type_, Whole) else f"{e:.4g}" for e in (type_.lowest, type_.highest))
+    return f"| `{name}` | {type_.size} | {' | '.join(ends)} | {type_.step(1.0):.3g} | {words} |\n"
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
