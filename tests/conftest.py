@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 from mcap.reader import make_reader
 from mcap.records import Attachment, Metadata
@@ -27,6 +28,9 @@ from triaxcald.cli.commands import main
 from triaxcald.simulation.bench import load_device, physics_of, simulate
 from triaxcald.simulation.unit import Faults, ReferenceUnit
 from triaxcald.station.lock import FOLDER_VARIABLE
+
+hypothesis.settings.register_profile("patient", deadline=None)  # a busy machine is no fault of the code
+hypothesis.settings.load_profile("patient")
 
 FIXTURE = {"poses": 14, "hold_s": 2.0, "move_s": 0.8}
 PLAN = {"poses": 14, "hold_s": 1.0, "check_poses": 3}
