@@ -22,8 +22,9 @@ from triaxcal.poses.stillness.detector import StillnessDetector, Windows
 from triaxcal.uncertainty import Stated
 from triaxcal.units import same_unit
 from triaxcal_drivers.files import read_whole
+from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.nearest import clipped
-from triaxcal_drivers.profile import READINGS, Bundle, Profile, parse_bundle
+from triaxcal_drivers.profile import READINGS, Bundle, Profile
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline, creeping, together
 from triaxcald.recording.reader import Recording

@@ -1,4 +1,4 @@
-"""A device as data: the TOML profile, its validation and the files it names.
+"""A device as data: the model of the TOML profile, and a profile with the files it names.
 
 The parts every device has stand here; a driver subclasses `Profile` and narrows ``streams`` and ``registers``
 to its transport. An unknown key is an error that names the nearest right one.
@@ -7,28 +7,19 @@ to its transport. An unknown key is an error that names the nearest right one.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
 from triaxcal_drivers import registers as codec
-from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.files import inside, read_whole, size
-from triaxcal_drivers.nearest import clipped, nearest
+from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.register_types import RawType
-from triaxcal_drivers.toml_text import SIZE_MOST
-from triaxcal_drivers.toml_text import parse_toml as parse_toml
-from triaxcal_drivers.validation import validate as validate
 
 AXES = ("x", "y", "z")
 READINGS, CORRECTED = "readings", "corrected"
-FILE_MOST = 16 * 2**20
-"""Bytes of a DBC or EDS file; the DBC of a whole vehicle, comments and all, has some ten million."""
 STREAMS_MOST, CHANNELS_MOST = 16, 256  # ours have two of six channels; a Modbus reply has room for 125
 STEPS_MOST = 100  # of a sequence; ours have at most three
 
@@ -228,55 +219,3 @@ class Bundle:
         for name in sorted(self.files):
             h.update(name.encode() + b"\0" + len(self.files[name]).to_bytes(8, "big") + self.files[name])
         return h.hexdigest()
-
-
-def parse_bundle(text: bytes, files: Mapping[str, bytes] | None, *, where: str, folder: Path | None = None) -> Bundle:
-    """Validate a profile's text. Files come from ``files`` where given, else from ``folder``.
-
-    Raises ProfileError (one line: where, line, field, what was expected), DriverMissing.
-    """
-    from triaxcal_drivers.catalogue import driver_named
-
-    data = parse_toml(text, where=where)
-    name = data.get("driver")
-    if not isinstance(name, str):
-        raise ProfileError(f'{where}: driver: expected the name of a driver, as in driver = "can"')
-    model = driver_named(name, where=where).profile_model
-    profile = validate(model, data, text, where=where)
-    return Bundle(profile, text, {file: _held(file, files, folder, where) for file in profile.files()})
-
-
-def _held(file: str, files: Mapping[str, bytes] | None, folder: Path | None, where: str) -> bytes:
-    """Raises ProfileError."""
-    try:
-        if files is None and folder is not None:
-            return read_whole(inside(folder, file), FILE_MOST)
-        data = (files or {})[file]
-    except KeyError:
-        raise ProfileError(f"{where}: the file '{clipped(file)}' that it names is missing") from None
-    except OSError as e:
-        raise ProfileError(f"{where}: the file '{clipped(file)}' that it names: {e.strerror}") from e
-    if len(data) > FILE_MOST:
-        raise ProfileError(f"{where}: the file '{clipped(file)}' that it names: larger than {size(FILE_MOST)}")
-    return data
-
-
-def load_bundle(path: Path) -> Bundle:
-    """The profile at ``path``, or a built-in one where ``path`` is a bare name such as ``triax-ref-can``."""
-    if "\0" in str(path):
-        raise ProfileError(f"{str(path)!r}: no file has such a name")
-    if not os.path.exists(path) and path.suffix in ("", ".toml") and path.parent == Path():
-        built_in = BUILT_IN / (path.stem + ".toml")
-        if os.path.exists(built_in):
-            path = built_in
-    try:
-        text = read_whole(path, SIZE_MOST)
-    except FileNotFoundError as e:
-        known = sorted(p.stem for p in BUILT_IN.glob("*.toml"))
-        raise ProfileError(f"{path}: {e.strerror}; built-in profiles: {', '.join(known)}") from e
-    except OSError as e:
-        raise ProfileError(f"{path}: {e.strerror}") from e
-    return parse_bundle(text, None, where=str(path), folder=path.parent)
-
-
-BUILT_IN = Path(__file__).parent / "profiles"

@@ -12,7 +12,8 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import Finding, QualityDetector
 from triaxcal.poses.quality.finding import MissingSamples, StuckOutput
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.profile import CORRECTED, READINGS, load_bundle
+from triaxcal_drivers.loading import load_bundle
+from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.pipeline import Pipeline, together
 from triaxcald.recording.schema import cut
 from triaxcald.simulation.bench import DeviceFile, physics_of

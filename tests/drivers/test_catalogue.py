@@ -77,7 +77,7 @@ def test_a_driver_installed_by_somebody_else_is_found(elsewhere):
 def test_a_profile_for_it_is_read_by_it(elsewhere):
     elsewhere("their_drivers", DRIVER, "their-serial = their_drivers:SerialDriver")
     said = elsewhere.python(
-        "from triaxcal_drivers.profile import parse_bundle\n"
+        "from triaxcal_drivers.loading import parse_bundle\n"
         f"bundle = parse_bundle({PROFILE.encode()!r}, None, where='p')\n"
         "print(type(bundle.profile).__name__, bundle.profile.letters)"
     )

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from triaxcal_drivers.errors import DriverMissing, ProfileError
-from triaxcal_drivers.profile import BUILT_IN, Bundle, PollStep, WriteStep, load_bundle, parse_bundle
+from triaxcal_drivers.loading import BUILT_IN, load_bundle, parse_bundle
+from triaxcal_drivers.profile import Bundle, PollStep, WriteStep
 
 GOOD = """\
 format = "triaxcal.profile/1"

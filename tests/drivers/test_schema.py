@@ -9,7 +9,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from triaxcal_drivers.profile import BUILT_IN
+from triaxcal_drivers.loading import BUILT_IN
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 

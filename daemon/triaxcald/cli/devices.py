@@ -12,7 +12,7 @@ from triaxcal.effects.plugins import package_of, plugins
 from triaxcal.rounding import REGISTER_DIGITS, number
 from triaxcal_drivers.catalogue import listed
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError
-from triaxcal_drivers.profile import BUILT_IN, load_bundle
+from triaxcal_drivers.loading import BUILT_IN, load_bundle
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import warn_of_a_journal

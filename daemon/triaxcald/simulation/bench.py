@@ -21,9 +21,11 @@ from triaxcal.synthetic import COVARIATES, Environment, SyntheticUnit, Tumble
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.files import read_whole
+from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.modbus.model import ModbusBus
-from triaxcal_drivers.profile import Bundle, Strict, load_bundle, parse_toml, validate
-from triaxcal_drivers.toml_text import SIZE_MOST
+from triaxcal_drivers.profile import Bundle, Strict
+from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
+from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
 from triaxcald.simulation.time_base import ElasticTimeBase, TimeBase
 from triaxcald.simulation.unit import ReferenceUnit

@@ -20,7 +20,7 @@ from triaxcal_drivers.can.bus import close_bus, opened_bus
 from triaxcal_drivers.can.description import object_dictionary
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
 from triaxcal_drivers.errors import BusError
-from triaxcal_drivers.profile import BUILT_IN, load_bundle
+from triaxcal_drivers.loading import BUILT_IN, load_bundle
 from triaxcald.simulation.frames_waiting import reader_is_behind
 from triaxcald.simulation.time_base import TimeBase
 from triaxcald.simulation.unit import (

@@ -23,8 +23,10 @@ from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict, load_bundle, parse_toml, validate
-from triaxcal_drivers.toml_text import SIZE_MOST
+from triaxcal_drivers.loading import load_bundle
+from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
+from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
+from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.lock import locked

@@ -12,7 +12,7 @@ from tests.devices.habits import Habits
 from tests.devices.in_memory import VirtualClock
 from tests.devices.profiles import profile_text
 from triaxcal_drivers.errors import DeviceBusy, DeviceSilent, RegisterRefused
-from triaxcal_drivers.profile import parse_bundle
+from triaxcal_drivers.loading import parse_bundle
 from triaxcald.provision.pace import Pace
 from triaxcald.provision.power import least_off_s, power_cycled
 

@@ -11,8 +11,9 @@ import pytest
 from triaxcal_drivers.can.driver import CanDriver
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.interface import Device
+from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.modbus.driver import ModbusDriver
-from triaxcal_drivers.profile import Bundle, load_bundle
+from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import ProvisionError
 from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.explain import explain

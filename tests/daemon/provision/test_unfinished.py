@@ -10,7 +10,8 @@ import pytest
 from tests.devices.habits import Habits
 from tests.devices.profiles import profile_text
 from tests.devices.table import NEW, OLD
-from triaxcal_drivers.profile import Profile, parse_bundle
+from triaxcal_drivers.loading import parse_bundle
+from triaxcal_drivers.profile import Profile
 from triaxcald.provision.image import image_of
 from triaxcald.provision.journal import Entry, Step
 from triaxcald.provision.snapshot import Snapshot

@@ -11,9 +11,10 @@ import pytest
 
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import SampleBlock
+from triaxcal_drivers.loading import BUILT_IN, parse_bundle
 from triaxcal_drivers.modbus.driver import ModbusDriver
 from triaxcal_drivers.modbus.protocol import READ_INPUT, SerialLine, TcpAddress
-from triaxcal_drivers.profile import BUILT_IN, Bundle, parse_bundle
+from triaxcal_drivers.profile import Bundle
 from triaxcal_drivers.registers import crc
 from triaxcald.simulation.memory import CALIBRATION, COVERED, TABLE
 from triaxcald.simulation.modbus_unit import FIFO_RECORDS, HOLDING, WINDOW_WORDS, ModbusMap, ModbusUnit

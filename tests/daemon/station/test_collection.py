@@ -14,7 +14,8 @@ import pytest
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle, load_bundle
+from triaxcal_drivers.loading import load_bundle
+from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.errors import DriverError
-from triaxcal_drivers.profile import load_bundle
+from triaxcal_drivers.loading import load_bundle
 from triaxcald.errors import InputError
 from triaxcald.station.config import load_station
 

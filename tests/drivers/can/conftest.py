@@ -10,7 +10,8 @@ from triaxcal_drivers.can.decode import CanDecoder
 from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.model import DbcStream, PdoStream
 from triaxcal_drivers.interface import RawBatch, SampleBlock
-from triaxcal_drivers.profile import BUILT_IN, Bundle, load_bundle, parse_bundle
+from triaxcal_drivers.loading import BUILT_IN, load_bundle, parse_bundle
+from triaxcal_drivers.profile import Bundle
 
 EDS = "triax-ref-can.eds"
 PDO_CHANNELS: dict[str, Any] = {

@@ -12,7 +12,8 @@ from triaxcal_drivers.can.driver import CanDriver
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, ProfileError, RegisterRefused
 from triaxcal_drivers.interface import RawBatch, RawFlag
-from triaxcal_drivers.profile import Bundle, parse_bundle
+from triaxcal_drivers.loading import parse_bundle
+from triaxcal_drivers.profile import Bundle
 
 START = (0x000, "01 05")
 VENDOR = (0x605, "40 18 10 01 00 00 00 00"), (0x585, "43 18 10 01 41 49 52 54")

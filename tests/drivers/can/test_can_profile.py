@@ -12,7 +12,9 @@ from triaxcal_drivers.can.description import object_dictionary, pdo_messages, st
 from triaxcal_drivers.can.driver import CanDriver
 from triaxcal_drivers.can.model import CanBus, CanProfile, PdoStream, object_address
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.profile import Bundle, parse_bundle, validate
+from triaxcal_drivers.loading import parse_bundle
+from triaxcal_drivers.profile import Bundle
+from triaxcal_drivers.validation import validate
 
 Edited = Callable[..., Bundle]
 EDS = "triax-ref-can.eds"

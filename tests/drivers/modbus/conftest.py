@@ -7,7 +7,8 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from triaxcal_drivers.profile import Bundle, parse_bundle
+from triaxcal_drivers.loading import parse_bundle
+from triaxcal_drivers.profile import Bundle
 
 PROFILE = """
 format = "triaxcal.profile/1"
