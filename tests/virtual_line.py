@@ -19,12 +19,13 @@ from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.run import line
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.simulation.can_unit import ABORT_CODES, tpdos
 from triaxcald.simulation.modbus_unit import ModbusMap
 from triaxcald.simulation.time_base import SteppedTimeBase
 from triaxcald.simulation.unit import ReferenceUnit, RegisterFault, UnitSilent
-from triaxcald.station import collection, line
+from triaxcald.station import collection
 from triaxcald.station.config import Place
 
 START_NS = 1_772_442_000_000_000_000  # 2026-03-02T09:00:00Z, when every unit is switched on

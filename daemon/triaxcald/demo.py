@@ -16,10 +16,10 @@ from triaxcald.errors import InputError
 from triaxcald.exit_codes import INTERRUPTED
 from triaxcald.files import write_text
 from triaxcald.provision.state import DeviceState
+from triaxcald.run.line import Outcome, UnitRun, run_station
 from triaxcald.simulation.bench import DeviceFile, SimulatedUnit, simulate
 from triaxcald.station.collection import Progress
 from triaxcald.station.config import load_station
-from triaxcald.station.line import Outcome, UnitRun, run_station
 from triaxcald.verification import Verification
 
 SPEED = 20.0

@@ -36,8 +36,8 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_RECORD
 from triaxcald.recording.survey import Survey, survey
 from triaxcald.report.unit import drawn_with
-from triaxcald.station.line import CERTIFICATE, REPORT
-from triaxcald.station.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
+from triaxcald.run.line import CERTIFICATE, REPORT
+from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
 
 ABORTED_WITH = (2, REFUSED, DEVICE, DISK, INTERRUPTED)
 NEW = (DeviceState.NEW_VERIFIED, DeviceState.NEW_UNVERIFIED)

@@ -15,9 +15,9 @@ from triaxcald.outcome import ATTACHMENT, FORMAT
 from triaxcald.provision.image import image_of
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import END_RECORD, FORMAT_RECORD, RAW_RECORD
+from triaxcald.run.line import CERTIFICATE
+from triaxcald.run.write_back import VERIFICATION_FILE
 from triaxcald.station.config import Limits
-from triaxcald.station.line import CERTIFICATE
-from triaxcald.station.write_back import VERIFICATION_FILE
 
 
 def turned_back(recording: Recording, raw: Digests) -> list[Difference]:

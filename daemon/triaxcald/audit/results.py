@@ -20,9 +20,9 @@ from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RawDigest
 from triaxcald.report.unit import unit_report
+from triaxcald.run.endings import judged
+from triaxcald.run.write_back import VERIFICATION_FILE
 from triaxcald.station.config import StationFile, parse_station
-from triaxcald.station.endings import judged
-from triaxcald.station.write_back import VERIFICATION_FILE
 from triaxcald.verification import Apart, fitted_attitudes, verification_document, verified
 
 CANNOT = (TriaxcalError, DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)

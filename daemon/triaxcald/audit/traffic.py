@@ -15,7 +15,7 @@ from triaxcald.provision.plausible import doubts
 from triaxcald.provision.power import MISSED
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.schema import REGISTERS, RegisterAccess
-from triaxcald.station.write_back import REGISTERS_AFTER, REGISTERS_BEFORE
+from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE
 
 Raw = Mapping[str, bytes]
 

@@ -33,13 +33,13 @@ from triaxcald.station.config import load_station
 
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit
+    from triaxcald.run.line import Outcome, UnitRun
     from triaxcald.simulation.bench import SimulatedUnit
-    from triaxcald.station.line import Outcome, UnitRun
 
 
 def run_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
-    from triaxcald.station.line import run_station
+    from triaxcald.run.line import run_station
 
     with Bars() as bars:
         outcomes = run_interruptible(run_station(station, bars, force=a.force))
@@ -231,7 +231,7 @@ def record_command(a: argparse.Namespace) -> int:
     writable(a.output)
     station = load_station(a.station)
     place = station.place(a.unit)
-    from triaxcald.station.line import UnitRun
+    from triaxcald.run.line import UnitRun
 
     with Bars() as bars:
         run_interruptible(_record(UnitRun(station, place, bars), a.output, a.seconds))

@@ -26,8 +26,8 @@ from triaxcald.inputs import read_document
 from triaxcald.provision.identity import same_serial
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.procedure import Provisioning
+from triaxcald.run.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
 from triaxcald.station.config import Place, load_station
-from triaxcald.station.provisioning import Provisioned, ProvisionRun, RestoreRun, snapshot_in, unit_in
 from triaxcald.station.today import days_since_1970
 
 

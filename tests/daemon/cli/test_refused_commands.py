@@ -17,8 +17,8 @@ import pytest
 from triaxcal_drivers.loading import BUILT_IN
 from triaxcald.demo import LIMIT_G, DemoUnit, _kept
 from triaxcald.provision.state import Held
+from triaxcald.run.line import Outcome
 from triaxcald.simulation.memory import Stored, factory_calibration
-from triaxcald.station.line import Outcome
 from triaxcald.verification import Verification
 
 Run = Callable[..., Any]

@@ -39,11 +39,11 @@ from triaxcald.provision.snapshot import Snapshot
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.provision.unfinished import journaled_image
 from triaxcald.recording.reader import Recording
+from triaxcald.run.endings import aborted
+from triaxcald.run.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
 from triaxcald.station.config import Place, Station
-from triaxcald.station.endings import aborted
 from triaxcald.station.output_check import doubts_of_live_output
 from triaxcald.station.power import power_cycle_asked
-from triaxcald.station.write_back import REGISTERS_BEFORE, REGISTERS_EARLIER
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from triaxcald.cli.line import _document, show_outcome, worst
 from triaxcald.errors import DiskError, InputError
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.run import line as station_line
+from triaxcald.run.line import Outcome, UnitRun, run_station
 from triaxcald.simulation.can_unit import CanUnit
 from triaxcald.simulation.memory import CALIBRATION, Stored, factory_calibration
-from triaxcald.station import line as station_line
 from triaxcald.station.config import load_station
-from triaxcald.station.line import Outcome, UnitRun, run_station
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())

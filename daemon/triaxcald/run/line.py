@@ -44,11 +44,11 @@ from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.unit import drawn_with, unit_report
+from triaxcald.run.endings import aborted, judged
+from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.config import Place, Station
-from triaxcald.station.endings import aborted, judged
 from triaxcald.station.serials import SerialsSeen
-from triaxcald.station.write_back import WriteBack, corrected
 from triaxcald.verification import Verification, fitted_attitudes
 
 CERTIFICATE, REPORT = "certificate.json", "report.html"

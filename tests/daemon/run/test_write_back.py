@@ -21,12 +21,12 @@ from triaxcald.provision.image import RegisterImage, build_image
 from triaxcald.provision.restore import restore
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.run.line import UnitRun
+from triaxcald.run.write_back import WriteBack
 from triaxcald.simulation.memory import CALIBRATION, TABLE, Stored, factory_calibration
 from triaxcald.simulation.unit import Faults
 from triaxcald.station.collection import Collection
 from triaxcald.station.config import Place, Station, load_station
-from triaxcald.station.line import UnitRun
-from triaxcald.station.write_back import WriteBack
 from triaxcald.verification import Verification, verify
 
 OLD = Stored(factory_calibration())
@@ -122,7 +122,7 @@ async def test_what_no_limit_judges_stays_and_is_not_said_to_be_verified(
     open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     good = Pose(0.0, 2.0, 200, np.array([1.0, 0.0, 0.0]), 1e-10 * np.eye(3), 50.0)
-    monkeypatch.setattr("triaxcald.station.write_back.corrected", lambda *_: verify([good], 1.0))
+    monkeypatch.setattr("triaxcald.run.write_back.corrected", lambda *_: verify([good], 1.0))
     async with open_bench() as bench:
         back = bench.write_back(_no_pose)
         await bench.run(back)
@@ -199,7 +199,7 @@ async def test_without_a_check_pose_that_can_be_trusted_the_old_calibration_is_b
 ) -> None:
     """Whether the station has a limit or not."""
     poses = [Pose(0.0, 2.0, 200, np.array([1.0, 0, 0]), 1e-10 * np.eye(3), 50.0, fault=fault) for fault in faults]
-    monkeypatch.setattr("triaxcald.station.write_back.corrected", lambda *_: verify(poses, 1.0))
+    monkeypatch.setattr("triaxcald.run.write_back.corrected", lambda *_: verify(poses, 1.0))
     async with open_bench() as bench:
         back = bench.write_back(_no_pose)
         with pytest.raises(StationError, match=why):
@@ -217,7 +217,7 @@ async def test_without_a_limit_a_calibration_worse_than_the_old_one_does_not_sta
         mean = np.array([next(outputs), 0.0, 0.0])
         return verify([Pose(float(t), t + 2.0, 200, mean, 1e-10 * np.eye(3), 50.0) for t in range(6)], 1.0)
 
-    monkeypatch.setattr("triaxcald.station.write_back.corrected", corrected)
+    monkeypatch.setattr("triaxcald.run.write_back.corrected", corrected)
     async with open_bench() as bench:
         back = bench.write_back(_no_pose)
         await bench.run(back)
