@@ -40,6 +40,7 @@ bench: $(TOOLS)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick 
 docs: $(TOOLS)  ## pages made from the code, and the notebook with its outputs
 	$(BIN)/python docs/reference/python.py
 	$(BIN)/python docs/reference/profile.py
+	$(BIN)/python docs/reference/effects.py
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	$(BIN)/jupyter execute --inplace docs/tutorial/*.ipynb
 

@@ -507,6 +507,12 @@ def test_the_pages_made_of_register_types_and_profile_models_are_theirs() -> Non
     assert {p: p.read_text("utf-8") for p in made} == made
 
 
+def test_the_page_of_the_effects_is_what_they_say_of_themselves() -> None:
+    """To renew it: python docs/reference/effects.py."""
+    names = runpy.run_path(str(PROJECT / "docs/reference/effects.py"))
+    assert names["PAGE"].read_text("utf-8") == names["page"]()
+
+
 def test_the_page_of_the_python_names_is_that_of_their_docstrings() -> None:
     script = PROJECT / "docs/reference/python.py"
     names = runpy.run_path(str(script))

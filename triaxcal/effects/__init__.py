@@ -9,13 +9,15 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR, ChannelBias, ChannelScaleFactor
-from triaxcal.effects.contract import TIME, Coefficient, Effect, channel_of, is_derived
+from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning, channel_of, is_derived
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.in_run import InRuns, runs_named
 from triaxcal.effects.plugins import plugins
 from triaxcal.effects.run_bias import BETWEEN_RUNS
 
 TEMPERATURE = "temp_c"
+OWN: tuple[Effect, ...] = (*CATALOGUE, *BETWEEN_RUNS, Empirical())
+"""All effects of this package that have a name of their own, those of old documents among them."""
 
 
 def catalogue_for(covariates: Collection[str]) -> tuple[Effect, ...]:
@@ -34,6 +36,15 @@ def effect_named(name: str) -> Effect:
         if name.startswith(prefix) and len(name) > len(prefix):
             return made(name[len(prefix) :])
     return {effect.name: effect for effect in (*plugins()[0], *CATALOGUE, Empirical())}[name]
+
+
+def meaning_of(name: str) -> Meaning | None:
+    """What an effect says that it is; None where it says nothing, or is not known."""
+    between = next((e for e in BETWEEN_RUNS if e.name == name), None)
+    try:
+        return (between or effect_named(name)).meaning
+    except KeyError:
+        return None
 
 
 def effect_of(name: str, values: Mapping[str, float]) -> tuple[Effect, Floats]:

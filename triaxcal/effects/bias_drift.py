@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import TIME, Coefficient, Effect, no_slope, on_each_axis, xyz
+from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning, no_slope, on_each_axis, xyz
 
 DEGREES = (1, 2, 3)
 
@@ -21,6 +21,17 @@ class BiasDrift(Effect):
     name: str = "bias_drift"
     needs: tuple[str, ...] = (TIME,)
     remedy: str = "Let the unit settle before the first pose, and repeat the first pose at the end."
+    meaning = Meaning(
+        clause="the bias drifts with time",
+        because=(
+            "The unit had not settled, or something around it changed slowly. It belongs to this "
+            "recording, not to the unit."
+        ),
+        formula="e = q (t − t₀) + q₂ (t − t₀)² + q₃ (t − t₀)³",
+        factors={"*": "t − t₀", "*2": "(t − t₀)²", "*3": "(t − t₀)³"},
+        symbols="t: time in s; powers without a coefficient are zero",
+        reference=("t₀", "t_s"),
+    )
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import DURATION, SINCE_START, Coefficient, Effect, no_slope, on_each_axis, xyz
+from triaxcal.effects.contract import DURATION, SINCE_START, Coefficient, Effect, Meaning, no_slope, on_each_axis, xyz
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,16 @@ class BiasStep(Effect):
     needs: tuple[str, ...] = (SINCE_START, DURATION)
     lasting: bool = True
     remedy: str = "Look for what happened then (a knock, a supply, a loose part) and record again."
+    meaning = Meaning(
+        clause="the bias jumps at one moment",
+        because=(
+            "A knock, a change of the supply, a part that came loose. It belongs to this recording, not to the unit."
+        ),
+        formula="e = −q before t₁, 0 after it",
+        factors={"*": "−1 before t₁, 0 after", "at": "t₁"},
+        symbols="t₁: seconds since the recording began",
+        in_run="{by}, t₁ in recording {n}; all earlier ones are before it",
+    )
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         held = np.maximum(covariates[DURATION], 1e-9)

@@ -11,6 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import (
     Coefficient,
     Effect,
+    Meaning,
     covariate_of,
     no_slope,
     on_each_axis,
@@ -28,6 +29,14 @@ class ChannelBias(Effect):
     """``e_i = q_i (c − c_ref)`` of a channel c."""
 
     channel: str
+    meaning = Meaning(
+        clause="the bias goes with {c}",
+        because="What {c} measures acts on the zero of the unit, or moves together with something that does.",
+        formula="e = q (c − c₀)",
+        factors={"*": "c − c₀"},
+        symbols="c: {c}, as logged",
+        reference=("c₀", "{c}"),
+    )
 
     @property
     def name(self) -> str:
@@ -60,6 +69,14 @@ class ChannelScaleFactor(Effect):
     """``e_i = q_i (c − c_ref) s_i`` of a channel c."""
 
     channel: str
+    meaning = Meaning(
+        clause="the scale factor goes with {c}",
+        because="What {c} measures acts on the scale of the unit, or moves together with something that does.",
+        formula="e = q (c − c₀) s",
+        factors={"*": "(c − c₀) s"},
+        symbols="c: {c}, as logged",
+        reference=("c₀", "{c}"),
+    )
 
     @property
     def name(self) -> str:

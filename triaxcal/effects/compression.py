@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import BEFORE, Coefficient, Effect, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import BEFORE, Coefficient, Effect, Meaning, per_axis, per_axis_slope, xyz
 
 KINDS = {"odd": "", "even": "even_"}
 KNEES = (0.5, 0.6, 0.7, 0.8, 0.9)
@@ -41,6 +41,13 @@ class Compression(Effect):
     name: str = "compression"
     needs: tuple[str, ...] = ()
     remedy: str = "Use the unit, or set its range, so that readings stay below the knee; else correct it in the host."
+    meaning = Meaning(
+        clause="the output gives way towards the ends of the range",
+        because="An amplifier nears its supply, or a torquer the end of its current; the unit keeps it.",
+        formula="e = −q (h(s) − h(−s))  or  e = −q (h(s) + h(−s))",
+        factors={"*": "h(−s) − h(s)", "even_*": "−h(s) − h(−s)", "knee": "κ"},
+        symbols="h(s): s − κ beyond the knee κ and zero below it, with a bend as wide as κ/10 between",
+    )
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -38,6 +38,7 @@ DERIVED = (*CLOCKS, *BEFORE, *CHANGE, *SCATTER, RUN)
 LOGGED = ".logged"
 LAGS_S = (10, 15, 22, 33, 47, 68, 100, 150, 220, 330, 470, 680, 1000, 1500, 2200, 3300, 4700, 6800, 10000)
 """Time constants for which it is known how far a channel's lag is behind it: preferred numbers (IEC 60063, E6)."""
+IN_ONE_RUN = "{by}, in recording {n} alone"
 _LAG = re.compile(r"(.+)\.lag:([1-9]\d{0,5})")
 
 
@@ -87,6 +88,30 @@ class Coefficient:
     part: str = ""
 
 
+@dataclass(frozen=True)
+class Meaning:
+    """What an effect is, in words and as a formula for one axis, as u = K (s + b + e) has it.
+
+    ``clause`` says it in a clause, ``because`` what usually makes it. ``formula`` gives e in the coefficients and in
+    letters that ``symbols`` explains; s is the specific force along the axis. ``factors`` are what a coefficient is
+    multiplied by, by its name with ``*`` in place of the axis, and the letters of the shape by their names.
+    ``reference`` is a letter of the formula and the condition whose reference it is. ``in_run`` says what a coefficient
+    of recording ``{n}`` is multiplied by, where ``{by}`` is that of a single one. In all of them ``{c}`` is the channel
+    of an effect that is one of any channel.
+    """
+
+    clause: str
+    because: str
+    formula: str
+    factors: Mapping[str, str]
+    symbols: str = ""
+    reference: tuple[str, str] | None = None
+    in_run: str = IN_ONE_RUN
+
+
+T_REFERENCE = ("T₀", "temp_c")
+
+
 class Effect(Protocol):
     """One way in which a sensor departs from the linear model.
 
@@ -114,6 +139,11 @@ class Effect(Protocol):
         """Its remedy, with numbers where it can: for the ``largest`` of its coefficients, where what it makes up to
         ``floor``, in the same unit but for the covariates, does not matter. `remedy`, unless said otherwise."""
         return self.remedy
+
+    @property
+    def meaning(self) -> Meaning | None:
+        """What it is, for reports and the reference; its name and its coefficients alone, unless said otherwise."""
+        return None
 
     @property
     def shape(self) -> Mapping[str, tuple[float, str]]:

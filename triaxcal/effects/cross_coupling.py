@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect
+from triaxcal.effects.contract import Coefficient, Effect, Meaning
 
 PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 """(axis, other): the axis reads its own component times the other."""
@@ -29,6 +29,16 @@ class CrossCoupling(Effect):
     )
     needs: tuple[str, ...] = ()
     remedy: str = "Correct it with the cross-coupling coefficients, in the host."
+    meaning = Meaning(
+        clause="what one axis reads depends on the product of two components",
+        because="A proof mass that moves along one axis changes how it answers along another; the unit keeps it.",
+        formula="e = qⱼ s sⱼ + qₖ s sₖ + q sⱼ sₖ",
+        factors={
+            **{f"{a}_{a}{b}": f"s_{a} s_{b}" for a in "xyz" for b in "xyz" if a != b},
+            "xyz": "product of the two other components, on each axis",
+        },
+        symbols="sⱼ, sₖ: the two other components; of the last product still poses show one coefficient for all axes",
+    )
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         out = np.zeros((len(s), 3, 7))

@@ -10,7 +10,7 @@ from math import factorial
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.effects.contract import TIME, Coefficient, Effect
+from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning
 
 KINDS = {"odd": 3, "even": 4, "time": 4}
 Terms = tuple[tuple[float, int, int, int], ...]
@@ -29,6 +29,18 @@ class Empirical(Effect):
     kind: str = "odd"
     name: str = "empirical"
     remedy: str = "This describes the poses that it was fitted to, and no others: find the cause."
+    meaning = Meaning(
+        clause="a smooth pattern is left that no known effect explains",
+        because="It describes what is left in these poses and does not say what makes it.",
+        formula="e = s f",
+        factors={
+            **{f"odd_{k}": "s × harmonic of degree 3" for k in range(1, 8)},
+            **{f"even_{k}": "s × harmonic of degree 4" for k in range(1, 10)},
+            **{f"time_{d}": f"s ((t − t₀) / 1000 s){p}" for d, p in ((1, ""), (2, "²"), (3, "³"), (4, "⁴"))},
+        },
+        symbols="f: a smooth function of the direction or of the time",
+        reference=("t₀", "t_s"),
+    )
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

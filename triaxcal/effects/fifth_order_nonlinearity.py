@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import Coefficient, Effect, Meaning, per_axis, per_axis_slope, xyz
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,15 @@ class FifthOrderNonlinearity(Effect):
     coefficients: tuple[Coefficient, ...] = xyz("g/g⁵")
     needs: tuple[str, ...] = ()
     remedy: str = "Correct it with the fifth-order coefficients, in the host."
+    meaning = Meaning(
+        clause="the output bends with the fifth power of the input",
+        because=(
+            "The sensing element or its amplifier flattens towards both ends of its range, more "
+            "steeply than a cube; the unit keeps it."
+        ),
+        formula="e = q s⁵",
+        factors={"*": "s⁵"},
+    )
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis(s**5)

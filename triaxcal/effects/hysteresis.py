@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import BEFORE, CHANGE, Coefficient, Effect, no_slope, per_axis, signs, xyz
+from triaxcal.effects.contract import BEFORE, CHANGE, Coefficient, Effect, Meaning, no_slope, per_axis, signs, xyz
 
 KINDS = {"memory": "", "reversal": "sign_"}
 REVERSAL = 1e-3
@@ -25,6 +25,13 @@ class Hysteresis(Effect):
     kind: str = "memory"
     name: str = "hysteresis"
     remedy: str = "Approach every pose from the same side, or wait longer in it before it counts."
+    meaning = Meaning(
+        clause="the reading depends on the pose before",
+        because="The element, its mounting or the fixture does not come all the way back.",
+        formula="e = q s′  or  e = q sign(s − s′)",
+        factors={"*": "s′", "sign_*": "sign(s − s′)"},
+        symbols="s′: the specific force along the axis in the pose before",
+    )
 
     @property
     def needs(self) -> tuple[str, ...]:

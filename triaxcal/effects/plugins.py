@@ -15,7 +15,7 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects.catalogue import CATALOGUE
 from triaxcal.effects.channel import BIAS, SCALE_FACTOR
-from triaxcal.effects.contract import DERIVED, RUN, SINCE_START, Effect
+from triaxcal.effects.contract import DERIVED, RUN, SINCE_START, Effect, Meaning
 from triaxcal.effects.empirical import Empirical
 from triaxcal.effects.run_bias import BETWEEN_RUNS
 from triaxcal.effects.wrapped import Wrapped
@@ -61,6 +61,14 @@ class Foreign(Wrapped):
             return str(self._asked(lambda: self.whole.advice(largest, floor)))
         except EffectFault:  # words only
             return self.remedy
+
+    @property
+    def meaning(self) -> Meaning | None:
+        try:
+            meaning = self._asked(lambda: self.whole.meaning)
+        except EffectFault:  # words only
+            return None
+        return meaning if isinstance(meaning, Meaning) else None
 
     @property
     def absent(self) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import BEFORE, Coefficient, Effect, no_slope, per_axis, signs, xyz
+from triaxcal.effects.contract import BEFORE, Coefficient, Effect, Meaning, no_slope, per_axis, signs, xyz
 
 DRIVEN = 0.05
 """The specific force along an axis that leaves the whole offset, in parts of its order of magnitude; below it the
@@ -34,6 +34,13 @@ class Remanence(Effect):
     coefficients: tuple[Coefficient, ...] = xyz("g")
     needs: tuple[str, ...] = BEFORE
     remedy: str = "Drive every axis to the same side before each pose, or to both sides by turns, less and less."
+    meaning = Meaning(
+        clause="the bias keeps the sign of the load in the pose before",
+        because="Iron that was magnetised, a charge that was left, a joint that slipped.",
+        formula="e = q sign(s′)",
+        factors={"*": "sign(s′)"},
+        symbols="s′: the specific force along the axis in the pose before",
+    )
 
     @property
     def absent(self) -> str:

@@ -10,8 +10,10 @@ from typing import Self
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import RUN, Coefficient, Effect, no_slope, xyz
+from triaxcal.effects.contract import RUN, Coefficient, Effect, Meaning, no_slope, xyz
 
+_OF_RUNS = "q: one for each recording, their sum zero; where one recording alone differs, zero in the others"
+_AGAINST_FIRST = "{by} in recording {n}, −{by} in recording 1"
 ALONE = re.compile(r"[xyz]_run([1-9]\d*)_alone")
 
 
@@ -30,6 +32,17 @@ class RunBias(Effect):
     unit: str = "g"
     remedy: str = (
         "The bias comes back anew at every start: allow for its spread, or correct it after each start by a few poses."
+    )
+    meaning = Meaning(
+        clause="the bias comes back a little different at every start",
+        because=(
+            "What is switched off and on does not settle in quite the same place. It belongs to these "
+            "recordings, not to the unit."
+        ),
+        formula="e = q",
+        factors={"*": "1"},
+        symbols=_OF_RUNS,
+        in_run=_AGAINST_FIRST,
     )
 
     def advice(self, largest: float, floor: float) -> str:
@@ -86,6 +99,17 @@ class RunScaleFactor(RunBias):
     remedy: str = (
         "The scale factor comes back anew at every start, or goes with what nobody logged: log the temperature, and "
         "allow for its spread."
+    )
+    meaning = Meaning(
+        clause="the scale factor comes back a little different at every start",
+        because=(
+            "What is switched off and on does not settle in quite the same place, or something that "
+            "nobody logged was different. It belongs to these recordings, not to the unit."
+        ),
+        formula="e = q s",
+        factors={"*": "s"},
+        symbols=_OF_RUNS,
+        in_run=_AGAINST_FIRST,
     )
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:

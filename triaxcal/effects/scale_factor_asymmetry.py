@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, per_axis, per_axis_slope, xyz
+from triaxcal.effects.contract import Coefficient, Effect, Meaning, per_axis, per_axis_slope, xyz
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,12 @@ class ScaleFactorAsymmetry(Effect):
     coefficients: tuple[Coefficient, ...] = xyz("1")
     needs: tuple[str, ...] = ()
     remedy: str = "Correct it with one scale factor for positive and one for negative outputs, in the host."
+    meaning = Meaning(
+        clause="the scale factor differs between positive and negative inputs",
+        because="The two halves of a push-pull stage or of a differential element are unlike; the unit keeps it.",
+        formula="e = q |s|",
+        factors={"*": "|s|"},
+    )
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return per_axis(np.abs(s))

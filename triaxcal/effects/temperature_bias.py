@@ -6,7 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, steady_within, xyz
+from triaxcal.effects.contract import (
+    T_REFERENCE,
+    Coefficient,
+    Effect,
+    Meaning,
+    no_slope,
+    on_each_axis,
+    steady_within,
+    xyz,
+)
 
 
 @dataclass(frozen=True)
@@ -17,6 +26,14 @@ class TemperatureBias(Effect):
     coefficients: tuple[Coefficient, ...] = xyz("g/K")
     needs: tuple[str, ...] = ("temp_c",)
     remedy: str = "Correct the bias by the logged temperature, or hold the temperature steadier."
+    meaning = Meaning(
+        clause="the bias goes with temperature",
+        because="The zero of the element or of its electronics changes as they warm.",
+        formula="e = q (T − T₀)",
+        factors={"*": "T − T₀"},
+        symbols="T: temp_c",
+        reference=T_REFERENCE,
+    )
 
     def advice(self, largest: float, floor: float) -> str:
         return steady_within(self.remedy, largest, floor, "K")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, no_slope, on_each_axis, xyz
+from triaxcal.effects.contract import T_REFERENCE, Coefficient, Effect, Meaning, no_slope, on_each_axis, xyz
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,14 @@ class TemperatureBiasQuadratic(Effect):
     )
     needs: tuple[str, ...] = ("temp_c",)
     remedy: str = "Correct the bias by a parabola in the logged temperature, or hold the temperature steadier."
+    meaning = Meaning(
+        clause="the bias follows temperature along a parabola",
+        because="The zero changes with temperature, and not in a straight line.",
+        formula="e = p (T − T₀) + q (T − T₀)²",
+        factors={"linear_*": "T − T₀", "quadratic_*": "(T − T₀)²"},
+        symbols="T: temp_c",
+        reference=T_REFERENCE,
+    )
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         deviation = covariates["temp_c"]

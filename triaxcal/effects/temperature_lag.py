@@ -12,8 +12,10 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import (
     LAGS_S,
     SINCE_START,
+    T_REFERENCE,
     Coefficient,
     Effect,
+    Meaning,
     lag_of,
     no_slope,
     on_each_axis,
@@ -48,6 +50,14 @@ class TemperatureLag(Effect):
     coefficients: tuple[Coefficient, ...] = xyz("g/K")
     remedy: str = (
         "Let the temperature settle before each pose, or correct the bias by a lagging temperature, in the host."
+    )
+    meaning = Meaning(
+        clause="the bias follows the temperature late",
+        because="What makes it warms and cools later than the thermometer.",
+        formula="e = q (θ − T₀), τ dθ/dt = T − θ",
+        factors={"*": "θ − T₀", "time_constant": "τ"},
+        symbols="T: temp_c; θ: the same after a first-order lag of the time constant τ",
+        reference=T_REFERENCE,
     )
 
     @property

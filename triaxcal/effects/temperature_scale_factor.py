@@ -8,7 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect, per_axis, per_axis_slope, steady_within, xyz
+from triaxcal.effects.contract import (
+    T_REFERENCE,
+    Coefficient,
+    Effect,
+    Meaning,
+    per_axis,
+    per_axis_slope,
+    steady_within,
+    xyz,
+)
 
 
 @dataclass(frozen=True)
@@ -19,6 +28,14 @@ class TemperatureScaleFactor(Effect):
     coefficients: tuple[Coefficient, ...] = xyz("1/K")
     needs: tuple[str, ...] = ("temp_c",)
     remedy: str = "Correct the scale factor by the logged temperature, or hold the temperature steadier."
+    meaning = Meaning(
+        clause="the scale factor goes with temperature",
+        because="A spring, a gap or a reference voltage changes as it warms.",
+        formula="e = q (T − T₀) s",
+        factors={"*": "(T − T₀) s"},
+        symbols="T: temp_c",
+        reference=T_REFERENCE,
+    )
 
     def advice(self, largest: float, floor: float) -> str:
         return steady_within(self.remedy, largest, floor, "K")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import SCATTER, Coefficient, Effect, no_slope, per_axis, xyz
+from triaxcal.effects.contract import SCATTER, Coefficient, Effect, Meaning, no_slope, per_axis, xyz
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,13 @@ class VibrationRectification(Effect):
     coefficients: tuple[Coefficient, ...] = xyz("g/g²")
     needs: tuple[str, ...] = SCATTER
     remedy: str = "Stop what shakes the stand while poses are held, or stand the fixture on something that damps."
+    meaning = Meaning(
+        clause="vibration shifts the bias",
+        because="The element is not straight, so that shaking it does not average to zero.",
+        formula="e = q v",
+        factors={"*": "v"},
+        symbols="v: variance of the readings inside the pose, in g²",
+    )
 
     @property
     def absent(self) -> str:

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import SINCE_START, Coefficient, Effect, no_slope, on_each_axis, span_of, xyz
+from triaxcal.effects.contract import SINCE_START, Coefficient, Effect, Meaning, no_slope, on_each_axis, span_of, xyz
 
 CONSTANTS = 8
 SLOWEST = 4.0
@@ -25,6 +25,13 @@ class WarmUp(Effect):
     coefficients: tuple[Coefficient, ...] = xyz("g")
     needs: tuple[str, ...] = (SINCE_START,)
     remedy: str = "Switch the unit on and wait before the first pose, until the bias has settled."
+    meaning = Meaning(
+        clause="the bias settles after the start, as while a unit warms up",
+        because="The unit was switched on shortly before. It belongs to this recording, not to the unit.",
+        formula="e = q exp(−t / τ)",
+        factors={"*": "exp(−t / τ)", "time_constant": "τ"},
+        symbols="t: seconds since the recording began",
+    )
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
         return on_each_axis(np.exp(-covariates[SINCE_START] / self.time_constant_s))

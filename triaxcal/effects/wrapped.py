@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 from triaxcal.arrays import Floats
-from triaxcal.effects.contract import Coefficient, Effect
+from triaxcal.effects.contract import Coefficient, Effect, Meaning
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +40,10 @@ class Wrapped(Effect):
 
     def advice(self, largest: float, floor: float) -> str:
         return self.whole.advice(largest, floor)
+
+    @property
+    def meaning(self) -> Meaning | None:
+        return self.whole.meaning
 
     @property
     def absent(self) -> str:
