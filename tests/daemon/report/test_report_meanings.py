@@ -43,16 +43,15 @@ def by_hand(text: str, effect: Effect, axis: int) -> np.ndarray:
     need = c[effect.needs[0]] if effect.needs else np.zeros(5)
     if product := re.fullmatch(r"s_([xyz]) s_([xyz])", text):
         return np.asarray(S[:, "xyz".index(product[1])] * S[:, "xyz".index(product[2])])
+    if power := re.fullmatch(r"s([²³⁴⁵⁶⁷⁸⁹])", text):
+        return s ** ("⁰¹²³⁴⁵⁶⁷⁸⁹".index(power[1]))
     tau, at = (effect.shape.get(n, (1.0, ""))[0] for n in ("time_constant", "at"))
     known = {
-        "s⁵": s**5,
         "h(−s) − h(s)": hinge(-s, effect) - hinge(s, effect),
         "−h(s) − h(−s)": -hinge(-s, effect) - hinge(s, effect),
         "θ − T₀": need + (c[effect.needs[1]] if effect.name == "temperature_lag" else 0.0),
         "(t − t₀) s": need * s,
         "sign(s′)": np.sign(c[BEFORE[axis]]),
-        "s²": s**2,
-        "s³": s**3,
         "|s|": np.abs(s),
         "T − T₀": need,
         "(T − T₀)²": need**2,

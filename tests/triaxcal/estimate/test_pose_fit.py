@@ -23,7 +23,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 
 MINUS = (-1, -1, -1)
-COEFFICIENTS: dict[str, list[float]] = {
+SIZED: dict[str, list[float]] = {
     "second_order_nonlinearity": [3e-3, -2e-3, 1e-3],
     "third_order_nonlinearity": [-1e-3, 4e-3, 2e-3],
     "scale_factor_asymmetry": [1e-3, -2e-3, 1e-3],
@@ -43,6 +43,8 @@ COEFFICIENTS: dict[str, list[float]] = {
     "temperature_lag": [1e-4, 2e-4, -1e-4],
     "remanence": [1e-3, -1e-3, 2e-3],
 }
+COEFFICIENTS = {e.name: SIZED.get(e.name, [1e-3] * len(e.coefficients)) for e in CATALOGUE}
+"""Of every effect; those not in `SIZED` act alike on all axes, by a thousandth."""
 SHAPES = {
     "compression": {"knee": 0.5},
     "temperature_lag": {"time_constant": 30.0},
@@ -84,7 +86,7 @@ def everything_on(paper_unit: Sensor, directions: np.ndarray, seed: int = 0) -> 
 def test_the_jacobian_is_that_of_central_differences_with_every_effect_on(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
-    assert [e.name for e in CATALOGUE] == list(COEFFICIENTS)
+    assert set(SIZED) <= {e.name for e in CATALOGUE}
     problem, state, _ = everything_on(paper_unit, twenty_six)
     _, J, _ = linearise(problem, state)
     assert np.all(np.abs(J).max(axis=0) > 0)
