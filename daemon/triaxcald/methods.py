@@ -13,7 +13,13 @@ import numpy as np
 from triaxcal.inputs.attitude import AttitudeFit
 from triaxcal.inputs.datasheet import Datasheet, Refinement
 from triaxcal.inputs.turning.rotation import RotationFit
-from triaxcal.interchange.calibration_document import LINEAR, Document, by_parameter, calibration_document
+from triaxcal.interchange.calibration_document import (
+    LINEAR,
+    Document,
+    by_parameter,
+    calibration_document,
+    residual_document,
+)
 from triaxcal.interchange.calibration_reading import calibration_part, holds_at_of, sensor_of
 from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.rounding import UNCERTAINTY_DIGITS, number, numbers, probability, uncertainty
@@ -37,6 +43,8 @@ def attitudes_document(found: AttitudeFit, *, output_unit: str, reference_unit: 
     document["attitudes"] = {
         "error_rad": uncertainty(found.attitude_error_rad),
         "estimated": found.estimated,
+        "error_standard_error_rad": uncertainty(found.attitude_error_uncertainty_rad),
+        "if_estimated": None if found.if_estimated is None else _if_estimated(found.if_estimated),
         "rotation": numbers(found.rotation),
         "rotation_standard_error_rad": numbers(found.rotation_error_rad, UNCERTAINTY_DIGITS),
         "standard_error_if_exact": {
@@ -54,6 +62,21 @@ def attitudes_document(found: AttitudeFit, *, output_unit: str, reference_unit: 
         ],
     }
     return document
+
+
+def _if_estimated(found: AttitudeFit) -> Document:
+    c = found.calibration
+    return {
+        "error_rad": uncertainty(found.attitude_error_rad),
+        "error_standard_error_rad": uncertainty(found.attitude_error_uncertainty_rad),
+        **{name: numbers(getattr(c.sensor, name)) for name in LINEAR},
+        "standard_error": {
+            name: numbers(c.standard_errors[3 * i : 3 * i + 3], UNCERTAINTY_DIGITS) for i, name in enumerate(LINEAR)
+        },
+        "rotation": numbers(found.rotation),
+        "rotation_standard_error_rad": numbers(found.rotation_error_rad, UNCERTAINTY_DIGITS),
+        "residual": residual_document(c.residual, c.reference),
+    }
 
 
 def datasheet_document(found: Refinement, *, output_unit: str, reference_unit: str) -> Document:

@@ -89,6 +89,19 @@ class AttitudesContradict(Caution):
 
 
 @dataclass(frozen=True)
+class DeclaredErrorContradicted(Caution):
+    """By the residuals, which say ``error_rad`` ± ``uncertainty_rad``; ``declared_rad`` stays in force.
+
+    With it the standard errors are up to ``raised`` times what they are with the estimate.
+    """
+
+    declared_rad: float
+    error_rad: float
+    uncertainty_rad: float
+    raised: float
+
+
+@dataclass(frozen=True)
 class MagnitudeContradicts(Caution):
     """Under the fit |a| is off by ``ratio`` times its noise, most in the ``worst`` row."""
 
@@ -100,8 +113,11 @@ class MagnitudeContradicts(Caution):
 class AttitudeFit:
     """``rotation`` C (3,3): ``a_sensor = C a_table``; ``rotation_error_rad`` (3,) standard errors of turns of the
     sensor's frame about its axes. ``attitude_error_rad`` by axis and pose, declared or ``estimated`` from the
-    residuals. ``noise_error`` (9,) are the standard errors that the same poses would give, were the attitudes exact;
-    ``attitudes`` are those of all poses.
+    residuals, then with its standard error, ``attitude_error_uncertainty_rad``. ``noise_error`` (9,) are the standard
+    errors that the same poses would give, were the attitudes exact; ``attitudes`` are those of all poses.
+
+    ``if_estimated`` is the fit with an estimate, where the residuals contradict the error that was declared and a
+    larger one explains them.
     """
 
     calibration: Calibration
@@ -111,6 +127,8 @@ class AttitudeFit:
     estimated: bool
     noise_error: Floats
     attitudes: tuple[Attitude, ...]
+    attitude_error_uncertainty_rad: float | None = None
+    if_estimated: AttitudeFit | None = None
 
 
 def fit_attitudes(
@@ -155,12 +173,41 @@ def fit_attitudes(
         if len(worst) != 1 or len(wrong) + 1 > WRONG_MOST * len(poses):
             break
         wrong = np.sort(np.append(wrong, kept[worst]))
-    tied = tuple(Row(called[i], poses[i].began) for i in kept[worst])
     found = _concluded(poses, data, solved(data.only(kept), attitude_error_rad), kept, called, signs)
-    if len(tied) < 2:
-        return found
-    cautions = (AttitudesTied(tied), *found.calibration.cautions)
-    return replace(found, calibration=replace(found.calibration, cautions=cautions))
+    more: list[Caution] = []
+    if len(worst) > 1:
+        more.append(AttitudesTied(tuple(Row(called[i], poses[i].began) for i in kept[worst])))
+    if attitude_error_rad is not None and found.calibration.birge_ratio > 1:
+        instead = _if_estimated(poses, ups, called, signs, reference)
+        if instead is not None and instead.attitude_error_rad > attitude_error_rad:
+            found = replace(found, if_estimated=instead)
+            more.append(_contradicted(found, instead))
+    return replace(found, calibration=replace(found.calibration, cautions=(*more, *found.calibration.cautions)))
+
+
+def _if_estimated(
+    poses: Sequence[Pose], ups: Floats, names: Sequence[str], signs: Sequence[float] | None, reference: float
+) -> AttitudeFit | None:
+    """The fit with an error of the attitudes that the residuals say; None where they say none.
+
+    Nor where |a| disagrees with it: then more than the attitudes is wrong, and the estimate would stand for all of it.
+    """
+    try:
+        found = fit_attitudes(poses, ups, names=names, signs=signs, reference=reference)
+    except Refused:
+        return None
+    doubtful = any(isinstance(c, MagnitudeContradicts) for c in found.calibration.cautions)
+    return found if found.estimated and not doubtful else None
+
+
+def _contradicted(found: AttitudeFit, instead: AttitudeFit) -> DeclaredErrorContradicted:
+    assert instead.attitude_error_uncertainty_rad is not None
+    return DeclaredErrorContradicted(
+        found.attitude_error_rad,
+        instead.attitude_error_rad,
+        instead.attitude_error_uncertainty_rad,
+        float(np.max(found.calibration.standard_errors / instead.calibration.standard_errors)),
+    )
 
 
 def _checked(
@@ -265,6 +312,7 @@ def _concluded(
         s.estimated,
         np.sqrt(np.diag(G @ s.noise_only @ G.T)[:9]),
         attitudes,
+        s.error_uncertainty_rad if s.estimated else None,
     )
     return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found, s))))
 

@@ -92,6 +92,18 @@ class TurntableSolution:
         return p[:9].reshape(3, 3), p[9:]
 
     @property
+    def error_uncertainty_rad(self) -> float:
+        """Standard error of ``error_rad`` as it is estimated: where ``chi2`` is ``left``.
+
+        The sum has variance 2 ``left``, and the part of it that is the attitudes' falls with the square of their error.
+        """
+        of_noise = np.einsum("nij,njk,nkl,nli->", self.weight, self.free, self.weight, self.data.covariance)
+        of_attitudes = float(self.left - of_noise)
+        if not of_attitudes > 0:
+            return float("inf")
+        return self.error_rad * float(np.sqrt(2 * self.left)) / (2 * of_attitudes)
+
+    @property
     def free(self) -> Floats:
         """(n,3,3): covariance of each pose's residual."""
         fitted = np.einsum("nip,pq,njq->nij", self.design, self.covariance, self.design)

@@ -129,6 +129,15 @@ def _(c: attitude.AttitudesContradict) -> str:
 
 
 @caution.register
+def _(c: attitude.DeclaredErrorContradicted) -> str:
+    return (
+        f"the residuals contradict the declared error of the attitudes, {c.declared_rad:.2g} rad, and say "
+        f"{c.error_rad:.2g} ± {c.uncertainty_rad:.1g} rad by axis; what was declared still weighs the readings, and "
+        f"makes the standard errors up to {c.raised:.2g} times as large as --attitude-error {c.error_rad:.2g} would"
+    )
+
+
+@caution.register
 def _(c: attitude.MagnitudeContradicts) -> str:
     return (
         f"attitudes disagree with |a|: under this fit the magnitude is off by {c.ratio:.1f} times its noise, most in "

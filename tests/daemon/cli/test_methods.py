@@ -216,6 +216,28 @@ def test_a_wrong_row_is_named_at_the_console(files: Path, triaxcal: Run, tmp_pat
     assert "as declared" in done.out
 
 
+def test_a_declared_error_that_the_poses_contradict_comes_with_what_they_say(
+    files: Path, triaxcal: Run, tmp_path: Path
+) -> None:
+    """Attitudes off by 0.02 rad, where 1e-4 is declared."""
+    off = UPS + np.cross(np.random.default_rng(1).standard_normal(UPS.shape) * 0.02, UPS)
+    path = attitudes(tmp_path, "x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in off))
+    declared = ["fit", files / "14.csv", "--attitudes", path, SIGNS, "--attitude-error"]
+    done = triaxcal(*declared, "1e-4", "--json")
+    assert done.code == 0
+    is_calibration(done.json)
+    instead = done.json["attitudes"]["if_estimated"]
+    assert instead["error_rad"] == pytest.approx(0.02, abs=4 * instead["error_standard_error_rad"])
+    assert (done.json["attitudes"]["error_rad"], done.json["attitudes"]["estimated"]) == (1e-4, False)
+    said = next(w for w in done.json["warnings"] if "contradict the declared error" in w)
+    option = said.partition("--attitude-error ")[2].split()[0]
+    taken = triaxcal(*declared, option, "--json").json
+    assert taken["attitudes"]["if_estimated"] is None
+    for name in ("scale_factor", "misalignment", "bias"):
+        assert np.max(np.abs(np.array(taken[name]) - instead[name]) / instead["standard_error"][name]) < 0.1
+    assert np.max(np.abs(pulls(instead, UNIT))) < 4.5
+
+
 ATTITUDE_FAULTS = [
     ("x,y\n1,0\n", "line 1: the column z is missing"),
     ("start_s,x,y,z\n0,1,0,0\n", "line 1: the column end_s is missing"),

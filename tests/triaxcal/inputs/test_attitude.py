@@ -16,6 +16,7 @@ from triaxcal.inputs.attitude import (
     AttitudeFit,
     AttitudesContradict,
     AttitudesTied,
+    DeclaredErrorContradicted,
     MagnitudeContradicts,
     fit_attitudes,
 )
@@ -163,6 +164,69 @@ def test_an_error_declared_too_small_is_noticed_and_raises_the_errors() -> None:
     assert any(isinstance(caution, MagnitudeContradicts) for caution in c.cautions)
     assert c.residual.lack_of_fit_p is not None
     assert c.residual.lack_of_fit_p < 1e-6
+
+
+def test_an_error_declared_fifty_times_too_small_is_told_with_the_estimate_and_what_the_fit_would_be() -> None:
+    declared, estimated, true, away = [], [], [], []
+    for seed in range(20):
+        poses, C = turntable(plan(14), seed, error_rad=1e-3)
+        found = fit_attitudes(poses, plan(14), signs=SIGNS, attitude_error_rad=2e-5)
+        instead = found.if_estimated
+        assert instead is not None
+        assert instead.attitude_error_uncertainty_rad is not None
+        told = [c for c in found.calibration.cautions if isinstance(c, DeclaredErrorContradicted)]
+        assert [c.error_rad for c in told] == [instead.attitude_error_rad]
+        assert told[0].raised > 10
+        assert found.attitude_error_rad == 2e-5
+        away.append((instead.attitude_error_rad - 1e-3) / instead.attitude_error_uncertainty_rad)
+        right = fit_attitudes(poses, plan(14), signs=SIGNS, attitude_error_rad=1e-3)
+        for errors, fitted in ((declared, found), (estimated, instead), (true, right)):
+            errors.append(errors_of(fitted, C)[:9])
+    low, high = stats.chi2.interval(0.999, 20) / np.array(20)
+    assert low < np.mean(np.square(away)) < high
+    rms = [float(np.sqrt(np.mean(np.square(errors)))) for errors in (declared, estimated, true)]
+    assert rms[0] > 10 * rms[2]
+    assert rms[1] == pytest.approx(rms[2], rel=0.05)
+
+
+@pytest.mark.parametrize("poses_of_plan", [14, 26])
+def test_the_estimated_error_has_a_true_standard_error(poses_of_plan: int) -> None:
+    ups, seeds, away = plan(poses_of_plan), 40, []
+    for seed in range(seeds):
+        poses, _ = turntable(ups, seed, error_rad=1e-3)
+        found = fit_attitudes(poses, ups, signs=SIGNS)
+        assert found.attitude_error_uncertainty_rad is not None
+        # Of the logarithm: a small estimate has a small error, which makes the others' pulls lopsided.
+        relative = found.attitude_error_uncertainty_rad / found.attitude_error_rad
+        away.append(np.log(found.attitude_error_rad / 1e-3) / relative)
+    low, high = stats.chi2.interval(0.999, seeds) / np.array(seeds)
+    assert low < np.mean(np.square(away)) < high
+
+
+def test_an_error_declared_rightly_is_hardly_ever_contradicted() -> None:
+    contradicted = 0
+    for seed in range(60):
+        poses, _ = turntable(plan(14), seed, error_rad=1e-3)
+        contradicted += fit_attitudes(poses, plan(14), signs=SIGNS, attitude_error_rad=1e-3).if_estimated is not None
+    assert contradicted <= stats.binom.isf(0.001, 60, 0.01)
+
+
+@pytest.mark.parametrize("step", [2e-5, 1e-3])
+def test_an_error_that_does_not_explain_the_magnitudes_is_not_offered(step: float) -> None:
+    """A bias that steps halfway moves |a|, which no attitude does: an estimate would stand for both."""
+    ups, offered = plan(26), []
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        true = ups + np.cross(rng.standard_normal(ups.shape) * 1e-3, ups)
+        true /= np.linalg.norm(true, axis=1, keepdims=True)
+        stepped = Sensor(UNIT.scale_factor, UNIT.misalignment, UNIT.bias + np.array([step, -step, step]))
+        poses = [*noisy_poses(UNIT, true[:13], NOISE, rng), *noisy_poses(stepped, true[13:], NOISE, rng)]
+        instead = fit_attitudes(poses, ups, signs=SIGNS, attitude_error_rad=2e-5).if_estimated
+        if instead is not None:
+            assert instead.attitude_error_uncertainty_rad is not None
+            offered.append((instead.attitude_error_rad - 1e-3) / instead.attitude_error_uncertainty_rad)
+    assert len(offered) < 15 * (0.5 if step == 2e-5 else 0.1)
+    assert all(abs(away) < 3.5 for away in offered)
 
 
 SEVEN = np.random.default_rng(4).standard_normal((7, 3))

@@ -24,7 +24,13 @@ from triaxcal.estimate.caution import (
 )
 from triaxcal.frames.orientations import NotFlush
 from triaxcal.frames.standing import SingleOrientation
-from triaxcal.inputs.attitude import AttitudeExcluded, AttitudesTied, MagnitudeContradicts, Row
+from triaxcal.inputs.attitude import (
+    AttitudeExcluded,
+    AttitudesTied,
+    DeclaredErrorContradicted,
+    MagnitudeContradicts,
+    Row,
+)
 from triaxcal.inputs.datasheet import DatasheetContradicted, StillOfDatasheet
 from triaxcal.inputs.turning.rotation import StretchesDiffer
 from triaxcal.poses.pose import PoseStart
@@ -89,6 +95,12 @@ SENTENCES: list[tuple[Caution, str]] = [
         AttitudesTied((Row("line 4", FIRST), Row("line 5", SECOND))),
         "one attitude is wrong, and the data do not tell which; none is excluded: line 4 (the pose at 10.0 s) or "
         "line 5 (the pose at 70.0 s of recording 2)",
+    ),
+    (
+        DeclaredErrorContradicted(2e-5, 9.23e-4, 1.02e-4, 33.2),
+        "the residuals contradict the declared error of the attitudes, 2e-05 rad, and say 0.00092 ± 0.0001 rad by "
+        "axis; what was declared still weighs the readings, and makes the standard errors up to 33 times as large as "
+        "--attitude-error 0.00092 would",
     ),
     (
         MagnitudeContradicts(4.44, Row("line 4", FIRST)),
