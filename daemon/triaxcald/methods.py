@@ -84,6 +84,8 @@ def datasheet_document(found: Refinement, *, output_unit: str, reference_unit: s
     document = calibration_document(c, output_unit=output_unit, reference_unit=reference_unit, budgeted=False)
     document["passport"] = {
         "conflict_p": probability(found.conflict_p),
+        "changed": [c.parameters[i] for i in found.changed],
+        "changed_alone": found.changed_alone if found.changed else None,
         "value": by_parameter(c, [number(float(v)) for v in found.datasheet.values]),
         "standard_error": by_parameter(c, [uncertainty(float(v)) for v in found.datasheet.standard_error]),
         "shift_standard_errors": by_parameter(c, [uncertainty(float(v)) for v in found.shift]),

@@ -9,7 +9,7 @@ contradict each other can be tested.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,6 +27,10 @@ from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof
 STEPS_MOST = 60
 CONVERGED = 1e-12
 CONFLICT = 0.01
+NAMED = 0.95
+"""Probability with which the value that has changed is among those named, the level of all coverage."""
+SHARE_LEAST = 1e-6
+"""Share of the information on a parameter below which rounding is all that the poses say."""
 FROM_POSES, FROM_DATASHEET = 0.9, 0.1
 """Share of the information on a parameter from which on it counts as the poses', or still as the datasheet's."""
 
@@ -87,12 +91,14 @@ class Datasheet:
 
 @dataclass(frozen=True)
 class DatasheetContradicted(Caution):
-    """Poses and datasheet values contradict each other (probability ``p``), most in ``parameter``, which moved by
-    ``shift`` standard errors; standard errors are ``raised`` so many times."""
+    """Poses and datasheet values contradict each other (probability ``p``). A change of any one of ``parameters``, the
+    likeliest first, would explain most of it; they moved by ``shifts`` standard errors. ``alone``: whether the change
+    of one explains all of it; standard errors are ``raised`` so many times."""
 
     p: float
-    parameter: str
-    shift: float
+    parameters: tuple[str, ...]
+    shifts: tuple[float, ...]
+    alone: bool
     raised: float
 
 
@@ -108,6 +114,10 @@ class Refinement:
     """``share`` (9+p,) of the information on each parameter that came from the poses, 0…1: one less the ratio of its
     variance after to that before. ``shift`` (9+p,) of the values in standard errors of a shift by chance, 0 where the
     poses say nothing. ``conflict_p`` is the probability of residuals and shifts as large as these together.
+
+    ``changed`` are the parameters (indices) of which one has changed, if one has, the likeliest first, with the change
+    in its standard errors by chance, given how the passport's errors go together; none where there is no conflict.
+    ``changed_alone``: whether that explains it.
     """
 
     calibration: Calibration
@@ -115,6 +125,8 @@ class Refinement:
     share: Floats
     shift: Floats
     conflict_p: float | None
+    changed: Mapping[int, float] = field(default_factory=dict)
+    changed_alone: bool = False
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -147,7 +159,7 @@ def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
     leverage = np.clip(np.einsum("ni,ij,nj->n", J, covariance, J) / s**2, 0.0, 1.0)
     share = np.where(free, 1 - np.diag(covariance) / np.where(free, prior, 1.0), 0.0)
     by_chance = np.sqrt(np.maximum(prior * share, 0.0))
-    shift = np.where(share > 1e-6, moved / np.where(share > 1e-6, by_chance, 1.0), 0.0)
+    shift = np.where(share > SHARE_LEAST, moved / np.where(share > SHARE_LEAST, by_chance, 1.0), 0.0)
     calibration = Calibration(
         sensor=state.sensor(problem),
         covariance=covariance * raised**2,
@@ -162,7 +174,38 @@ def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
         holds_at=datasheet.holds_at,
     )
     found = Refinement(calibration, datasheet, share, shift, conflict_p)
+    if raised > 1:
+        changed = _changed(datasheet, root, z, information)
+        without = chi2 - next(iter(changed.values()), 0.0) ** 2
+        rest = lack_of_fit_p(without, len(poses) - 1, pure if pure >= 1 else 1e6)
+        found = replace(found, changed=changed, changed_alone=rest is None or rest >= CONFLICT)
     return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found))))
+
+
+def _changed(datasheet: Datasheet, root: Floats, z: Floats, information: Floats) -> dict[int, float]:
+    """`Refinement.changed`: the parameters one of which has changed with the probability `NAMED`, if one has.
+
+    A change of unknown size in one value is ``effect / variance`` ± ``1/√variance``, and takes ``effect²/variance`` off
+    the sum. Changes are taken to be as many times the passport's standard error as a Cauchy variable is: they may be of
+    any size, and of two that explain the same, the smaller is the likelier. Few poses feel a change of many values, of
+    most by a change a thousand times as large.
+    """
+    free = np.flatnonzero(datasheet.standard_error > 0)
+    back = np.linalg.pinv(root[free])
+    effect = back.T @ z
+    variance = np.einsum("qi,qr,ri->i", back, np.eye(len(z)) - np.linalg.inv(information), back)
+    error = datasheet.standard_error[free]
+    felt = np.flatnonzero(variance * error**2 > SHARE_LEAST)
+    if not len(felt):
+        return {}
+    shift = effect[felt] / np.sqrt(variance[felt])
+    size = np.abs(effect[felt] / variance[felt]) / error[felt]
+    width = 1 / np.sqrt(variance[felt]) / error[felt]
+    log = shift**2 / 2 + np.log(width) - np.log1p(size**2)
+    chance = np.exp(log - log.max())
+    likeliest = np.argsort(-chance, kind="stable")
+    count = int(np.searchsorted(np.cumsum(chance[likeliest]), NAMED * chance.sum())) + 1
+    return {int(free[felt[i]]): float(shift[i]) for i in likeliest[:count]}
 
 
 def _problem(poses: Sequence[Pose], datasheet: Datasheet) -> Problem:
@@ -268,9 +311,12 @@ def _dilution(problem: Problem, state: State) -> float:
 def _cautions(found: Refinement) -> Iterator[Caution]:
     names = found.calibration.parameters
     if found.conflict_p is not None and found.conflict_p < CONFLICT:
-        worst = int(np.argmax(np.abs(found.shift)))
         yield DatasheetContradicted(
-            found.conflict_p, names[worst], float(found.shift[worst]), found.calibration.birge_ratio
+            found.conflict_p,
+            tuple(names[i] for i in found.changed),
+            tuple(found.changed.values()),
+            found.changed_alone,
+            found.calibration.birge_ratio,
         )
     if kept := tuple(n for n, s in zip(names, found.sources, strict=True) if s == "passport"):
         yield StillOfDatasheet(kept)

@@ -148,10 +148,22 @@ def _(c: attitude.MagnitudeContradicts) -> str:
 @caution.register
 def _(c: datasheet.DatasheetContradicted) -> str:
     return (
-        f"datasheet and poses contradict each other (p {c.p:.1e}), most in {c.parameter}, which moved by "
-        f"{c.shift:+.1f} standard errors: the unit has changed, the datasheet's standard errors are too small, or a "
-        f"pose was not still; the standard errors are raised by {c.raised:.1f}"
+        f"datasheet and poses contradict each other (p {c.p:.1e}){_changed(c)}: the unit has changed, the datasheet's "
+        f"standard errors are too small, or a pose was not still; the standard errors are raised by {c.raised:.1f}"
     )
+
+
+def _changed(c: datasheet.DatasheetContradicted) -> str:
+    moved = [f"{shift:+.1f} standard errors" for shift in c.shifts]
+    part = "" if c.alone else "; a change of one value does not explain all of it"
+    match c.parameters:
+        case ():
+            return ""
+        case (only,):
+            return f", most in {only}, which moved by {moved[0]}{part}"
+        case names:
+            each = " or ".join(f"{name} ({by})" for name, by in zip(names, moved, strict=True))
+            return f", most in {each}, which these poses do not tell apart{part}"
 
 
 @caution.register

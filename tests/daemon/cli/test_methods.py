@@ -330,9 +330,26 @@ def test_a_unit_that_has_changed_contradicts_its_datasheet(
     document = json.loads(datasheet.read_text())
     document["bias"][1] += 0.01
     datasheet.write_text(json.dumps(document))
-    done = triaxcal("fit", files / "4.csv", "--datasheet", datasheet)
+    done = triaxcal("fit", files / "check.csv", "--datasheet", datasheet)
     assert done.code == 0
     assert "datasheet and poses contradict each other" in done.err
+    assert "most in bias.y, which moved by" in done.err
+    held = triaxcal("fit", files / "check.csv", "--datasheet", datasheet, "--json").json
+    is_calibration(held)
+    assert (held["passport"]["changed"], held["passport"]["changed_alone"]) == (["bias.y"], True)
+
+
+def test_values_that_the_poses_do_not_tell_apart_are_all_named(
+    files: Path, triaxcal: Run, tmp_path: Path, datasheet: Path
+) -> None:
+    document = json.loads(datasheet.read_text())
+    document["bias"][0] += 0.01
+    datasheet.write_text(json.dumps(document))
+    one = still(tmp_path / "one.csv", UNIT, UPS[:1], 1e-3, 8)
+    error = ["--datasheet-error", "1e-3,1e-3,1e-3"]
+    held = triaxcal("fit", one, "--datasheet", datasheet, *error, "--json").json["passport"]
+    assert sorted(held["changed"]) == ["bias.x", "scale_factor.x"]
+    assert "which these poses do not tell apart" in triaxcal("fit", one, "--datasheet", datasheet, *error).err
 
 
 def test_a_certificate_is_a_datasheet_and_its_effects_come_with_it(triaxcal: Run, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from scipy import optimize, stats
 from triaxcal.effects import effect_named
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.inputs.datasheet import Datasheet, DatasheetContradicted, StillOfDatasheet, refine
+from triaxcal.inputs.datasheet import Datasheet, DatasheetContradicted, Refinement, StillOfDatasheet, refine
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -129,7 +129,64 @@ def test_a_unit_that_has_changed_conflicts_and_the_value_is_named() -> None:
         assert found.calibration.birge_ratio > 2
         caution = found.calibration.cautions[0]
         assert isinstance(caution, DatasheetContradicted)
-        assert caution.parameter == "bias.y"
+        assert caution.parameters == ("bias.y",)
+
+
+def changed(at: int, by: float, count: int, seed: int) -> Refinement:
+    """Poses of a unit of which value ``at`` has changed by ``by`` of the passport's standard errors."""
+    values = datasheet(seed).values
+    values[at] += by * ERROR[at]
+    return refine(poses(count, seed), Datasheet(sensor(values), ERROR, {}, 1.0))
+
+
+@pytest.mark.parametrize("at", [0, 6])
+def test_one_pose_does_not_tell_a_scale_factor_from_a_bias_and_both_are_named(at: int) -> None:
+    for seed in range(20):
+        found = changed(at, 20, 1, seed)
+        assert set(found.changed) == {0, 6}
+        assert found.changed_alone
+        caution = found.calibration.cautions[0]
+        assert isinstance(caution, DatasheetContradicted)
+        assert set(caution.parameters) == {"scale_factor.x", "bias.x"}
+
+
+@pytest.mark.parametrize("count", [2, 4, 6, 9, 14])
+@pytest.mark.parametrize("by", [6, 20])
+def test_the_value_that_changed_is_among_those_named_and_alone_where_the_poses_tell(count: int, by: float) -> None:
+    named, alone, conflicts = 0, 0, 0
+    for at in (0, 6, 7):  # values that each of these plans feels
+        for seed in range(20):
+            found = changed(at, by, count, seed)
+            if found.changed:
+                conflicts += 1
+                named += at in found.changed
+                alone += tuple(found.changed) == (at,)
+    assert conflicts > 40
+    assert named >= stats.binom.ppf(1e-3, conflicts, 0.95)
+    assert alone >= 0.95 * conflicts if count >= 6 else alone == 0
+
+
+def test_two_values_that_changed_are_not_explained_by_one() -> None:
+    apart = 0
+    for seed in range(20):
+        values = datasheet(seed).values
+        values[[6, 8]] += 20 * ERROR[[6, 8]]
+        found = refine(poses(6, seed), Datasheet(sensor(values), ERROR, {}, 1.0))
+        apart += not found.changed_alone and next(iter(found.changed)) in (6, 8)
+    assert apart == 20
+
+
+def test_errors_that_go_together_blame_the_value_that_does_not_go_with_the_others() -> None:
+    """Scale factors known to 1e-3, their ratios to 1e-5, as where the reference was off: all may move, not one."""
+    together = np.full((9, 9), 0.0)
+    together[:3, :3] = np.outer(np.sign(TRUTH[:3]), np.sign(TRUTH[:3])) * (1 - 1e-4)
+    np.fill_diagonal(together, 1.0)
+    for seed in range(20):
+        values = TRUTH.copy()
+        values[1] *= 1 + 1e-4  # a tenth of its standard error, ten of its ratio
+        found = refine(poses(6, seed), Datasheet(sensor(values), ERROR, {}, 1.0, together))
+        assert tuple(found.changed) == (1,)
+        assert abs(found.changed[1]) > 4 > abs(found.shift[1])
 
 
 def test_a_value_without_error_stays_where_it_is() -> None:

@@ -108,10 +108,17 @@ SENTENCES: list[tuple[Caution, str]] = [
         "pose at 10.0 s)",
     ),
     (
-        DatasheetContradicted(1.2e-9, "bias.y", 20.04, 3.21),
+        DatasheetContradicted(1.2e-9, ("bias.y",), (20.04,), alone=True, raised=3.21),
         "datasheet and poses contradict each other (p 1.2e-09), most in bias.y, which moved by +20.0 standard errors: "
         "the unit has changed, the datasheet's standard errors are too small, or a pose was not still; the standard "
         "errors are raised by 3.2",
+    ),
+    (
+        DatasheetContradicted(1.2e-9, ("bias.x", "scale_factor.x"), (20.04, 19.96), alone=False, raised=3.21),
+        "passport and poses contradict each other (p 1.2e-09), most in bias.x (+20.0 standard errors) or "
+        "scale_factor.x (+20.0 standard errors), which these poses do not tell apart; a change of one value does not "
+        "explain all of it: the unit has changed, the passport's standard errors are too small, or a pose was not "
+        "still; the standard errors are raised by 3.2",
     ),
     (
         StillOfDatasheet(("bias.x", "bias.y")),
