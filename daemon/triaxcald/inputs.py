@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from triaxcal.documents import Calibration
+from triaxcal.effects import TEMPERATURE
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.inputs.turning.moments import Moments
@@ -76,8 +77,8 @@ def measure(
     """``name`` is a path to an `.mcap`, a text table or a Parquet file, or `-`; ``reading`` says how a table is to be
     read. Raises InputError, RecordingError.
 
-    ``moments`` are fed all raw samples on the way, block by block: of a unit that turns, where what turns slowly enough
-    would pass for a pose that creeps.
+    ``moments`` are fed all raw samples and their temperature on the way, block by block: of a unit that turns, where
+    what turns slowly enough would pass for a pose that creeps.
     """
     if name.endswith(".mcap"):
         with Recording.open(Path(name)) as recording:
@@ -94,7 +95,7 @@ def measure(
         judge.feed(samples.time_ns, samples.readings)
         judge.finish()
         if moments is not None:
-            moments.feed(samples.readings)
+            moments.feed(samples.readings, samples.channels.get(TEMPERATURE))
     except InvalidData as e:
         raise InputError(f"{name}: {e}") from e
     spans = detector.spans()
@@ -139,7 +140,7 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str, moments:
     for batch in recording.raw(phase):
         block = pipeline.feed(batch)
         if moments is not None:
-            moments.feed(block.readings)
+            moments.feed(block.readings, block.channels.get(TEMPERATURE))
     poses = pipeline.finish()
     quality = pipeline.data_quality() + losses_of(recording) + ([] if moments is not None else creeping(poses))
     signs = signs_of(recording) or bundle.profile.output.signs

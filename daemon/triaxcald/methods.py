@@ -30,6 +30,10 @@ def turning_document(found: RotationFit, *, output_unit: str, reference_unit: st
     document = calibration_document(
         found.calibration, output_unit=output_unit, reference_unit=reference_unit, budgeted=False
     )
+    t = found.temperature
+    document["temperature_c"] = (
+        None if t is None else {"mean": number(t.mean), "lowest": number(t.lowest), "highest": number(t.highest)}
+    )
     document["samples"] = found.samples
     document["stretches"] = found.stretches
     document["noise_g"] = numbers(found.noise_g, UNCERTAINTY_DIGITS)

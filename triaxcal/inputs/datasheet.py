@@ -187,8 +187,8 @@ def _changed(datasheet: Datasheet, root: Floats, z: Floats, information: Floats)
 
     A change of unknown size in one value is ``effect / variance`` ± ``1/√variance``, and takes ``effect²/variance`` off
     the sum. Changes are taken to be as many times the passport's standard error as a Cauchy variable is: they may be of
-    any size, and of two that explain the same, the smaller is the likelier. Few poses feel a change of many values, of
-    most by a change a thousand times as large.
+    any size, and of two that explain the same, the smaller is the likelier. A single pose could be explained by any
+    value, by most of them with a change a thousand times as large.
     """
     free = np.flatnonzero(datasheet.standard_error > 0)
     back = np.linalg.pinv(root[free])

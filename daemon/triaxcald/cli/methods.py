@@ -20,7 +20,7 @@ from triaxcal.interchange.calibration_document import Document
 from triaxcald import methods
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import micro, table
-from triaxcald.cli.results import cross_validated, show_coefficients
+from triaxcald.cli.results import cross_validated, held_at, show_coefficients, temperature_of
 from triaxcald.cli.showing import Choice, chosen, read_recording, telling_data_quality
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, read_document, require_unit
@@ -71,6 +71,8 @@ def _turning(a: argparse.Namespace) -> Way:
 
 def _show_turning(found: RotationFit, choice: Choice) -> None:
     show_coefficients(found.calibration, choice)
+    if t := found.temperature:
+        print(held_at(t.mean, t.lowest, t.highest, "samples"))
     r, small = found.calibration.residual, choice.small
     noise = ", ".join(f"{v:.3g}" for v in found.noise_g)
     print(f"{found.samples} samples, whose noise is {noise} {choice.reference_unit} in x, y, z")
@@ -101,6 +103,8 @@ def _attitudes(a: argparse.Namespace) -> Way:
 def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
     c = found.calibration
     show_coefficients(c, choice)
+    if said := temperature_of(c):
+        print(said)
     table(
         "attitudes",
         ["", "start s", "off µrad", "off, standard errors", f"|a| off {choice.small}", "used"],

@@ -28,7 +28,7 @@ WORTH_A_LINE = 0.01
 def show_calibration(c: Calibration, choice: Choice) -> None:
     b = budget(c, choice.stated)
     show_coefficients(c, choice, b.parameters)
-    if said := _temperature_of(c):
+    if said := temperature_of(c):
         print(said)
     r, small = c.residual, choice.small
     poses = counted(len(c.poses), sum(not p.used for p in c.poses))
@@ -45,15 +45,20 @@ def cross_validated(r: Residual, small: ErrorUnit) -> str:
     return f"cross-validated {small.in_full(r.cross_validated_rms_g)}"
 
 
-def _temperature_of(c: Calibration) -> str:
+def temperature_of(c: Calibration) -> str:
     """Where the values of a model without temperature are known to hold; empty for any other."""
     of_poses = [p.pose.channels.get(TEMPERATURE, math.nan) for p in c.poses if p.used]
     modelled = any(TEMPERATURE in effect.needs for effect, _ in c.sensor.effects)
-    if modelled or not all(map(math.isfinite, of_poses)):
+    if modelled or not of_poses or not all(map(math.isfinite, of_poses)):
         return ""
-    low, mean, high = (f"{v:.4g}" for v in (min(of_poses), sum(of_poses) / len(of_poses), max(of_poses)))
-    spread = "" if low == high else f", the mean of the poses ({low} to {high} °C)"
-    return f"scale factor, misalignment and bias are those at {TEMPERATURE} = {mean} °C{spread}"
+    return held_at(sum(of_poses) / len(of_poses), min(of_poses), max(of_poses), "poses")
+
+
+def held_at(mean: float, lowest: float, highest: float, of: str) -> str:
+    """At which temperature the values hold, the mean over the poses or samples ``of`` the fit."""
+    low, middle, high = (f"{v:.4g}" for v in (lowest, mean, highest))
+    spread = "" if low == high else f", the mean of the {of} ({low} to {high} °C)"
+    return f"scale factor, misalignment and bias are those at {TEMPERATURE} = {middle} °C{spread}"
 
 
 def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = None) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcal.documents import Calibration
 from triaxcal.model.directions import cube_directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.synthetic import Tumble
@@ -127,6 +128,27 @@ def test_a_turning_unit_at_the_console(files: Path, triaxcal: Run) -> None:
     assert done.code == 0
     assert "20000 samples, whose noise is 0.0" in done.out
     assert "scale_factor.x" in done.out
+
+
+def test_a_turning_unit_says_at_which_temperature_its_biases_hold(files: Path, triaxcal: Run, tmp_path: Path) -> None:
+    warm, cal, older = tmp_path / "warm.csv", tmp_path / "cal.json", tmp_path / "older.json"
+    header, *rows = (files / "turning.csv").read_text().splitlines()
+    degrees = np.round(np.linspace(20, 26, len(rows)) ** 2 / 26, 3)
+    warm.write_text("\n".join([f"{header},temp_c", *(f"{r},{d}" for r, d in zip(rows, degrees, strict=True))]) + "\n")
+    document = triaxcal("fit", warm, "--turning", SIGNS, "--json", "-o", cal).json
+    is_calibration(document)
+    assert document["temperature_c"] == pytest.approx(
+        {"mean": float(np.mean(degrees)), "lowest": float(degrees[0]), "highest": 26.0}
+    )
+    shown = triaxcal("fit", warm, "--turning", SIGNS).out
+    assert f"temp_c = {np.mean(degrees):.4g} °C, the mean of the samples (15.38 to 26 °C)" in shown
+    without = triaxcal("fit", files / "turning.csv", "--turning", SIGNS, "--json").json
+    assert without.pop("temperature_c") is None
+    assert {k: v for k, v in document.items() if k != "temperature_c"} == without
+    older.write_text(json.dumps(without))
+    assert Calibration.load(older).to_dict()["bias"] == document["bias"]
+    assert triaxcal("verify", older, files / "check.csv", "--limit", "1e-3").code == 0
+    assert triaxcal("fit", files / "4.csv", "--passport", older).code == 0
 
 
 def test_a_turning_unit_through_standard_input(files: Path, triaxcal: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,30 +37,33 @@ class Moments:
     count: int = 0
     _origin: Floats = field(default_factory=lambda: np.zeros(3))
     _size: int = STRETCH_LEAST
-    _low: Floats = field(default_factory=lambda: np.full((STRETCHES_MOST, 3), np.inf))
-    _high: Floats = field(default_factory=lambda: np.full((STRETCHES_MOST, 3), -np.inf))
+    _low: Floats = field(default_factory=lambda: np.full((STRETCHES_MOST, 4), np.inf))
+    _high: Floats = field(default_factory=lambda: np.full((STRETCHES_MOST, 4), -np.inf))
     _sums: Floats = field(default_factory=lambda: np.zeros((STRETCHES_MOST, 10, 10)))
     _rough: Floats = field(default_factory=lambda: np.zeros((STRETCHES_MOST, 3)))
     _lags: Floats = field(default_factory=lambda: np.zeros(STRETCHES_MOST))
     _sampled: Floats = field(default_factory=lambda: np.zeros((STRETCHES_MOST, SAMPLED, 3)))
+    _warmth: Floats = field(default_factory=lambda: np.zeros(STRETCHES_MOST))
     _pieces: int = 0
-    _rest: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    _rest: Floats = field(default_factory=lambda: np.zeros((0, 4)))
 
-    def feed(self, u: Floats) -> None:
-        """``u`` (n,3) raw outputs. Raises InvalidData where one is not a finite number."""
+    def feed(self, u: Floats, temp_c: Floats | None = None) -> None:
+        """``u`` (n,3) raw outputs, ``temp_c`` (n,) beside them, None or NaN where it is not known. Raises InvalidData
+        where an output is not a finite number."""
         if not len(u):
             return
         if not np.isfinite(u).all():
             raise InvalidData(f"reading {self.count + int(np.argmin(np.isfinite(u).all(axis=1)))} is not finite")
         self.count += len(u)
-        waiting = np.concatenate([self._rest, u]) if len(self._rest) else np.asarray(u, dtype=float)
+        warm = np.full(len(u), np.nan) if temp_c is None else temp_c
+        waiting = np.concatenate([self._rest, np.column_stack([u, warm])])
         if not self._pieces and len(waiting) >= STRETCH_LEAST:
-            self._origin = np.median(waiting[:STRETCH_LEAST], axis=0)  # so that no digits are lost to an offset
+            self._origin = np.median(waiting[:STRETCH_LEAST, :3], axis=0)  # so that no digits are lost to an offset
         at = 0
         while len(waiting) - at >= (piece := min(self._size, _PIECE)):
             until_full = STRETCHES_MOST * self._size // piece - self._pieces
             number = min((len(waiting) - at) // piece, _PIECE // piece, until_full)
-            self._take(waiting[at : at + number * piece].reshape(number, piece, 3))
+            self._take(waiting[at : at + number * piece].reshape(number, piece, 4))
             at += number * piece
         self._rest = waiting[at:].copy()
 
@@ -68,22 +71,23 @@ class Moments:
     def _take(self, pieces: Floats) -> None:
         number, piece, _ = pieces.shape
         into = (self._pieces + np.arange(number)) * piece // self._size
-        sums, rough = _sums_of(pieces - self._origin)
+        sums, rough = _sums_of(pieces[..., :3] - self._origin)
         np.minimum.at(self._low, into, pieces.min(axis=1))
         np.maximum.at(self._high, into, pieces.max(axis=1))
         np.add.at(self._sums, into, sums)
         np.add.at(self._rough, into, rough)
         np.add.at(self._lags, into, piece - DIFFERENCE)
+        np.add.at(self._warmth, into, pieces[..., 3].sum(axis=1))
         # At no constant distance, so that no rate of rotation hides behind it.
         scattered = (into[:, None] * SAMPLED + np.arange(SAMPLED)) * 0.6180339887 % 1
-        self._sampled[into] = pieces[np.arange(number)[:, None], (scattered * piece).astype(int)]
+        self._sampled[into] = pieces[np.arange(number)[:, None], (scattered * piece).astype(int), :3]
         self._pieces += number
         if self._pieces * piece == STRETCHES_MOST * self._size:
             self._halve()
 
     def _halve(self) -> None:
         half = STRETCHES_MOST // 2
-        for held in (self._sums, self._rough, self._lags):
+        for held in (self._sums, self._rough, self._lags, self._warmth):
             held[:half] = held[::2] + held[1::2]
             held[half:] = 0
         self._low[:half], self._low[half:] = np.minimum(self._low[::2], self._low[1::2]), np.inf
@@ -102,14 +106,18 @@ class Moments:
         held = _Stretches(
             self._origin,
             counts,
-            *(v[:closed] for v in (self._low, self._high, self._sums, self._rough, self._lags, self._sampled)),
+            *(
+                v[:closed]
+                for v in (self._low, self._high, self._sums, self._rough, self._lags, self._sampled, self._warmth)
+            ),
         )
         return held.summary() if not len(self._rest) else held.and_then(self._rest).summary()
 
 
 @dataclass(frozen=True)
 class _Stretches:
-    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in `Moments`."""
+    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in `Moments`. ``low`` and ``high`` (m,4) have the
+    temperature too, and ``warmth`` (m,) its sum."""
 
     origin: Floats
     counts: Ints
@@ -119,10 +127,11 @@ class _Stretches:
     rough: Floats
     lags: Floats
     sampled: Floats
+    warmth: Floats
 
     def and_then(self, rest: Floats) -> _Stretches:
-        """With samples (n,3) that did not fill a stretch."""
-        sums, rough = _sums_of(rest[None] - self.origin)
+        """With samples and temperatures (n,4) that did not fill a stretch."""
+        sums, rough = _sums_of(rest[None, :, :3] - self.origin)
         return replace(
             self,
             counts=np.r_[self.counts, len(rest)],
@@ -131,15 +140,16 @@ class _Stretches:
             sums=np.concatenate([self.sums, sums]),
             rough=np.concatenate([self.rough, rough]),
             lags=np.r_[self.lags, max(len(rest) - DIFFERENCE, 1)],
-            sampled=np.concatenate([self.sampled, np.broadcast_to(rest[:1], (1, SAMPLED, 3))]),
+            sampled=np.concatenate([self.sampled, np.broadcast_to(rest[:1, :3], (1, SAMPLED, 3))]),
+            warmth=np.r_[self.warmth, rest[:, 3].sum()],
         )
 
     def only(self, kept: Bools) -> _Stretches:
-        names = ("counts", "low", "high", "sums", "rough", "lags", "sampled")
+        names = ("counts", "low", "high", "sums", "rough", "lags", "sampled", "warmth")
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def summary(self) -> Summary:
-        low, high = self.low.min(axis=0), self.high.max(axis=0)
+        low, high = self.low[:, :3].min(axis=0), self.high[:, :3].max(axis=0)
         flat = [axis for axis, least, most in zip("xyz", low, high, strict=True) if not most > least]
         if flat:
             raise InvalidData(f"the output of axis {', '.join(flat)} never changes")
@@ -154,8 +164,23 @@ class _Stretches:
             moments=T @ (self.sums / self.counts[:, None, None]) @ T.T,
             quick=np.median(self.rough / self.lags[:, None], axis=0) / _DIFFERENCE_GAIN / half**2,
             sampled=self.sampled.reshape(-1, 3),
+            temperature=self._temperature(),
             _fed=self,
         )
+
+    def _temperature(self) -> Temperature | None:
+        mean = float(self.warmth.sum() / self.counts.sum())
+        found = Temperature(mean, float(self.low[:, 3].min()), float(self.high[:, 3].max()))
+        return found if np.isfinite([found.mean, found.lowest, found.highest]).all() else None
+
+
+@dataclass(frozen=True)
+class Temperature:
+    """Of the samples, °C."""
+
+    mean: float
+    lowest: float
+    highest: float
 
 
 @dataclass(frozen=True)
@@ -164,7 +189,7 @@ class Summary:
 
     ``counts`` (m,) samples in each stretch, ``moments`` (m,10,10) mean products of `MONOMIALS` in it; ``quick`` (3,)
     variance of the noise of one sample, in scaled units, as far as differences from sample to sample show it;
-    ``sampled`` (k,3) some of the outputs, from everywhere.
+    ``sampled`` (k,3) some of the outputs, from everywhere; ``temperature`` None where it is not known of all samples.
     """
 
     middle: Floats
@@ -173,6 +198,7 @@ class Summary:
     moments: Floats
     quick: Floats
     sampled: Floats
+    temperature: Temperature | None
     _fed: _Stretches
 
     @property
@@ -183,7 +209,7 @@ class Summary:
     def reach(self) -> Floats:
         """(m,3) how far the outputs of each stretch go from the median, at most."""
         middle = np.median(self.sampled, axis=0)
-        return np.maximum(np.abs(self._fed.low - middle), np.abs(self._fed.high - middle))
+        return np.maximum(np.abs(self._fed.low[:, :3] - middle), np.abs(self._fed.high[:, :3] - middle))
 
     def only(self, stretches: Bools) -> Summary:
         """Of some of the stretches, scaled anew."""

@@ -35,7 +35,7 @@ from triaxcal.inputs.turning.adjusted import (
     fitted,
     noise,
 )
-from triaxcal.inputs.turning.moments import MONOMIALS, Moments, Summary
+from triaxcal.inputs.turning.moments import MONOMIALS, Moments, Summary, Temperature
 from triaxcal.model.directions import linear_design, most_wanted
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pure_error import LACK_OF_FIT
@@ -110,6 +110,8 @@ class RotationFit:
     noises of one sample over the root of ``samples``. ``noise_g`` (3,) of one sample along each sensitive axis.
 
     ``unseen_share`` of the noise, 0…1, does not show from sample to sample: how the axes share it is not known.
+    ``temperature`` is that of the samples that were fitted, at whose mean the coefficients hold; None where it is not
+    known of all.
     """
 
     calibration: Calibration
@@ -117,6 +119,7 @@ class RotationFit:
     unseen_share: float
     samples: int
     stretches: int
+    temperature: Temperature | None
 
 
 def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), reference: float = 1.0) -> RotationFit:
@@ -165,7 +168,7 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
         dof=float(max(len(held.counts) - 10, 1) if birge_ratio > 1 else held.count - 9),
     )
     noise_g = np.sqrt(e.variance) * held.half / k
-    found = RotationFit(calibration, noise_g, unseen, held.count, len(held.counts))
+    found = RotationFit(calibration, noise_g, unseen, held.count, len(held.counts), held.temperature)
     raised = float(np.max(np.sum(shares**2, axis=1) / np.diag(calibration.covariance)))
     return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found, whole, held, raised))))
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import signal, stats
 
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.inputs.turning.moments import MONOMIALS, STRETCHES_MOST, Moments
+from triaxcal.inputs.turning.moments import MONOMIALS, STRETCHES_MOST, Moments, Temperature
 from triaxcal.inputs.turning.rotation import (
     CoarseSteps,
     NoiseUnequal,
@@ -152,17 +152,20 @@ def test_the_unit_of_the_outputs_does_not_matter(unit: Sensor, factor: float) ->
 
 def test_blocks_of_any_size_give_the_same_to_the_last_bit(unit: Sensor) -> None:
     u = outputs(unit, path(30_000), 0.01, 5)
+    temp_c = np.random.default_rng(1).uniform(20, 30, len(u))
     whole, parts = Moments(), Moments()
-    whole.feed(u)
+    whole.feed(u, temp_c)
     rng = np.random.default_rng(0)
     at = 0
     while at < len(u):
         size = int(rng.integers(0, 3000))
-        parts.feed(u[at : at + size])
+        parts.feed(u[at : at + size], temp_c[at : at + size])
         at += size
     one, other = whole.summary(), parts.summary()
     for name in ("middle", "half", "counts", "moments", "quick", "sampled"):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
+    assert one.temperature is not None
+    assert one.temperature == other.temperature
 
 
 def test_the_sums_are_those_of_all_samples(unit: Sensor) -> None:
@@ -218,9 +221,53 @@ def test_memory_does_not_grow_with_the_samples(unit: Sensor) -> None:
     early = held()
     for seed in range(30):
         moments.feed(outputs(unit, path(20_000), 0.01, seed))
-    assert held() <= early + 8 * 3 * (1 << 13)  # what waits to be summed up
+    assert held() <= early + 8 * 4 * (1 << 13)  # what waits to be summed up, and its temperature
     assert moments.count == 50 * 20_000
     assert len(moments.summary().counts) <= STRETCHES_MOST + 1
+
+
+# Temperature
+
+
+def test_the_biases_hold_at_the_mean_temperature_that_is_told(unit: Sensor) -> None:
+    """A bias of 1 mg/K while the unit warms by 10 K and cools again twenty times, a recording's mean not the middle."""
+    a, slope, seeds = path(20_000), np.array([1e-3, -1e-3, 0.5e-3]), 20
+    pulls = []
+    for seed in range(seeds):
+        temp_c = 20 + 10 * np.abs(np.sin(np.linspace(0, 20 * np.pi, len(a)) + seed))
+        moments = Moments()
+        warmed = outputs(unit, a, 0.01, seed) + (temp_c[:, None] - 20) * slope * unit.scale_factor
+        moments.feed(warmed, temp_c)
+        found = fit_rotation(moments, signs=SIGNS)
+        t = found.temperature
+        assert t is not None
+        assert (t.mean, t.lowest, t.highest) == pytest.approx((np.mean(temp_c), np.min(temp_c), np.max(temp_c)))
+        bias = unit.bias + slope * (t.mean - 20)
+        pulls.append((found.calibration.values[6:] - bias) / found.calibration.standard_errors[6:])
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.5
+    assert np.max(np.abs(np.mean(pulls, axis=0))) < 3.9 / np.sqrt(seeds)
+
+
+def test_what_is_excluded_does_not_warm_the_rest(unit: Sensor) -> None:
+    u, temp_c = outputs(unit, path(20_000), 0.01, 1), np.full(20_000, 25.0)
+    u[7000:7005] += 50.0
+    temp_c[7000:7005] = 80.0
+    moments = Moments()
+    moments.feed(u, temp_c)
+    found = fit_rotation(moments, signs=SIGNS)
+    assert any(isinstance(c, StretchesExcluded) for c in found.calibration.cautions)
+    assert found.temperature == Temperature(25.0, 25.0, 25.0)
+
+
+def test_a_temperature_that_is_not_there_for_all_samples_is_not_told(unit: Sensor) -> None:
+    u = outputs(unit, path(20_000), 0.01, 1)
+    half, none = Moments(), Moments()
+    half.feed(u[:9000], np.full(9000, 25.0))
+    half.feed(u[9000:])
+    none.feed(u)
+    found = [fit_rotation(moments, signs=SIGNS) for moments in (half, none)]
+    assert [f.temperature for f in found] == [None, None]
+    assert np.array_equal(found[0].calibration.values, found[1].calibration.values)
 
 
 # Is noise all there is?
