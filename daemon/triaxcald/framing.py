@@ -109,6 +109,7 @@ def frame_document(sources: Sequence[Source], frames: Frames) -> Document:
         "between": [_between(sources, frames, i, j) for i, j in pairs],
         "fixture": _fixture(frames.fixture),
         "agreement": {
+            "agree": frames.agree,
             "chi2": uncertainty(frames.chi2) if frames.left else None,
             "degrees_of_freedom": frames.left,
             "p_value": probability(frames.lack_of_fit_p),

@@ -123,6 +123,11 @@ class Frames:
     def lack_of_fit_p(self) -> float | None:
         return float(chi2_sf(self.chi2, self.left)) if self.left else None
 
+    @property
+    def agree(self) -> bool | None:
+        """Whether the units stood on one fixture; None where they have no faces to tell it by."""
+        return self.birge_ratio == 1 if self.left else None
+
     def between(self, i: int, j: int) -> tuple[Floats, Floats]:
         """Rotation vector (3,) rad from the sensor's frame of unit i to that of j, and its covariance (3,3).
 

@@ -190,7 +190,8 @@ def _if_estimated(
 ) -> AttitudeFit | None:
     """The fit with an error of the attitudes that the residuals say; None where they say none.
 
-    Nor where |a| disagrees with it: then more than the attitudes is wrong, and the estimate would stand for all of it.
+    Nor where |a| disagrees with it: then more than the attitudes is wrong, and the estimate would
+    stand for all of it.
     """
     try:
         found = fit_attitudes(poses, ups, names=names, signs=signs, reference=reference)

@@ -28,7 +28,7 @@ STEPS_MOST = 60
 CONVERGED = 1e-12
 CONFLICT = 0.01
 NAMED = 0.95
-"""Probability with which the value that has changed is among those named, the level of all coverage."""
+"""Probability with which the value that has changed is among those named: the level of coverage."""
 SHARE_LEAST = 1e-6
 """Share of the information on a parameter below which rounding is all that the poses say."""
 FROM_POSES, FROM_DATASHEET = 0.9, 0.1
@@ -91,9 +91,10 @@ class Datasheet:
 
 @dataclass(frozen=True)
 class DatasheetContradicted(Caution):
-    """Poses and datasheet values contradict each other (probability ``p``). A change of any one of ``parameters``, the
-    likeliest first, would explain most of it; they moved by ``shifts`` standard errors. ``alone``: whether the change
-    of one explains all of it; standard errors are ``raised`` so many times."""
+    """Poses and datasheet values contradict each other (probability ``p``). A change of any one of
+    ``parameters``, the likeliest first, would explain most of it; they moved by ``shifts`` standard
+    errors. ``alone``: whether the change of one explains all of it; standard errors are ``raised``
+    so many times."""
 
     p: float
     parameters: tuple[str, ...]
@@ -115,9 +116,9 @@ class Refinement:
     variance after to that before. ``shift`` (9+p,) of the values in standard errors of a shift by chance, 0 where the
     poses say nothing. ``conflict_p`` is the probability of residuals and shifts as large as these together.
 
-    ``changed`` are the parameters (indices) of which one has changed, if one has, the likeliest first, with the change
-    in its standard errors by chance, given how the passport's errors go together; none where there is no conflict.
-    ``changed_alone``: whether that explains it.
+    ``changed`` are the parameters (indices) of which one has changed, if one has, the likeliest
+    first, with the change in its standard errors by chance, given how the passport's errors go
+    together; none where there is no conflict. ``changed_alone``: whether that explains it.
     """
 
     calibration: Calibration
@@ -183,12 +184,13 @@ def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
 
 
 def _changed(datasheet: Datasheet, root: Floats, z: Floats, information: Floats) -> dict[int, float]:
-    """`Refinement.changed`: the parameters one of which has changed with the probability `NAMED`, if one has.
+    """`Refinement.changed`: the parameters one of which has changed with the probability `NAMED`.
 
-    A change of unknown size in one value is ``effect / variance`` ± ``1/√variance``, and takes ``effect²/variance`` off
-    the sum. Changes are taken to be as many times the passport's standard error as a Cauchy variable is: they may be of
-    any size, and of two that explain the same, the smaller is the likelier. A single pose could be explained by any
-    value, by most of them with a change a thousand times as large.
+    A change of unknown size in one value is ``effect / variance`` ± ``1/√variance``, and takes
+    ``effect²/variance`` off the sum of squares. Changes are taken to be as many times the passport's
+    standard error as a Cauchy variable is: they may be of any size, and of two that explain the
+    same, the smaller is the likelier. A single pose could be explained by any value, by most of them
+    with a change a thousand times as large.
     """
     free = np.flatnonzero(datasheet.standard_error > 0)
     back = np.linalg.pinv(root[free])

@@ -95,7 +95,8 @@ class TurntableSolution:
     def error_uncertainty_rad(self) -> float:
         """Standard error of ``error_rad`` as it is estimated: where ``chi2`` is ``left``.
 
-        The sum has variance 2 ``left``, and the part of it that is the attitudes' falls with the square of their error.
+        The sum has variance 2 ``left``, and the part of it that is the attitudes' falls with the
+        square of their error.
         """
         of_noise = np.einsum("nij,njk,nkl,nli->", self.weight, self.free, self.weight, self.data.covariance)
         of_attitudes = float(self.left - of_noise)

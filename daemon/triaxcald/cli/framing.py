@@ -14,6 +14,7 @@ import numpy as np
 
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.figures import probability
 from triaxcal.frames.faces import LABELS, Labelling, labelled, opposite, recognise
 from triaxcal.frames.frames import Datum, Frames, frames
 from triaxcal.frames.orientations import Assumed
@@ -26,6 +27,7 @@ from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say, table
 from triaxcald.cli.showing import chosen, read_recording, warn
 from triaxcald.errors import InputError
+from triaxcald.exit_codes import DONE, OUTSIDE
 from triaxcald.files import write_text
 from triaxcald.framing import Source, frame_document, own_source, source_under
 from triaxcald.inputs import read_document, require_unit
@@ -66,8 +68,11 @@ def frame_command(a: argparse.Namespace) -> int:
     worst = float(max(unit.standard_error.max() for unit in result.units))
     if a.limit is not None and not worst <= a.limit:
         say(f"outside the limit: standard error {worst:.3g} rad, limit {a.limit:.3g}")
-        return 1
-    return 0
+        return OUTSIDE
+    if result.agree is False:
+        say(f"not one fixture: the units disagree on its faces, p {probability(result.lack_of_fit_p)}")
+        return OUTSIDE
+    return DONE
 
 
 def _for_each(given: list[Any] | None, names: Sequence[str], option: str, *, one_for_all: bool = False) -> list[Any]:

@@ -111,6 +111,7 @@ def test_a_unit_comes_into_the_frame_of_the_faces(first: Path, fixture: Syntheti
     assert "no labels were given" in unit["warnings"][0]
     assert document["fixture"]["independent_errors"] == 9
     assert document["agreement"]["p_value"] is None
+    assert document["agreement"]["agree"] is None
 
 
 def test_the_matrix_turns_readings_into_the_bodys_frame(first: Path, fixture: SyntheticFixture, triaxcal: Run) -> None:
@@ -165,6 +166,31 @@ def test_several_units_come_into_one_frame(
     assert between["rotation_vector_rad"] == pytest.approx(right.as_rotvec(), abs=3e-5)
     assert done.json["agreement"]["degrees_of_freedom"] == 9
     assert done.json["agreement"]["p_value"] > 1e-4
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_units_on_two_fixtures_are_no_success(first: Path, seed: int, tmp_path: Path, triaxcal: Run) -> None:
+    other = SyntheticFixture.drawn(np.random.default_rng(seed))
+    elsewhere, output = write(tmp_path / "elsewhere.csv", other, seed=seed), tmp_path / "frame.json"
+    done = triaxcal("frame", first, elsewhere, SIGNS, "--faces", SEQUENCE, "-o", output, "--json")
+    assert done.code == 1
+    assert "not one fixture: the units disagree on its faces, p" in done.err
+    assert done.json["agreement"]["agree"] is False
+    assert done.json["agreement"]["inflation"] > 10
+    assert any("the units disagree on the fixture's faces" in w for w in done.json["warnings"])
+    assert json.loads(output.read_text()) == done.json
+
+
+def test_units_on_one_fixture_are_a_success(
+    first: Path, fixture: SyntheticFixture, tmp_path: Path, triaxcal: Run
+) -> None:
+    codes = []
+    for seed in range(10, 20):
+        unit = write(tmp_path / f"{seed}.csv", fixture, seed=seed)
+        done = triaxcal("frame", first, unit, SIGNS, "--faces", SEQUENCE, "--json")
+        assert done.json["agreement"]["agree"] is (done.code == 0)
+        codes.append(done.code)
+    assert codes.count(1) <= 1  # one in a hundred is expected
 
 
 def test_a_calibration_from_a_file_gives_the_same_frame_and_its_uncertainty(

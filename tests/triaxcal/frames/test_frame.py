@@ -267,7 +267,7 @@ def test_seatings_that_differ_are_found_and_the_intervals_still_cover(paper_unit
 def test_several_units_come_into_one_frame_and_share_the_fixture(paper_unit: Sensor) -> None:
     other = Sensor(paper_unit.scale_factor * 2e5, -paper_unit.misalignment, -paper_unit.bias)
     quarter = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
-    pulls, chi2 = [], []
+    pulls, chi2, agree = [], [], []
     for seed in range(24):
         first = Bench.of(paper_unit, seed)
         rng = np.random.default_rng(1000 + seed)
@@ -284,6 +284,7 @@ def test_several_units_come_into_one_frame_and_share_the_fixture(paper_unit: Sen
         result = frames([first.stood(seating=0.0), second.stood(labels, seating=0.0)])
         chi2.append(result.chi2)
         assert result.left == 9
+        agree.append(result.agree)
         between, covariance = result.between(0, 1)
         truth = second.mount.T @ first.mount
         miss = Rotation.from_matrix(truth.T @ Rotation.from_rotvec(between).as_matrix()).as_rotvec()
@@ -294,6 +295,7 @@ def test_several_units_come_into_one_frame_and_share_the_fixture(paper_unit: Sen
     # Standard errors that the fits raised for residuals a little large make pulls smaller, never larger.
     assert np.mean(np.square(pulls)) < stats.chi2.ppf(0.999, 3 * len(pulls)) / (3 * len(pulls))
     assert np.mean(np.square(pulls)) > 0.8 * stats.chi2.ppf(1e-3, 3 * len(pulls)) / (3 * len(pulls))
+    assert agree.count(False) <= stats.binom.isf(0.001, len(agree), 0.01)
     assert np.sum(chi2) < stats.chi2.ppf(0.999, 9 * len(chi2))
     assert np.sum(chi2) > 0.8 * stats.chi2.ppf(1e-3, 9 * len(chi2))
 
@@ -303,6 +305,7 @@ def test_units_on_different_fixtures_are_told_by_their_faces(paper_unit: Sensor)
     assert result.lack_of_fit_p is not None
     assert result.lack_of_fit_p < 1e-10
     assert isinstance(result.cautions[-1], UnitsDisagree)
+    assert result.agree is False
     assert result.units[0].standard_error.min() > 1e-4
 
 

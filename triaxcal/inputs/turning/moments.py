@@ -48,8 +48,10 @@ class Moments:
     _rest: Floats = field(default_factory=lambda: np.zeros((0, 4)))
 
     def feed(self, u: Floats, temp_c: Floats | None = None) -> None:
-        """``u`` (n,3) raw outputs, ``temp_c`` (n,) beside them, None or NaN where it is not known. Raises InvalidData
-        where an output is not a finite number."""
+        """``u`` (n,3) raw outputs, ``temp_c`` (n,) beside them, None or NaN where it is not known.
+
+        Raises InvalidData where an output is not a finite number.
+        """
         if not len(u):
             return
         if not np.isfinite(u).all():
@@ -116,8 +118,8 @@ class Moments:
 
 @dataclass(frozen=True)
 class _Stretches:
-    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in `Moments`. ``low`` and ``high`` (m,4) have the
-    temperature too, and ``warmth`` (m,) its sum."""
+    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in `Moments`. ``low`` and
+    ``high`` (m,4) have the temperature too, and ``warmth`` (m,) its sum."""
 
     origin: Floats
     counts: Ints
@@ -189,7 +191,8 @@ class Summary:
 
     ``counts`` (m,) samples in each stretch, ``moments`` (m,10,10) mean products of `MONOMIALS` in it; ``quick`` (3,)
     variance of the noise of one sample, in scaled units, as far as differences from sample to sample show it;
-    ``sampled`` (k,3) some of the outputs, from everywhere; ``temperature`` None where it is not known of all samples.
+    ``sampled`` (k,3) some of the outputs, from everywhere; ``temperature`` None where it is not
+    known of all samples.
     """
 
     middle: Floats
