@@ -117,7 +117,7 @@ class Refinement:
     poses say nothing. ``conflict_p`` is the probability of residuals and shifts as large as these together.
 
     ``changed`` are the parameters (indices) of which one has changed, if one has, the likeliest
-    first, with the change in its standard errors by chance, given how the passport's errors go
+    first, with the change in its standard errors by chance, given how the datasheet's errors go
     together; none where there is no conflict. ``changed_alone``: whether that explains it.
     """
 
@@ -187,7 +187,7 @@ def _changed(datasheet: Datasheet, root: Floats, z: Floats, information: Floats)
     """`Refinement.changed`: the parameters one of which has changed with the probability `NAMED`.
 
     A change of unknown size in one value is ``effect / variance`` ± ``1/√variance``, and takes
-    ``effect²/variance`` off the sum of squares. Changes are taken to be as many times the passport's
+    ``effect²/variance`` off the sum of squares. Changes are taken to be as many times the datasheet's
     standard error as a Cauchy variable is: they may be of any size, and of two that explain the
     same, the smaller is the likelier. A single pose could be explained by any value, by most of them
     with a change a thousand times as large.

@@ -133,7 +133,7 @@ def test_a_unit_that_has_changed_conflicts_and_the_value_is_named() -> None:
 
 
 def changed(at: int, by: float, count: int, seed: int) -> Refinement:
-    """Poses of a unit of which value ``at`` has changed by ``by`` of the passport's standard errors."""
+    """Poses of a unit of which value ``at`` has changed by ``by`` of the datasheet's standard errors."""
     values = datasheet(seed).values
     values[at] += by * ERROR[at]
     return refine(poses(count, seed), Datasheet(sensor(values), ERROR, {}, 1.0))
