@@ -10,7 +10,7 @@ import numpy as np
 
 from triaxcal.effects.contract import SCATTER, Effect, channel_of, is_derived, rate_of
 from triaxcal.evidence.marginal_likelihood import Evidence
-from triaxcal.planning.visibility import VISIBLE
+from triaxcal.planning.design import VISIBLE
 from triaxcal.poses.covariates import static_covariates
 
 

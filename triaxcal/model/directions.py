@@ -106,15 +106,35 @@ def linear_design(a: Floats, x: Floats) -> Floats:
     return np.concatenate([a[:, rows] * x[:, columns], -a], axis=1)
 
 
-def dilution(a: Floats, design: Floats | None = None) -> float:
-    """The worst standard error of any direction of the nine parameters, in standard errors of one pose.
+def in_range(u: Floats) -> Floats:
+    """Outputs (n,3), to any scale and offset of the axes, scaled so that each axis goes from −1 to 1."""
+    low, high = u.min(axis=0), u.max(axis=0)
+    half = (high - low) / 2
+    return np.asarray((u - (low + high) / 2) / np.where(half > 0, half, 1.0))
 
-    About 1 for the 14 poses; infinite where the set is singular.
+
+def dilution(a: Floats, design: Floats | None = None) -> float:
+    """What the directions make of the noise: the largest standard error of any direction of the nine parameters, each
+    scaled by the range that its axis goes through (`in_range`), in standard errors of one pose.
+
+    Noises of poses are taken as alike, as in a dilution of precision. ``design`` is `linear_design` of the outputs in
+    their range, where these are known; without it the triad counts as ideal. About 1 for the 14 poses; infinite where
+    the set is singular.
     """
-    J = linear_design(a, a) if design is None else design
-    if len(J) < 9:
+    if design is None and not len(a):
         return float("inf")
-    smallest = float(np.linalg.svd(J, compute_uv=False)[-1])
+    return worst_error(linear_design(a, in_range(a)) if design is None else design)
+
+
+def worst_error(design: Floats) -> float:
+    """The largest standard error of any direction of the nine parameters, in standard errors of the rows (n,9).
+
+    With `linear_design` (a, a) the parameters are those at the whole reference, wherever the poses are, so that a
+    further pose never makes it larger. Infinite where the design is singular.
+    """
+    if len(design) < 9:
+        return float("inf")
+    smallest = float(np.linalg.svd(design, compute_uv=False)[-1])
     return 1 / smallest if smallest > 1e-12 else float("inf")
 
 

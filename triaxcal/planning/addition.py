@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME
-from triaxcal.model.directions import FULL, Direction, cube_directions, dilution, directions, linear_design
+from triaxcal.model.directions import (
+    FULL,
+    Direction,
+    cube_directions,
+    dilution,
+    directions,
+    in_range,
+    linear_design,
+    worst_error,
+)
+from triaxcal.planning.clock import PLANS_CLOCK
 from triaxcal.planning.design import LINEAR, Asked, channels_needed, profile_times
 from triaxcal.planning.optimal import profile
 
@@ -23,29 +33,32 @@ MOST = 26
 @dataclass(frozen=True)
 class Had:
     """The poses that are there. ``up`` (n,3); ``weights`` (n,) 1/variance, of a typical pose 1; ``held`` by channel
-    and time (n,), each from −1 to 1 over what it went through, of which ``half`` is the half in the channel's unit."""
+    and time (n,), each from −1 to 1 over what it went through, of which ``half`` is the half in the channel's unit;
+    ``axes`` (3,3) the sensitive axes, in rows."""
 
     up: Floats
     weights: Floats
     held: Mapping[str, Floats]
     half: Mapping[str, float]
+    axes: Floats = field(default_factory=lambda: np.eye(3))
 
     @property
-    def dilution(self) -> float:
-        """In standard errors of a typical pose."""
-        root = np.sqrt(self.weights)[:, None]
-        return dilution(self.up, linear_design(self.up, self.up) * root)
+    def worst_error(self) -> float:
+        """Of the nine parameters, in standard errors of a typical pose (`worst_error`)."""
+        return worst_error(linear_design(self.up, self.up) * np.sqrt(self.weights)[:, None])
 
 
 @dataclass(frozen=True)
 class Addition:
-    """One pose more. ``levels`` of the channels, −1 lowest to 1 highest; ``dilution`` and ``errors`` (`Asked.errors`,
-    per unit of the channels) are those of the poses there with this one and all before it."""
+    """One pose more. ``levels`` of the channels, −1 lowest to 1 highest; ``dilution``, ``worst_error`` of the nine
+    parameters and ``errors`` (`Asked.errors`, per unit of the channels) are those of the poses there with this one and
+    all before it."""
 
     label: str
     up: Floats
     levels: Mapping[str, float]
     dilution: float
+    worst_error: float
     errors: Mapping[str, Mapping[str, float | None]]
 
 
@@ -77,11 +90,9 @@ class _Adding:
         return self.out
 
     def _enough(self, limit: float) -> bool:
-        errors = [e for of in self.asked.errors(self.rows, self.weights).values() for e in of.values()]
-        shown = [e for e in errors if e is not None]
         _, singular, _ = np.linalg.svd(self.rows * np.sqrt(self.weights)[:, None])
         whole = len(self.rows) >= self.rows.shape[1] and singular[-1] > 1e-6 * singular[0]
-        return bool(whole and max(shown, default=0.0) <= limit)
+        return bool(whole and self.asked.worst(self.rows, self.weights) <= limit)
 
     def _add(self, choice: Sequence[Direction]) -> None:
         """The best of these directions, at the best levels."""
@@ -89,7 +100,7 @@ class _Adding:
         options = [(d, dict(zip(self.channels, at, strict=True))) for at in combined for d in choice]
         ups = np.array([v for (_, v), _ in options])
         time = 1 + self.step * (len(self.out) + 1)
-        held = {TIME: np.full(len(options), time)} | {
+        held = {clock: np.full(len(options), time) for clock in (TIME, PLANS_CLOCK)} | {
             c: np.array([levels[c] for _, levels in options]) for c in self.channels
         }
         rows = self.asked.rows(ups, held)
@@ -102,7 +113,9 @@ class _Adding:
         scaled = self.asked.rows(ups[at : at + 1], {n: v[at : at + 1] for n, v in self._in_units(held).items()})
         self.scaled = np.concatenate([self.scaled, scaled])
         errors = self.asked.errors(self.scaled, self.weights)
-        self.out.append(Addition(label, up, levels, dilution(linear, linear), errors))
+        ups = np.concatenate([self.had.up, *(a.up[None] for a in self.out), up[None]])
+        spread = dilution(ups, linear_design(ups, in_range(ups @ self.had.axes.T)))
+        self.out.append(Addition(label, up, levels, spread, worst_error(linear), errors))
 
     def _in_units(self, held: Mapping[str, Floats]) -> dict[str, Floats]:
         return {name: v * self.had.half.get(name, 1.0) for name, v in held.items()}
@@ -117,9 +130,8 @@ class _Adding:
 
 
 def _as_a_whole_plan(asked: Asked) -> float:
-    """The worst standard error that the effects' coefficients may have."""
+    """The worst standard error that the combinations of the effects' coefficients may have."""
     ups = np.array([v for _, v in directions(FULL)])
     ups = np.concatenate([ups, ups[:1]])
     held = {TIME: profile_times(len(ups))} | profile(channels_needed(asked.effects), len(ups), 3)
-    errors = [e for of in asked.errors(asked.rows(ups, held)).values() for e in of.values() if e is not None]
-    return ENOUGH * max(errors, default=np.inf)
+    return ENOUGH * asked.worst(asked.rows(ups, held))

@@ -12,21 +12,23 @@ from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect
 from triaxcal.effects.in_run import of_clocks
 from triaxcal.effects.wrapped import Wrapped
 
+PLANS_CLOCK = "plans_clock"
+"""`TIME` from −1 to 1, where that itself is in seconds."""
 POSES = 27
 HELD_SHARE = 0.01
 
 
 @dataclass(frozen=True)
 class OnPlansClock(Wrapped):
-    """``whole`` with a shape that suits a recording two units long, by `TIME` alone."""
+    """``whole`` with a shape that suits a recording two units long, by `PLANS_CLOCK`, or `TIME` where that is one."""
 
     needs: tuple[str, ...] = (TIME,)
 
     def basis(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        return self.whole.basis(s, _clocks(covariates[TIME]))
+        return self.whole.basis(s, _clocks(_plans(covariates)))
 
     def slope(self, s: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        return self.whole.slope(s, _clocks(covariates[TIME]))
+        return self.whole.slope(s, _clocks(_plans(covariates)))
 
 
 def in_plan(effect: Effect) -> Effect:
@@ -35,6 +37,10 @@ def in_plan(effect: Effect) -> Effect:
         return effect
     variants = effect.variants(_clocks(np.linspace(-1, 1, POSES)))
     return OnPlansClock(variants[len(variants) // 2])
+
+
+def _plans(covariates: Mapping[str, Floats]) -> Floats:
+    return covariates[PLANS_CLOCK] if PLANS_CLOCK in covariates else covariates[TIME]
 
 
 def _clocks(time: Floats) -> dict[str, Floats]:

@@ -13,6 +13,9 @@ from triaxcal.model.directions import linear_design
 
 SHOWS = 1e-6
 """A combination of coefficients shows at all where this share of it is left beside the nine parameters."""
+VISIBLE = 0.02
+"""What shows of an effect, or of a coefficient, can be used where at least this share of it is left beside all else.
+What is less comes of directions that are a degree off."""
 LINEAR = 9
 
 
@@ -56,21 +59,17 @@ class Asked:
     def errors(self, rows: Floats, weights: Floats | None = None) -> dict[str, dict[str, float | None]]:
         """Standard error of each coefficient by effect, in standard errors of one pose, fitted all together.
 
-        None where the poses (``rows`` (n,9+q), each with its weight) cannot show that coefficient by itself.
+        None where the poses (``rows`` (n,9+q), each with its weight) cannot show that coefficient by itself: less than
+        `VISIBLE` of what it makes is left beside the other parameters.
         """
-        w = np.ones(len(rows)) if weights is None else weights
-        size = np.linalg.norm(rows, axis=0)
-        size = np.where(size > 0, size, 1.0)
-        _, singular, v = np.linalg.svd(rows * np.sqrt(w)[:, None] / size, full_matrices=True)
-        values = np.zeros(rows.shape[1])
-        values[: len(singular)] = singular
-        bad = values < SHOWS
-        # By combination of parameters: what the poses do not determine, and the spread of what they do.
-        loose = np.abs(self._from_parameters(v[bad].T / size[:, None])).max(axis=1, initial=0.0)
-        spread = self._from_parameters(v[~bad].T / size[:, None] / values[~bad])
+        loose, spread = self._spread(rows, weights)
         alone = np.linalg.norm(self.hidden, axis=1) < 1e-6
-        known = alone & (loose < 1e-6)
-        errors = np.linalg.norm(spread, axis=1)
+        known = alone & (np.abs(self.seen @ loose).max(axis=1, initial=0.0) < 1e-6)
+        errors = np.linalg.norm(self.seen @ spread, axis=1)
+        w = np.ones(len(rows)) if weights is None else weights
+        # Of a coefficient alone; the columns of what is hidden are those of others.
+        whole = np.linalg.norm(rows[:, LINEAR:] @ self.seen.T * np.sqrt(w)[:, None], axis=0)
+        known &= errors * whole * VISIBLE <= 1
         out: dict[str, dict[str, float | None]] = {}
         at = 0
         for e in self.effects:
@@ -80,9 +79,24 @@ class Asked:
             at += len(e.coefficients)
         return out
 
-    def _from_parameters(self, v: Floats) -> Floats:
-        """(p,m): coefficients of combinations (9+q,m) of the parameters."""
-        return np.asarray(self.seen @ v[LINEAR:])
+    def worst(self, rows: Floats, weights: Floats | None = None) -> float:
+        """The largest standard error of the combinations that can show; infinite where the poses do not show one."""
+        loose, spread = self._spread(rows, weights)
+        known = np.abs(loose).max(axis=1, initial=0.0) < 1e-6
+        return float(np.linalg.norm(spread, axis=1).max(initial=0.0)) if known.all() else float("inf")
+
+    def _spread(self, rows: Floats, weights: Floats | None) -> tuple[Floats, Floats]:
+        """Of the combinations that can show, (q,·) each: what of them the poses do not determine, and the spread of
+        what they do."""
+        w = np.ones(len(rows)) if weights is None else weights
+        size = np.linalg.norm(rows, axis=0)
+        size = np.where(size > 0, size, 1.0)
+        _, singular, v = np.linalg.svd(rows * np.sqrt(w)[:, None] / size, full_matrices=True)
+        values = np.zeros(rows.shape[1])
+        values[: len(singular)] = singular
+        bad = values < SHOWS
+        combined = v / size
+        return combined[bad].T[LINEAR:], (combined[~bad].T / values[~bad])[LINEAR:]
 
 
 def ask(effects: Sequence[Effect]) -> Asked:

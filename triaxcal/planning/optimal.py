@@ -18,13 +18,13 @@ import numpy as np
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
-from triaxcal.model.directions import Direction, cube_directions, dilution, directions, linear_design
+from triaxcal.model.directions import Direction, cube_directions, directions, linear_design, worst_error
 from triaxcal.model.order import in_order
 from triaxcal.planning.design import LINEAR, Asked, ask, channels_needed, needs_time, profile_times
 
-DILUTION_RATIO = 1.5
+WORSE_MOST = 1.5
 """The nine parameters may come out so many times worse than by the plain plan of as many poses."""
-BEYOND_DILUTION = 1e3
+BEYOND_COSTS = 1e3
 """What a plan beyond that limit loses of the criterion, so that it is taken only where there is no other."""
 CUBE_COSTS = 0.01
 """So much efficiency may be lost for faces, edges and vertices of the cube, which fixtures have."""
@@ -112,7 +112,8 @@ class _Search:
         self.count, self.asked = count, asked
         self.ups, self.cube = candidates(1000)
         self.linear = linear_design(self.ups, self.ups)
-        self.limit = DILUTION_RATIO * dilution(np.array([v for _, v in directions(count)]))
+        plain = np.array([v for _, v in directions(count)])
+        self.limit = WORSE_MOST * worst_error(linear_design(plain, plain))
         self.near = self.ups @ self.ups.T > np.cos(min(np.radians(APART_DEG), 0.6 * np.sqrt(4 * np.pi / count)))
         self.times = profile_times(count + 1)
 
@@ -182,18 +183,18 @@ class _Search:
         now = gain[rows[k]]
         gain[taken] = -np.inf
         rest = M[:LINEAR, :LINEAR] - np.outer(X[k, :LINEAR], X[k, :LINEAR])
-        limit = max(self.limit, _dilution(M[:LINEAR, :LINEAR]))
+        limit = max(self.limit, _worst_error(M[:LINEAR, :LINEAR]))
         for c in np.argsort(-np.round(gain, 9), kind="stable")[:200]:
             if not gain[c] > now + 1e-7:
                 return
-            if _dilution(rest + np.outer(self.linear[c], self.linear[c])) <= limit * (1 + 1e-9):
+            if _worst_error(rest + np.outer(self.linear[c], self.linear[c])) <= limit * (1 + 1e-9):
                 rows[k] = c
                 return
 
     def _value(self, rows: Ints, blocks: list[Floats]) -> float:
         X = np.array([blocks[i][r] for i, r in enumerate(rows)])
-        above = np.log(max(dilution(self.ups[rows]) / self.limit, 1.0))
-        return information(X.T @ X) - BEYOND_DILUTION * float(above)
+        above = np.log(max(worst_error(self.linear[rows]) / self.limit, 1.0))
+        return information(X.T @ X) - BEYOND_COSTS * float(above)
 
 
 def _random(rng: np.random.Generator, n: int) -> Floats:
@@ -210,7 +211,7 @@ def _gain(M: Floats, candidates: Floats, out: Floats) -> Floats:
     return np.asarray(np.log(np.maximum((1 + comes) * (1 - goes) + against**2, 1e-300)))
 
 
-def _dilution(linear: Floats) -> float:
+def _worst_error(linear: Floats) -> float:
     return float(1 / np.sqrt(max(float(np.linalg.eigvalsh(linear)[0]), 1e-12)))
 
 

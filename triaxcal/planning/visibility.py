@@ -12,10 +12,7 @@ from triaxcal.effects import CATALOGUE
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.model.directions import linear_design
 from triaxcal.planning.clock import in_plan
-from triaxcal.planning.design import combinations, profile_times, radial
-
-VISIBLE = 0.02
-"""An effect is visible when the part of it that the model cannot absorb is at least this share of it."""
+from triaxcal.planning.design import VISIBLE, combinations, profile_times, radial
 
 
 @dataclass(frozen=True)

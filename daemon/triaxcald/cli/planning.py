@@ -13,7 +13,17 @@ from triaxcal.effects import CATALOGUE, TIME, Effect, effect_named
 from triaxcal.effects.contract import BEFORE, CHANGE, SCATTER, lag_in
 from triaxcal.errors import InvalidData
 from triaxcal.interchange.calibration_document import Document
-from triaxcal.model.directions import FULL, LEAST, PAPER, Direction, closed, dilution, directions
+from triaxcal.model.directions import (
+    FULL,
+    LEAST,
+    PAPER,
+    Direction,
+    closed,
+    dilution,
+    directions,
+    linear_design,
+    worst_error,
+)
 from triaxcal.planning.addition import Addition
 from triaxcal.planning.clock import in_plan
 from triaxcal.planning.design import Asked, ask, needs_time
@@ -137,7 +147,8 @@ def _document(plan: Sequence[Direction], sights: Mapping[str, Sight]) -> Documen
         "format": "triaxcal.plan/1",
         "poses": poses,
         "directions": len(plan) - 1,
-        "dilution": number(dilution(_ups(plan))),
+        "dilution": number(dilution(ups := _ups(plan))),
+        "worst_standard_error": number(worst_error(linear_design(ups, ups))),
         **_seen(sights),
     }
 
@@ -215,13 +226,16 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
         "have": len(had),
         "left_out": len(measured.poses) - len(had),
         "dilution": number(found.dilution),
+        "worst_standard_error": None if found.had is None else number(found.had.worst_error),
+        "noise_g": uncertainty(found.noise),
         **(_seen(sights) if sights else {"blind_to": None, "sees": None}),
         "poses": [_added(found, pose) for pose in found.wanted],
     }
     if effects:
         document |= {
             "for": [e.name for e in effects],
-            "promised": _errors(found.now, found.noise),
+            "promised": _errors(_of_all(effects, found.now), found.noise),
+            "cannot_show": _not_shown(found, effects),
             "moves": found.moves,
         }
     document["data_quality"] = measured.data_quality
@@ -233,8 +247,14 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
     title = f"the {len(had)} of {measured.name}"
     if found.wanted:
         _show_wanted(f"poses worth adding to {title}", found)
-    else:
+    elif not found.absent:
         print(f"{title.replace('of', 'poses of', 1)} are well spread; none is wanted")
+    if effects and found.noise is not None:
+        _show_errors(found.now, found.noise, "by the poses there")
+        if found.wanted:
+            _show_errors(found.wanted[-1].errors, found.noise, "with them")
+    for why in document.get("cannot_show", {}).values():
+        print(why)
     for name, text in found.moves.items():
         print(f"{name}: {text}")
     if sights is not None:
@@ -249,12 +269,41 @@ def _added(found: Lacking, pose: Addition) -> Document:
         "label": pose.label,
         "up": numbers(pose.up),
         "dilution": number(pose.dilution),
-        "standard_error_g": None if noise is None else uncertainty(pose.dilution * noise),
+        "worst_standard_error": number(pose.worst_error),
+        "standard_error_g": None if noise is None else uncertainty(pose.worst_error * noise),
     }
     if pose.errors:
         out["promised"] = _errors(pose.errors, noise)
     if pose.levels:
         out["levels"] = {name: number(v) for name, v in pose.levels.items()}
+    return out
+
+
+def _of_all(
+    effects: Sequence[Effect], errors: Mapping[str, Mapping[str, float | None]]
+) -> dict[str, Mapping[str, float | None]]:
+    """With the effects for which the recording has no channel."""
+    return {e.name: errors.get(e.name) or dict.fromkeys(c.name for c in e.coefficients) for e in effects}
+
+
+def _not_shown(found: Lacking, effects: Sequence[Effect]) -> dict[str, str]:
+    """In words, by effect: what of it the poses there cannot show, and whether the poses to add do."""
+    out = {}
+    for effect in effects:
+        lost = [n for n in effect.needs if n in found.absent]
+        missing = [c for c, e in _of_all([effect], found.now)[effect.name].items() if e is None]
+        if lost:
+            out[effect.name] = f"{effect.name}: cannot show, since the recording has no channel {', '.join(lost)}"
+        elif missing and found.had is not None:
+            then = found.wanted[-1].errors.get(effect.name, {}) if found.wanted else {}
+            never = [c for c in missing if then.get(c) is None]
+            after = "; nor with the poses to add" if never == missing else "; with the poses to add they can"
+            if never and never != missing:
+                after = f"; with the poses to add all but {', '.join(never)}"
+            out[effect.name] = (
+                f"{effect.name}: the poses there cannot tell {', '.join(missing)} from the other parameters"
+                + (after if found.wanted else "")
+            )
     return out
 
 
@@ -266,13 +315,11 @@ def _show_wanted(title: str, found: Lacking) -> None:
             p.label,
             *(f"{c:+.3f}" for c in p.up),
             *(_level(p.levels[c]) for c in channels),
-            f"{p.dilution:.3g}" if np.isfinite(p.dilution) else "—",
+            f"{p.worst_error:.3g}" if np.isfinite(p.worst_error) else "—",
         ]
         for i, p in enumerate(found.wanted)
     ]
     table(title, ["pose", "up", "x", "y", "z", *channels, "worst parameter then"], rows)
-    if found.wanted[-1].errors:
-        _show_errors(found.wanted[-1].errors, found.noise, "with them")
 
 
 def _show_errors(errors: Mapping[str, Mapping[str, float | None]], scale: float | None, note: str) -> None:
@@ -285,7 +332,7 @@ def _show(plan: Sequence[Direction], document: Document) -> None:
     title = f"{document['directions']} directions, the first repeated at the end"
     rows = [[i + 1, label, *(f"{c:+.3f}" for c in v)] for i, (label, v) in enumerate(plan)]
     table(title, ["pose", "up", "x", "y", "z"], rows)
-    print(f"worst parameter: {document['dilution']:.2f} standard errors of one pose")
+    print(f"worst parameter: {document['worst_standard_error']:.2f} standard errors of one pose")
     print(f"cannot show: {_list(document['blind_to'])}")
     for name in document["blind_to"]:
         s = document["sees"][name]

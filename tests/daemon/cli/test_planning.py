@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from triaxcal.model.directions import directions
+from triaxcal.model.directions import cube_directions, dilution, directions
 
 Run = Callable[..., Any]
 HZ, HOLD = 50, 80
@@ -80,13 +80,47 @@ def test_poses_that_cannot_show_an_effect_are_told_which_others_do(fourteen: Pat
 
 def test_what_each_added_pose_would_do_is_said(half: Path, triaxcal: Run, asked: Run) -> None:
     document = asked("plan", half, "--json").json
-    dilutions = [document["dilution"], *(p["dilution"] for p in document["poses"])]
-    assert dilutions == sorted(dilutions, reverse=True)
-    assert dilutions[-1] <= 1.25 < dilutions[-2]
+    worst = [of["worst_standard_error"] for of in (document, *document["poses"])]
+    assert worst == sorted(worst, reverse=True)
+    assert worst[-1] <= 1.25 < worst[-2]
     fitted = triaxcal("fit", half, "--json").json
     noise = np.median([p["standard_error_g"] for p in fitted["poses"]])
     # The noise of a typical pose, raised where the residuals are larger than it explains.
-    assert 0.99 < document["poses"][-1]["standard_error_g"] / dilutions[-1] / noise < 1.5
+    assert 0.99 < document["poses"][-1]["standard_error_g"] / worst[-1] / noise < 1.5
+    assert document["poses"][-1]["standard_error_g"] == pytest.approx(worst[-1] * document["noise_g"], rel=1e-4)
+
+
+def test_the_same_poses_have_the_same_dilution_in_a_plan_and_in_a_fit(tmp_path: Path, triaxcal: Run) -> None:
+    edges = [v for _, v in cube_directions() if np.sum(np.abs(v) > 0.1) == 2]
+    path = _csv(tmp_path / "edges.csv", edges)
+    planned, fitted = triaxcal("plan", path, "--json").json, triaxcal("fit", path, "--json").json
+    assert planned["dilution"] == pytest.approx(fitted["dilution"], rel=1e-5)
+    # Scaled by what the axes went through, which is 0.71 g either way; at the whole of g the errors are larger.
+    assert planned["dilution"] == pytest.approx(dilution(np.array(edges)), rel=0.01)
+    assert planned["worst_standard_error"] > 1.4 * planned["dilution"]
+    whole = _csv(tmp_path / "whole.csv", [v for _, v in directions(14)])
+    plain, fitted = triaxcal("plan", "--poses", "14", "--json").json, triaxcal("fit", whole, "--json").json
+    assert plain["dilution"] == pytest.approx(fitted["dilution"], rel=0.03)  # its first pose is there twice
+
+
+def test_what_cannot_show_is_said_in_words(tmp_path: Path, fourteen: Path, triaxcal: Run) -> None:
+    """Directions that are a degree off tell the third order by next to nothing."""
+    rng = np.random.default_rng(2)
+    off = [v + 0.02 * rng.standard_normal(3) for _, v in directions(14)]
+    path = _csv(tmp_path / "off.csv", [v / np.linalg.norm(v) for v in off])
+    for recording in (path, fourteen):
+        arguments = ("plan", recording, "--for", "third_order_nonlinearity", "temperature_bias")
+        document = triaxcal(*arguments, "--json").json
+        nothing = dict.fromkeys("xyz")
+        assert document["promised"] == {"third_order_nonlinearity": nothing, "temperature_bias": nothing}
+        said = document["cannot_show"]
+        assert "the poses there cannot tell x, y, z from the other parameters" in said["third_order_nonlinearity"]
+        assert "with the poses to add they can" in said["third_order_nonlinearity"]
+        assert "the recording has no channel temp_c" in said["temperature_bias"]
+        assert all(line in triaxcal(*arguments).out.replace("\n", " ") for line in said.values())
+        assert 0 < document["poses"][-1]["promised"]["third_order_nonlinearity"]["x"] < 1e-4
+    seen = triaxcal("plan", fourteen, "--for", "second_order_nonlinearity", "--json").json
+    assert seen["cannot_show"] == {}
 
 
 def test_the_poses_wanted_of_a_recording_that_is_refused_mend_it(tmp_path: Path, triaxcal: Run) -> None:

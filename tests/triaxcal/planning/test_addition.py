@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from triaxcal.effects import Effect, effect_named
-from triaxcal.model.directions import cube_directions, dilution, directions, linear_design, most_wanted
+from triaxcal.model.directions import (
+    cube_directions,
+    dilution,
+    directions,
+    linear_design,
+    most_wanted,
+    worst_error,
+)
 from triaxcal.planning.addition import ENOUGH, Addition, Had, additions
 from triaxcal.planning.design import ask
 
@@ -35,7 +42,7 @@ def test_a_good_set_wants_nothing() -> None:
     assert additions(had(plan(26)), ask([THIRD])) == []
 
 
-def test_the_dilution_after_each_pose_is_that_of_the_poses_so_far() -> None:
+def test_the_worst_error_and_the_dilution_after_each_pose_are_those_of_the_poses_so_far() -> None:
     ups = plan(26)[plan(26)[:, 0] < 0.4]
     weights = np.random.default_rng(0).uniform(0.2, 3, len(ups))
     first = most_wanted(ups, enough=ENOUGH, most=26, weights=weights)
@@ -44,8 +51,9 @@ def test_the_dilution_after_each_pose_is_that_of_the_poses_so_far() -> None:
     for k in range(1, len(added) + 1):
         a = with_them(ups, added[:k])
         root = np.sqrt(np.append(weights, np.ones(k)))[:, None]
-        assert added[k - 1].dilution == pytest.approx(dilution(a, linear_design(a, a) * root))
-    assert added[-1].dilution <= ENOUGH
+        assert added[k - 1].worst_error == pytest.approx(worst_error(linear_design(a, a) * root))
+        assert added[k - 1].dilution == pytest.approx(dilution(a))
+    assert added[-1].worst_error <= ENOUGH
 
 
 def test_fourteen_poses_want_edges_for_the_third_order() -> None:

@@ -15,8 +15,10 @@ from triaxcal.model.directions import (
     directions,
     distinct,
     elsewhere,
+    in_range,
     linear_design,
     most_wanted,
+    worst_error,
 )
 
 
@@ -77,8 +79,15 @@ def test_dilution_is_the_worst_standard_error_of_least_squares() -> None:
     a = vectors(directions(14))
     J = linear_design(a, a)
     worst = np.sqrt(np.linalg.eigvalsh(np.linalg.inv(J.T @ J))[-1])
-    assert dilution(a) == pytest.approx(worst)
+    assert dilution(a) == worst_error(J) == pytest.approx(worst)
     assert dilution(np.concatenate([a] * 4)) == pytest.approx(worst / 2)
+
+
+def test_dilution_is_scaled_by_the_range_and_the_worst_error_is_not() -> None:
+    edges = np.array([v for label, v in directions(26) if np.sum(np.abs(v) > 0.1) == 2])
+    assert dilution(edges) == pytest.approx(np.sqrt(0.5))
+    assert worst_error(linear_design(edges, edges)) == pytest.approx(1.0)
+    assert dilution(edges) == dilution(edges, linear_design(edges, in_range(edges * [3, 2, 1] + 5)))
 
 
 @pytest.mark.parametrize("rows", [slice(0, 6), slice(6, 14), slice(0, 8)])
