@@ -90,7 +90,7 @@ def _require_alike(first: Measured, other: Measured, a: argparse.Namespace, *, h
     ours, theirs = ({"unit": _serial(m), **_settings(chosen(a, m))} for m in (first, other))
     for what, said in theirs.items():
         if said != ours[what] and not (what == "unit" and None in (said, ours[what])):
-            more = hint if what == "unit" else ""
+            more = hint if what == "unit" else f"; {_SAID_BY[what]} says it for all"
             raise InputError(f"{other.name}: {what}: {said}; {first.name} has {ours[what]}{more}")
 
 
@@ -129,6 +129,14 @@ def doubts_of_check(measured: Measured, check: Measured, loop: Loop, choice: Cho
 
 def _serial(m: Measured) -> str | None:
     return m.unit.get("serial") if m.unit else None
+
+
+_SAID_BY = {
+    "signs of the scale factors": "--sign",
+    "reference": "--reference, --reference-unit",
+    "output unit": "--output-unit",
+}
+"""The options by which a setting is the same for all recordings."""
 
 
 def _settings(choice: Choice) -> dict[str, str | None]:

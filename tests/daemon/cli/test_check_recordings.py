@@ -58,6 +58,18 @@ def test_a_check_recording_that_is_read_otherwise_is_an_error(folder: Path, tria
     done.failed(2, "check.csv: signs of the scale factors: +,+,+", "-,-,-")
 
 
+def test_an_error_of_other_settings_names_the_option_that_says_them_of_both(folder: Path, triaxcal: Run) -> None:
+    later = folder / "later.csv"
+    stated = folder / "stated.csv"
+    stated.write_text(later.read_text("utf-8").replace("t_s,ux,uy,uz", "t_s,ux [V],uy [V],uz [V]"), "utf-8")
+    for recordings in ((stated, "--check", later), (stated, later)):
+        words = f"{later}: output unit: not stated; {stated} has V; --output-unit says it for all"
+        triaxcal("diagnose", *recordings).failed(2, words)
+        assert triaxcal("diagnose", *recordings, "--output-unit", "V", "--json").code == 0
+    done = triaxcal("diagnose", RECORDINGS / "can-second-order.mcap", "--check", later)
+    done.failed(2, "signs of the scale factors", "; --sign says it for all")
+
+
 def test_what_is_diagnosed_is_no_check_however_its_path_is_written(folder: Path, triaxcal: Run) -> None:
     main, later = folder / "main.csv", folder / "later.csv"
     (folder / "link.csv").unlink(missing_ok=True)
