@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ class Measured:
 
     ``profile``, ``signs`` of the scale factors and ``reference`` are what the recording was made with, where it says;
     ``unit`` is its name and serial; ``output_unit`` what the header of a table says. ``remarks`` say how a table was
-    read.
+    read. ``parted`` gives the same for another ``turn_s``, as for `find_spans`; None where poses are all that was read.
     """
 
     name: str
@@ -64,6 +64,7 @@ class Measured:
     holds_at: Moment | float | None = None
     output_unit: str = ""
     remarks: tuple[str, ...] = ()
+    parted: Callable[[float | None], Measured] | None = None
 
 
 def measure(
@@ -73,16 +74,18 @@ def measure(
     stream: str = READINGS,
     moments: Moments | None = None,
     reading: Reading | None = None,
+    turn_s: float | None = None,
 ) -> Measured:
     """``name`` is a path to an `.mcap`, a text table or a Parquet file, or `-`; ``reading`` says how a table is to be
     read. Raises InputError, RecordingError.
 
     ``moments`` are fed all raw samples and their temperature on the way, block by block: of a unit that turns, where
-    what turns slowly enough would pass for a pose that creeps.
+    what turns slowly enough would pass for a pose that creeps. ``turn_s``: the unit may turn in
+    place, as for `find_spans`.
     """
     if name.endswith(".mcap"):
         with Recording.open(Path(name)) as recording:
-            return _measure_recording(recording, phase, stream, moments)
+            return _measure_recording(recording, phase, stream, moments, turn_s)
     table = read_table(name, reading)
     samples = table.samples
     if reading is not None and reading.pose_means:
@@ -98,13 +101,17 @@ def measure(
             moments.feed(samples.readings, samples.channels.get(TEMPERATURE))
     except InvalidData as e:
         raise InputError(f"{name}: {e}") from e
-    spans = detector.spans()
-    seen = judge.findings(windows, spans)
-    poses = poses_of(windows, spans, untrusted_poses(seen))
     counted = {"duplicate_samples": str(samples.duplicates)} if samples.duplicates else {}
-    quality = together(counted, seen)
-    creep = [] if moments is not None else creeping(poses)
-    return Measured(name, poses, windows, quality + creep, output_unit=table.output_unit, remarks=table.remarks)
+    read = Measured(name, [], windows, [], output_unit=table.output_unit, remarks=table.remarks)
+
+    def parted(turn_s: float | None) -> Measured:
+        spans = detector.spans(turn_s)
+        seen = judge.findings(windows, spans)
+        poses = poses_of(windows, spans, untrusted_poses(seen))
+        quality = together(counted, seen) + ([] if moments is not None else creeping(poses))
+        return replace(read, poses=poses, data_quality=quality, parted=parted)
+
+    return parted(turn_s)
 
 
 def require_same_outputs(calibration: Calibration, name: str, unit: str) -> None:
@@ -134,15 +141,18 @@ def _of_means(name: str, table: Table) -> Measured:
     return Measured(name, poses, None, quality, output_unit=table.output_unit, remarks=table.remarks)
 
 
-def _measure_recording(recording: Recording, phase: Phase, stream: str, moments: Moments | None) -> Measured:
+def _measure_recording(
+    recording: Recording, phase: Phase, stream: str, moments: Moments | None, turn_s: float | None
+) -> Measured:
     bundle = bundle_of(recording)
-    pipeline = Pipeline(bundle, stream)
+    pipeline = Pipeline(bundle, stream, turn_s=turn_s)
     for batch in recording.raw(phase):
         block = pipeline.feed(batch)
         if moments is not None:
             moments.feed(block.readings, block.channels.get(TEMPERATURE))
     poses = pipeline.finish()
-    quality = pipeline.data_quality() + losses_of(recording) + ([] if moments is not None else creeping(poses))
+    quality = pipeline.data_quality() + losses_of(recording) + ([] if moments is not None else creeping(poses)) ``turn_s``: the unit may turn in
+    place, as for `find_spans`.
     signs = signs_of(recording) or bundle.profile.output.signs
     station = None
     if STATION_FILE in recording.attachments:
@@ -154,9 +164,14 @@ def _measure_recording(recording: Recording, phase: Phase, stream: str, moments:
         reference, stated, at = station.reference, station.stated(bundle.profile), station.moment
     meant = recording.metadata.get("unit", {})
     unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
-    return Measured(
-        recording.name, poses, pipeline.windows, quality, bundle.profile, signs, reference, unit, stated, at
-    )
+    read = Measured(recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at)
+
+    def parted(turn_s: float | None) -> Measured:
+        poses = pipeline.parted(turn_s)
+        quality = pipeline.data_quality() + lost + ([] if moments is not None else creeping(poses))
+        return replace(read, poses=poses, data_quality=quality, parted=parted)
+
+    return parted(turn_s)
 
 
 def require_unit(document: Mapping[str, Any], measured: Measured, *, where: str) -> None:

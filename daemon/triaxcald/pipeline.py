@@ -27,6 +27,8 @@ class Pipeline:
     bundle: Bundle
     stream: str
     counts: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(COUNTS, 0)))
+    turn_s: float | None = None
+    """Where the unit may turn in place, as for `find_spans`."""
 
     def __post_init__(self) -> None:
         self._decoder = driver_named(self.bundle.profile.driver).decoder(self.bundle, self.stream)
@@ -96,14 +98,22 @@ class Pipeline:
     def _still(self, windows: Windows) -> list[Span]:
         """The still spans so far, found once for the same windows."""
         if self._spans[0] != len(windows):
-            self._spans = (len(windows), self._detector.spans())
+            self._spans = (len(windows), self._detector.spans(self.turn_s))
         return self._spans[1]
 
     def finish(self) -> list[Pose]:
         """The still poses of the whole stream."""
+        self.close()
+        return self.parted(self.turn_s)
+
+    def close(self) -> None:
+        """No more records come."""
         self._detector.finish()
         self._quality.finish()
-        self._findings = None
+
+    def parted(self, turn_s: float | None) -> list[Pose]:
+        """The still poses of the whole stream once that is closed, for another ``turn_s``."""
+        self.turn_s, self._spans, self._findings = turn_s, (0, []), None
         windows = self.windows
         return [] if windows is None else poses_of(windows, self._still(windows), untrusted_poses(self._seen(windows)))
 

@@ -54,6 +54,10 @@ def _proper() -> Floats:
 TURNS: Floats = _proper()
 
 
+class Miscounted(InvalidData):
+    """There are more labels, or fewer, than anything that they may be of."""
+
+
 @dataclass(frozen=True)
 class AxesAssumed(Caution):
     """No labels were given: the sensor's axes are taken to lie near the faces' axes of the same name."""
@@ -121,8 +125,8 @@ def labelled(
     """Face poses by the labels given, whatever the mounting.
 
     There are as many labels as poses (None, or a label that is no face's, for poses on no face), or as face poses, or
-    as faces stood on, in order of time. Raises InvalidData where they contradict the readings, Refused where the faces
-    are too few.
+    as faces stood on, in order of time. Raises Miscounted where there are not, InvalidData where they contradict the
+    readings, Refused where the faces are too few.
     """
     given = [label if label in LABELS else None for label in labels]
     turns = list(headings) if headings is not None else [None] * len(labels)
@@ -152,7 +156,7 @@ def _spread(
         for i in on_face:
             labels[i] = meaning[found.labels[i]]
     else:
-        raise InvalidData(
+        raise Miscounted(
             f"{len(given)} labels for {len(up)} poses, of which {len(on_face)} stand on {len(order)} faces; expected "
             "one for each pose, or for each pose on a face, or for each face"
         )

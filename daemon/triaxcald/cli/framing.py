@@ -6,7 +6,7 @@ import argparse
 import math
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,14 @@ import numpy as np
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.figures import probability
-from triaxcal.frames.faces import LABELS, Labelling, labelled, opposite, recognise
+from triaxcal.frames.faces import LABELS, Labelling, Miscounted, labelled, opposite, recognise
 from triaxcal.frames.frames import Datum, Frames, frames
 from triaxcal.frames.orientations import Assumed
 from triaxcal.frames.standing import Standing, stand
 from triaxcal.interchange.calibration_reading import sensor_of
 from triaxcal.model.directions import directions
+from triaxcal.poses.stillness.detector import find_spans
+from triaxcal.poses.stillness.turns import TURN_S
 from triaxcal.units import reference_unit_of
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
@@ -30,7 +32,7 @@ from triaxcald.errors import InputError
 from triaxcald.exit_codes import DONE, OUTSIDE
 from triaxcald.files import write_text
 from triaxcald.framing import Source, frame_document, own_source, source_under
-from triaxcald.inputs import read_document, require_unit
+from triaxcald.inputs import Measured, read_document, require_unit
 
 OWN = "own"
 NO_FACE = "*"
@@ -50,9 +52,9 @@ def frame_command(a: argparse.Namespace) -> int:
     standings: list[Standing] = []
     for name, calibration, given in zip(names, calibrations, labels, strict=True):
         with _of(name):
-            source = _source(a, name, calibration, [s.name for s in sources])
+            source, standing = _placed(a, name, calibration, [s.name for s in sources], given, assumed)
             sources.append(source)
-            standings.append(_stand(source, given, assumed))
+            standings.append(standing)
     result = frames(standings, datum=Datum(a.datum) if a.datum else None)
     document = frame_document(sources, result)
     if a.output:
@@ -115,8 +117,38 @@ def _of(name: str) -> Iterator[None]:
         raise InputError(f"{name}: {e}") from e
 
 
-def _source(a: argparse.Namespace, name: str, calibration: str, taken: Sequence[str]) -> Source:
-    measured = read_recording(a, name)
+def _placed(
+    a: argparse.Namespace,
+    name: str,
+    calibration: str,
+    taken: Sequence[str],
+    given: Labels | None,
+    assumed: Assumed,
+) -> tuple[Source, Standing]:
+    """On a level table a turn and a knock look the same but for their length. Labels, where they count the poses, say
+    how many of the longest were turns."""
+    measured = read_recording(a, name, turn_s=TURN_S)
+    source = _source(a, measured, name, calibration, taken)
+    try:
+        return source, _stand(source, given, assumed)
+    except Miscounted:
+        for turn_s in _lengths(measured):
+            with suppress(InvalidData, Refused):
+                assert measured.parted is not None
+                source = _source(a, measured.parted(turn_s), name, calibration, taken)
+                return source, _stand(source, given, assumed)
+        raise
+
+
+def _lengths(measured: Measured) -> list[float]:
+    """How long disturbances lasted that left the readings as they were, the longest first."""
+    if measured.windows is None:
+        return []
+    found = {span.since_s for span in find_spans(measured.windows, turn_s=0.0)}
+    return sorted(found | {math.inf}, reverse=True)
+
+
+def _source(a: argparse.Namespace, measured: Measured, name: str, calibration: str, taken: Sequence[str]) -> Source:
     choice = chosen(a, measured)
     unit = measured.unit or {}
     called = unit.get("serial") or re.sub(r"(\.csv\.gz|\.csv|\.mcap)$", "", Path(name).name)

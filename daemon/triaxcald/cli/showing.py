@@ -38,11 +38,16 @@ class Choice:
 
 
 def read_recording(
-    a: argparse.Namespace, name: str, moments: Moments | None = None, of: Calibration | None = None
+    a: argparse.Namespace,
+    name: str,
+    moments: Moments | None = None,
+    of: Calibration | None = None,
+    turn_s: float | None = None,
 ) -> Measured:
     """The still poses of the recording ``name``, read as the arguments say; how a table was read is told. ``of`` is the
-    calibration that is to be applied to them. Raises InputError where that is of other units."""
-    found = measure(name, moments=moments, reading=reading_of(a, name, of))
+    calibration that is to be applied to them; ``turn_s`` as for `measure`. Raises InputError where that is of other
+    units."""
+    found = measure(name, moments=moments, reading=reading_of(a, name, of), turn_s=turn_s)
     if of is not None:
         require_same_outputs(of, name, a.output_unit or found.output_unit)
     for remark in found.remarks:

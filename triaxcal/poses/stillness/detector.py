@@ -10,6 +10,7 @@ the stand, `triaxcal.poses.stillness.shaken` looks for the poses that are left.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contr
 from triaxcal.poses.stillness.quantization import Rounding, resolution
 from triaxcal.poses.stillness.shaken import ALONE_S, runs, shaken_noise, shaken_runs
 from triaxcal.poses.stillness.trimming import SPAN_LEAST_WINDOWS, trimmed
+from triaxcal.poses.stillness.turns import without_turns
 from triaxcal.poses.stillness.windows import WindowCutter, Windows
 
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
@@ -43,9 +45,13 @@ FROZEN_WINDOWS = 3
 
 @dataclass(frozen=True)
 class Span:
-    """A still span as indices of windows. ``used`` (k,) are the windows in it that no bump disturbs."""
+    """A still span as indices of windows. ``used`` (k,) are the windows in it that no bump disturbs.
+
+    ``since_s`` is how long the disturbance before it lasted, where that left the mean as it was; else infinite.
+    """
 
     used: Ints
+    since_s: float = math.inf
 
     @property
     def first(self) -> int:
@@ -60,13 +66,19 @@ class Span:
 class StillnessDetector(WindowCutter):
     """Feed it blocks of any size; ask for `windows` and `spans` at any time."""
 
-    def spans(self) -> list[Span]:
-        """The still spans so far, in order."""
-        return find_spans(self.windows())
+    def spans(self, turn_s: float | None = None) -> list[Span]:
+        """The still spans so far, in order; ``turn_s`` as for `find_spans`."""
+        return find_spans(self.windows(), turn_s)
 
 
-def find_spans(w: Windows) -> list[Span]:
-    """The still spans of a stream of windows, at least 0.4 s long."""
+def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
+    """The still spans of a stream of windows, at least 0.4 s long.
+
+    A unit that turns about the vertical on a level table comes to rest with the mean that it had: no reading tells the
+    turn from a bump. Where the unit may have turned so, ``turn_s`` says how long a turn takes at least; a disturbance
+    of that length parts spans then, whatever the means, and what stands out of it for a while is no span of its own
+    (`triaxcal.poses.stillness.turns`).
+    """
     # Rounding of a digital output leaves windows without any scatter; a step of it is noise all the same.
     raw, step = w.variance, resolution(w)
     frozen = _frozen(w, step)
@@ -85,7 +97,11 @@ def find_spans(w: Windows) -> list[Span]:
     taken, pieces = _quiet_pieces(w, found, noise)
     shaken = shaken_runs(w, [*taken, *runs(stuck, w.joined)], noise)
     disturbed = ~_steady(w, calm, noise)
-    spans = _rejoin(w, sorted([*pieces, *shaken], key=lambda p: int(p[0])), noise, disturbed)
+    if turn_s is None:
+        kept, longest = sorted([*pieces, *shaken], key=lambda p: int(p[0])), REJOIN_S
+    else:
+        kept, longest = without_turns(w, pieces, shaken), turn_s
+    spans = _rejoin(w, kept, noise, disturbed, longest)
     quiet = np.zeros(len(w), dtype=bool)
     quiet[np.concatenate([*pieces, np.zeros(0, dtype=np.int64)])] = True
     return [s for s in spans if _long_enough(w, s.used, SPAN_LEAST_S if quiet[s.used].any() else ALONE_S)]
@@ -270,8 +286,8 @@ def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
     return np.asarray(np.unique(hit[:, None] + np.arange(scale)), dtype=np.int64)
 
 
-def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools) -> list[Span]:
-    """Pieces of one pose on either side of a bump, put together."""
+def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools, longest_s: float) -> list[Span]:
+    """Pieces of one pose on either side of a bump, which is shorter than ``longest_s``, put together."""
     period_s = w.period_ns * 1e-9
     spans: list[Span] = []
     for piece in pieces:
@@ -279,10 +295,12 @@ def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools
         silent_s = (w.start_ns[piece[0]] - w.start_ns[here]) * 1e-9 - (piece[0] - here) * period_s
         between = np.flatnonzero(disturbed[here : piece[0]])
         bump_s = float(np.ptp(between) + 1 if len(between) else 0) * period_s + max(silent_s, 0.0)
-        if spans and bump_s < REJOIN_S and _same_pose(w, spans[-1].used, piece, noise):
-            spans[-1] = Span(np.concatenate([spans[-1].used, piece]))
-        else:
+        if not spans or not _same_pose(w, spans[-1].used, piece, noise):
             spans.append(Span(piece))
+        elif bump_s < longest_s:
+            spans[-1] = replace(spans[-1], used=np.concatenate([spans[-1].used, piece]))
+        else:
+            spans.append(Span(piece, bump_s))
     return spans
 
 
