@@ -150,9 +150,8 @@ def _measure_recording(
         block = pipeline.feed(batch)
         if moments is not None:
             moments.feed(block.readings, block.channels.get(TEMPERATURE))
-    poses = pipeline.finish()
-    quality = pipeline.data_quality() + losses_of(recording) + ([] if moments is not None else creeping(poses)) ``turn_s``: the unit may turn in
-    place, as for `find_spans`.
+    pipeline.close()
+    lost = losses_of(recording)
     signs = signs_of(recording) or bundle.profile.output.signs
     station = None
     if STATION_FILE in recording.attachments:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.half_turns import HANDS, stood
 from triaxcal.effects import effect_named
 from triaxcal.frames.faces import LABELS, axis_of
 from triaxcal.frames.synthetic_fixture import SyntheticFixture
@@ -356,3 +357,33 @@ def test_an_effect_in_the_calibration_is_taken_off_first(
     assert unit["terms"] == ["linear", "third_order_nonlinearity"]
     assert off(unit, truth(fixture)) < 2
     assert max(unit["standard_error_rad"]) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("hand", "knocks"), [("slides it slowly", None), ("is quick", None), ("slides it slowly", (0.1, 0.2))]
+)
+@pytest.mark.parametrize("given", [True, False])
+def test_two_orientations_are_told_on_a_level_table(
+    hand: str, knocks: tuple[float, float] | None, given: bool, tmp_path: Path, triaxcal: Run
+) -> None:
+    """Where labels count the poses, even beside knocks that last as long as a turn may."""
+    stream = stood(SENSOR, HANDS[hand], 0.0, 5, knocks=knocks)
+    path = tmp_path / "level.csv"
+    lines = [f"{t:.2f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(stream.t_s, stream.u, strict=True)]
+    path.write_text("\n".join(["t_s,ux,uy,uz", *lines]) + "\n")
+    labels = ["--faces", ",".join(stream.labels)] if given else []
+    (unit,) = triaxcal("frame", path, SIGNS, *labels, "--json").json["units"]
+    assert off(unit, stream.rotation) < 2
+    assert max(unit["standard_error_rad"]) < 2e-5
+    if given:
+        assert [p["label"] for p in unit["poses"]] == [x if x in LABELS else None for x in stream.labels]
+    assert {f["label"] for f in unit["table"]["faces"] if f["resolved"]} == set(LABELS)
+
+
+def test_labels_that_count_nothing_are_refused_on_a_level_table(tmp_path: Path, triaxcal: Run) -> None:
+    stream = stood(SENSOR, HANDS["is quick"], 0.0, 6)
+    path = tmp_path / "level.csv"
+    lines = [f"{t:.2f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(stream.t_s, stream.u, strict=True)]
+    path.write_text("\n".join(["t_s,ux,uy,uz", *lines]) + "\n")
+    given = ",".join([*stream.labels, "+X"])
+    triaxcal("frame", path, SIGNS, "--faces", given).failed(2, "33 labels for 32 poses, of which 12 stand on 6 faces")
