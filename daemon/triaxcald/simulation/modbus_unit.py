@@ -224,7 +224,7 @@ class ModbusUnit:
 
     async def _serve(self, stack: AsyncExitStack) -> ModbusBus:
         if isinstance(self._where, TcpAddress):
-            port = await stack.enter_async_context(serve_tcp(self._map, self._where, unit_id=self._unit_id))
+            port = await stack.enter_async_context(serve_tcp({self._unit_id: self._map}, self._where))
             return ModbusBus(host=self._where.host, port=port, unit_id=self._unit_id)
         line = self._where
         outside = line.port
@@ -232,7 +232,7 @@ class ModbusUnit:
             outside = line.port.removeprefix(PTY)
             near, _ = await stack.enter_async_context(pty_pair(Path(outside)))
             line = SerialLine(near, line.baudrate, parity="N")  # a pseudo-terminal takes no parity
-        await stack.enter_async_context(serve_serial(self._map, line, unit_id=self._unit_id))
+        await stack.enter_async_context(serve_serial({self._unit_id: self._map}, line))
         return ModbusBus(
             serial_port=outside,
             baudrate=line.baudrate,

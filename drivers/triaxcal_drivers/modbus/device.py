@@ -18,15 +18,14 @@ from triaxcal_drivers.errors import (
     RegisterValueError,
 )
 from triaxcal_drivers.interface import RawBatch, RawFlag
+from triaxcal_drivers.modbus.client import ModbusClient
 from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream, words_of
 from triaxcal_drivers.modbus.protocol import (
     READ_HOLDING,
     READ_INPUT,
     MalformedReply,
     ModbusRefusal,
-    SerialLine,
 )
-from triaxcal_drivers.modbus.stack import ModbusClient
 from triaxcal_drivers.register_types import TYPES
 
 _BATCH_REPLIES = 32
@@ -34,6 +33,8 @@ _BATCH_REPLIES = 32
 _DISCARD_S = 60.0
 """A FIFO that does not say how much is in it is read for so long until it is empty: it may fill as fast as it is read.
 4096 records of 20 bytes take 48 s at 19200 baud."""
+_DOUBLINGS = 10
+"""Of the pause before a unit that does not answer is asked again: a thousand time-outs at most."""
 
 _EMPTY = "it answers, but its FIFO stays empty"
 
@@ -49,6 +50,8 @@ class _Polled:
     due_s: float
     heard_s: float
     trouble: str = "no reply"
+    unanswered: int = 0
+    """Requests in a row to which no reply came."""
 
     @property
     def source(self) -> int:
@@ -73,14 +76,9 @@ class ModbusDevice:
     async def open(self) -> None:
         await self.close()
         timeout_s = self._profile.sampling.reply_timeout_s
-        unit_id = self._bus.unit_id
-        where = self._bus.where
-        if isinstance(where, SerialLine):
-            self._client = await ModbusClient.over_serial(
-                where, unit_id=unit_id, reply_timeout_s=timeout_s, quiet_s=self._owed_s
-            )
-        else:
-            self._client = await ModbusClient.over_tcp(where, unit_id=unit_id, reply_timeout_s=timeout_s)
+        self._client = await ModbusClient.joined(
+            self._bus.where, unit_id=self._bus.unit_id, reply_timeout_s=timeout_s, owed_s=self._owed_s
+        )
         try:
             await self._probe(self._client)
         except BaseException:
@@ -136,6 +134,8 @@ class ModbusDevice:
                 records = await self._drain(p)
                 yield RawBatch.of(records)
                 self._check_heard(p)
+                if p.unanswered:
+                    p.due_s = max(p.due_s, loop.time() + self._pause_s(p))
 
     def _check_heard(self, p: _Polled) -> None:
         """Raises DeviceSilent."""
@@ -144,6 +144,14 @@ class ModbusDevice:
             raise DeviceSilent(
                 f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
             )
+
+    def _pause_s(self, p: _Polled) -> float:
+        """Before a unit that does not answer is asked again: twice as long each time, so that it takes ever less of a
+        line that it shares, but not beyond the moment at which it counts as silent. A lost reply costs no pause."""
+        patience_s = self._profile.sampling.reply_timeout_s
+        until_silent_s = p.heard_s + self._profile.sampling.silence_timeout_s - self._connected().attention.now_s()
+        pause_s = patience_s * (float(2 ** min(p.unanswered - 1, _DOUBLINGS)) - 1)
+        return max(min(pause_s, until_silent_s - patience_s), 0.0)
 
     def _polled(self, name: str) -> _Polled:
         now_s = asyncio.get_running_loop().time()
@@ -188,6 +196,7 @@ class ModbusDevice:
         return records
 
     async def _request(self, p: _Polled) -> tuple[RawFlag, bytes]:
+        unanswered, p.unanswered = p.unanswered, 0
         try:
             data = await self._connected().read(p.stream.function, p.stream.address, p.stream.words)
         except ModbusRefusal as e:
@@ -197,7 +206,7 @@ class ModbusDevice:
             p.trouble = "malformed replies"
             return RawFlag.INVALID, e.pdu
         except DeviceSilent:
-            p.trouble = "no reply"
+            p.trouble, p.unanswered = "no reply", unanswered + 1
             return RawFlag.ERROR, b""
         return RawFlag(0), data
 

@@ -12,10 +12,10 @@ import pytest
 from tests.drivers.virtual_time import run, virtual
 from triaxcal_drivers.attention import TICK_S
 from triaxcal_drivers.errors import BusError, DeviceSilent
+from triaxcal_drivers.modbus.client import ModbusClient
 from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcal_drivers.modbus.model import ModbusBus
 from triaxcal_drivers.modbus.protocol import READ_HOLDING, TcpAddress
-from triaxcal_drivers.modbus.stack import ModbusClient
 
 HELD_UP_S = 30.0
 Reply = Callable[[bytes], bytes]
@@ -49,7 +49,7 @@ def test_a_modbus_reply_that_waits_unread_is_in_time() -> None:
             return _words(request, 7)
 
         async with served(reply) as port:
-            client = await ModbusClient.over_tcp(TcpAddress("127.0.0.1", port), unit_id=1, reply_timeout_s=1.0)
+            client = await ModbusClient.joined(TcpAddress("127.0.0.1", port), unit_id=1, reply_timeout_s=1.0)
             try:
                 return await client.read(READ_HOLDING, 0, 1)
             finally:
@@ -61,7 +61,7 @@ def test_a_modbus_reply_that_waits_unread_is_in_time() -> None:
 def test_a_modbus_unit_that_does_not_reply_is_silent_in_its_time() -> None:
     async def work() -> float:
         async with served(lambda request: b"") as port:
-            client = await ModbusClient.over_tcp(TcpAddress("127.0.0.1", port), unit_id=1, reply_timeout_s=1.0)
+            client = await ModbusClient.joined(TcpAddress("127.0.0.1", port), unit_id=1, reply_timeout_s=1.0)
             begun_s = virtual().time()
             with pytest.raises(DeviceSilent, match="no reply in 1 s"):
                 await client.read(READ_HOLDING, 0, 1)
@@ -75,10 +75,10 @@ def test_a_modbus_unit_that_does_not_reply_is_silent_in_its_time() -> None:
 def test_a_closed_connection_has_no_timer_left() -> None:
     async def work() -> int:
         async with served(lambda request: b"") as port:
-            client = await ModbusClient.over_tcp(TcpAddress("127.0.0.1", port), unit_id=1, reply_timeout_s=1.0)
+            client = await ModbusClient.joined(TcpAddress("127.0.0.1", port), unit_id=1, reply_timeout_s=1.0)
             await client.close()
         with pytest.raises(BusError, match="cannot connect"):
-            await ModbusClient.over_tcp(TcpAddress("127.0.0.1", port), unit_id=1, reply_timeout_s=1.0)
+            await ModbusClient.joined(TcpAddress("127.0.0.1", port), unit_id=1, reply_timeout_s=1.0)
         await asyncio.sleep(0)
         return sum(not handle.cancelled() for handle in virtual()._scheduled)  # type: ignore[attr-defined]
 

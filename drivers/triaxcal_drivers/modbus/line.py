@@ -1,0 +1,177 @@
+"""A Modbus line: one open connection for all units of this process that are reached by it.
+
+A serial port has one owner, and a gateway serves few connections. So the units on them share one `Line`, which asks
+one unit at a time, in the order in which they come. A unit that does not answer costs the others one time-out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from weakref import WeakKeyDictionary
+
+from triaxcal_drivers.attention import Attention
+from triaxcal_drivers.claim import canonical_host, canonical_port
+from triaxcal_drivers.errors import BusError, DeviceSilent
+from triaxcal_drivers.modbus.protocol import SerialLine, TcpAddress
+from triaxcal_drivers.modbus.stack import Link, connect_serial, connect_tcp, reason_of
+
+_LOOK_S = 0.01
+"""How often a unit that owes a late reply looks whether it has come."""
+
+
+class Line:
+    """To be had by `join`. ``attention`` is what its time-outs count."""
+
+    def __init__(self, where: TcpAddress | SerialLine) -> None:
+        self.where = where
+        self.name = where.port if isinstance(where, SerialLine) else f"{where.host}:{where.port}"
+        self.users = 0
+        self.attention = Attention(asyncio.get_running_loop())
+        self._frame_gap_s = where.frame_gap_s if isinstance(where, SerialLine) else 0.0
+        self._opening, self._turn = asyncio.Lock(), asyncio.Lock()
+        self._link: Link | None = None
+        self._late_until_s: dict[int, float] = {}
+        self._transaction = 0
+        self._asked = 0
+        self._expected: asyncio.Future[bytes] | None = None
+
+    async def open(self, timeout_s: float) -> None:
+        """Nothing where it is open. Raises BusError where it cannot be opened, by TCP within ``timeout_s``."""
+        async with self._opening:
+            if self._link is not None and self._link.transport is not None:
+                return
+            if isinstance(self.where, SerialLine):
+                self._link = await connect_serial(self.where, self._on_frame)
+            else:
+                self._link = await self._connected(self.where, timeout_s)
+            self._link.lost = self._on_lost
+
+    async def _connected(self, address: TcpAddress, timeout_s: float) -> Link:
+        try:
+            async with self.attention.timeout(timeout_s):
+                return await connect_tcp(address, self._on_frame)
+        except TimeoutError as e:
+            raise BusError(f"cannot connect to {self.name}: no answer in {timeout_s:g} s") from e
+        except OSError as e:
+            raise BusError(f"cannot connect to {self.name}: {reason_of(e)}") from e
+
+    def close(self) -> None:
+        self.attention.close()
+        if self._link is not None:
+            self._link.close()
+        self._on_lost()
+
+    def owed_s(self, unit: int) -> float:
+        """So long the late reply of a request to this unit that was given up may still come, which on RTU would pass
+        for the reply to the next one."""
+        return max(self._late_until_s.get(unit, 0.0) - self.attention.now_s(), 0.0) if self._frame_gap_s else 0.0
+
+    def owe(self, unit: int, seconds: float) -> None:
+        if seconds > 0:
+            self._late_until_s[unit] = self.attention.now_s() + seconds
+
+    async def transact(self, unit: int, pdu: bytes, *, patience_s: float, late_s: float) -> bytes:
+        """The reply to a request, function code first. A reply that does not come within ``patience_s`` may come
+        ``late_s`` later still. Raises DeviceSilent, BusError."""
+        async with self._turn_of(unit):
+            if self._link is None or self._link.transport is None:
+                raise BusError(f"{self.name} unit {unit}: the connection is closed")
+            await self._keep_the_gap(self._link)
+            expected = self._expected = asyncio.get_running_loop().create_future()
+            self._asked = unit
+            if not self._frame_gap_s:
+                self._transaction = self._transaction % 0xFFFF + 1
+            self._link.send(unit, self._transaction, pdu)
+            try:
+                async with self.attention.timeout(patience_s):
+                    reply: bytes = await expected
+            except TimeoutError as e:
+                raise DeviceSilent(f"{self.name} unit {unit}: no reply in {patience_s:g} s") from e
+            finally:
+                self._expected = None
+                if not expected.done() or expected.cancelled():
+                    self.owe(unit, late_s)
+        return reply
+
+    @asynccontextmanager
+    async def _turn_of(self, unit: int) -> AsyncIterator[None]:
+        """The line, once no late reply of this unit is to come; the others have it meanwhile. RTU frames have no
+        transaction number: a late reply would pass for the next one's."""
+        while True:
+            while (left_s := self.owed_s(unit)) > 0:
+                await asyncio.sleep(min(left_s, _LOOK_S))
+            async with self._turn:
+                if self.owed_s(unit) == 0:
+                    yield
+                    return
+
+    async def _keep_the_gap(self, link: Link) -> None:
+        """The silence between RTU frames. Half-received replies are dropped."""
+        loop = asyncio.get_running_loop()
+        while self._frame_gap_s and (left := link.last_byte_s + self._frame_gap_s - loop.time()) > 0:
+            await asyncio.sleep(left)
+        link.forget()
+
+    def _on_frame(self, link: Link, unit: int, transaction: int, pdu: bytes) -> None:
+        if link is not self._link or transaction != self._transaction:
+            return
+        if self._expected is None or unit != self._asked:
+            self._late_until_s.pop(unit, None)  # the late reply has come
+        elif not self._expected.done():
+            self._expected.set_result(pdu)
+
+    def _on_lost(self) -> None:
+        if self._expected is not None and not self._expected.done():
+            self._expected.set_exception(BusError(f"{self.name} unit {self._asked}: the connection was lost"))
+
+
+_lines: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, Line]] = WeakKeyDictionary()
+"""The lines that this process has open, by event loop and place."""
+
+
+async def join(where: TcpAddress | SerialLine, timeout_s: float) -> Line:
+    """The line there, opened where it is not; to be given back by `leave`.
+
+    Raises BusError where it cannot be opened, or where other units have the port with other settings.
+    """
+    lines = _lines.setdefault(asyncio.get_running_loop(), {})
+    line = lines.get(_key(where))
+    if line is None:
+        line = lines[_key(where)] = Line(where)
+    elif (
+        isinstance(where, SerialLine)
+        and isinstance(line.where, SerialLine)
+        and _settings(where) != _settings(line.where)
+    ):
+        raise BusError(
+            f"{where.port}: another unit has it with {_settings(line.where)}; this one asks for {_settings(where)}"
+        )
+    line.users += 1
+    try:
+        await line.open(timeout_s)
+    except BaseException:
+        leave(line)
+        raise
+    return line
+
+
+def leave(line: Line) -> None:
+    """Closes the line once nobody uses it any more."""
+    line.users -= 1
+    if line.users == 0:
+        line.close()
+        lines = _lines.get(line.attention.loop, {})
+        if lines.get(_key(line.where)) is line:
+            del lines[_key(line.where)]
+
+
+def _key(where: TcpAddress | SerialLine) -> str:
+    if isinstance(where, SerialLine):
+        return canonical_port(where.port)
+    return f"{canonical_host(where.host)}:{where.port}"
+
+
+def _settings(line: SerialLine) -> str:
+    return f"{line.baudrate} baud, parity {line.parity}, {line.stopbits} stop bits"
