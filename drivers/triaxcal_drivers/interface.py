@@ -130,7 +130,9 @@ class Driver(Protocol):
 
     A ``bus_model`` says by a method ``claim`` what one process has for itself while it works with a unit (see
     `triaxcal_drivers.claim`); without it all settings together name the device. A driver may name the ``packages`` that
-    it imports only when a device is opened, so that `triaxcal devices` can say which are not there.
+    it imports only when a device is opened, so that `triaxcal devices` can say which are not there. By a method
+    ``loads(bundle, bus)`` it may say what each stream takes of a line on which units are asked in turn
+    (`triaxcal_drivers.load.LineLoad`, by stream).
     """
 
     profile_model: type[Profile]

@@ -69,7 +69,11 @@ def buses(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
     if request.param == "tcp":
         return {"host": "127.0.0.1", "port": 0}, {}, "Modbus unit 1, TCP port "
     line = tmp_path / "line"
-    return {"serial_port": f"pty:{line}"}, {"serial_port": str(line), "parity": "N"}, "serial port /dev/pts/"
+    return (
+        {"serial_port": f"pty:{line}"},
+        {"serial_port": str(line), "baudrate": 115200, "parity": "N"},
+        "serial port /dev/pts/",
+    )
 
 
 @pytest.mark.parametrize("holder", COMMANDS)

@@ -33,7 +33,11 @@ def buses(request: pytest.FixtureRequest, tmp_path: Path, free_port: int, multic
         bus = {"host": "127.0.0.1", "port": free_port, "unit_id": 3}
         return "triax-ref-modbus", bus, bus
     line = tmp_path / "line"
-    return "triax-ref-modbus", {"serial_port": f"pty:{line}"}, {"serial_port": str(line), "parity": "N"}
+    return (
+        "triax-ref-modbus",
+        {"serial_port": f"pty:{line}"},
+        {"serial_port": str(line), "baudrate": 115200, "parity": "N"},
+    )
 
 
 def test_a_unit_is_calibrated_across_processes_and_stays_so_when_its_power_goes(

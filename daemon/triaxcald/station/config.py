@@ -23,6 +23,7 @@ from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.interface import Device
+from triaxcal_drivers.load import LineLoad
 from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
 from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
@@ -259,6 +260,7 @@ def load_station(path: Path) -> Station:
         places.append(Place(unit, bundle, bus))
         places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
     _check_distinct(places, where=str(path))
+    _check_lines(places, where=str(path))
     return Station(path, text, file, tuple(places))
 
 
@@ -277,6 +279,34 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
             raise InputError(
                 f"{where}: units.{i}.serial: unit {b.unit.name} has the serial number of unit {a.unit.name}, "
                 f"{a.unit.serial}"
+            )
+
+
+def _check_lines(places: Sequence[Place], *, where: str) -> None:
+    """Every line carries its units, and all of them drive it alike. Raises InputError with the arithmetic."""
+    lines: dict[str, list[tuple[int, str, LineLoad]]] = {}
+    for i, place in enumerate(places):
+        loads = getattr(driver_named(place.bundle.profile.driver), "loads", None)
+        of_streams = loads(place.bundle, place.bus) if loads else {}
+        if of_streams:
+            load = max(of_streams.values(), key=lambda load: load.share)
+            lines.setdefault(load.line, []).append((i, place.unit.name, load))
+    for line, units in lines.items():
+        first = units[0][2]
+        for i, name, load in units:
+            if load.settings != first.settings:
+                raise InputError(
+                    f"{where}: units.{i}.bus: unit {name} asks for {load.settings} on {line}, unit {units[0][1]} for "
+                    f"{first.settings}"
+                )
+        total = sum(load.share for _, _, load in units)
+        if total > 1:
+            each = " + ".join(
+                f"{name} {load.reads_per_s:.3g}/s × {1e3 * load.read_s:.3g} ms" for _, name, load in units
+            )
+            raise InputError(
+                f"{where}: units.{units[-1][0]}.bus: {line} at {first.settings} cannot carry its units at their rates: "
+                f"{each} = {total:.0%} of its time; raise the baud rate, or lower sampling.rate_hz of the profiles"
             )
 
 

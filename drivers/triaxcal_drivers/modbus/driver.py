@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from typing import Any
 
+from triaxcal_drivers.claim import canonical_port
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.interface import Decoder, Device
+from triaxcal_drivers.load import LineLoad
 from triaxcal_drivers.modbus.decoder import ModbusDecoder
 from triaxcal_drivers.modbus.model import ModbusBus, ModbusProfile
+from triaxcal_drivers.modbus.protocol import SerialLine
 from triaxcal_drivers.profile import Bundle
 
 
@@ -25,6 +29,17 @@ class ModbusDriver:
         from triaxcal_drivers.modbus.device import ModbusDevice  # pymodbus, which no recording needs
 
         return ModbusDevice(_profile(bundle), bus)
+
+    def loads(self, bundle: Bundle, bus: Any) -> Mapping[str, LineLoad]:
+        """By stream; nothing over TCP, where the line is as fast as it is."""
+        where = bus.where
+        if not isinstance(where, SerialLine):
+            return {}
+        profile, port = _profile(bundle), canonical_port(where.port)
+        return {
+            name: LineLoad(port, where.settings, s.reads_per_s(profile.sampling.rate_hz), where.read_s(s.words))
+            for name, s in profile.streams.items()
+        }
 
     def decoder(self, bundle: Bundle, stream: str) -> Decoder:
         profile = _profile(bundle)

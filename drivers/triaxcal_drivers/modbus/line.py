@@ -140,13 +140,9 @@ async def join(where: TcpAddress | SerialLine, timeout_s: float) -> Line:
     line = lines.get(_key(where))
     if line is None:
         line = lines[_key(where)] = Line(where)
-    elif (
-        isinstance(where, SerialLine)
-        and isinstance(line.where, SerialLine)
-        and _settings(where) != _settings(line.where)
-    ):
+    elif isinstance(where, SerialLine) and isinstance(line.where, SerialLine) and where.settings != line.where.settings:
         raise BusError(
-            f"{where.port}: another unit has it with {_settings(line.where)}; this one asks for {_settings(where)}"
+            f"{where.port}: another unit has it with {line.where.settings}; this one asks for {where.settings}"
         )
     line.users += 1
     try:
@@ -171,7 +167,3 @@ def _key(where: TcpAddress | SerialLine) -> str:
     if isinstance(where, SerialLine):
         return canonical_port(where.port)
     return f"{canonical_host(where.host)}:{where.port}"
-
-
-def _settings(line: SerialLine) -> str:
-    return f"{line.baudrate} baud, parity {line.parity}, {line.stopbits} stop bits"

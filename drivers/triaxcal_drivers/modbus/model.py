@@ -116,6 +116,10 @@ class PollStream(_Stream):
     def words(self) -> int:
         return self._span
 
+    def reads_per_s(self, rate_hz: float) -> float:
+        """A read for each sample, and none more often than the poll period says."""
+        return min(rate_hz, 1 / self.poll_period_s) if self.poll_period_s else rate_hz
+
 
 class FifoHeader(Strict):
     """Words at the start of a FIFO window."""
@@ -147,6 +151,10 @@ class FifoStream(_Stream):
     @property
     def words(self) -> int:
         return self.record_start + self.record_words * self.record_capacity
+
+    def reads_per_s(self, rate_hz: float) -> float:
+        """Of full windows: so many keep the FIFO from filling up."""
+        return rate_hz / self.record_capacity
 
 
 Stream = Annotated[PollStream | FifoStream, Field(discriminator="layout")]

@@ -60,9 +60,22 @@ class SerialLine:
     @property
     def frame_gap_s(self) -> float:
         """The silence that separates RTU frames: 3.5 characters, 1.75 ms above 19200 baud."""
-        if self.baudrate > 19200:
-            return 1.75e-3
-        return 3.5 * (9 + (self.parity != "N") + self.stopbits) / self.baudrate
+        return 1.75e-3 if self.baudrate > 19200 else 3.5 * self.character_s
+
+    @property
+    def character_s(self) -> float:
+        """A byte on the line: start bit, eight data bits, parity and stop bits."""
+        return (9 + (self.parity != "N") + self.stopbits) / self.baudrate
+
+    @property
+    def settings(self) -> str:
+        return f"{self.baudrate} baud, parity {self.parity}, {self.stopbits} stop bits"
+
+    def read_s(self, words: int) -> float:
+        """The least time for which a read of so many registers keeps the line: request and reply with their gaps, of a
+        unit that answers at once."""
+        request, reply = 8, 5 + 2 * words
+        return (request + reply) * self.character_s + 2 * self.frame_gap_s
 
 
 class Unanswered(Exception):

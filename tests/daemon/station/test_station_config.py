@@ -119,7 +119,7 @@ def test_a_fault_is_said_with_file_line_and_field(tmp_path: Path, old: str, new:
 
 
 TCP = {"host": "127.0.0.1", "port": 1502}
-RTU = {"serial_port": "/dev/ttyUSB0", "parity": "N"}
+RTU = {"serial_port": "/dev/ttyUSB0", "baudrate": 115200, "parity": "N"}
 
 
 @pytest.mark.parametrize(
@@ -145,6 +145,29 @@ def test_units_of_one_gateway_and_of_one_line_are_different_places(workshop: Any
     buses = [TCP, {**TCP, "unit_id": 2}, {**TCP, "port": 1503}, RTU, {**RTU, "unit_id": 2}]
     units = [{"name": f"u{i}", "bus": bus, "serial": str(i)} for i, bus in enumerate(buses, 1)]
     assert len(load_station(workshop.station(*units)).places) == 5
+
+
+def test_a_line_that_cannot_carry_its_units_is_refused_with_the_arithmetic(workshop: Any) -> None:
+    """A read of 123 words: 8 + 251 bytes of 10 bits at 115200 baud, two gaps of 1.75 ms; 100/12 a second."""
+    units = [{"name": f"u{i}", "bus": {**RTU, "unit_id": i}, "serial": str(i)} for i in (1, 2, 3, 4)]
+    assert len(load_station(workshop.station(*units)).places) == 4
+    words = (
+        "units.4.bus: /dev/ttyUSB0 at 115200 baud, parity N, 1 stop bits cannot carry its units at their rates: "
+        + " + ".join(f"u{i} 8.33/s × 26 ms" for i in (1, 2, 3, 4, 5))
+        + " = 108% of its time; raise the baud rate"
+    )
+    path = workshop.station(*units, {"name": "u5", "bus": {**RTU, "unit_id": 5}, "serial": "5"})
+    with pytest.raises(InputError, match=rf"^{path}: {re.escape(words)}"):
+        load_station(path)
+
+
+def test_units_that_drive_one_line_otherwise_are_refused(workshop: Any) -> None:
+    otherwise = {**RTU, "unit_id": 2, "stopbits": 2}
+    units = [{"name": "a", "bus": RTU, "serial": "1"}, {"name": "b", "bus": otherwise}]
+    words = "unit b asks for 115200 baud, parity N, 2 stop bits on /dev/ttyUSB0, unit a for 115200 baud, parity N, 1"
+    path = workshop.station(*units)
+    with pytest.raises(InputError, match=rf"^{path}: units.1.bus: {re.escape(words)}"):
+        load_station(path)
 
 
 def test_no_unit_at_all_is_a_fault(tmp_path: Path) -> None:
