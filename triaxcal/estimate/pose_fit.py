@@ -38,7 +38,7 @@ from triaxcal.estimate.likelihood import (
 from triaxcal.estimate.outliers import OutlierSet
 from triaxcal.estimate.pose_slopes import residual_chi2, slopes_p, with_slopes
 from triaxcal.estimate.shape_errors import shape_errors
-from triaxcal.model.directions import dilution, linear_design, most_wanted
+from triaxcal.model.directions import dilution, in_range, linear_design, most_wanted
 from triaxcal.poses.covariates import of_unknown_history
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof, raised_dof
@@ -185,7 +185,7 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
     sensor = state.sensor(problem)
     direction = sensor.specific_force(problem.u, problem.covariates)
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    design = linear_design(direction, (problem.u - problem.middle) / problem.half)
+    design = linear_design(direction, in_range(problem.u))
     spread = dilution(direction, design)
     if not spread < DILUTION_LIMIT:
         # No scale factor and a bias of one reference fit anything: |a| is right everywhere and means nothing.
