@@ -98,8 +98,6 @@ class PoseResult:
     leverage: float
     excluded: Exclusion | None = None
     total_standard_error_g: float | None = None
-    largest_leverage: float = 0.0
-    """0…1: how much of some combination of its mean and its slope the pose determines by itself."""
     outlier_probability: float | None = None
     """None where nobody asked."""
 

@@ -22,8 +22,9 @@ from triaxcal.estimate.pose_slopes import residual_chi2
 from triaxcal.poses.pure_error import lack_of_fit_p
 
 NO_CHANCE = 1e-4
-"""Probability of residuals below which the noise no longer has the weights to itself. Rarer than what is called more
-than noise: where poses differ much in noise, other weights cost a hundredfold in variance if nothing was there."""
+"""Lack-of-fit p below which an excess variance is added, which changes the weights. Above it, a Birge ratio multiplies
+all errors. It is small because other weights cost a hundredfold in variance where poses differ much in noise and no
+excess was there."""
 EXACT = 1e-10
 """To which share the excess is sought."""
 

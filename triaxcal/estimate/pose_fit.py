@@ -177,8 +177,6 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
     weighted = J / every_s[:, None]
     q, _ = np.linalg.qr(weighted)
     leverage = np.clip((q**2).sum(axis=1), 0.0, 1.0)[:n]
-    own = q.reshape(-1, n, p).transpose(1, 0, 2)
-    largest_leverage = np.linalg.eigvalsh(own @ own.transpose(0, 2, 1))[:, -1]
     free = np.sqrt(np.maximum(1 - leverage, 0.0))
     studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
     dof = raised_dof(*found.with_doubtful, pure_error_dof(poses, leverage / leverage.sum()))
@@ -215,7 +213,6 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
                 float(studentized[i]),
                 float(leverage[i]),
                 total_standard_error_g=float(s[i]) * birge_ratio,
-                largest_leverage=float(largest_leverage[i]),
             )
             for i, pose in enumerate(poses)
         ),

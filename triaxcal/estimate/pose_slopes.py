@@ -92,21 +92,6 @@ class PoseSlopes:
         widening: Floats = np.broadcast_to(self.widening, n)[rows]
         return replace(self, inside=inside, middle=self.middle.only(rows), errors=errors, widening=widening)
 
-    def chi2(self, state: State, weighted: Floats) -> float:
-        """How far the slopes are from those that a model predicts, as a sum of squares of n; as near as the means,
-        whose weighted derivatives by theta (n, 9+p) are given, let the model come.
-        """
-        r, J, error = self.linearise(state)
-        stacked = np.concatenate([weighted, J / error[:, None]])
-        return residual_sum_of_squares(stacked, np.concatenate([np.zeros(len(weighted)), r / error]))
-
-    def rms_g(self, state: State) -> float:
-        """By how much |a| is off its mean over a pose, beyond noise and what the model predicts: rms of all, the
-        quieter the more."""
-        r, _, error = self.linearise(state)
-        excess = float(np.sum((r / error) ** 2)) - len(r)
-        return float(np.sqrt(max(excess, 0.0) / np.sum(error**-2.0) / 12))
-
     def inform(self, effects: Sequence[Effect]) -> bool:
         """Whether any of the effects goes with something that moves inside the poses."""
         return any(n in self.moving for e in effects for n in e.needs)

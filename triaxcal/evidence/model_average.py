@@ -145,9 +145,9 @@ def _with_errors(
 
 @dataclass(frozen=True, eq=False)
 class _Projection:
-    """``effects`` in the form and the shape that stands for each name, ``columns`` (N,p) theirs. ``by_term`` (9+p,C)
-    are the parameters, as deviations, by the scaled coefficients of all terms; zero for outliers. What a name that is
-    not listed does goes into the nine parameters, as far as these can take it."""
+    """Maps the scaled coefficients of every term to deviations of the reported parameters: ``by_term`` (9+p,C), zero
+    for outliers. ``effects`` are those listed, each in the form and the shape that stands for its name, and ``columns``
+    (N,p) theirs. An effect that is not listed is projected onto the nine parameters."""
 
     effects: tuple[Effect, ...]
     columns: Floats
@@ -319,8 +319,8 @@ def _moments(
 
 
 def _where_linearised(posterior: Posterior, deviation: Floats, projection: _Projection) -> State:
-    """Where residuals are those of the linearisation: the nine parameters take up what the effects are in truth beside
-    what they are to first order."""
+    """Adjust the nine parameters until the exact residuals are those of the linear model. This absorbs the higher
+    orders of the effects."""
     rows = posterior.evidence.rows
     wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + projection.columns @ deviation[9:]
     state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), projection.effects)

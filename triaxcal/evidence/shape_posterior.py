@@ -12,7 +12,8 @@ from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.terms import Term
 
 AT_AN_END = 0.5
-"""Share of the longest or the shortest value that was asked about, from which on the poses do not tell the shape."""
+"""If an end value of the grid holds more than this probability, the data do not bound the shape. No standard error is
+given then."""
 
 
 @dataclass(frozen=True)

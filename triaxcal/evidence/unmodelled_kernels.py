@@ -30,7 +30,8 @@ MEMORY = 0.8
 IN_TIME = (0.1, 0.3)
 """Of the recording's duration."""
 ABSORBED = 1e-9
-"""A covariance of which the nine parameters leave no more is theirs: of time, where nobody knows when poses were."""
+"""A kind is dropped if projection off the nine parameters leaves less than this share of its covariance. An example is
+time, where the times of the poses are unknown."""
 
 
 class UnmodelledKind(StrEnum):

@@ -117,8 +117,8 @@ def with_scale(
 
 
 def of_unknown_history(poses: Sequence[Pose], effects: Iterable[Effect]) -> tuple[int, ...]:
-    """Which poses nothing is known of that one of the effects needs: what was before them. The covariates have them as
-    if the unit had rested there before."""
+    """Poses whose preceding pose is unknown although an effect needs it. Their covariates assume rest in the same
+    attitude."""
     needed = {n for e in effects for n in e.needs} & {*BEFORE, *CHANGE}
     return tuple(i for i, p in enumerate(poses) if p.before is None) if needed else ()
 

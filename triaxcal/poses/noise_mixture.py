@@ -1,8 +1,8 @@
 """How large the noise of a pose's mean may be: every model of its spectrum that the poses leave possible.
 
 Whether there is slow noise below what a pose can show is often open: most likely there is none, perhaps there is much.
-One number of degrees of freedom says how far intervals must reach for that. What residuals tell of it, many of them at
-once, takes the models one by one.
+An effective number of degrees of freedom says how far intervals must reach for that. The likelihood of residuals is
+averaged over the noise models: one number of degrees of freedom does not suffice there.
 """
 
 from __future__ import annotations
@@ -73,12 +73,6 @@ class NoiseLevels:
         """(m,) degrees of freedom, none below those of all together: an unlikely level that is hardly known would have
         the longest tail of all, and account for residuals of any size."""
         return np.maximum(self.dof, min(self.students_dof, float(self.dof.max())))
-
-    def drawn(self, count: int, rng: np.random.Generator) -> Floats:
-        """(count,) what the true variance over the one stated may be."""
-        which = rng.choice(len(self.share), count, p=self.share)
-        dof = self._known[which]
-        return np.asarray(self.variance[which] * dof / rng.chisquare(dof))
 
     def log_likelihood(self, chi2: Floats, left: int) -> Floats:
         """Of residuals in ``left`` degrees of freedom whose sum of squares, by the stated variance, is ``chi2`` (any

@@ -7,7 +7,7 @@ noise's colour.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -56,13 +56,6 @@ class NoiseScales:
     def of_edge(self, scale: int, before: int) -> Floats:
         """(3,) ``edge`` for an average over ``before`` windows beside that over ``scale``, fewer than four times."""
         return np.asarray(self.edge[scale] * np.sqrt((1 / scale + 1 / before) / (1.25 / scale)))
-
-    def louder(self, variance: Floats) -> NoiseScales:
-        """The same where the outputs scatter with ``variance`` (3,) inside a window, if that is more."""
-        by = np.sqrt(np.maximum(variance / np.maximum(self.scatter, 1e-300) ** 2, 1.0))
-        return replace(
-            self, step={s: v * by for s, v in self.step.items()}, edge={s: v * by for s, v in self.edge.items()}
-        )
 
 
 def _scale(differences: Floats, quantile: float, least: Floats, white: Floats, half: Floats | None) -> Floats:

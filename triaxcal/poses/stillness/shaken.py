@@ -30,7 +30,8 @@ LONGEST = 16
 ABOUT = 7
 """Windows over which the usual scatter is taken."""
 UNEVEN = 5.0
-"""Where the usual variance is so many times that of the run, or a window's its square, is a move, or a knock."""
+"""A window belongs to a move or a knock if the median variance around it exceeds that of the run by this factor, or its
+own variance by the square."""
 SHARE = 0.03
 """Shaking makes the outputs scatter by no more than this share of the range of the poses."""
 
