@@ -72,6 +72,9 @@ def covariate_of(channel: str) -> str:
     return channel + LOGGED if is_derived(bare) else channel
 
 
+condition_of = covariate_of  # effects of other packages import it by its older name
+
+
 def channel_of(covariate: str) -> str:
     """The logged channel that a covariate is: the inverse of `covariate_of`."""
     bare = covariate.removesuffix(LOGGED)
