@@ -29,7 +29,7 @@ from triaxcald.exit_codes import SEVEREST
 from triaxcald.inputs import CALIBRATION
 from triaxcald.pipeline import Pipeline
 from triaxcald.station.collection import Collection
-from triaxcald.station.config import load_station
+from triaxcald.station.config import check_lines, load_station
 
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit
@@ -39,6 +39,7 @@ if TYPE_CHECKING:  # a command imports its work once its file is known to be goo
 
 def run_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
+    check_lines(station.places, where=str(station.path))
     from triaxcald.run.line import run_station
 
     with Bars() as bars:
@@ -231,6 +232,7 @@ def record_command(a: argparse.Namespace) -> int:
     writable(a.output)
     station = load_station(a.station)
     place = station.place(a.unit)
+    check_lines([place], where=str(station.path))
     from triaxcald.run.line import UnitRun
 
     with Bars() as bars:

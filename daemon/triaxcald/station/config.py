@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from itertools import combinations
@@ -25,7 +25,7 @@ from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.load import LineLoad
 from triaxcal_drivers.loading import load_bundle
-from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
+from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle, Profile, Strict
 from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
 from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
@@ -260,7 +260,6 @@ def load_station(path: Path) -> Station:
         places.append(Place(unit, bundle, bus))
         places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
     _check_distinct(places, where=str(path))
-    _check_lines(places, where=str(path))
     return Station(path, text, file, tuple(places))
 
 
@@ -282,22 +281,24 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
             )
 
 
-def _check_lines(places: Sequence[Place], *, where: str) -> None:
-    """Every line carries its units, and all of them drive it alike. Raises InputError with the arithmetic."""
+def check_lines(places: Sequence[Place], *, where: str) -> None:
+    """Every line carries those of its units that are to be recorded, and all of them drive it alike. Raises InputError
+    with the arithmetic."""
     lines: dict[str, list[tuple[int, str, LineLoad]]] = {}
     for i, place in enumerate(places):
         loads = getattr(driver_named(place.bundle.profile.driver), "loads", None)
-        of_streams = loads(place.bundle, place.bus) if loads else {}
-        if of_streams:
-            load = max(of_streams.values(), key=lambda load: load.share)
-            lines.setdefault(load.line, []).append((i, place.unit.name, load))
+        of_streams: Mapping[str, LineLoad] = loads(place.bundle, place.bus) if loads else {}
+        for name in (READINGS, CORRECTED):  # which are recorded side by side
+            if name in of_streams:
+                load = of_streams[name]
+                lines.setdefault(load.line, []).append((i, f"{place.unit.name} {name}", load))
     for line, units in lines.items():
         first = units[0][2]
-        for i, name, load in units:
+        for i, _, load in units:
             if load.settings != first.settings:
                 raise InputError(
-                    f"{where}: units.{i}.bus: unit {name} asks for {load.settings} on {line}, unit {units[0][1]} for "
-                    f"{first.settings}"
+                    f"{where}: unit {places[i].unit.name} asks for {load.settings} on {line}, unit "
+                    f"{places[units[0][0]].unit.name} for {first.settings}"
                 )
         total = sum(load.share for _, _, load in units)
         if total > 1:
@@ -305,7 +306,7 @@ def _check_lines(places: Sequence[Place], *, where: str) -> None:
                 f"{name} {load.reads_per_s:.3g}/s × {1e3 * load.read_s:.3g} ms" for _, name, load in units
             )
             raise InputError(
-                f"{where}: units.{units[-1][0]}.bus: {line} at {first.settings} cannot carry its units at their rates: "
+                f"{where}: {line} at {first.settings} cannot carry its units at their rates: "
                 f"{each} = {total:.0%} of its time; raise the baud rate, or lower sampling.rate_hz of the profiles"
             )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 
 from triaxcal_drivers.attention import Attention
+from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.modbus.line import Line, join, leave
 from triaxcal_drivers.modbus.protocol import (
     WRITE_MULTIPLE,
@@ -45,9 +46,21 @@ class ModbusClient:
     def owed_s(self) -> float:
         return self._last.owed_s(self._unit_id)
 
+    @property
+    def own_s(self) -> float:
+        """Time [s] that goes on while this unit has the line or could have it: `attention`, less what other units took
+        while a request of this one waited."""
+        return self._last.attention.now_s() - self._last.waited_s(self._unit_id)
+
+    @property
+    def alone(self) -> bool:
+        """Whether no other unit uses the line."""
+        return self._last.users < 2
+
     async def close(self) -> None:
         line, self._line = self._line, None
         if line is not None:
+            line.forsake(self._unit_id)
             leave(line)
 
     async def read(self, function: int, address: int, count: int) -> bytes:
@@ -79,8 +92,10 @@ class ModbusClient:
             raise MalformedReply(f"{self.where}: reply to a write at 0x{address:04X}: {pdu.hex(' ')}", pdu)
 
     async def _transact(self, request: bytes, timeout_s: float | None = None) -> bytes:
+        if self._line is None:
+            raise BusError(f"{self.where}: the device is closed")
         patience_s = self._reply_timeout_s if timeout_s is None else timeout_s
-        reply = await self._last.transact(self._unit_id, request, patience_s=patience_s, late_s=self._reply_timeout_s)
+        reply = await self._line.transact(self._unit_id, request, patience_s=patience_s, late_s=self._reply_timeout_s)
         if reply[0] == request[0] | 0x80 and len(reply) == 2:
             raise ModbusRefusal(reply[1])
         return reply

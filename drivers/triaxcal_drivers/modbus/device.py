@@ -43,7 +43,7 @@ Record = tuple[int, int, int, bytes]
 
 @dataclass
 class _Polled:
-    """A stream while it is polled. ``due_s`` is of the loop's time, ``heard_s`` of the connection's attention."""
+    """A stream while it is polled. ``due_s`` is of the loop's time, ``heard_s`` of the unit's own time."""
 
     name: str
     stream: PollStream | FifoStream
@@ -134,12 +134,12 @@ class ModbusDevice:
                 records = await self._drain(p)
                 yield RawBatch.of(records)
                 self._check_heard(p)
-                if p.unanswered:
+                if p.unanswered and not self._connected().alone:
                     p.due_s = max(p.due_s, loop.time() + self._pause_s(p))
 
     def _check_heard(self, p: _Polled) -> None:
         """Raises DeviceSilent."""
-        silent_s = self._connected().attention.now_s() - p.heard_s
+        silent_s = self._connected().own_s - p.heard_s
         if silent_s >= self._profile.sampling.silence_timeout_s:
             raise DeviceSilent(
                 f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
@@ -149,13 +149,13 @@ class ModbusDevice:
         """Before a unit that does not answer is asked again: twice as long each time, so that it takes ever less of a
         line that it shares, but not beyond the moment at which it counts as silent. A lost reply costs no pause."""
         patience_s = self._profile.sampling.reply_timeout_s
-        until_silent_s = p.heard_s + self._profile.sampling.silence_timeout_s - self._connected().attention.now_s()
+        until_silent_s = p.heard_s + self._profile.sampling.silence_timeout_s - self._connected().own_s
         pause_s = patience_s * (float(2 ** min(p.unanswered - 1, _DOUBLINGS)) - 1)
         return max(min(pause_s, until_silent_s - patience_s), 0.0)
 
     def _polled(self, name: str) -> _Polled:
         now_s = asyncio.get_running_loop().time()
-        return _Polled(name, self._profile.streams[name], now_s, self._connected().attention.now_s())
+        return _Polled(name, self._profile.streams[name], now_s, self._connected().own_s)
 
     async def _discard(self, p: _Polled) -> None:
         """Takes out of a stream's FIFO what it held at the first reply; whole windows. Raises DeviceSilent."""
@@ -173,7 +173,7 @@ class ModbusDevice:
             left = min(left - taken, remaining) if counted else remaining
             self.discarded += taken
             if taken:
-                p.heard_s = self._connected().attention.now_s()
+                p.heard_s = self._connected().own_s
             elif left > 0:
                 p.trouble = p.trouble if flags else _EMPTY
                 self._check_heard(p)
@@ -187,7 +187,7 @@ class ModbusDevice:
             records.append((self._now_ns(), p.source, flags, data))
             taken, remaining = self._held(p.stream, data) if not flags else (0, 0)
             if taken:
-                p.heard_s = self._connected().attention.now_s()
+                p.heard_s = self._connected().own_s
             elif not flags:
                 p.trouble = _EMPTY
             if not remaining:

@@ -31,11 +31,11 @@ class ModbusDriver:
         return ModbusDevice(_profile(bundle), bus)
 
     def loads(self, bundle: Bundle, bus: Any) -> Mapping[str, LineLoad]:
-        """By stream; nothing over TCP, where the line is as fast as it is."""
+        """By stream; nothing where no baud rate tells how fast the line is: over TCP, and on a pseudo-terminal."""
         where = bus.where
-        if not isinstance(where, SerialLine):
+        if not isinstance(where, SerialLine) or (port := canonical_port(where.port)).startswith("/dev/pts/"):
             return {}
-        profile, port = _profile(bundle), canonical_port(where.port)
+        profile = _profile(bundle)
         return {
             name: LineLoad(port, where.settings, s.reads_per_s(profile.sampling.rate_hz), where.read_s(s.words))
             for name, s in profile.streams.items()

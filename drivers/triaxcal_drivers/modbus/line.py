@@ -1,12 +1,14 @@
 """A Modbus line: one open connection for all units of this process that are reached by it.
 
 A serial port has one owner, and a gateway serves few connections. So the units on them share one `Line`, which asks
-one unit at a time, in the order in which they come. A unit that does not answer costs the others one time-out.
+one unit at a time, in the order in which they come, also by TCP: what is behind a gateway is mostly one line. A unit
+that does not answer costs the others one time-out.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from weakref import WeakKeyDictionary
@@ -33,20 +35,27 @@ class Line:
         self._opening, self._turn = asyncio.Lock(), asyncio.Lock()
         self._link: Link | None = None
         self._late_until_s: dict[int, float] = {}
+        self._waited_s: dict[int, float] = {}
+        self._mute = False
         self._transaction = 0
         self._asked = 0
         self._expected: asyncio.Future[bytes] | None = None
 
     async def open(self, timeout_s: float) -> None:
-        """Nothing where it is open. Raises BusError where it cannot be opened, by TCP within ``timeout_s``."""
+        """Nothing where it is open and answers; a TCP connection that went mute is made anew. Raises BusError where it
+        cannot be opened, by TCP within ``timeout_s``."""
         async with self._opening:
-            if self._link is not None and self._link.transport is not None:
+            if self._link is not None and self._link.transport is not None and not self._mute:
                 return
-            if isinstance(self.where, SerialLine):
-                self._link = await connect_serial(self.where, self._on_frame)
-            else:
-                self._link = await self._connected(self.where, timeout_s)
-            self._link.lost = self._on_lost
+            async with self._turn:  # no request of another unit is under way, nor begins on a closed link
+                if self._link is not None:
+                    self._link.lost = lambda: None
+                    self._link.close()
+                if isinstance(self.where, SerialLine):
+                    self._link = await connect_serial(self.where, self._on_frame)
+                else:
+                    self._link = await self._connected(self.where, timeout_s)
+                self._link.lost, self._mute = self._on_lost, False
 
     async def _connected(self, address: TcpAddress, timeout_s: float) -> Link:
         try:
@@ -54,7 +63,7 @@ class Line:
                 return await connect_tcp(address, self._on_frame)
         except TimeoutError as e:
             raise BusError(f"cannot connect to {self.name}: no answer in {timeout_s:g} s") from e
-        except OSError as e:
+        except (OSError, UnicodeError) as e:  # the latter: no host can have that name
             raise BusError(f"cannot connect to {self.name}: {reason_of(e)}") from e
 
     def close(self) -> None:
@@ -66,11 +75,24 @@ class Line:
     def owed_s(self, unit: int) -> float:
         """So long the late reply of a request to this unit that was given up may still come, which on RTU would pass
         for the reply to the next one."""
-        return max(self._late_until_s.get(unit, 0.0) - self.attention.now_s(), 0.0) if self._frame_gap_s else 0.0
+        now_s = self.attention.now_s()
+        if not self._frame_gap_s or math.isinf(now_s):  # closed: nothing is asked any more
+            return 0.0
+        return max(self._late_until_s.get(unit, 0.0) - now_s, 0.0)
 
     def owe(self, unit: int, seconds: float) -> None:
-        if seconds > 0:
-            self._late_until_s[unit] = self.attention.now_s() + seconds
+        now_s = self.attention.now_s()
+        if seconds > 0 and math.isfinite(now_s):
+            self._late_until_s[unit] = now_s + seconds
+
+    def waited_s(self, unit: int) -> float:
+        """So long a unit's requests have waited, all in all, while other units had the line."""
+        return self._waited_s.get(unit, 0.0)
+
+    def forsake(self, unit: int) -> None:
+        """A request of this unit that is under way fails: nobody waits for it any more."""
+        if self._asked == unit and self._expected is not None and not self._expected.done():
+            self._expected.set_exception(BusError(f"{self.name} unit {unit}: the device is closed"))
 
     async def transact(self, unit: int, pdu: bytes, *, patience_s: float, late_s: float) -> bytes:
         """The reply to a request, function code first. A reply that does not come within ``patience_s`` may come
@@ -79,20 +101,24 @@ class Line:
             if self._link is None or self._link.transport is None:
                 raise BusError(f"{self.name} unit {unit}: the connection is closed")
             await self._keep_the_gap(self._link)
+            if self._link.transport is None:
+                raise BusError(f"{self.name} unit {unit}: the connection was lost")
             expected = self._expected = asyncio.get_running_loop().create_future()
             self._asked = unit
             if not self._frame_gap_s:
                 self._transaction = self._transaction % 0xFFFF + 1
+            until_s = self.attention.now_s() + patience_s
             self._link.send(unit, self._transaction, pdu)
             try:
                 async with self.attention.timeout(patience_s):
                     reply: bytes = await expected
             except TimeoutError as e:
+                self._mute = not self._frame_gap_s  # by TCP: until another frame comes
                 raise DeviceSilent(f"{self.name} unit {unit}: no reply in {patience_s:g} s") from e
             finally:
                 self._expected = None
                 if not expected.done() or expected.cancelled():
-                    self.owe(unit, late_s)
+                    self.owe(unit, late_s + max(until_s - self.attention.now_s(), 0.0))
         return reply
 
     @asynccontextmanager
@@ -102,8 +128,11 @@ class Line:
         while True:
             while (left_s := self.owed_s(unit)) > 0:
                 await asyncio.sleep(min(left_s, _LOOK_S))
+            begun_s = self.attention.now_s()
             async with self._turn:
-                if self.owed_s(unit) == 0:
+                if math.isfinite(waited_s := self.attention.now_s() - begun_s):
+                    self._waited_s[unit] = self._waited_s.get(unit, 0.0) + waited_s
+                if not self.owed_s(unit) > 0:
                     yield
                     return
 
@@ -115,7 +144,10 @@ class Line:
         link.forget()
 
     def _on_frame(self, link: Link, unit: int, transaction: int, pdu: bytes) -> None:
-        if link is not self._link or transaction != self._transaction:
+        if link is not self._link:
+            return
+        self._mute = False
+        if transaction != self._transaction:
             return
         if self._expected is None or unit != self._asked:
             self._late_until_s.pop(unit, None)  # the late reply has come

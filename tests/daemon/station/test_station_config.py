@@ -11,7 +11,7 @@ import pytest
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.loading import load_bundle
 from triaxcald.errors import InputError
-from triaxcald.station.config import load_station
+from triaxcald.station.config import Station, check_lines, load_station
 
 PROFILE = load_bundle(Path("triax-ref-can")).profile
 
@@ -147,27 +147,38 @@ def test_units_of_one_gateway_and_of_one_line_are_different_places(workshop: Any
     assert len(load_station(workshop.station(*units)).places) == 5
 
 
+def on_one_line(workshop: Any, *buses: dict[str, Any]) -> Station:
+    units = [{"name": f"u{i}", "bus": {**bus, "unit_id": i}, "serial": str(i)} for i, bus in enumerate(buses, 1)]
+    return load_station(workshop.station(*units))
+
+
 def test_a_line_that_cannot_carry_its_units_is_refused_with_the_arithmetic(workshop: Any) -> None:
-    """A read of 123 words: 8 + 251 bytes of 10 bits at 115200 baud, two gaps of 1.75 ms; 100/12 a second."""
-    units = [{"name": f"u{i}", "bus": {**RTU, "unit_id": i}, "serial": str(i)} for i in (1, 2, 3, 4)]
-    assert len(load_station(workshop.station(*units)).places) == 4
+    """A read of 123 words: 8 + 251 bytes of 10 bits at 115200 baud, two gaps of 1.75 ms; 100/12 a second, by stream."""
+    check_lines(on_one_line(workshop, RTU, RTU).places, where="a.toml")
+    each = " + ".join(f"u{i} {stream} 8.33/s × 26 ms" for i in (1, 2, 3) for stream in ("readings", "corrected"))
     words = (
-        "units.4.bus: /dev/ttyUSB0 at 115200 baud, parity N, 1 stop bits cannot carry its units at their rates: "
-        + " + ".join(f"u{i} 8.33/s × 26 ms" for i in (1, 2, 3, 4, 5))
-        + " = 108% of its time; raise the baud rate"
+        f"a.toml: /dev/ttyUSB0 at 115200 baud, parity N, 1 stop bits cannot carry its units at their rates: {each} = "
     )
-    path = workshop.station(*units, {"name": "u5", "bus": {**RTU, "unit_id": 5}, "serial": "5"})
-    with pytest.raises(InputError, match=rf"^{path}: {re.escape(words)}"):
-        load_station(path)
+    with pytest.raises(InputError, match=f"^{re.escape(words)}130% of its time; raise the baud rate"):
+        check_lines(on_one_line(workshop, RTU, RTU, RTU).places, where="a.toml")
+
+
+def test_a_station_is_read_whatever_its_lines_carry_and_one_unit_of_it_is_recorded(workshop: Any) -> None:
+    """Registers are read and restored at any rate."""
+    places = on_one_line(workshop, RTU, RTU, {**RTU, "baudrate": 57600}).places
+    for place in places:
+        check_lines([place], where="a.toml")
+
+
+def test_a_pseudo_terminal_carries_what_it_is_given(workshop: Any) -> None:
+    check_lines(on_one_line(workshop, *[{"serial_port": "/dev/pts/7"}] * 9).places, where="a.toml")
 
 
 def test_units_that_drive_one_line_otherwise_are_refused(workshop: Any) -> None:
-    otherwise = {**RTU, "unit_id": 2, "stopbits": 2}
-    units = [{"name": "a", "bus": RTU, "serial": "1"}, {"name": "b", "bus": otherwise}]
-    words = "unit b asks for 115200 baud, parity N, 2 stop bits on /dev/ttyUSB0, unit a for 115200 baud, parity N, 1"
-    path = workshop.station(*units)
-    with pytest.raises(InputError, match=rf"^{path}: units.1.bus: {re.escape(words)}"):
-        load_station(path)
+    places = on_one_line(workshop, RTU, {**RTU, "stopbits": 2}).places
+    words = "a.toml: unit u2 asks for 115200 baud, parity N, 2 stop bits on /dev/ttyUSB0, unit u1 for 115200 baud"
+    with pytest.raises(InputError, match=f"^{re.escape(words)}"):
+        check_lines(places, where="a.toml")
 
 
 def test_no_unit_at_all_is_a_fault(tmp_path: Path) -> None:

@@ -184,3 +184,77 @@ async def test_a_time_out_of_one_unit_leaves_the_line_to_the_others(bundle: Make
         assert order == ["dead", "alive", "dead"]
         await one.close()
         await other.close()
+
+
+async def test_a_neighbour_that_is_dead_makes_no_healthy_unit_silent(bundle: Make) -> None:
+    """The good unit loses one reply, and then has to wait for the time-outs of three others."""
+    units = {i: Unit(i) for i in (1, 2, 3, 4)}
+    patience = ("reply_timeout_s = 5.0, silence_timeout_s = 10.0", "reply_timeout_s = 0.2, silence_timeout_s = 0.4")
+    async with rs485(units) as port:
+        profile = bundle(patience).profile
+        devices = [ModbusDevice(profile, ModbusBus(serial_port=port, parity="N", unit_id=i)) for i in units]
+        await asyncio.gather(*(d.open() for d in devices))
+        for i in (2, 3, 4):
+            units[i].there = False
+        others = [asyncio.create_task(_readings(d, 1)) for d in devices[1:]]
+        await asyncio.sleep(0)
+        units[1].there = False
+        reading = asyncio.create_task(_readings(devices[0], 30))
+        while units[1].asked < 2:
+            await asyncio.sleep(0.01)
+        units[1].there = True
+        assert len(await reading) == 30
+        for result in await asyncio.gather(*others, return_exceptions=True):
+            assert isinstance(result, DeviceSilent)
+        for device in devices:
+            await device.close()
+
+
+async def test_a_device_that_is_closed_asks_nothing_more_and_waits_for_nothing(bundle: Make) -> None:
+    """Of two requests one is under way and one waits; another unit keeps the line open."""
+    dead, unit = Unit(11), Unit(22)
+    async with rs485({1: dead, 2: unit}) as port:
+        one, other = (
+            ModbusDevice(bundle().profile, ModbusBus(serial_port=port, parity="N", unit_id=i)) for i in (1, 2)
+        )
+        await one.open()
+        await other.open()
+        dead.there = False
+        requests = [asyncio.create_task(one.read("level")) for _ in range(2)]
+        while dead.asked < 2:
+            await asyncio.sleep(0.01)
+        requests[0].cancel()
+        await one.close()
+        await other.close()
+        async with asyncio.timeout(4.0):  # less than the time-out of a reply
+            first, second = await asyncio.gather(*requests, return_exceptions=True)
+        assert isinstance(first, asyncio.CancelledError)
+        assert isinstance(second, BusError)
+
+
+async def test_a_connection_that_went_mute_is_made_anew_though_another_unit_uses_it(bundle: Make) -> None:
+    """A gateway that keeps the first connection open and serves it no more."""
+    connections: list[int] = []
+    units = {1: Unit(11), 2: Unit(22)}
+    async with gateway(units, connections) as port:
+        profile = bundle(hasty=True).profile
+        one, other = (ModbusDevice(profile, ModbusBus(host="127.0.0.1", port=port, unit_id=i)) for i in units)
+        await one.open()
+        await other.open()
+        for unit in units.values():
+            unit.there = False
+        with pytest.raises(DeviceSilent):
+            await one.read("level")
+        for unit in units.values():
+            unit.there = True
+        await one.open()
+        assert len(connections) == 2
+        assert [await d.read("level") for d in (one, other)] == [struct.pack(">H", n) for n in (11, 22)]
+        await one.close()
+        await other.close()
+
+
+async def test_a_host_that_no_name_can_be_is_one_line(bundle: Make) -> None:
+    device = ModbusDevice(bundle(hasty=True).profile, ModbusBus(host="a..b", port=502, unit_id=1))
+    with pytest.raises(BusError, match="cannot connect to a..b:502"):
+        await device.open()
