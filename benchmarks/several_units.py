@@ -24,7 +24,7 @@ from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import posterior_of
 from triaxcal.evidence.linearised_data import Rows
-from triaxcal.evidence.pooled import together
+from triaxcal.evidence.pooled import pool
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -58,7 +58,7 @@ def poses_of(rng: np.random.Generator, name: str, along: np.ndarray | None) -> l
         return made(None)
     bare = made(None)
     rows = Rows.of(bare, fit(bare, signs=SIGNS), SIGNS)
-    shown = rows.beside.T @ rows.by_coefficients(effect_named(name)) @ along
+    shown = rows.complement.T @ rows.by_coefficients(effect_named(name)) @ along
     return made(along * STRENGTH / float(np.linalg.norm(shown)))
 
 
@@ -82,7 +82,7 @@ def session(kind: str, seed: int) -> Told:
         along = {"own": rng.standard_normal(3), "common": common, "nothing": None}[kind]
         poses = poses_of(rng, name, along)
         units.append(posterior_of(poses, fit(poses, signs=SIGNS), signs=SIGNS, smallest_g=0.1 * NOISE_G))
-    found = together(units)
+    found = pool(units)
     return Told(name, found.nothing <= 1 - CERTAIN, found.certain(CERTAIN), found.common.get(name, 0.0) > 0.5)
 
 

@@ -584,7 +584,7 @@ class Failing(Radiation):
     # Who asks for it all the same gets one line that names it.
     asked = partial(fit, poses, signs=(-1, -1, -1), effects=[radiation])
     if method == "variants":
-        asked = partial(radiation.variants, loop.seen.evidence.rows.problem.covariates)
+        asked = partial(radiation.variants, loop.posterior.evidence.rows.problem.covariates)
     with pytest.raises(InvalidData, match="the effect radiation of the package dosimetry-effects: "):
         asked()
 

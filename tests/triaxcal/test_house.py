@@ -123,7 +123,7 @@ def _sentences(node: ast.AST) -> Iterator[tuple[int, str]]:
             continue
         if isinstance(child, ast.ClassDef) and any(isinstance(b, ast.Name) and b.id == "Refused" for b in child.bases):
             continue
-        if isinstance(child, ast.Recommendation) and ast.unparse(child.func) == "warnings.warn":
+        if isinstance(child, ast.Call) and ast.unparse(child.func) == "warnings.warn":
             continue
         parts = child.values if isinstance(child, ast.JoinedStr) else [child]
         words = "".join(p.value for p in parts if isinstance(p, ast.Constant) and isinstance(p.value, str))
@@ -134,4 +134,4 @@ def _sentences(node: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def _is_call(child: ast.stmt) -> bool:
-    return isinstance(child, ast.Expr) and isinstance(child.value, ast.Recommendation | ast.Yield | ast.Await)
+    return isinstance(child, ast.Expr) and isinstance(child.value, ast.Call | ast.Yield | ast.Await)

@@ -143,7 +143,7 @@ def test_run_6_holds_a_drift_and_the_residual_falls_threefold_with_it(
     sensor: int, diagnosed: Callable[[str], Loop]
 ) -> None:
     loop = diagnosed(f"mimu4444/run6_sensor{sensor}")
-    assert loop.seen.any_of(OF_TIME) + loop.seen.unmodelled_kind_probabilities[UnmodelledKind.TIME] > 0.99
+    assert loop.posterior.any_of(OF_TIME) + loop.posterior.unmodelled_kind_probabilities[UnmodelledKind.TIME] > 0.99
     told = {name for f in loop.findings for name in (f.effect, *f.alternatives)} | {c.effect for c in loop.candidates}
     assert told <= OF_TIME
     if sensor == NOT_CORRECTED:

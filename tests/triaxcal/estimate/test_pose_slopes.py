@@ -189,8 +189,8 @@ def test_what_has_no_name_and_moves_inside_the_poses_goes_with_the_time(
     for loop in (moves, rests):
         assert loop.found.unexplained.probability > 0.99
         assert loop.refusal is Refusal.UNMODELLED
-    assert moves.seen.unmodelled_kind_probabilities[UnmodelledKind.TIME] > 0.99
-    assert rests.seen.unmodelled_kind_probabilities[UnmodelledKind.TIME] < 0.01
+    assert moves.posterior.unmodelled_kind_probabilities[UnmodelledKind.TIME] > 0.99
+    assert rests.posterior.unmodelled_kind_probabilities[UnmodelledKind.TIME] < 0.01
 
 
 def test_a_step_between_two_poses_is_no_slope_inside_them(paper_unit: Sensor, fourteen: np.ndarray) -> None:
@@ -360,7 +360,7 @@ def test_what_all_poses_have_beside_their_noise_widens_the_trend_of_each_as_its_
     assert problem
     state = solve(problem, start(problem, poses, MINUS), (TEMPERATURE,))
     before = linearise_all(problem, state)[2].reshape(2, 26)
-    beside = Excess(excess_g=SIGMA_G).beside(problem, state)
+    beside = Excess(excess_g=SIGMA_G).added_to(problem, state)
     after = linearise_all(beside, state)[2].reshape(2, 26)
     assert after[0] == pytest.approx(np.hypot(before[0], SIGMA_G))
     assert after[1] / before[1] == pytest.approx(after[0] / before[0])
@@ -409,7 +409,7 @@ def test_what_moves_inside_the_poses_alone_says_nothing_of_the_means(
     for share, only in ((0.0, False), (3e-4, True)):
         odd = [replace(p, slope=p.slope + share * rng.standard_normal() * p.mean) for p in poses]
         loop = diagnose(odd, signs=MINUS, catalogue=[SQUARE, TEMPERATURE])
-        inside = loop.seen.unmodelled_kind_probabilities[UnmodelledKind.WITHIN_POSE]
+        inside = loop.posterior.unmodelled_kind_probabilities[UnmodelledKind.WITHIN_POSE]
         assert inside > 0.99 if only else inside < 0.05
         assert not loop.found.unexplained.significant
         assert loop.probabilities[SQUARE.name] > 0.95
@@ -430,7 +430,7 @@ def test_what_an_effect_of_the_means_foretells_in_vain_inside_the_poses_is_a_par
             for p, q in zip(means, quiet, strict=True)
         ]
         loop = diagnose(poses, signs=MINUS, catalogue=[TEMPERATURE, SQUARE])
-        inside = loop.seen.unmodelled_kind_probabilities[UnmodelledKind.WITHIN_POSE]
+        inside = loop.posterior.unmodelled_kind_probabilities[UnmodelledKind.WITHIN_POSE]
         assert inside > 0.99 if in_vain else inside < 0.05
         assert [(f.effect, f.verdict) for f in loop.findings] == [(TEMPERATURE.name, Verdict.ADOPTED)]
         assert np.all(np.abs(loop.after.values[9:] - SENSITIVITY) < 4 * loop.after.standard_errors[9:])

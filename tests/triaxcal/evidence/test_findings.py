@@ -91,7 +91,7 @@ def test_a_name_that_hangs_on_one_pose_is_a_candidate_and_no_finding(
 ) -> None:
     poses = poses_with(11, temperature_bias=[5e-4, -4e-4, 6e-4])
     posterior = posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS)
-    monkeypatch.setattr(type(posterior), "without_any_pose", lambda self, name: 0.5)
+    monkeypatch.setattr(type(posterior), "least_leave_one_out", lambda self, name: 0.5)
     found = findings(posterior)
     assert found.named == ()
     assert "temperature_bias" in found.candidates

@@ -173,7 +173,7 @@ def test_a_pose_on_which_a_certain_name_hangs_is_taken_again(
     posterior = seen_in(poses_with(11, temperature_bias=[5e-4, -4e-4, 6e-4]))
     without = np.full(30, 0.999)
     without[4] = 0.5
-    monkeypatch.setattr(type(posterior), "without_each_pose", lambda self, name: without)
+    monkeypatch.setattr(type(posterior), "leave_one_out", lambda self, name: without)
     made = advice(posterior)
     assert [(action.kind, action.repeat_of) for action in made.actions] == [(ActionKind.REPEAT, 4)]
 

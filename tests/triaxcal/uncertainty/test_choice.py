@@ -34,7 +34,7 @@ def test_a_drift_that_may_be_a_warm_up_holds_the_truth_in_the_middle_of_the_reco
         still = c.poses(rng.standard_normal((26, 3)) * c.error + drift)
         loop = diagnose(one_after_the_other(still, 8.0, 6.0), signs=c.signs, at=Moment.MEAN)
         assert next(iter(loop.probabilities)) == "bias_drift"
-        assert loop.seen.any_of({"bias_drift", "warm_up"}) > 0.99
+        assert loop.posterior.any_of({"bias_drift", "warm_up"}) > 0.99
         b = budget(loop.after)
         assert np.all(np.abs(loop.after.values[:9] - c.truth) < 1.5 * b.parameters.expanded[:9])
         lines = {line.source: line for line in b.components}
