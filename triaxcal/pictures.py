@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SIZE_IN = (9.0, 4.0)
+"""Width and height in inches: two panels side by side, legible across a page."""
 
 
 def residuals_figure(document: Mapping[str, Any]) -> Figure:

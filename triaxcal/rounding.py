@@ -15,6 +15,9 @@ from triaxcal.arrays import Floats
 from triaxcal.units import SMALLEST
 
 DIGITS, UNCERTAINTY_DIGITS, PROBABILITY_DIGITS, CHANCE_DIGITS = 10, 6, 4, 4
+"""Significant digits of coefficients, of standard errors, of p-values; decimals of a
+posterior's probabilities. Some five more than noise warrants, some five fewer than the
+arithmetic has, so that an audit can compare bytes (decision 0007)."""
 REGISTER_DIGITS = 12
 """So many tell any two float32 apart, and any two integers of a register."""
 GRID_G = 1e-11

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -114,6 +115,49 @@ class Far(Refused):
         super().__init__("it is too far away from here")
 """
     assert list(_sentences(ast.parse(source))) == [(7, "there are  of them too many")]
+
+
+def test_constants_have_a_reason_beside_them() -> None:
+    package = Path(triaxcal.__file__).parent
+    found = [
+        f"{file.relative_to(package)}:{line}: {names}"
+        for file in sorted(package.rglob("*.py"))
+        for line, names in _bare_constants(file.read_text())
+    ]
+    assert found == []
+
+
+def test_a_reason_is_a_docstring_below_or_a_comment_beside_or_above() -> None:
+    source = """
+LEAST = 9
+"The parameters of a line."
+MOST: int = 26  # all of a cube
+# Of the standard.
+A, B = 1.0, 2.0
+NAME, WORDS = "nine", {"x": True}
+GRID = tuple(range(3))
+TABLE[0] = 4.0
+PARTS = 5
+"""
+    assert list(_bare_constants(source)) == [(8, "GRID"), (10, "PARTS")]
+
+
+def _bare_constants(source: str) -> Iterator[tuple[int, str]]:
+    """Line and names of the constants of a module with a number in them, and no reason beside."""
+    lines, body = source.splitlines(), ast.parse(source).body
+    for statement, below in itertools.zip_longest(body, body[1:]):
+        if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
+            continue
+        target = statement.targets[0] if isinstance(statement, ast.Assign) else statement.target
+        names = ast.unparse(target).strip("()")
+        values = [c.value for c in ast.walk(statement.value) if isinstance(c, ast.Constant)]
+        if "[" in names or not names.isupper() or not any(type(v) in (int, float) for v in values):
+            continue
+        docstring = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        beside = "#" in lines[(statement.end_lineno or statement.lineno) - 1]
+        above = lines[statement.lineno - 2].startswith("#")
+        if not (docstring or beside or above):
+            yield statement.lineno, names
 
 
 def _sentences(node: ast.AST) -> Iterator[tuple[int, str]]:

@@ -13,6 +13,8 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning
 
 KINDS = {"odd": 3, "even": 4, "time": 4}
+"""Degree of each: the lowest odd and even ones that the nine parameters do not absorb,
+and of time a curve that bends three times; with more it would follow the noise."""
 Terms = tuple[tuple[float, int, int, int], ...]
 """A polynomial: (factor, powers of x, y, z)."""
 Table = tuple[Ints, Floats]

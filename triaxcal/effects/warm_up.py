@@ -13,7 +13,11 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import SINCE_START, Coefficient, Effect, Meaning, no_slope, on_each_axis, span_of, xyz
 
 CONSTANTS = 8
+"""Time constants tried, evenly in the logarithm: a factor of 1.8 apart in 27 poses.
+More cost time for each hypothesis; fewer leave gaps between the shapes."""
 SLOWEST = 4.0
+"""Lengths of the recording. Over a quarter of its time constant an exponential is off
+its chord by 3 % of its change: what is slower is a straight drift."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import combined_dof, pose_dof, pure_error_dof
 
 OUTLIER_ROUNDS = 4
+"""The search is repeated without the outliers found, since large ones bend the fit
+beyond linear reckoning; it ends sooner once the set stays the same. The last set
+stands."""
 
 
 def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> OutlierSet:

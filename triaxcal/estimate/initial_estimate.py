@@ -13,7 +13,7 @@ from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.ellipsoid import closed_form, coefficients
 from triaxcal.estimate.likelihood import Problem, State, linearise
 from triaxcal.model.directions import dilution, distinct, linear_design, most_wanted
-from triaxcal.model.sensor import Sensor
+from triaxcal.model.sensor import LINEAR, Sensor
 from triaxcal.poses.covariates import channels_of, lags_for, references, with_scale
 from triaxcal.poses.pose import Pose
 
@@ -21,7 +21,6 @@ DILUTION_LIMIT = 100.0
 """Above this a set of poses is refused: some combination of parameters is a hundred times worse than one pose."""
 NOISE_LIMIT = 0.05
 """Poses are refused where noise alone, times the dilution, is this share of the reference."""
-POSES_LEAST = 9
 ROUGH_LEAST, ROUGH_APART_DEG, ROUGH_LIMIT_RAD, TRIAD_UNLIKE_SPHERE = 6, 10.0, 0.2, 0.03
 """Directions are determined without a fit from so many poses so far apart, where they are not less sure than this; and
 by how much at least scale factors of the axes are taken to differ."""
@@ -43,9 +42,9 @@ def problem_of(
 ) -> Problem:
     """With the lags of channels that the ``effects`` need. Raises InvalidData, Refused where there are fewer than nine
     poses."""
-    if len(poses) < POSES_LEAST:
+    if len(poses) < LINEAR:
         raise Refused(
-            f"{len(poses)} still pose{'s' * (len(poses) != 1)}; nine parameters need at least {POSES_LEAST}, "
+            f"{len(poses)} still pose{'s' * (len(poses) != 1)}; nine parameters need at least {LINEAR}, "
             "14 or 26 are better",
             wanted=wanted_for(poses, signs),
         )

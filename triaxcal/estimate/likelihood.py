@@ -26,6 +26,7 @@ from triaxcal.poses.covariates import covariates, references
 Linearised = tuple[Floats, Floats, Floats]
 """Residuals (n,), their derivatives by theta (n, 9+p), their standard errors (n,)."""
 STEPS_MOST = 60
+"""Three or four do from the closed form; so many mean that the search runs away."""
 FAR = 1e6
 """Times the reference vector: what no unit has as bias, nor as the half of its range."""
 HALVES = 0.5 ** np.arange(13)

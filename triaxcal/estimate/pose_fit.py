@@ -41,15 +41,17 @@ from triaxcal.estimate.shape_errors import shape_errors
 from triaxcal.model.directions import dilution, in_range, linear_design, most_wanted
 from triaxcal.poses.covariates import of_unknown_history
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof, raised_dof
+from triaxcal.poses.pure_error import SIGNIFICANT, lack_of_fit_p, pure_error_dof, raised_dof
 
 DILUTION_WARNING = 10.0
+"""A tenth of `DILUTION_LIMIT`, at which a fit is refused: errors still hold, but are
+large."""
 SPREAD_WARNING = 15.0
 """Dilution times the root of the number of poses: about 5 where they are all over the sphere, 25 over half of it."""
 LEFT_LEAST = 3
 """Degrees of freedom below which a residual proves little: its standard deviation is known to about 40 % by three."""
 LEVERAGE_WARNING = 0.95
-SIGNIFICANT = 0.05
+"""Such a pose shows no more than a twentieth of its own error as a residual."""
 CONTRADICTED = 0.01
 """p of the slopes within the poses below which the coefficients are left to the means."""
 

@@ -10,9 +10,9 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import LINEAR
 from triaxcal.poses.pose import Pose
 
-PARAMETERS = 9
 NOISE_FIRST = 1e-4
 """Of the outputs' size: a noise to begin with, far below what turning changes."""
 ROUNDS, SETTLED = 10, 0.05
@@ -55,20 +55,20 @@ def poses_of_means(
 
 
 def _with_noise_of_residuals(poses: Sequence[Pose]) -> list[Pose]:
-    if len(poses) <= PARAMETERS:
+    if len(poses) <= LINEAR:
         raise Refused(
             f"{len(poses)} pose means without standard errors: nine parameters leave nothing to tell the noise by; "
-            f"{PARAMETERS + 1} or more are needed"
+            f"{LINEAR + 1} or more are needed"
         )
     before = 0.0
     for _ in range(ROUNDS):
         found = fit(poses)
         used = sum(p.excluded is None for p in found.poses)
-        if used <= PARAMETERS:
+        if used <= LINEAR:
             raise Refused(f"{used} pose means that agree leave nothing to tell the noise by")
         gain = float(np.sqrt(np.mean(found.sensor.scale_factor**2)))
-        variance = (found.residual.rms_g * gain) ** 2 * used / (used - PARAMETERS)
-        left = float(used - PARAMETERS)
+        variance = (found.residual.rms_g * gain) ** 2 * used / (used - LINEAR)
+        left = float(used - LINEAR)
         poses = [replace(p, covariance=variance * np.eye(3), dof=left, shared_dof=left) for p in poses]
         if abs(np.sqrt(variance) - before) < SETTLED * before:
             break

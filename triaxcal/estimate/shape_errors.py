@@ -16,7 +16,10 @@ UNLIKELY = 16.0
 STRAIGHT = 1.0
 """The likelihood is looked at so closely that chi-square changes by no more from one value to the next."""
 HALVED_MOST = 8
+"""Halvings of an interval, to 1/256: a likelihood that is steeper still is an edge."""
 PARTS = 20
+"""Parts of an interval in the sum that stands for an integral: chi-square changes by
+about `STRAIGHT` over it, so that the weight changes little over a part."""
 NOTHING_LIKE = 1e300
 """In place of infinity, between which and the next nothing could be interpolated."""
 

@@ -16,13 +16,12 @@ from triaxcal.estimate.creep import without_creep
 from triaxcal.estimate.initial_estimate import started_problem
 from triaxcal.estimate.likelihood import Problem, State, by_coefficients, linearise_all
 from triaxcal.estimate.pose_slopes import PoseSlopes
-from triaxcal.model.sensor import Radius
+from triaxcal.model.sensor import LINEAR, Radius
 from triaxcal.poses.covariates import channels_of, with_scale
 from triaxcal.poses.noise_mixture import NoiseLevels
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import noise_levels
 
-LINEAR = 9
 QUIETEST = 0.1
 """Of the median: a pose without scatter (a logger's dead band) would weigh without end."""
 CHI2_LOG = np.linspace(-8.0, 70.0, 12000)

@@ -9,9 +9,9 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp
-from triaxcal.evidence.linearised_data import LINEAR
 from triaxcal.evidence.marginal_likelihood import SetEvidence
 from triaxcal.evidence.posterior import Posterior
+from triaxcal.model.sensor import LINEAR
 
 NEGLIGIBLE = 1e-6
 """The probability of a set that moves no average."""

@@ -19,12 +19,11 @@ from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.estimate.likelihood import State, linearise_all, parameters_by_theta
-from triaxcal.evidence.linearised_data import LINEAR
 from triaxcal.evidence.mixture_components import NEGLIGIBLE, Components, components
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind, reading_geometry
 from triaxcal.model.directions import cube_directions
-from triaxcal.model.sensor import Sensor
+from triaxcal.model.sensor import LINEAR, Sensor
 from triaxcal.poses.covariates import at_moment
 
 NOTICEABLE = 0.1

@@ -23,9 +23,12 @@ FEWEST = 4
 SPHERE = 48
 """Directions over which the size of an effect is reckoned."""
 NOTHING_G = 1e-12
+"""A coefficient that makes less than this makes nothing but rounding: no term is scaled
+by it."""
 ABSORBED = 1e-6
 """Of a term's columns: what the nine parameters leave no more of is theirs, to rounding."""
 AXES = 3
+"""The sensitive axes, and the components of a vector."""
 
 
 @dataclass(frozen=True, eq=False)

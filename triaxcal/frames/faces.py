@@ -22,7 +22,11 @@ NEAR_RAD = 0.05
 LABEL_RAD = 0.2
 """Beyond this a label that was given contradicts the others."""
 AS_GOOD = 0.75
+"""Share of the best score from which on a frame is as good; the one nearest to the
+sensor's axes is taken. Beside a whole cube with two poses a face it may lack one
+face, or the second poses of two."""
 SEEDS_MOST = 300
+"""Poses of which pairs span frames: 45 thousand pairs at most, for the sake of time."""
 
 
 def axis_of(label: str) -> Floats:

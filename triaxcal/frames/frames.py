@@ -25,6 +25,8 @@ from triaxcal.frames.standing import Standing, basis_of
 from triaxcal.poses.pure_error import LACK_OF_FIT
 
 ROUNDS = 8
+"""Steps of Gauss–Newton over small rotations, always all of them. Fewer may leave a
+rest of large angles; more cost time alone."""
 SINGULAR = 0.05
 """Faces that connect units give singular values near 1; ones that do not, those of the faces' own errors."""
 

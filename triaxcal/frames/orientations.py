@@ -19,6 +19,8 @@ from triaxcal.frames.verticals import Verticals
 from triaxcal.poses.pose import PoseStart
 
 FLOOR_RAD = 1e-12
+"""Standard error of a direction that has no noise, as in a simulation: keeps the
+weights finite, and is far below what any pose tells."""
 SHOWS = 1e-4
 """Probability below which a tilt, or a face that was not turned, is more than noise."""
 PAIRS_LEAST = 3
@@ -26,8 +28,14 @@ PAIRS_LEAST = 3
 SHORT = 0.95
 """The share of the tilt that a turn by 143° shows."""
 SPLIT_MOST = 12
+"""Poses on one face of which every split in two is tried, 2048 of twelve; with each
+more there are twice as many."""
 APART_RAD = 0.2
+"""Orientations that differ by less, 11°, are one: a fifth of a tilt shows between
+them."""
 LARGE_RAD = 0.01
+"""Tilts and errors of faces beyond this are asked about: a fixture's are far smaller,
+and poses of a unit in the hand lie on a cube by chance."""
 
 
 @dataclass(frozen=True)

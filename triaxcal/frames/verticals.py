@@ -13,8 +13,7 @@ from triaxcal.estimate.calibration import Calibration
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
-
-SIGNIFICANT = 0.05
+from triaxcal.poses.pure_error import SIGNIFICANT
 
 
 @dataclass(frozen=True)

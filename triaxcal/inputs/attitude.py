@@ -36,6 +36,8 @@ from triaxcal.poses.pose_labels import the_poses
 from triaxcal.poses.pure_error import LACK_OF_FIT, pure_error_dof
 
 DILUTION_MOST = 100.0
+"""Largest standard error of a combination of the twelve parameters, in errors of one
+pose: the limit that a fit to still poses has."""
 SECOND_ORDER = 0.2
 """Share of a standard error from which on squares of the misalignments' errors are added to it."""
 RAISED = 1.5

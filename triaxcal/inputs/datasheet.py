@@ -25,8 +25,14 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof
 
 STEPS_MOST = 60
+"""Bounds the search, which ends sooner where it converges and refuses where it does
+not."""
 CONVERGED = 1e-12
+"""Relative step of the search at which rounding is all that is left."""
 CONFLICT = 0.01
+"""Probability below which poses contradict the datasheet: one sound unit in a hundred
+is called so. A higher level would blame more; a lower one let more changed units
+pass."""
 NAMED = 0.95
 """Probability with which the value that has changed is among those named: the level of coverage."""
 SHARE_LEAST = 1e-6

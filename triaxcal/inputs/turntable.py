@@ -17,16 +17,24 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import lack_of_fit_p
 
 PARAMETERS = 12
+"""A matrix of nine and three offsets: the attitudes tell the rotation as well."""
 ROUNDS_MOST = 60
+"""Steps of Gauss–Newton, which ends sooner where it converges."""
 CONVERGED = 1e-11
+"""Relative change of the matrix from step to step: far below any noise, above
+rounding."""
 ALARM = 0.005
 """Probability that one of a set of right rows is called wrong."""
 ESTIMATE_BELOW = 0.2
 """Residuals of less probability are put down to the attitudes, where nobody declared their error."""
 ERROR_LEAST = 1e-8
+"""Attitudes that are off by less, in rad (2 milliarcseconds), count as exact."""
 ERROR_MOST = 0.3
 """Attitudes that are off by more, in rad, carry nothing."""
 PAIRS_MOST = 400
+"""Pairs of rows of which each is tried for the rotation: one of two right rows is
+enough. All pairs of 28 rows; of more rows some, always the same, for the sake of
+time."""
 TIED = 0.02
 """Rows that take out of the sum of squares within this share of each other cannot be distinguished."""
 

@@ -15,6 +15,7 @@ from triaxcal.model.samples import Samples
 from triaxcal.poses.stillness.windows import RATE_SAMPLES
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000, "ns": 1}
+"""Nanoseconds in a unit of time (SI prefixes)."""
 TIME_COLUMN, OUTPUTS = "t_s", ("ux", "uy", "uz")
 NO_ROLES = frozenset(
     ("x", "y", "z", "ax", "ay", "az", "u_x", "u_y", "u_z", "acc_x", "acc_y", "acc_z", "time", "timestamp", "time_s")

@@ -11,9 +11,13 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.errors import InvalidData
 from triaxcal.model.order import in_order
+from triaxcal.model.sensor import LINEAR
 
 PAPER, FULL = 14, 26
-LEAST = 9
+"""Faces and vertices of a cube, as the paper has them; with its edges, which let
+effects of second and third order be seen together."""
+LEAST = LINEAR
+"""A pose tells one number, |a|: fewer cannot carry nine parameters."""
 Direction = tuple[str, Floats]
 """A label, and the unit vector (3,) of up in the unit's frame."""
 

@@ -11,16 +11,18 @@ STANDARD_GRAVITY = 9.80665
 
 # Geodetic Reference System 1980 (Moritz 2000, J. Geodesy 74:128).
 _EQUATOR_MPS2 = 9.7803267715
-_SOMIGLIANA_K = 0.001931851353
-_E2 = 0.00669438002290
-_FLATTENING = 1 / 298.257222101
-_RADIUS_M = 6_378_137.0
+_SOMIGLIANA_K = 0.001931851353  # k of Somigliana's formula, GRS80
+_E2 = 0.00669438002290  # first eccentricity squared, GRS80
+_FLATTENING = 1 / 298.257222101  # f, GRS80
+_RADIUS_M = 6_378_137.0  # semi-major axis a, GRS80
 _M = 0.00344978600308
 """Centrifugal acceleration over gravity at the equator."""
 ANOMALY_MPS2 = 1795**0.5 * 1e-5
 """rms over the Earth of what gravity differs from this formula by: 42 mGal (Tscherning and Rapp 1974: point variance of
 free-air anomalies 1795 mGal²)."""
 HEIGHTS_M = (-500.0, 9000.0)
+"""From below the lowest shore on land (the Dead Sea, −430 m) to above the highest
+summit (8849 m): beyond them a height is a slip, or in other units."""
 
 
 def local_gravity(latitude_deg: float, height_m: float) -> float:

@@ -16,6 +16,9 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 
+LINEAR = 9
+"""Parameters without effects: scale factor, misalignment and bias, three of each."""
+
 SOLVE_TOLERANCE = 1e-13
 """Relative step, of the reference vector, at which the inverse of a nonlinear model counts as found."""
 
@@ -129,6 +132,7 @@ class Sensor:
 
 
 _UNITY = np.eye(3)
+"""The derivative of a reading that has no effects in it: the unit matrix, made once."""
 
 
 def _solved(slopes: Floats, right: Floats) -> Floats:

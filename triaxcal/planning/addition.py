@@ -20,14 +20,16 @@ from triaxcal.model.directions import (
     linear_design,
     worst_error,
 )
+from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.clock import PLANS_CLOCK
-from triaxcal.planning.design import LINEAR, Asked, channels_needed, profile_times
+from triaxcal.planning.design import Asked, channels_needed, profile_times
 from triaxcal.planning.optimal import profile
 
 ENOUGH = 1.25
 """A set is good whose worst parameter is no more uncertain than this many poses' standard errors (the 14 have 1.06
 where all are alike), and whose effects come out no more than so many times worse than from the plan of 26."""
-MOST = 26
+MOST = FULL
+"""No more are added than a whole plan has: that would be the better one to take."""
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,15 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect
 from triaxcal.effects.in_run import of_clocks
 from triaxcal.effects.wrapped import Wrapped
+from triaxcal.model.directions import FULL
 
 PLANS_CLOCK = "plans_clock"
 """`TIME` from −1 to 1, where that itself is in seconds."""
-POSES = 27
+POSES = FULL + 1
+"""Of the plan that shapes are chosen for: the one of 26, its first pose repeated."""
 HELD_SHARE = 0.01
+"""How long a pose is held, where the plan is two long: an eighth of the time from pose
+to pose, so that a step falls between poses as a rule."""
 
 
 @dataclass(frozen=True)

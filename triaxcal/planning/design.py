@@ -10,13 +10,13 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME, Effect
 from triaxcal.model.directions import linear_design
+from triaxcal.model.sensor import LINEAR
 
 SHOWS = 1e-6
 """A combination of coefficients shows at all where this share of it is left beside the nine parameters."""
 VISIBLE = 0.02
 """What shows of an effect, or of a coefficient, can be used where at least this share of it is left beside all else.
 What is less comes of directions that are a degree off."""
-LINEAR = 9
 
 
 def channels_needed(effects: Sequence[Effect]) -> tuple[str, ...]:

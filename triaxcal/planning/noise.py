@@ -13,11 +13,12 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.initial_estimate import started_problem
 from triaxcal.estimate.likelihood import Problem, State, linearise, solve
-from triaxcal.estimate.pose_fit import SIGNIFICANT, fit
+from triaxcal.estimate.pose_fit import fit
+from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.clock import OnPlansClock
-from triaxcal.planning.design import LINEAR, VISIBLE, combinations
+from triaxcal.planning.design import VISIBLE, combinations
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import pure_error_dof
+from triaxcal.poses.pure_error import SIGNIFICANT, pure_error_dof
 
 
 @dataclass(frozen=True, eq=False)

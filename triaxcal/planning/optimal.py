@@ -20,7 +20,8 @@ from triaxcal.effects.contract import TIME, Effect
 from triaxcal.errors import Refused
 from triaxcal.model.directions import Direction, cube_directions, directions, linear_design, worst_error
 from triaxcal.model.order import in_order
-from triaxcal.planning.design import LINEAR, Asked, ask, channels_needed, needs_time, profile_times
+from triaxcal.model.sensor import LINEAR
+from triaxcal.planning.design import Asked, ask, channels_needed, needs_time, profile_times
 
 WORSE_MOST = 1.5
 """The nine parameters may come out so many times worse than by the plain plan of as many poses."""
@@ -31,6 +32,9 @@ CUBE_COSTS = 0.01
 APART_DEG = 10.0
 """Directions are no nearer to each other than this, or a station would count them once."""
 STARTS, PASSES_MOST, BOUND_STEPS = 4, 12, 150
+"""Exchange finds a local optimum: the best of so many is taken. Its passes end sooner
+where nothing changes. The bound holds after any number of steps; fewer leave it too
+high, and the efficiency that is told too low."""
 EVEN = 2e-3
 """Share of an even design in the one that the bound is taken at."""
 LEVELS = (2, 3, 4)

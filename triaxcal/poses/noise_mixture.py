@@ -17,10 +17,16 @@ from triaxcal.arrays import Floats
 from triaxcal.distributions import DOF_MOST, t_isf
 
 DOF_LEVEL = 0.99
+"""Coverage at which the reach of the mixture is taken: far enough out for improbable
+levels to count, not so far that only they do."""
 DOF_GRID = np.geomspace(1.0, 1e5, 200)
+"""Degrees of freedom between which it is interpolated, 6 % apart; beyond the last
+Student's t is the normal distribution."""
 LIKELY = 1e-6
 """Models less probable than this are none."""
 GRID = 4000
+"""Places at which the likelihood is reckoned, between which it is interpolated: it is
+smooth, and is asked for hundreds of thousands of sums of squares."""
 CHI2_LEAST = 1e-3
 """Below it the likelihood does not change any more."""
 

@@ -24,10 +24,15 @@ from triaxcal.poses.noise_mixture import NoiseLevels
 BANDS = 1.25
 """Ordinates of a periodogram are gathered in bands whose edges rise by this factor."""
 TIME_CONSTANTS = 12
+"""First-order processes tried, evenly in the logarithm. Together they have one prior,
+so that their number costs time alone; fewer leave gaps."""
 LENGTHS = 12
+"""Moving averages tried, in the same way."""
 SLOWEST = 0.40
 """exp(3/2 − γ) / 2π: ∫(1 − sinc²(πx)) dx/x from 0 to X tends to ln X + ln 2π + γ − 3/2."""
 STEPS = 12
+"""Of the search for amplitudes. Always all, so that the same bits come out everywhere;
+each step costs as much as the first."""
 FLICKER = 0.3
 """Odds, before the data, of 1/f noise strong enough to matter (decision 0022)."""
 MISFIT = 1e-3
@@ -234,6 +239,7 @@ def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Flo
 
 
 SUBSETS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]], dtype=bool)
+"""Which of the three amplitudes are above zero: all seven are solved, the best is taken."""
 
 
 def _amplitudes(basis: Floats, power: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]:

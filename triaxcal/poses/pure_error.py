@@ -17,6 +17,9 @@ from triaxcal.poses.pose import Pose
 
 LACK_OF_FIT = 0.01
 """Residuals of less probability (`Residual.lack_of_fit_p`) are more than noise."""
+SIGNIFICANT = 0.05
+"""The usual level of a test that excludes nothing: below it a misfit is worth a warning,
+or a variance of its own. Chance makes one in twenty."""
 BEYOND_DOUBT = 0.2
 """Where residuals like these have less than this probability, the residuals alone say how large the noise is."""
 

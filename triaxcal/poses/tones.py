@@ -18,12 +18,18 @@ from triaxcal.poses.noise_spectrum import Track
 CYCLES_LEAST = 4.0
 """What is slower, in cycles a pose, is the noise that the mean has."""
 WINDOWS_LEAST = 24
+"""A pose of 2.4 s (decision 0025): shorter ones have too little noise beside a tone to
+tell it by."""
 TONES_MOST = 6
+"""Each takes three degrees of freedom: so many leave a quarter of the shortest
+pose's."""
 LOUD = 30.0
 """A tone is so many times the median power about its frequency; noise makes one in one pose of two hundred."""
 ABOUT = 8
 """The median is taken over so many cycles a pose to either side."""
 PADDED = 2
+"""Times the length, by zeros appended: bins are half a cycle apart, so that a tone
+between two of them loses less."""
 
 
 @dataclass(frozen=True)

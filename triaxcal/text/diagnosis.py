@@ -17,6 +17,7 @@ from triaxcal.units import ErrorUnit
 __all__ = ["advice", "call", "cause", "chance", "errors", "lines", "reason", "unexplained"]
 
 EVEN = 0.5
+"""Probability from which on it is likelier than not that nothing acts."""
 LIKELIEST = 3
 """Effects that are named where none is likely."""
 CALLS = {

@@ -26,6 +26,7 @@ from triaxcal.uncertainty.stated import Stated
 from triaxcal.uncertainty.thermal import needs_temperature, temperature, thermometer
 
 LEVEL = 0.95
+"""Coverage of expanded uncertainties: the usual one (JCGM 100, annex G)."""
 
 
 @dataclass(frozen=True)

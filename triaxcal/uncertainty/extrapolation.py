@@ -16,6 +16,7 @@ from triaxcal.poses.covariates import at_moment
 STEP = 1e-4
 """Relative step of the derivative by a shape, far above rounding and far below the curvature of any effect."""
 FACES = np.concatenate([np.eye(3), -np.eye(3)])
+"""(6,3) up along each sensitive axis, both ways, where a bias shows whole."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ from triaxcal.model.directions import spiral
 from triaxcal.poses.covariates import at_moment
 
 SPHERE = 200
+"""Directions in a mean over the sphere. The variance of the magnitude is a polynomial
+of the fourth degree there, which so many average well."""
 
 
 class ErrorPropagation:

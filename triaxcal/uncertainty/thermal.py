@@ -27,6 +27,8 @@ SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
 """Standard deviation, before any data, of a coefficient that the fit has not taken up: in references per kelvin, and
 per kelvin. Typical of a mass-market MEMS accelerometer's data sheet; a navigation unit is ten times better."""
 NO_SENSITIVITY = 1e-12
+"""In place of a sensitivity of zero, whose inverse is infinite: it makes nothing that
+shows."""
 
 
 def temperature(

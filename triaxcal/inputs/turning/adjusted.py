@@ -78,10 +78,10 @@ def _undoing() -> list[tuple[tuple[int, int], tuple[int, int], tuple[int, ...], 
 
 
 _TERMS = _undoing()
-_TO = tuple(np.array([t[0] for t in _TERMS]).T)
-_FROM = tuple(np.array([t[1] for t in _TERMS]).T)
-_POWERS = np.array([t[2] for t in _TERMS])
-_FACTOR = np.array([t[3] for t in _TERMS])
+_TO = tuple(np.array([t[0] for t in _TERMS]).T)  # entries that are corrected
+_FROM = tuple(np.array([t[1] for t in _TERMS]).T)  # entries that hold the lower moments
+_POWERS = np.array([t[2] for t in _TERMS])  # of the variances of the axes
+_FACTOR = np.array([t[3] for t in _TERMS])  # products of the coefficients of `_UNDO`
 
 
 def corrected(moments: Floats, variance: Floats) -> Floats:

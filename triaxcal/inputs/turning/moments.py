@@ -18,7 +18,10 @@ from triaxcal.errors import InvalidData
 MONOMIALS = [e for e in itertools.product(range(3), repeat=3) if sum(e) <= 2]
 """Exponents of the ten monomials of a quadric; products of two of them give all up to the fourth degree."""
 STRETCHES_MOST = 128
+"""Bounds the memory. Once they are put together in pairs half of them are left, twice
+as many as a judgement of their scatter needs. Even, so that pairs come out."""
 STRETCH_LEAST = 16
+"""Samples in a stretch to begin with: as many as are kept of one (`SAMPLED`)."""
 SAMPLED = 16
 """Samples that are kept of every stretch, to know the directions."""
 DIFFERENCE = 4
@@ -26,6 +29,8 @@ DIFFERENCE = 4
 _DIFFERENCE_GAIN = 70.0
 """What it does to the variance of white noise: the sum of the squares of 1, 4, 6, 4, 1."""
 _PIECE = 1 << 13
+"""Samples of which products are formed at once, which bounds the memory. A power of
+two, as a stretch's length is one: either holds the other a whole number of times."""
 _SPAN_LIMIT = 1e60
 """Outputs whose range, or its inverse, is larger would not survive the fourth power."""
 

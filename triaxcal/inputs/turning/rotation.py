@@ -41,10 +41,15 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pure_error import LACK_OF_FIT
 
 SAMPLES_LEAST = 100
+"""Nine parameters and three noises by fewer samples would be chance. Errs on the side
+of refusing."""
 ROUNDS_MOST = 20
+"""The noises of the axes follow the scale factors from fit to fit; it ends sooner where
+these no longer change."""
 DILUTION_MOST = 100.0
 """Largest standard error of a combination of parameters, in noises of one sample over the root of their number."""
 DILUTION_WARNING = 10.0
+"""A tenth of what is refused: errors still hold, but are large."""
 UNSEEN_WARNING = 0.2
 """Share of a coefficient's variance from which on the unknown share of the noise is worth a word."""
 QUICK = 0.7
@@ -55,9 +60,13 @@ UNEQUAL = 2.5
 STRETCHES_LEAST = 30
 """With fewer, the scatter between stretches says too little for nine parameters."""
 OUTLIER_SIGMA = 6.0
+"""Robust standard deviations, which noise passes twice in 10⁹: sound stretches stay.
+What is off by less stays too, and raises the standard errors."""
 OUTLIERS_MOST = 0.05
 """Stretches that stand out so far from the others are excluded, if they are no more than this share."""
 OUTLIER_ROUNDS = 4
+"""Large outliers hide lesser ones, so that it is looked again without them; ends sooner
+where none is left."""
 SPIKE = 10.0
 """How many times farther than nine tenths of all others a stretch may reach."""
 STEPS = 0.5

@@ -20,11 +20,11 @@ from triaxcal.poses.quality.run_lengths import RunLengths
 from triaxcal.poses.quality.timing import Gaps
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.quantization import OTHERWISE, shown_step
-from triaxcal.poses.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, Windows
+from triaxcal.poses.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, WINDOW_LEAST, WINDOW_S, Windows
 
-CELL_S = 0.1
-CELL_LEAST = 3
 CHUNK_LEAST = 4096
+"""Samples that are judged at once, 256 blocks of noise: enough for their quantiles, and
+little memory. Not less at slow rates, where a chunk then lasts longer."""
 
 
 @dataclass
@@ -71,7 +71,7 @@ class QualityDetector:
         time_ns = time_ns[:enough]
         lag = len(time_ns) // 4
         self._period_ns = max(float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag, 1.0)
-        size = max(CELL_LEAST, round(CELL_S * 1e9 / self._period_ns))
+        size = max(WINDOW_LEAST, round(WINDOW_S * 1e9 / self._period_ns))
         self._chunk = -(-CHUNK_LEAST // size) * size
         self._cells, self._steps, self._runs = CellKeeper(size), StepEstimator(), RunLengths()
         self._gaps, self._spectra = Gaps(), mains.Spectra(self._period_ns)

@@ -11,13 +11,26 @@ from triaxcal.arrays import Bools, Floats, Ints
 LATTICE = 20.5
 """Differences up to so many steps tell whether there are steps at all."""
 OFF_LATTICE = 0.05
+"""Steps by which a difference may miss a whole number of them; one in ten is as near by
+chance."""
 LATTICE_LEAST = 8
+"""Differences that have to lie on the lattice: by chance as many do once in ten
+million."""
 COARSE = 0.5
+"""Noise in steps, of a sample: with less, readings rest on one value for long."""
 HUSHED = 0.35
+"""The same for the quietest tenth of the blocks, which chance makes quieter than the
+rest."""
 BLOCK = 16
+"""Samples in a block. Longer ones hold noise and motion at once; of shorter ones chance
+decides which it is."""
 BLOCKS_LEAST = 4
+"""Blocks of noise in a chunk below which their quantiles say nothing."""
 NOISE_LIKE = 0.4
+"""Variance by fourth differences over that by second ones: 1 for white noise, next to 0
+for smooth motion. Nearer to 1 sound noise is lost by chance."""
 NOISY_SHARE = 0.2
+"""Of all blocks: moves and stretches without noise may fill the others."""
 NOISELESS = 1e-13
 """Scatter, as a share of the readings, that the arithmetic makes."""
 FINEST = 1e-10

@@ -25,19 +25,35 @@ from triaxcal.poses.quality.run_lengths import ROWS, EqualRun, RunLengths
 from triaxcal.poses.stillness.quantization import noise_of
 
 RAIL_LEAST = 10
+"""Readings at a rail beyond `RAIL_TIMES` those of other poses: poses of few are not
+judged."""
 RAIL_TIMES = 3
+"""As often as any other pose reads its own extreme: vibration too dwells at its
+extremes."""
 REFERENCES_LEAST = 4
+"""Other poses that say how often an extreme is read; with fewer, chance says it."""
 CLIPPED_LEAST = 3
+"""Readings at a known rail: one or two are the tail of the noise, or a knock."""
 CLIPPED_SHARE = 0.005
+"""Of a pose. Gaussian noise that is cut off there has its mean shifted by 0.0016 of its
+standard deviation: less than that does no harm."""
 SMOOTH = 2.0
 """Scatter in steps above which no single code is much more frequent than those beside it."""
 APART = 20.0
+"""Steps between the extreme and the fifth value below it from which on a coincidence is
+reckoned: nearer ones are the tail of the noise."""
 COINCIDENCE = 1e-4
+"""Probability below which the same extreme, reached several times, is a rail and no
+chance."""
 FULL_SCALE_BITS = (15, 17, 19, 23, 31)
 """Largest magnitudes of two's complement numbers that no nominal scale factor makes out of 1 g."""
 SLOW_SHARE = 0.1
+"""Of samples that repeat: up to this some came twice, above it the sensor updates more
+slowly than it is read."""
 REPEATS_LEAST = 10
+"""Repeats from which on their number says more than chance."""
 REPEATED_SHARE = 0.002
+"""Beyond twice what chance expects, which is itself an estimate: less does no harm."""
 
 
 def saturation(

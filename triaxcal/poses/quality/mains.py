@@ -17,21 +17,33 @@ from triaxcal.distributions import gamma_sf
 from triaxcal.poses.quality.finding import MainsPickup, StillIntervals, Tone
 
 MAINS_HZ = (50.0, 60.0)
+"""Nominal frequencies of the public grids."""
 HARMONICS = (1, 2, 3)
+"""The mains and two harmonics. Each more is one more place at which noise, or a motor,
+may pass for it."""
 TOLERANCE = 0.02
 """The mains wander by half a hertz in fifty, and the sampling clock is off by up to one percent."""
 SEGMENT_S = 1.0
+"""One bin is 1 Hz then. Longer segments fit into fewer poses; shorter ones do not part
+a line from the noise beside it."""
 SEGMENT_LEAST = 16
+"""Samples in a segment where the rate is low; no band of the mains has room in so few
+bins."""
 SEGMENTS_LEAST = 8
+"""Segments of still poses below which their mean spectrum is too rough to judge."""
 GAP = 4.0
 """A silence longer than this many sample periods ends a segment."""
 GUARD = 3
+"""Bins from a band to its flank: a line at its edge reaches two through a Hann
+window."""
 FLANK = 8
 """Bins beside a band: a line at its edge reaches the first ones, the others show the noise."""
 FALSE_ALARM = 3e-4
 """Of all tests of a recording together."""
 OUTLYING = 4.0
-LOUD = 4.0
+"""Standard deviations above the noise beside a band: bins beyond hold a line of their
+own."""
+LOUD = 4.0  # over the median level: a machine was on, or somebody knocked
 KNOCK = 12.0
 """Segments this much louder than most are left out, and bins of a single one count no more than this: knocks."""
 WIDEST = 0.125

@@ -11,13 +11,24 @@ from triaxcal.arrays import Bools, Floats, Ints
 ROWS = 4
 """The three axes, and all of them together."""
 LONGEST_COUNTED = 4096
+"""Lengths that are counted each by itself; longer runs count as this long, and are kept
+besides."""
 KEPT_LEAST = 8
+"""Samples in a run from which on it is kept by itself: shorter ones are common in sound
+noise. A frozen output of fewer samples is not told."""
 KEPT_MOST = 256
+"""Longest runs that are kept of each row, which bounds the memory; all others are
+counted."""
 RUNS_LEAST = 200
 """Runs from which it is learned how long they are."""
 FALSE_ALARM = 1e-4
+"""Probability, in a stream, of a run by chance that is called a fault."""
 MARGIN = 1.5
+"""By which the tail may fall more slowly than was learned, from one run in a
+thousand."""
 SCALE_LEAST = 0.3
+"""Samples over which the tail falls by a factor of e, at least: as though one sample in
+28 repeated, where fewer do. Errs on the side of calling nothing a fault."""
 
 
 @dataclass(frozen=True)

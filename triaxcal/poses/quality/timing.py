@@ -11,11 +11,19 @@ from triaxcal.arrays import Floats, Ints
 OFF_LATTICE = 0.2
 """Time stamps of an even clock: steps within this many periods of a whole number of them."""
 EVEN_SHARE = 0.95
+"""Of steps that are whole periods, from which on the clock is even: a few may be
+late."""
 EVEN_LEAST = 0.4
+"""Median step over the average period below which samples come in bursts: half of the
+steps lie within one then, and say nothing of the period."""
 BESIDE = 64
+"""Samples on each side of a gap whose earliest stamps are compared: more find a
+prompter one, but two gaps within them count as one."""
 SHIFT_LEAST = 0.75
 """Of uneven time stamps, a gap is what shifts all that follow by so many periods."""
 LONG = 3.5
+"""Periods: of uneven stamps only steps above three are looked at, since late ones make
+others."""
 
 
 @dataclass

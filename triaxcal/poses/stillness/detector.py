@@ -19,7 +19,7 @@ from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
 from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrasts
 from triaxcal.poses.stillness.quantization import Rounding, resolution
-from triaxcal.poses.stillness.shaken import ALONE_S, runs, shaken_noise, shaken_runs
+from triaxcal.poses.stillness.shaken import ALONE_S, MOVE_SIGMA, runs, shaken_noise, shaken_runs
 from triaxcal.poses.stillness.trimming import SPAN_LEAST_WINDOWS, trimmed
 from triaxcal.poses.stillness.turns import without_turns
 from triaxcal.poses.stillness.windows import WindowCutter, Windows
@@ -27,10 +27,12 @@ from triaxcal.poses.stillness.windows import WindowCutter, Windows
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
 
 SPAN_LEAST_S = 0.4
+"""Four windows (decision 0008): in less there is hardly a middle beside the ends."""
 REJOIN_S = 1.5
 """A disturbance shorter than this, with the same mean before and after, is a bump inside one pose."""
 FALSE_ALARM = 1e-6
-MOVE_SIGMA = 5.0
+"""Probability that the noise of an axis takes a still window for motion: once in 28
+hours."""
 STEP_SIGMA = 7.0
 """Of a single step, tested on noise that need not be Gaussian."""
 BESIDE = 6

@@ -30,6 +30,8 @@ OTHERWISE = 1.5
 FINE = 1.0
 """Noise of so many steps has nothing to do with them any more: exp(−2π²) is 3e-9."""
 HARMONICS = np.arange(1, 50)[:, None]
+"""Of the series in the place between two steps. Without noise its terms go with 1/k²
+and what is left out is 1.2 %; with noise they vanish as an exponential."""
 SIGMAS = np.linspace(0.0, FINE, 201)
 """Noise in steps, where its inverse is looked up."""
 BLUR = 0.01

@@ -20,9 +20,12 @@ from triaxcal.poses.stillness.trimming import trimmed
 from triaxcal.poses.stillness.windows import Windows
 
 LEAST_S = 1.0
+"""A shorter rest between shaking is not told from a hand that hesitates."""
 ALONE_S = 1.5
 """A span that is shaken throughout lasts longer than a hand hesitates; a part of one need not."""
 MOVE_SIGMA = 5.0
+"""Of a difference of averages: noise passes it once in two million. Less would cut
+poses in pieces; more lets slight moves pass."""
 TONE = 0.5
 """The bound for tones over `MOVE_SIGMA`, about: a standard deviation to judge by."""
 LONGEST = 16

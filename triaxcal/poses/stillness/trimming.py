@@ -9,11 +9,12 @@ from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales
 from triaxcal.poses.stillness.windows import Windows
 
 SPAN_LEAST_WINDOWS = 3
+"""Windows in a span: fewer have no middle that ends could differ from."""
 EDGE_SIGMA = 3.5
 """At the ends of a run, where a false alarm costs a few windows and nothing else."""
 EVENLY = 0.1
 """The scatter of a steady tone repeats itself to less than that: a little more of it at an end is no sign of a move."""
-ONSET_SIGMA = 6.0
+ONSET_SIGMA = 6.0  # standard deviations of the mean of a window, which no noise reaches
 ONSET_WINDOWS = 30
 """Where the onset of a move is judged by what follows: well above the noise, and within this reach."""
 

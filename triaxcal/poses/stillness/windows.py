@@ -15,13 +15,18 @@ from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.errors import InvalidData
 
 WINDOW_S = 0.1
+"""Short beside a pose and a move, so that edges cost little; long beside a sample, so
+that summaries are few (decision 0008)."""
 WINDOW_LEAST = 3
+"""Samples in a window at low rates: fewer tell no scatter."""
 GAP = 4.0
 """A silence longer than this many sample periods ends a window, and a span."""
-RATE_SAMPLES = 64
+RATE_SAMPLES = 64  # steps are taken over a quarter of them, so that bursts average out
 RATE_S = 1.0
 """The sample period is learned from at least so many samples over at least so long."""
 RATE_LEAST = 12
+"""Samples of a stream that ends before that; with fewer the period is not known, and
+there is no window."""
 READING_MOST = 1e100
 """Squares of readings, and sums of them, have to be numbers too."""
 
