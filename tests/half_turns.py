@@ -51,7 +51,7 @@ class Hand:
 # The pull towards the axis is all that a slow smooth turn shows; nearer to the axis it would be lost in the noise.
 HANDS = {
     "lifts it and puts it down": Hand((1.0, 4.0), band_hz=(0.5, 12.0)),
-    "is quick": Hand((0.9, 1.6), band_hz=(0.5, 12.0)),
+    "is quick": Hand((1.0, 1.6), band_hz=(0.5, 12.0)),
     "slides it on the table": Hand((1.0, 4.0)),
     "slides it slowly": Hand((4.0, 8.0)),
     "changes its grip half-way": Hand((1.4, 3.0), stops_s=(0.5, 1.4)),

@@ -17,8 +17,9 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.poses.stillness.windows import Windows
 
-TURN_S = 0.8
-"""Turning a fixture by half a circle and putting it down takes longer; so does a knock, seldom."""
+TURN_S = 1.0
+"""Turning a fixture by half a circle and putting it down takes as long; some knocks that ring do.
+What noise makes of the longest averages, which are over 0.8 s, is shorter, but for rare chance."""
 IN_PLACE = 0.01
 """Of the range of the outputs. Where poses cover the sphere this is 20 mrad: two orientations on a
 table that tilts by 10 mrad, or the pull 8 cm off the axis of half a turn in 2 s, on average."""
