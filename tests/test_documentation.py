@@ -393,6 +393,7 @@ def keys_of(value: object, named: frozenset[str]) -> set[str]:
 
 NAMED = frozenset(
     {
+        "cannot_show",
         "held_out_rms_g",
         "channels",
         "channel_reference",

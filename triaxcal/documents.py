@@ -227,6 +227,8 @@ class Calibration:
         durations = [p.pose.end_s - p.pose.start_s for p in self._fitted.poses]
         return float(np.median(durations)) if durations else DURATION_S
 
+    held_s = duration_s  # its older name
+
     def _channels_in(self, table: Any, by_ours: Mapping[str, str]) -> dict[str, Any]:
         """Of those that the model needs: under their own names, and under those that they are called by."""
         needed = self._needed()

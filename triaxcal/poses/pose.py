@@ -88,6 +88,16 @@ class Pose:
             raise InvalidData(f"pose at {self.start_s:.3f} s: mean or covariance is not a finite number")
 
     @property
+    def trend(self) -> Floats:
+        """`slope`, by its older name."""
+        return self.slope
+
+    @property
+    def trend_error(self) -> float:
+        """`slope_error`, by its older name."""
+        return self.slope_error
+
+    @property
     def t_s(self) -> float:
         return (self.start_s + self.end_s) / 2
 

@@ -282,8 +282,8 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
 
 
 def check_lines(places: Sequence[Place], *, where: str) -> None:
-    """Every line carries those of its units that are to be recorded, and all of them drive it alike. Raises InputError
-    with the arithmetic."""
+    """Every shared line carries those of its units that are to be recorded, and all of them drive it alike. A unit alone
+    has what the line gives, and its losses are counted. Raises InputError with the arithmetic."""
     lines: dict[str, list[tuple[int, str, LineLoad]]] = {}
     for i, place in enumerate(places):
         loads = getattr(driver_named(place.bundle.profile.driver), "loads", None)
@@ -301,7 +301,7 @@ def check_lines(places: Sequence[Place], *, where: str) -> None:
                     f"{places[units[0][0]].unit.name} for {first.settings}"
                 )
         total = sum(load.share for _, _, load in units)
-        if total > 1:
+        if total > 1 and len({i for i, _, _ in units}) > 1:
             each = " + ".join(
                 f"{name} {load.reads_per_s:.3g}/s × {1e3 * load.read_s:.3g} ms" for _, name, load in units
             )

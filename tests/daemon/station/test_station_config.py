@@ -168,6 +168,8 @@ def test_a_station_is_read_whatever_its_lines_carry_and_one_unit_of_it_is_record
     places = on_one_line(workshop, RTU, RTU, {**RTU, "baudrate": 57600}).places
     for place in places:
         check_lines([place], where="a.toml")
+    (slow,) = on_one_line(workshop, {**RTU, "baudrate": 9600}).places
+    check_lines([slow], where="a.toml")  # which loses samples, and counts them
 
 
 def test_a_pseudo_terminal_carries_what_it_is_given(workshop: Any) -> None:
