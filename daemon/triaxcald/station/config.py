@@ -282,7 +282,7 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
 
 
 def check_lines(places: Sequence[Place], *, where: str) -> None:
-    """Every shared line carries those of its units that are to be recorded, and all of them drive it alike. A unit alone
+    """Every shared line carries those of its units that are recorded, and all of them drive it alike. A unit alone
     has what the line gives, and its losses are counted. Raises InputError with the arithmetic."""
     lines: dict[str, list[tuple[int, str, LineLoad]]] = {}
     for i, place in enumerate(places):

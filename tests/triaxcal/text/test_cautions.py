@@ -115,9 +115,9 @@ SENTENCES: list[tuple[Caution, str]] = [
     ),
     (
         DatasheetContradicted(1.2e-9, ("bias.x", "scale_factor.x"), (20.04, 19.96), alone=False, raised=3.21),
-        "passport and poses contradict each other (p 1.2e-09), most in bias.x (+20.0 standard errors) or "
+        "datasheet and poses contradict each other (p 1.2e-09), most in bias.x (+20.0 standard errors) or "
         "scale_factor.x (+20.0 standard errors), which these poses do not tell apart; a change of one value does not "
-        "explain all of it: the unit has changed, the passport's standard errors are too small, or a pose was not "
+        "explain all of it: the unit has changed, the datasheet's standard errors are too small, or a pose was not "
         "still; the standard errors are raised by 3.2",
     ),
     (
