@@ -1,4 +1,5 @@
-"""The metrology of three-axis accelerometers: numbers in, numbers out. Needs numpy and scipy alone.
+"""The metrology of three-axis accelerometers: numbers in, numbers out. Needs
+numpy and scipy alone.
 
     import triaxcal as tc
 

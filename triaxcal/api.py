@@ -1,4 +1,5 @@
-"""From samples to a calibration, for whoever calls from Python: `import triaxcal as tc`."""
+"""From samples to a calibration, for whoever calls from Python: `import
+triaxcal as tc`."""
 
 from __future__ import annotations
 
@@ -33,15 +34,17 @@ from triaxcal.units import ErrorUnit
 
 
 class PlannedPose(NamedTuple):
-    """``label`` names the axes that point up ("+X-Y"); ``up`` (3,) is that direction in the sensor's frame."""
+    """``label`` names the axes that point up ("+X-Y"); ``up`` (3,) is that
+    direction in the sensor's frame."""
 
     label: str
     up: tuple[float, float, float]
 
 
 class Poses(tuple[Pose, ...]):
-    """Still poses, in order of time. ``data_quality`` has a line for everything that the raw stream is to be blamed
-    for; ``output_unit`` is what `find_poses` was given."""
+    """Still poses, in order of time. ``data_quality`` has a line for everything
+    that the raw stream is to be blamed for; ``output_unit`` is what
+    `find_poses` was given."""
 
     data_quality: tuple[str, ...] = ()
     output_unit: str = ""
@@ -59,9 +62,11 @@ class Poses(tuple[Pose, ...]):
         channels: Mapping[str, Any] | None = None,
         time_unit: str | None = None,
     ) -> Poses:
-        """One pose a row, where only means are known: ``u`` (n,3) in output units, ``standard_errors`` (n,3) of them,
-        ``t`` (n,) as in `find_poses`, ``channels`` (n,) each. Without standard errors the noise is estimated from the
-        residuals of the linear model, so that no lack of fit can show. Raises Refused, InvalidData."""
+        """One pose a row, where only means are known: ``u`` (n,3) in output
+        units, ``standard_errors`` (n,3) of them, ``t`` (n,) as in `find_poses`,
+        ``channels`` (n,) each. Without standard errors the noise is estimated
+        from the residuals of the linear model, so that no lack of fit can show.
+        Raises Refused, InvalidData."""
         readings = tables.readings_of(u)
         if readings.ndim != 2:
             raise InvalidData(f"u: expected shape (n, 3), one row a pose, not {readings.shape}")
@@ -77,10 +82,12 @@ class Poses(tuple[Pose, ...]):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The closed loop: ``before`` is the linear calibration, ``calibration`` the one to use, with the effects that were
-    found; ``findings`` act for certain, ``candidates`` more likely than not, and ``probabilities`` has that of every
-    effect that was looked for; ``unexplained`` is what no effect describes, ``held_out`` the error in poses that no fit
-    saw, ``advice`` what to do, a line each. ``call`` is whether the calibration can be used."""
+    """The closed loop: ``before`` is the linear calibration, ``calibration``
+    the one to use, with the effects that were found; ``findings`` act for
+    certain, ``candidates`` more likely than not, and ``probabilities`` has that
+    of every effect that was looked for; ``unexplained`` is what no effect
+    describes, ``held_out`` the error in poses that no fit saw, ``advice`` what
+    to do, a line each. ``call`` is whether the calibration can be used."""
 
     before: Calibration
     calibration: Calibration
@@ -95,7 +102,8 @@ class Diagnosis:
     _lines: tuple[str, ...] = field(repr=False, default=())
 
     def summary(self) -> str:
-        """Whether it can be used, what acts, the error before and after, and what to do, a line each."""
+        """Whether it can be used, what acts, the error before and after, and
+        what to do, a line each."""
         return "\n".join(["Diagnosis", *(f"  {line}" for line in self._lines)])
 
     def __repr__(self) -> str:
@@ -104,8 +112,9 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Verification:
-    """Errors |a| − reference (n,) of ``poses`` under a calibration, in the unit of the reference, with their standard
-    errors from noise (n,), and the standard uncertainty of |a| that the calibration leaves there (n,)."""
+    """Errors |a| − reference (n,) of ``poses`` under a calibration, in the unit
+    of the reference, with their standard errors from noise (n,), and the
+    standard uncertainty of |a| that the calibration leaves there (n,)."""
 
     poses: tuple[Pose, ...]
     error: Floats
@@ -145,10 +154,12 @@ def find_poses(
 ) -> Poses:
     """The still spans of a recording, without a threshold.
 
-    ``t`` (n,) floats in seconds, datetimes, or integers with ``time_unit`` (s, ms, us, ns); ``u`` (n,3) output units;
-    ``channels`` (n,) each by name. Or ``t`` a DataFrame with the columns t_s, ux, uy, uz and any further channels;
-    ``columns`` says how they are called where that is otherwise, channels too: {"t": "time", "ux": "ax", …, "temp_c":
-    "Temperatur"}. A file is first read into a DataFrame, by whatever reads it. Raises InvalidData.
+    ``t`` (n,) floats in seconds, datetimes, or integers with ``time_unit`` (s,
+    ms, us, ns); ``u`` (n,3) output units; ``channels`` (n,) each by name. Or
+    ``t`` a DataFrame with the columns t_s, ux, uy, uz and any further channels;
+    ``columns`` says how they are called where that is otherwise, channels too:
+    {"t": "time", "ux": "ax", …, "temp_c": "Temperatur"}. A file is first read
+    into a DataFrame, by whatever reads it. Raises InvalidData.
     """
     samples = _samples(t, u, channels, time_unit, columns)
     detector, judge = StillnessDetector(), QualityDetector()
@@ -183,9 +194,10 @@ def calibrate(
 ) -> Calibration:
     """Fit the linear model, and the ``effects`` named, to still poses.
 
-    ``poses`` from `find_poses`; or what that takes. ``signs`` (3,) of the scale factors, which |a| does not show;
-    ``reference`` the magnitude of the reference vector in ``reference_unit``. Raises Refused where the poses cannot
-    carry the parameters, InvalidData.
+    ``poses`` from `find_poses`; or what that takes. ``signs`` (3,) of the scale
+    factors, which |a| does not show; ``reference`` the magnitude of the
+    reference vector in ``reference_unit``. Raises Refused where the poses
+    cannot carry the parameters, InvalidData.
     """
     found = _poses(poses, u, channels, time_unit, columns, output_unit)
     names = [effects] if isinstance(effects, str) else list(effects)
@@ -217,8 +229,9 @@ def diagnose(
 ) -> Diagnosis:
     """Find what the poses show beyond the linear model, and add it.
 
-    As `calibrate`; ``check`` are poses of another recording, or a table of its samples, for the held-out error; ``at``
-    the moment for which effects of time hold elsewhere: "end", "mean", or seconds from the first sample.
+    As `calibrate`; ``check`` are poses of another recording, or a table of its
+    samples, for the held-out error; ``at`` the moment for which effects of time
+    hold elsewhere: "end", "mean", or seconds from the first sample.
     """
     found = _poses(poses, u, channels, time_unit, columns, output_unit)
     try:
@@ -252,9 +265,11 @@ def diagnose(
 
 
 def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> Verification:
-    """The errors of the magnitude in still poses of another recording, as `find_poses` gives them or takes samples.
+    """The errors of the magnitude in still poses of another recording, as
+    `find_poses` gives them or takes samples.
 
-    Poses whose samples have a fault are excluded. Raises Refused where none is left, InvalidData.
+    Poses whose samples have a fault are excluded. Raises Refused where none is
+    left, InvalidData.
     """
     found = [p for p in _poses(poses, u, **how) if not p.fault]
     if not found:
@@ -272,15 +287,17 @@ def verify(calibration: Calibration, poses: Any, u: Any = None, **how: Any) -> V
 
 
 def plan(poses: int = FULL) -> tuple[PlannedPose, ...]:
-    """Where to point the unit, in an order in which attitude and time tell apart; the first pose comes once more at
-    the end, so there is one more than ``poses``. Raises InvalidData for fewer than 9."""
+    """Where to point the unit, in an order in which attitude and time tell
+    apart; the first pose comes once more at the end, so there is one more than
+    ``poses``. Raises InvalidData for fewer than 9."""
     return tuple(PlannedPose(label, (float(x), float(y), float(z))) for label, (x, y, z) in closed(directions(poses)))
 
 
 def budget(calibration: Calibration, stated: uncertainty.Stated | None = None) -> uncertainty.Budget:
-    """The uncertainty budget by the GUM (JCGM 100). ``stated`` is what no recording can tell, by default what the
-    calibration was made with. Raises InvalidData where
-    the calibration is not of still poses, or was loaded: its document holds the budget then."""
+    """The uncertainty budget by the GUM (JCGM 100). ``stated`` is what no
+    recording can tell, by default what the calibration was made with. Raises
+    InvalidData where the calibration is not of still poses, or was loaded: its
+    document holds the budget then."""
     stated = calibration.stated if stated is None else stated
     if not calibration.poses:
         raise InvalidData(

@@ -1,4 +1,5 @@
-"""Close the loop: what acts beyond the linear model, with which probability, and what the error becomes with it."""
+"""Close the loop: what acts beyond the linear model, with which probability,
+and what the error becomes with it."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ class Verdict(StrEnum):
     ADOPTED = "adopted"
     """Known, and corrected."""
     CONFOUNDED = "confounded"
-    """One of several acts; or it is known, and no effect is corrected (`Loop.refusal`)."""
+    """One of several acts; or it is known, and no effect is corrected
+    (`Loop.refusal`)."""
 
 
 class Recommendation(StrEnum):
@@ -46,17 +48,20 @@ class Recommendation(StrEnum):
     USABLE = "usable"
     """What acts is known and corrected, or nothing does."""
     RECORD_MORE = "record_more"
-    """What acts is not known for certain, and poses could tell; or the calibration is less certain than the unit comes
-    back after a start."""
+    """What acts is not known for certain, and poses could tell; or the
+    calibration is less certain than the unit comes back after a start."""
     INVESTIGATE = "investigate"
-    """Something acts that no effect describes, or this is not one unit in one mounting."""
+    """Something acts that no effect describes, or this is not one unit in one
+    mounting."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect that acts for certain, alone or as the likeliest of ``alternatives``, each with its probability;
-    ``together`` is that of at least one of them. The ``coefficients`` are those that are corrected, or else those if it
-    is this effect that acts; ``remedy`` is how to be rid of it."""
+    """An effect that acts for certain, alone or as the likeliest of
+    ``alternatives``, each with its probability; ``together`` is that of at
+    least one of them. The ``coefficients`` are those that are corrected, or
+    else those if it is this effect that acts; ``remedy`` is how to be rid of
+    it."""
 
     effect: str
     verdict: Verdict
@@ -69,7 +74,8 @@ class Finding:
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect that acts more likely than not, and not for certain: with the ``coefficients`` if it acts."""
+    """An effect that acts more likely than not, and not for certain: with the
+    ``coefficients`` if it acts."""
 
     effect: str
     probability: float
@@ -78,9 +84,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Loop:
-    """The closed loop. ``before`` is the linear calibration, ``after`` the one that is handed on; ``found`` all that is
-    read off the posterior. ``not_identifiable`` are effects that these poses cannot show in full, ``faulty`` those of
-    other packages that cannot be used, each with the reason."""
+    """The closed loop. ``before`` is the linear calibration, ``after`` the one
+    that is handed on; ``found`` all that is read off the posterior.
+    ``not_identifiable`` are effects that these poses cannot show in full,
+    ``faulty`` those of other packages that cannot be used, each with the
+    reason."""
 
     before: Calibration
     after: Calibration
@@ -108,13 +116,15 @@ class Loop:
 
     @cached_property
     def next_recording(self) -> NextRecording:
-        """As the recording tells by itself, without what a station knows of its reference."""
+        """As the recording tells by itself, without what a station knows of its
+        reference."""
         return next_recording(self.after, budget(self.after))
 
     @cached_property
     def too_uncertain(self) -> bool:
-        """Whether more poses would make the next recording better, whatever acts: the calibration's own uncertainty is
-        more than half of what is expected there of a usual unit."""
+        """Whether more poses would make the next recording better, whatever
+        acts: the calibration's own uncertainty is more than half of what is
+        expected there of a usual unit."""
         known = max(self.next_recording.start_to_start, START_TO_START * self.after.reference)
         return bool(self.next_recording.standard > np.sqrt(2) * known)
 
@@ -137,12 +147,14 @@ def diagnose(
     at: Moment | float = Moment.END,
     odds: Odds | None = None,
 ) -> Loop:
-    """Find and correct the effects that still poses show beyond the linear model.
+    """Find and correct the effects that still poses show beyond the linear
+    model.
 
-    ``catalogue`` are the effects to look for: all that are known for these poses' channels where it is None. ``check``
-    are poses of another recording, for the held-out error. ``at`` is the moment of the recording for which the
-    calibration holds elsewhere: a number in seconds from the first sample. Raises as `triaxcal.estimate.pose_fit.fit`
-    does.
+    ``catalogue`` are the effects to look for: all that are known for these
+    poses' channels where it is None. ``check`` are poses of another recording,
+    for the held-out error. ``at`` is the moment of the recording for which the
+    calibration holds elsewhere: a number in seconds from the first sample.
+    Raises as `triaxcal.estimate.pose_fit.fit` does.
     """
     linear = fit(poses, signs=signs, reference=reference)
     sound = [p for p in poses if not p.fault]
@@ -175,7 +187,8 @@ def diagnose(
 def _without_outliers(
     poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], posterior: Posterior
 ) -> Calibration:
-    """The linear calibration without the poses that are outliers whatever else acts, and with all others."""
+    """The linear calibration without the poses that are outliers whatever else
+    acts, and with all others."""
     likely = {
         int(i): float(p) for i, p in zip(posterior.evidence.rows.places, posterior.outlier_probabilities, strict=True)
     }
@@ -190,7 +203,8 @@ def _without_outliers(
 
 @dataclass(frozen=True)
 class _Report:
-    """What is reported of an effect of this name: as it is in ``after``, or as it would be if it acted."""
+    """What is reported of an effect of this name: as it is in ``after``, or as
+    it would be if it acted."""
 
     posterior: Posterior
     moment: HoldsAt

@@ -1,7 +1,9 @@
-"""Tails and quantiles of the usual distributions, by the functions that ``scipy.stats`` calls too; sums of likelihoods.
+"""Tails and quantiles of the usual distributions, by the functions that
+``scipy.stats`` calls too; sums of likelihoods.
 
-That package takes longer to import than most commands take for their work. Degrees of freedom and shapes that are not
-above zero give NaN. Arguments may be arrays, which broadcast.
+That package takes longer to import than most commands take for their work.
+Degrees of freedom and shapes that are not above zero give NaN. Arguments may be
+arrays, which broadcast.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ def chi2_isf(q: Given, dof: Given) -> Floats:
 
 
 def f_sf(x: Given, above: Given, below: Given) -> Floats:
-    """Probability of a ratio F above ``x``; degrees of freedom of its numerator and of its denominator."""
+    """Probability of a ratio F above ``x``; degrees of freedom of its numerator
+    and of its denominator."""
     return _defined(special.fdtrc(above, below, np.maximum(x, 0.0)), np.greater(above, 0) & np.greater(below, 0))
 
 
@@ -66,8 +69,9 @@ def _defined(value: Any, where: Bools | np.bool_) -> Floats:
 
 
 def log_sum_exp(log: Sequence[Any] | Floats, axis: int | tuple[int, ...] | None = None) -> Floats:
-    """The logarithm of a sum of what is given by its logarithm, along axes; −∞ counts nothing. SciPy's takes ten times
-    as long for a few hundred values, and the posterior takes a thousand such sums."""
+    """The logarithm of a sum of what is given by its logarithm, along axes; −∞
+    counts nothing. SciPy's takes ten times as long for a few hundred values,
+    and the posterior takes a thousand such sums."""
     values = np.asarray(log)
     largest = np.max(values, axis=axis, keepdims=True)
     largest = np.where(np.isfinite(largest), largest, 0.0)

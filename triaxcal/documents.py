@@ -1,4 +1,5 @@
-"""A calibration as callers have it: applied, shown, and kept as the JSON document that others script against.
+"""A calibration as callers have it: applied, shown, and kept as the JSON
+document that others script against.
 
 The one file of the metrology that opens files.
 """
@@ -34,9 +35,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RETURNS = 1e-6
-"""How far a reading may be off, relative to its size, that is made from its own specific force."""
+"""How far a reading may be off, relative to its size, that is made from its own
+specific force."""
 BESIDE, BESIDE_S = 1.2, 60.0
-"""A recording ends after its last pose: by a fifth of its length and a minute at most."""
+"""A recording ends after its last pose: by a fifth of its length and a minute
+at most."""
 HOLD_S = 1.0
 """By so much a recording may end before its last pose seemed to."""
 DURATION_S = 5.0
@@ -48,10 +51,11 @@ UNCERTAINTY = ("u_ax", "u_ay", "u_az")
 class Calibration:
     """Scale factors, misalignments, biases and effects of one unit.
 
-    From `triaxcal.calibrate`, `triaxcal.diagnose`, or a file (`load`); of a file, what only a fit knows is NaN.
-    `apply` takes readings in output units and gives the specific force in the unit of the reference vector, in the
-    sensor's own orthogonal frame: ``a = A (u − c)`` for a linear one, with the matrix A (3,3) and the centre c (3,)
-    (paper, eq. 4).
+    From `triaxcal.calibrate`, `triaxcal.diagnose`, or a file (`load`); of a
+    file, what only a fit knows is NaN. `apply` takes readings in output units
+    and gives the specific force in the unit of the reference vector, in the
+    sensor's own orthogonal frame: ``a = A (u − c)`` for a linear one, with the
+    matrix A (3,3) and the centre c (3,) (paper, eq. 4).
     """
 
     def __init__(
@@ -77,7 +81,8 @@ class Calibration:
 
     @property
     def stated(self) -> Stated | None:
-        """What was stated that no recording can tell; None of a calibration that was loaded."""
+        """What was stated that no recording can tell; None of a calibration
+        that was loaded."""
         return self._stated
 
     @property
@@ -107,7 +112,8 @@ class Calibration:
 
     @property
     def matrix(self) -> Floats:
-        """A (3,3). Beside effects it is not a calibration without them: see `linear_only`."""
+        """A (3,3). Beside effects it is not a calibration without them: see
+        `linear_only`."""
         return self._fitted.sensor.matrix
 
     @property
@@ -122,7 +128,8 @@ class Calibration:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """By parameter ("bias.x", "temperature_bias.x"), in its unit; NaN where they are not known."""
+        """By parameter ("bias.x", "temperature_bias.x"), in its unit; NaN where
+        they are not known."""
         return dict(zip(self._fitted.parameters, map(float, self._fitted.standard_errors), strict=True))
 
     @property
@@ -131,7 +138,8 @@ class Calibration:
 
     @property
     def poses(self) -> tuple[PoseResult, ...]:
-        """Those of the fit; none of a calibration that was loaded (`to_dict` has them)."""
+        """Those of the fit; none of a calibration that was loaded (`to_dict`
+        has them)."""
         return self._fitted.poses
 
     @property
@@ -150,8 +158,8 @@ class Calibration:
 
     @property
     def linear_only(self) -> Calibration:
-        """The linear calibration fitted by itself; this one where it has no effects. Raises InvalidData where nobody
-        fitted it."""
+        """The linear calibration fitted by itself; this one where it has no
+        effects. Raises InvalidData where nobody fitted it."""
         if not self._fitted.sensor.effects:
             return self
         if self._fitted.linear_only is not None:
@@ -179,15 +187,19 @@ class Calibration:
     ) -> Any:
         """Calibrated readings.
 
-        ``u`` (3,) or (n,3) in output units, or a DataFrame with the columns ux, uy, uz: then a DataFrame of the same
-        library with ax, ay, az, whose other columns serve as channels; ``columns`` says how it calls them where that is
-        otherwise, as in `find_poses`. Where it has the times too, rates and lags of channels are those of the rows.
-        ``channels`` are named as in
-        ``channel_reference`` of the document (temp_c, temp_c.rate, before_x, …), one number or (n,) each; one that an
-        effect needs and that is not given counts as at its reference, with a `MissingChannel` warning. Effects of time
-        hold at `holds_at`, or with ``own_recording`` at the times ``t`` (n,) from the first sample of the recording
-        that was fitted. ``uncertainty``: also the standard uncertainties that the calibration gives them, in the same
-        shape, without the noise of the readings. Raises InvalidData; Refused where the model has no inverse.
+        ``u`` (3,) or (n,3) in output units, or a DataFrame with the columns ux,
+        uy, uz: then a DataFrame of the same library with ax, ay, az, whose
+        other columns serve as channels; ``columns`` says how it calls them
+        where that is otherwise, as in `find_poses`. Where it has the times too,
+        rates and lags of channels are those of the rows. ``channels`` are named
+        as in ``channel_reference`` of the document (temp_c, temp_c.rate,
+        before_x, …), one number or (n,) each; one that an effect needs and that
+        is not given counts as at its reference, with a `MissingChannel`
+        warning. Effects of time hold at `holds_at`, or with ``own_recording``
+        at the times ``t`` (n,) from the first sample of the recording that was
+        fitted. ``uncertainty``: also the standard uncertainties that the
+        calibration gives them, in the same shape, without the noise of the
+        readings. Raises InvalidData; Refused where the model has no inverse.
         """
         table = u if tables.is_table(u) else None
         if table is None and columns is not None:
@@ -217,26 +229,30 @@ class Calibration:
         return tables.like(table, out if errors is None else out | dict(zip(UNCERTAINTY, errors.T, strict=True)))
 
     def needs_recording(self) -> tuple[str, ...]:
-        """Rates and lags of channels that the effects need: what no single reading shows, and a recording does."""
+        """Rates and lags of channels that the effects need: what no single
+        reading shows, and a recording does."""
         needs = dict.fromkeys(name for effect, _ in self._fitted.sensor.effects for name in effect.needs)
         return tuple(name for name in needs if followed(name))
 
     @property
     def duration_s(self) -> float:
-        """How long the poses were held of which it is, in the median: over such a time rates of channels are taken."""
+        """How long the poses were held of which it is, in the median: over such
+        a time rates of channels are taken."""
         durations = [p.pose.end_s - p.pose.start_s for p in self._fitted.poses]
         return float(np.median(durations)) if durations else DURATION_S
 
     held_s = duration_s  # its older name
 
     def _channels_in(self, table: Any, by_ours: Mapping[str, str]) -> dict[str, Any]:
-        """Of those that the model needs: under their own names, and under those that they are called by."""
+        """Of those that the model needs: under their own names, and under those
+        that they are called by."""
         needed = self._needed()
         found = {name: tables.column(table, name) for name in tables.names_of(table) if name in needed}
         return found | {name: tables.column(table, theirs) for name, theirs in by_ours.items() if name in needed}
 
     def _in_stream(self, table: Any, by_ours: Mapping[str, str], time_unit: str | None) -> dict[str, Floats]:
-        """Rates and lags that the effects need, where the rows have times that are known: those of a recording."""
+        """Rates and lags that the effects need, where the rows have times that
+        are known: those of a recording."""
         needed, names, time = self.needs_recording(), tables.names_of(table), by_ours[tables.TIME_COLUMN]
         if not needed or time not in names:
             return {}
@@ -276,7 +292,8 @@ class Calibration:
         return times
 
     def require_whole(self, t: Floats) -> None:
-        """Raises InvalidData where times from a table's own first row cannot be those of the whole recording."""
+        """Raises InvalidData where times from a table's own first row cannot be
+        those of the whole recording."""
         end_s = self._end_s()
         if end_s is not None and len(t) and t[-1] < end_s - HOLD_S:
             raise InvalidData(
@@ -285,14 +302,16 @@ class Calibration:
             )
 
     def _end_s(self) -> float | None:
-        """When the last pose of the recording that was fitted ended; None where that is not known."""
+        """When the last pose of the recording that was fitted ended; None where
+        that is not known."""
         poses = calibration_part(self.to_dict(), where="document").get("poses")
         ends = [p.get("end_s") for p in poses if isinstance(p, Mapping)] if isinstance(poses, list) else []
         known = [float(e) for e in ends if isinstance(e, int | float)]
         return max(known) if known else None
 
     def _require_inverse(self, u: Floats, a: Floats, covariates: Mapping[str, Floats]) -> None:
-        """Raises Refused where the readings do not come out of what they were made into."""
+        """Raises Refused where the readings do not come out of what they were
+        made into."""
         with np.errstate(all="ignore"):
             back = self._fitted.sensor.output(a, covariates)
             wrong = ~(np.abs(back - u).max(axis=1) <= RETURNS * (1 + np.abs(u).max(axis=1)))
@@ -324,8 +343,9 @@ class Calibration:
         return covariates
 
     def uncertainty_in(self, poses: Sequence[Pose]) -> Floats:
-        """(n,) standard uncertainty of |a| in poses of another recording that the calibration leaves, without the
-        noise of these poses. Raises InvalidData where a channel that the effects need is missing."""
+        """(n,) standard uncertainty of |a| in poses of another recording that
+        the calibration leaves, without the noise of these poses. Raises
+        InvalidData where a channel that the effects need is missing."""
         c = self._fitted
         u = np.array([p.mean for p in poses])
         covariates = covariates_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
@@ -344,7 +364,8 @@ class Calibration:
         return np.sqrt(variance)
 
     def _steps(self, u: Floats, covariates: Mapping[str, Floats]) -> Iterator[Floats]:
-        """(n,3) each: one standard error along each principal axis of the parameters' covariance, and what it does."""
+        """(n,3) each: one standard error along each principal axis of the
+        parameters' covariance, and what it does."""
         c = self._fitted
         covariance = c.covariance * np.outer(*[self._after_the_recording(c)] * 2)
         if not np.isfinite(covariance).all():
@@ -356,7 +377,8 @@ class Calibration:
             yield sensor.moved(step).specific_force(u, covariates) - a
 
     def _after_the_recording(self, c: Fitted) -> Floats:
-        """(p,) standard uncertainties over standard errors: what the budget has beside the fit."""
+        """(p,) standard uncertainties over standard errors: what the budget has
+        beside the fit."""
         budget = calibration_part(self.to_dict(), where="document").get("uncertainty") or {}
         out = []
         for name, error in zip(c.parameters, c.standard_errors, strict=True):
@@ -368,7 +390,8 @@ class Calibration:
         return np.array(out)
 
     def to_dict(self) -> Document:
-        """The `triaxcal.calibration/1` document; as it was loaded, where it was."""
+        """The `triaxcal.calibration/1` document; as it was loaded, where it
+        was."""
         if self._document is None:
             self._document = calibration_document(
                 self._fitted,
@@ -381,8 +404,8 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], *, where: str = "document") -> Calibration:
-        """Of a calibration, loop or certificate document, of 0.1 too. Raises InvalidData, which begins with
-        ``where``."""
+        """Of a calibration, loop or certificate document, of 0.1 too. Raises
+        InvalidData, which begins with ``where``."""
         part = calibration_part(document, where=where)
         units = part.get("units")
         named = units if isinstance(units, Mapping) else {}
@@ -394,7 +417,8 @@ class Calibration:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Whole or not at all. Raises OSError; InvalidData where the document cannot be written as JSON."""
+        """Whole or not at all. Raises OSError; InvalidData where the document
+        cannot be written as JSON."""
         if not Path(path).parent.is_dir():
             raise FileNotFoundError(errno.ENOENT, "there is no folder", str(Path(path).parent))
         try:
@@ -409,12 +433,14 @@ class Calibration:
         return cls.from_dict(read_document(Path(path)), where=str(path))
 
     def summary(self) -> str:
-        """A few lines: the coefficients with their standard errors, the residual, and what speaks against it."""
+        """A few lines: the coefficients with their standard errors, the
+        residual, and what speaks against it."""
         return text.summary(self._fitted, self.output_unit, self.reference_unit, self.warnings)
 
     def plot(self) -> Figure:
-        """The residuals of the poses, and where these lie on the sphere: also of a loaded document, which holds them.
-        Raises InvalidData where there are none; ModuleNotFoundError without matplotlib."""
+        """The residuals of the poses, and where these lie on the sphere: also
+        of a loaded document, which holds them. Raises InvalidData where there
+        are none; ModuleNotFoundError without matplotlib."""
         from triaxcal.pictures import residuals_figure  # matplotlib, which nothing else needs
 
         return residuals_figure(calibration_part(self.to_dict(), where="document"))
@@ -437,7 +463,8 @@ def _of(budget: Mapping[str, Any], key: str, parameter: str) -> float | None:
 
 
 def read_document(path: Path) -> Mapping[str, Any]:
-    """A JSON object. Raises InvalidData, which names file and line, and OSError."""
+    """A JSON object. Raises InvalidData, which names file and line, and
+    OSError."""
     with path.open("rb") as file:
         data = file.read()
     try:
@@ -452,7 +479,8 @@ def read_document(path: Path) -> Mapping[str, Any]:
 
 
 def to_text(document: Mapping[str, Any]) -> str:
-    """The document as it is written and compared: UTF-8, two spaces, one key a line, a newline at the end."""
+    """The document as it is written and compared: UTF-8, two spaces, one key a
+    line, a newline at the end."""
     return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 

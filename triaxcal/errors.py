@@ -10,13 +10,15 @@ class TriaxcalError(Exception):
 
 
 class InvalidData(TriaxcalError):
-    """Numbers that cannot be what they are said to be: shapes, NaN, times that run backwards."""
+    """Numbers that cannot be what they are said to be: shapes, NaN, times that
+    run backwards."""
 
 
 class Refused(TriaxcalError):
     """The data cannot carry the answer.
 
-    ``wanted`` names the poses that would mend it (labels of `triaxcal.model.directions`), best first.
+    ``wanted`` names the poses that would mend it (labels of
+    `triaxcal.model.directions`), best first.
     """
 
     def __init__(self, message: str, *, wanted: Sequence[str] = ()) -> None:
@@ -32,4 +34,5 @@ class NotStill(Refused):
 
 
 class MissingChannel(UserWarning):
-    """A channel that an effect needs was not given, and counts as at its reference."""
+    """A channel that an effect needs was not given, and counts as at its
+    reference."""

@@ -1,4 +1,5 @@
-"""How numbers are written in sentences: without an exponent where one can do without."""
+"""How numbers are written in sentences: without an exponent where one can do
+without."""
 
 from __future__ import annotations
 
@@ -7,13 +8,15 @@ P_LEAST = 1e-12
 
 
 def plain(value: float, digits: int = 3, sign: str = "") -> str:
-    """To so many significant digits, and with all those before the point; ``sign`` "+" also for what is positive."""
+    """To so many significant digits, and with all those before the point;
+    ``sign`` "+" also for what is positive."""
     text = f"{value:{sign}.{digits}g}"
     return f"{value:{sign}.0f}" if "e+" in text and abs(value) < 1e15 else text
 
 
 def micro_g(value: float | None, sign: str = "") -> str:
-    """A number of g in µg: to a tenth, as in tables, or to three digits where that is finer."""
+    """A number of g in µg: to a tenth, as in tables, or to three digits where
+    that is finer."""
     if value is None:
         return "unknown"
     count = value * 1e6

@@ -1,4 +1,5 @@
-"""Pictures of results. The one room of the metrology that imports matplotlib, when it is called."""
+"""Pictures of results. The one room of the metrology that imports matplotlib,
+when it is called."""
 
 from __future__ import annotations
 
@@ -18,8 +19,9 @@ SIZE_IN = (9.0, 4.0)
 
 
 def residuals_figure(document: Mapping[str, Any]) -> Figure:
-    """Of a `triaxcal.calibration/1`: the residuals of its poses in their order, with their standard errors, and where
-    the poses lie on the sphere, in an equal-area projection of both halves. Raises InvalidData where it has no
+    """Of a `triaxcal.calibration/1`: the residuals of its poses in their order,
+    with their standard errors, and where the poses lie on the sphere, in an
+    equal-area projection of both halves. Raises InvalidData where it has no
     poses."""
     from matplotlib.figure import Figure  # not pyplot: no window, no state
 

@@ -1,7 +1,9 @@
-"""Several units in one environment, eight sensors on a board say: which effects act in all of them.
+"""Several units in one environment, eight sensors on a board say: which effects
+act in all of them.
 
-Every unit has its own linear model and its own coefficients of an effect. They may share which effect it is, its size,
-and its shape (a time constant, the moment of a step). Existence is asked of all together.
+Every unit has its own linear model and its own coefficients of an effect. They
+may share which effect it is, its size, and its shape (a time constant, the
+moment of a step). Existence is asked of all together.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ class Answer(StrEnum):
 
 @dataclass(frozen=True)
 class SharedShape:
-    """A shape that the units share, and their ``own`` by the index of each unit that may have the effect."""
+    """A shape that the units share, and their ``own`` by the index of each unit
+    that may have the effect."""
 
     shared: Shape
     own: Mapping[int, Shape]
@@ -37,9 +40,11 @@ class SharedShape:
 
 @dataclass(frozen=True)
 class PooledEffect:
-    """An effect: the ``probability`` that it acts in every unit, and ``common`` that its values are the same in all, if
-    it does. ``units`` is the probability that it acts in each, by that unit alone. ``named`` are the units (indices) in
-    which it is a finding by itself, ``listed`` those in which it is among others of which one acts."""
+    """An effect: the ``probability`` that it acts in every unit, and ``common``
+    that its values are the same in all, if it does. ``units`` is the
+    probability that it acts in each, by that unit alone. ``named`` are the
+    units (indices) in which it is a finding by itself, ``listed`` those in
+    which it is among others of which one acts."""
 
     effect: str
     probability: float
@@ -52,9 +57,11 @@ class PooledEffect:
 
 @dataclass(frozen=True)
 class PooledAnalysis:
-    """``agreed`` are groups of effects, in each of which one acts in every unit; where the answer is only likely, that
-    one effect. ``probability`` is that of the most doubtful of the groups. ``effects`` are all that
-    every unit could have shown, the likeliest first; ``nothing`` is the probability that none acts in any unit."""
+    """``agreed`` are groups of effects, in each of which one acts in every
+    unit; where the answer is only likely, that one effect. ``probability`` is
+    that of the most doubtful of the groups. ``effects`` are all that every unit
+    could have shown, the likeliest first; ``nothing`` is the probability that
+    none acts in any unit."""
 
     answer: Answer
     agreed: tuple[tuple[str, ...], ...]
@@ -64,7 +71,8 @@ class PooledAnalysis:
 
 
 def pooled_analysis(loops: Sequence[Loop]) -> PooledAnalysis:
-    """Of units that were diagnosed one by one. Raises InvalidData for fewer than two."""
+    """Of units that were diagnosed one by one. Raises InvalidData for fewer
+    than two."""
     if len(loops) < 2:
         raise InvalidData("whether units agree takes two of them")
     smallest = min(float(loop.posterior.evidence.sizes[0]) for loop in loops)

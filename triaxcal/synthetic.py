@@ -1,4 +1,5 @@
-"""A sensor whose truth is known: attitude path, environment, noise and any effect of the catalogue."""
+"""A sensor whose truth is known: attitude path, environment, noise and any
+effect of the catalogue."""
 
 from __future__ import annotations
 
@@ -22,10 +23,12 @@ COVARIATES = frozenset({TEMPERATURE, rate_of(TEMPERATURE), *LAGS, TIME, SINCE_ST
 
 @dataclass(frozen=True)
 class Tumble:
-    """A path from pose to pose, for ever: ``hold_s`` still in each direction, then ``move_s`` on the shortest arc.
+    """A path from pose to pose, for ever: ``hold_s`` still in each direction,
+    then ``move_s`` on the shortest arc.
 
-    ``directions`` (k,3) of up in the sensor's frame, unit vectors. The move follows a minimum-jerk profile; the sensor
-    sits ``lever_m`` off the axis it turns about and feels the tangential and the centripetal acceleration.
+    ``directions`` (k,3) of up in the sensor's frame, unit vectors. The move
+    follows a minimum-jerk profile; the sensor sits ``lever_m`` off the axis it
+    turns about and feels the tangential and the centripetal acceleration.
     """
 
     directions: Floats
@@ -43,7 +46,8 @@ class Tumble:
         return self.step_s * len(self.directions)
 
     def before(self, t_s: Floats) -> Floats:
-        """a (n,3) in g in the pose before, that at times (n,) is held or left; that of the first pose itself in it."""
+        """a (n,3) in g in the pose before, that at times (n,) is held or left;
+        that of the first pose itself in it."""
         return self.taken(np.maximum(self._step(t_s) - 1, 0))
 
     def taken(self, step: Ints) -> Floats:
@@ -71,7 +75,8 @@ class Tumble:
 
 
 def _square(here: Floats, there: Floats) -> Floats:
-    """Unit vectors at right angles to ``here``, towards ``there``; any where the two are opposite."""
+    """Unit vectors at right angles to ``here``, towards ``there``; any where
+    the two are opposite."""
     across = there - np.sum(here * there, axis=1, keepdims=True) * here
     length = np.linalg.norm(across, axis=1, keepdims=True)
     spare = np.cross(here, np.where(np.abs(here[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
@@ -97,7 +102,8 @@ class Environment:
         return np.asarray(self.ramp_c_per_s + self.swing_c * turn * np.cos(turn * t_s))
 
     def temperature_lag(self, t_s: Floats, constant_s: float) -> Floats:
-        """By how much a first-order lag is off the temperature, which stood still before the start."""
+        """By how much a first-order lag is off the temperature, which stood
+        still before the start."""
         turn = 2 * np.pi / self.swing_period_s
         x, gone = turn * constant_s, np.exp(-np.asarray(t_s) / constant_s)
         swing = self.swing_c * x / (1 + x**2) * (gone - np.cos(turn * t_s) - x * np.sin(turn * t_s))
@@ -106,8 +112,10 @@ class Environment:
 
 @dataclass
 class SyntheticUnit:
-    """A sensor on its path. ``noise_g`` (3,) is white, of one sample; effects count from ``channel_reference``, and
-    from zero what goes with the temperature's rate, the time since the start or the pose before (`COVARIATES`)."""
+    """A sensor on its path. ``noise_g`` (3,) is white, of one sample; effects
+    count from ``channel_reference``, and from zero what goes with the
+    temperature's rate, the time since the start or the pose before
+    (`COVARIATES`)."""
 
     sensor: Sensor
     path: Tumble
@@ -120,7 +128,8 @@ class SyntheticUnit:
         self._rng = np.random.default_rng(self.seed)
 
     def sample(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Outputs (n,3) and temperature (n,) at times (n,). The noise goes on from call to call."""
+        """Outputs (n,3) and temperature (n,) at times (n,). The noise goes on
+        from call to call."""
         t_s = np.asarray(t_s, dtype=float)
         temperature = self.environment.temperature(t_s)
         a = self.path.specific_force(t_s)
@@ -149,10 +158,11 @@ def noisy_poses(
     channel_reference: Mapping[str, float] | None = None,
     hold_s: float = 10.0,
 ) -> list[Pose]:
-    """Pose means as a perfect detector would give them, one after the other, ``hold_s`` apart.
+    """Pose means as a perfect detector would give them, one after the other,
+    ``hold_s`` apart.
 
-    ``standard_error_g`` of a mean: one number, (3,) by axis, or (n,3). Covariates count from ``channel_reference``
-    (0 where not given).
+    ``standard_error_g`` of a mean: one number, (3,) by axis, or (n,3).
+    Covariates count from ``channel_reference`` (0 where not given).
     """
     n = len(directions)
     error = np.broadcast_to(np.asarray(standard_error_g, dtype=float), (n, 3)) * np.abs(sensor.scale_factor)

@@ -1,4 +1,5 @@
-"""How units are written: small errors of the magnitude, and coefficients where the reference is not in g."""
+"""How units are written: small errors of the magnitude, and coefficients where
+the reference is not in g."""
 
 from __future__ import annotations
 
@@ -19,8 +20,9 @@ _G = re.compile(r"(?<![A-Za-zµ_])g(?![A-Za-z_])")
 
 @dataclass(frozen=True)
 class ErrorUnit:
-    """The unit in which errors of the magnitude are reported to people: ``unit``, that of the reference vector, times
-    ten to the ``exponent``. µg as it is; where nobody named the unit, ppm of the reference, whose magnitude is
+    """The unit in which errors of the magnitude are reported to people:
+    ``unit``, that of the reference vector, times ten to the ``exponent``. µg as
+    it is; where nobody named the unit, ppm of the reference, whose magnitude is
     ``whole``.
     """
 
@@ -30,7 +32,8 @@ class ErrorUnit:
 
     @classmethod
     def of(cls, reference_unit: str, reference: float) -> ErrorUnit:
-        """About a millionth of the reference, by a power of a thousand: 1e-6 µT of 50 µT, 1e-12 T of 5e-5 T."""
+        """About a millionth of the reference, by a power of a thousand: 1e-6 µT
+        of 50 µT, 1e-12 T of 5e-5 T."""
         if reference_unit == "g" or not 0 < reference < math.inf:
             return cls(reference_unit)
         if reference_unit == UNNAMED:
@@ -60,7 +63,8 @@ class ErrorUnit:
         return self.in_words(micro_g(value))
 
     def in_words(self, text: str) -> str:
-        """What the metrology says in words, where it writes µg for a millionth of the reference's unit."""
+        """What the metrology says in words, where it writes µg for a millionth
+        of the reference's unit."""
         return text if self.unit == "g" else _MICRO_G.sub(self._instead, text)
 
     def _instead(self, found: re.Match[str]) -> str:
@@ -70,14 +74,15 @@ class ErrorUnit:
         return self._behind(number)
 
     def _behind(self, number: str) -> str:
-        """`20.1e-6 m/s^2`, not `20.1 1e-6 m/s^2`; a number that has an exponent keeps it."""
+        """`20.1e-6 m/s^2`, not `20.1 1e-6 m/s^2`; a number that has an exponent
+        keeps it."""
         joined = not self.name and number[-1].isdecimal() and "e" not in number
         return f"{number}e{self.exponent} {self.unit}" if joined else f"{number} {self}"
 
 
 def in_units_of(unit: str, reference_unit: str) -> str:
-    """A coefficient's unit, which the metrology writes with g for the unit of the reference vector, and with the names
-    of channels in brackets."""
+    """A coefficient's unit, which the metrology writes with g for the unit of
+    the reference vector, and with the names of channels in brackets."""
     if reference_unit == "g":
         return unit
     parts = _CHANNEL.split(unit)
@@ -101,5 +106,6 @@ def _spelled(unit: str) -> str:
 
 
 def reference_unit_of(reference: float) -> str:
-    """g where the magnitude can be gravity in units of g, else what the caller did not name."""
+    """g where the magnitude can be gravity in units of g, else what the caller
+    did not name."""
     return "g" if 0.9 <= reference <= 1.1 else UNNAMED

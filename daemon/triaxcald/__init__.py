@@ -1,1 +1,2 @@
-"""The daemon: recording, station, provisioning, audit, command line. Knows the metrology and the drivers."""
+"""The daemon: recording, station, provisioning, audit, command line. Knows the
+metrology and the drivers."""

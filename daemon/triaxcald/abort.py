@@ -1,7 +1,9 @@
-"""The end at once, without unwinding: what is still done before it, what is said, and the exit code.
+"""The end at once, without unwinding: what is still done before it, what is
+said, and the exit code.
 
-It comes from a signal handler, in the midst of whatever the main thread was doing. What it calls therefore takes no
-lock that the main thread could hold, and waits for nothing without a bound.
+It comes from a signal handler, in the midst of whatever the main thread was
+doing. What it calls therefore takes no lock that the main thread could hold,
+and waits for nothing without a bound.
 """
 
 from __future__ import annotations
@@ -18,11 +20,13 @@ from typing import NamedTuple, NoReturn
 STOP_SIGNALS = [s for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None)) is not None]
 DEVICE, INTERRUPTED = 4, 130
 CLOSING_S = 1.0
-"""For all that is still to be done, together: a disk that works has long finished a recording by then."""
+"""For all that is still to be done, together: a disk that works has long
+finished a recording by then."""
 
 
 class Left(NamedTuple):
-    """What the end leaves behind, in words; ``in_doubt`` where nobody can vouch for what a device holds."""
+    """What the end leaves behind, in words; ``in_doubt`` where nobody can vouch
+    for what a device holds."""
 
     note: str
     in_doubt: bool = False
@@ -55,7 +59,8 @@ def at_abort(action: Action) -> Iterator[None]:
 
 
 def abort(reason: str) -> NoReturn:
-    """Ends the process: 130, or 4 where a device is in doubt; one line on standard error."""
+    """Ends the process: 130, or 4 where a device is in doubt; one line on
+    standard error."""
     said, code = [reason], INTERRUPTED
     try:
         for number in STOP_SIGNALS:
@@ -71,7 +76,8 @@ def abort(reason: str) -> NoReturn:
 
 
 def tell(line: str) -> None:
-    """A line to standard error, also in the midst of a write to it; nowhere, where it is closed or nobody reads."""
+    """A line to standard error, also in the midst of a write to it; nowhere,
+    where it is closed or nobody reads."""
     with suppress(AttributeError, OSError, ValueError):
         descriptor = sys.stderr.fileno()
         if select.select([], [descriptor], [], 0)[1]:

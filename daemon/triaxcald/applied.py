@@ -25,14 +25,17 @@ from triaxcald.tables.samples import Reading, read_table
 BLOCK = 65536
 """Samples at a time, of a text: its effects take some hundred bytes for each."""
 FAR = 3.0
-"""Beyond so many times the reference, or as small a part of it, the median is no matter of how the unit was moved."""
+"""Beyond so many times the reference, or as small a part of it, the median is
+no matter of how the unit was moved."""
 
 
 @dataclass
 class Applied:
-    """``blocks`` have the columns of the input, and behind them the calibrated readings; ``start_ns`` is where their
-    seconds begin, None for the first sample. ``cautions`` has, once they are through, what the calibration needs
-    and the recording lacks, and whether the readings can be of its unit; ``remarks`` say how a table was read."""
+    """``blocks`` have the columns of the input, and behind them the calibrated
+    readings; ``start_ns`` is where their seconds begin, None for the first
+    sample. ``cautions`` has, once they are through, what the calibration needs
+    and the recording lacks, and whether the readings can be of its unit;
+    ``remarks`` say how a table was read."""
 
     blocks: Iterator[Rows]
     start_ns: int | None
@@ -50,8 +53,9 @@ def applied(
     reading: Reading | None = None,
     output_unit: str = "",
 ) -> Applied:
-    """Of the recording ``name``; ``reading`` says how a table is read, and ``output_unit`` what its outputs are in.
-    Rates and lags of channels that the effects need are those of the recording, unless it logs them.
+    """Of the recording ``name``; ``reading`` says how a table is read, and
+    ``output_unit`` what its outputs are in. Rates and lags of channels that the
+    effects need are those of the recording, unless it logs them.
 
     Raises InputError, RecordingError; where its blocks are read, also Refused.
     """
@@ -116,7 +120,8 @@ def applied(
 
 
 def _of_another_unit(calibration: Calibration, name: str, lengths: list[float]) -> list[str]:
-    """A line where the magnitude, in the median of each block, is nowhere near the reference."""
+    """A line where the magnitude, in the median of each block, is nowhere near
+    the reference."""
     reference, unit = calibration.fitted.reference, calibration.reference_unit
     if not lengths or reference / FAR < (typical := float(np.median(lengths))) < reference * FAR:
         return []

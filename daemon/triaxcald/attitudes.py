@@ -1,4 +1,5 @@
-"""Attitude files: which way was up in each pose, as CSV, matched to the still poses of a recording."""
+"""Attitude files: which way was up in each pose, as CSV, matched to the still
+poses of a recording."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ TABLE_MOST, ROWS_MOST = 2**20, 10_000  # bytes; a turntable that takes ten thous
 
 @dataclass(frozen=True)
 class Row:
-    """``up`` (3,) in the table's frame; ``start_s``, ``end_s`` where the file has them. ``name`` for messages."""
+    """``up`` (3,) in the table's frame; ``start_s``, ``end_s`` where the file
+    has them. ``name`` for messages."""
 
     line: int
     name: str
@@ -33,9 +35,11 @@ class Row:
 
 
 def read_attitudes(path: str) -> list[Row]:
-    """A CSV with the columns ``x,y,z`` or ``label`` (a label of a plan), or both, and ``start_s,end_s`` or neither.
+    """A CSV with the columns ``x,y,z`` or ``label`` (a label of a plan), or
+    both, and ``start_s,end_s`` or neither.
 
-    `#` lines are comments. Raises InputError: file, line, field, what was expected.
+    `#` lines are comments. Raises InputError: file, line, field, what was
+    expected.
     """
     try:
         text = read_whole(Path(path), TABLE_MOST, pipe=True).decode("utf-8-sig")
@@ -121,7 +125,8 @@ def _labelled(where: str, label: str) -> Floats:
 
 
 def match(rows: Sequence[Row], poses: Sequence[Pose], *, path: str, recording: str) -> tuple[list[Pose], list[Row]]:
-    """The poses that have a row, and their rows: by time where the file has times, else in order.
+    """The poses that have a row, and their rows: by time where the file has
+    times, else in order.
 
     Raises InputError where the two do not go together.
     """

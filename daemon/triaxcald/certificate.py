@@ -1,7 +1,9 @@
-"""The certificate: everything that follows from a recording, its profile and its station file, and nothing else.
+"""The certificate: everything that follows from a recording, its profile and
+its station file, and nothing else.
 
-A station writes it once; an audit computes it again from the recording alone and must get the same bytes. So no clock,
-no path and no random number enters here.
+A station writes it once; an audit computes it again from the recording alone
+and must get the same bytes. So no clock, no path and no random number enters
+here.
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ TEMPERATURE = "temp_c"
 
 @dataclass(frozen=True)
 class Certified:
-    """A certificate, what it stands on, and the registers that it asks for (None where the device has none)."""
+    """A certificate, what it stands on, and the registers that it asks for
+    (None where the device has none)."""
 
     document: Document
     loop: Loop
@@ -66,9 +69,11 @@ def certify(
     signs: tuple[int, int, int],
     computed_with: Mapping[str, str],
 ) -> Certified:
-    """``computed_with``: `software` of the station, so that an audit years later can get the same bytes.
+    """``computed_with``: `software` of the station, so that an audit years
+    later can get the same bytes.
 
-    Raises Refused where the poses cannot carry the answer, RegisterValueError where the registers cannot."""
+    Raises Refused where the poses cannot carry the answer, RegisterValueError
+    where the registers cannot."""
     loop = diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
     profile = bundle.profile
     stated = station.stated(profile)
@@ -141,7 +146,8 @@ def roles(sensor: Sensor, channel_reference: Mapping[str, float]) -> dict[str, f
 
 
 def why_not_written(profile: Profile) -> str | None:
-    """Why a device cannot take a calibration at all: without one of the nine, the other eight would be wrong."""
+    """Why a device cannot take a calibration at all: without one of the nine,
+    the other eight would be wrong."""
     linear = [f"{name}.{axis}" for name in ("scale_factor", "misalignment", "bias") for axis in "xyz"]
     missing = [role for role in linear if profile.by_role(role) is None]
     return f"the device has no register for {', '.join(missing)}" if missing else None
@@ -149,9 +155,10 @@ def why_not_written(profile: Profile) -> str | None:
 
 @dataclass(frozen=True)
 class HeldByDevice:
-    """What a device can hold of a calibration: ``registers`` are the whole correction, as nearly as its registers have
-    it, at the moment for which that holds. ``beside_process`` is the same beside what belongs to the recording and not
-    to the unit, in the recording's own poses."""
+    """What a device can hold of a calibration: ``registers`` are the whole
+    correction, as nearly as its registers have it, at the moment for which that
+    holds. ``beside_process`` is the same beside what belongs to the recording
+    and not to the unit, in the recording's own poses."""
 
     registers: Reduced
     beside_process: Calibration
@@ -209,8 +216,8 @@ def _registers_document(
 
 
 def registers_hold(registers: Calibration, full: Calibration) -> list[str]:
-    """Under which conditions the linear part of the registers is all of a reading, where ``full`` has effects of time:
-    at their moment."""
+    """Under which conditions the linear part of the registers is all of a
+    reading, where ``full`` has effects of time: at their moment."""
     timed = any(of_clocks(effect) for effect, _ in full.sensor.effects)
     moment = [text.as_at(full.holds_at)] if timed and full.holds_at is not None else []
     return [*moment, *holds_of(registers)]
@@ -221,7 +228,8 @@ def _steps(image: RegisterImage) -> dict[str, float]:
 
 
 def rounding_cost(image: RegisterImage, held: Calibration, poses: list[Pose]) -> float:
-    """rms change of |a| in the poses, in g, that rounding the coefficients to their registers makes."""
+    """rms change of |a| in the poses, in g, that rounding the coefficients to
+    their registers makes."""
     rounded = {w.role: w.held for w in image.words}
     sensor = held.sensor
 
@@ -255,7 +263,8 @@ def verdict_of(outside: Sequence[str], limits: Limits) -> str:
 
 
 def over_limits(measured: Mapping[str, float | None], limits: Limits) -> list[str]:
-    """A line for each figure, by its key, that is above its limit, or that is not known."""
+    """A line for each figure, by its key, that is above its limit, or that is
+    not known."""
     out = []
     for name, limit in (("rms_g", limits.rms_g), ("cross_validated_rms_g", limits.cross_validated_rms_g)):
         value = measured.get(name)

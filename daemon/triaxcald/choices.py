@@ -1,4 +1,5 @@
-"""What each way of correcting a unit leaves: the linear model alone, its registers, its registers and a host."""
+"""What each way of correcting a unit leaves: the linear model alone, its
+registers, its registers and a host."""
 
 from __future__ import annotations
 
@@ -14,8 +15,10 @@ REGISTERS, HOST, PROCESS = "registers", "host", "process"
 
 @dataclass(frozen=True)
 class Choice:
-    """``terms`` are corrected by ``corrected_by``, in the order in which they act; ``residual`` is what is left in the
-    poses of the fit. With `PROCESS` among them, what belongs to the recording alone is taken as kept out of the next.
+    """``terms`` are corrected by ``corrected_by``, in the order in which they
+    act; ``residual`` is what is left in the poses of the fit. With `PROCESS`
+    among them, what belongs to the recording alone is taken as kept out of the
+    next.
     """
 
     corrected_by: tuple[str, ...]
@@ -24,8 +27,9 @@ class Choice:
 
 
 def choices_of(loop: Loop, held: Calibration | None = None) -> tuple[Choice, ...]:
-    """From the least to the most. ``held`` is the calibration that the device has registers for, None without one:
-    then the host corrects everything, the linear part too."""
+    """From the least to the most. ``held`` is the calibration that the device
+    has registers for, None without one: then the host corrects everything, the
+    linear part too."""
     whole = [effect for effect, _ in loop.after.sensor.effects]
     unit, process = _of_unit(loop.after), (PROCESS,) if any(map(is_passing, whole)) else ()
     first = HOST if held is None else REGISTERS
@@ -41,7 +45,8 @@ def choices_of(loop: Loop, held: Calibration | None = None) -> tuple[Choice, ...
 
 
 def is_passing(effect: Effect) -> bool:
-    """Whether an effect is the recording's rather than the unit's, so that no register could hold it."""
+    """Whether an effect is the recording's rather than the unit's, so that no
+    register could hold it."""
     return bool(effect.needs) and all(n in DERIVED or n.endswith(rate_of("")) for n in effect.needs)
 
 

@@ -1,4 +1,5 @@
-"""The whole line on two simulated units, one on CAN and one on Modbus, each with an effect hidden in it."""
+"""The whole line on two simulated units, one on CAN and one on Modbus, each
+with an effect hidden in it."""
 
 from __future__ import annotations
 
@@ -58,8 +59,9 @@ bus = {{ host = "127.0.0.1", port = {port}, unit_id = 1 }}
 class DemoUnit:
     """One unit's outcome beside its truth.
 
-    ``found`` says that what was hidden probably acts, by the diagnosis, and nothing else; ``kept`` that the device's
-    own output is within the limit still after a power cycle.
+    ``found`` says that what was hidden probably acts, by the diagnosis, and
+    nothing else; ``kept`` that the device's own output is within the limit
+    still after a power cycle.
     """
 
     hidden: Mapping[str, Mapping[str, float]]
@@ -70,7 +72,8 @@ class DemoUnit:
 
 
 async def run_demo(folder: Path, seed: int, progress: Progress) -> list[DemoUnit]:
-    """Recordings, certificates and reports go to ``folder``. Raises InputError where it cannot be made."""
+    """Recordings, certificates and reports go to ``folder``. Raises InputError
+    where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
@@ -137,7 +140,8 @@ async def _after_power_cycle(
 ) -> list[Verification | None]:
     async with AsyncExitStack() as second:
         stored = [u.unit.eeprom for u in units]
-        # Other attitudes and other noise, or the poses of the calibration would judge it.
+        # Other attitudes and other noise, or the poses of the calibration would
+        # judge it.
         anew = [device.model_copy(update={"seed": device.seed + 1}) for device in devices]
         again = [simulate(d, where="demo", stored=s) for d, s in zip(anew, stored, strict=True)]
         servers = [await second.enter_async_context(unit.serve()) for unit in again]

@@ -1,4 +1,5 @@
-"""The JSON document of a closed loop (`triaxcal.loop/1`), and how documents are written."""
+"""The JSON document of a closed loop (`triaxcal.loop/1`), and how documents are
+written."""
 
 from __future__ import annotations
 
@@ -28,11 +29,13 @@ from triaxcald.doubts import UNIT
 
 NO_LONGER_OF_A_FINDING = ("p_value", "spoiled", "coincidence", "held_out_rms_g", "apart", "residual", "pose_residual_g")
 NO_LONGER_OF_WHAT_IS_UNEXPLAINED = ("p_value", "or_spoiled", "or_named", "only_inside")
-"""Keys of 0.1 that mean nothing since names have probabilities: others read them, and find null."""
+"""Keys of 0.1 that mean nothing since names have probabilities: others read
+them, and find null."""
 
 
 def to_text(document: Mapping[str, Any]) -> str:
-    """The document as it is written and compared: UTF-8, two spaces, one key a line, a newline at the end."""
+    """The document as it is written and compared: UTF-8, two spaces, one key a
+    line, a newline at the end."""
     return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -47,8 +50,9 @@ def loop_document(
     remarks: Sequence[str] = (),
     unit_in_doubt: bool = False,
 ) -> Document:
-    """``held_by_device`` is the calibration that a device has registers for, None where there is no such device.
-    ``remarks`` are warnings besides those of the fit; ``unit_in_doubt``: one of them asks whether it is one unit."""
+    """``held_by_device`` is the calibration that a device has registers for,
+    None where there is no such device. ``remarks`` are warnings besides those
+    of the fit; ``unit_in_doubt``: one of them asks whether it is one unit."""
     calibration = calibration_document(
         loop.after, output_unit=output_unit, reference_unit=reference_unit, stated=stated
     )
@@ -122,7 +126,8 @@ def _unexplained(part: Unexplained, small: ErrorUnit, reference: float) -> Docum
 
 
 def _another(loop: Loop) -> Document | None:
-    """From which pose on there is another unit, or another mounting; None where that is unlikely."""
+    """From which pose on there is another unit, or another mounting; None where
+    that is unlikely."""
     found = loop.found.change_point
     if found is None:
         return None

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 UNIT = "unit"
-"""Under ``doubts``: recordings, or a calibration and a recording, may not be of one unit."""
+"""Under ``doubts``: recordings, or a calibration and a recording, may not be of
+one unit."""
 
 
 def doubts_of(doubts: Iterable[str]) -> list[str]:

@@ -12,7 +12,8 @@ class DaemonError(Exception):
 
 
 class InputError(DaemonError):
-    """A file or an option given by the user is wrong: file, line, field, what was expected."""
+    """A file or an option given by the user is wrong: file, line, field, what
+    was expected."""
 
     exit_code = 2
 
@@ -22,7 +23,8 @@ class RecordingError(InputError):
 
 
 class DiskError(RecordingError):
-    """The disk failed at work; what was recorded is sound up to the time stated."""
+    """The disk failed at work; what was recorded is sound up to the time
+    stated."""
 
     exit_code = 5
 
@@ -34,7 +36,8 @@ class StationError(DaemonError):
 
 
 class DeviceInUse(StationError):
-    """Another command works with the device, or with the serial port that it is on; the message says which."""
+    """Another command works with the device, or with the serial port that it is
+    on; the message says which."""
 
 
 class ProvisionError(StationError):
@@ -42,6 +45,7 @@ class ProvisionError(StationError):
 
 
 class Implausible(DaemonError):
-    """What the device holds is no calibration under its profile; nothing was written."""
+    """What the device holds is no calibration under its profile; nothing was
+    written."""
 
     exit_code = 3

@@ -1,4 +1,5 @@
-"""Files written whole or not at all, and through no symbolic link: whoever can make one shall not choose the file."""
+"""Files written whole or not at all, and through no symbolic link: whoever can
+make one shall not choose the file."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ def write_text(path: Path, text: str) -> Path:
 
 
 def write_bytes(path: Path, data: bytes) -> Path:
-    """Through a temporary file beside it; a pipe or a device (/dev/null, /dev/stdout) is written to as it is.
+    """Through a temporary file beside it; a pipe or a device (/dev/null,
+    /dev/stdout) is written to as it is.
 
     Raises InputError, one line.
     """
@@ -41,7 +43,8 @@ def write_bytes(path: Path, data: bytes) -> Path:
 
 
 def write_new(folder: Path, stem: str, suffix: str, text: str) -> Path:
-    """To a file that did not exist: ``stem`` gets a number where it did. Raises InputError."""
+    """To a file that did not exist: ``stem`` gets a number where it did. Raises
+    InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for number in count(1):
@@ -60,7 +63,8 @@ def write_new(folder: Path, stem: str, suffix: str, text: str) -> Path:
 
 
 def write_durably(path: Path, text: str) -> None:
-    """Whole or not at all, and on the disk when it returns: it outlives a loss of power. Raises OSError."""
+    """Whole or not at all, and on the disk when it returns: it outlives a loss
+    of power. Raises OSError."""
     replace_bytes(path, text.encode())
     synchronise(path.parent)
 
@@ -75,14 +79,16 @@ def synchronise(folder: Path) -> None:
 
 
 def require_writable(path: Path) -> None:
-    """Raises InputError where ``path`` is a symbolic link to a file, or to nothing."""
+    """Raises InputError where ``path`` is a symbolic link to a file, or to
+    nothing."""
     if path.is_symlink() and not _is_stream(path):
         raise InputError(f"{path}: cannot be written: a symbolic link, expected a file of its own")
 
 
 def _is_stream(path: Path) -> bool:
-    """Whether it is a pipe or a character device, wherever links lead, or one of the system's own names for whatever
-    a descriptor stands for (/dev/stdout, /dev/fd/3)."""
+    """Whether it is a pipe or a character device, wherever links lead, or one
+    of the system's own names for whatever a descriptor stands for (/dev/stdout,
+    /dev/fd/3)."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
@@ -106,8 +112,8 @@ def replace_bytes(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_beside(path: Path) -> Iterator[Path]:
-    """A temporary file beside ``path``, empty, which takes its place where the context comes to its end and is gone
-    where it does not. Raises OSError."""
+    """A temporary file beside ``path``, empty, which takes its place where the
+    context comes to its end and is gone where it does not. Raises OSError."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():
@@ -121,7 +127,8 @@ def new_beside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[BinaryIO]:
-    """A file that was not there before. Nothing of it is left where the context does not come to its end.
+    """A file that was not there before. Nothing of it is left where the context
+    does not come to its end.
 
     Raises FileExistsError and other OSError.
     """

@@ -1,4 +1,5 @@
-"""Units on the faces of a fixture: what goes into their common frame, and the document that comes out."""
+"""Units on the faces of a fixture: what goes into their common frame, and the
+document that comes out."""
 
 from __future__ import annotations
 
@@ -30,9 +31,11 @@ ROUND_TURN_DEG = 360.0
 
 @dataclass(frozen=True)
 class Source:
-    """One unit: its recording, the sensor that turns readings into g, and up in its poses.
+    """One unit: its recording, the sensor that turns readings into g, and up in
+    its poses.
 
-    ``calibration`` is ``own``, or the file that it was read from; ``fitted`` the calibration in the former case.
+    ``calibration`` is ``own``, or the file that it was read from; ``fitted``
+    the calibration in the former case.
     """
 
     name: str
@@ -87,7 +90,8 @@ def source_under(
 
 
 def covariance_of(document: Mapping[str, Any], sensor: Sensor, *, where: str) -> tuple[Floats, list[str]]:
-    """(p,p) of the parameters of a calibration document, and warnings. Raises InputError."""
+    """(p,p) of the parameters of a calibration document, and warnings. Raises
+    InputError."""
     part = calibration_part(document, where=where)
     if "standard_error" not in part:
         count = 9 + sum(len(c) for _, c in sensor.effects)
@@ -120,7 +124,8 @@ def frame_document(sources: Sequence[Source], frames: Frames) -> Document:
 
 
 def _angles(values: Any) -> list[Any]:
-    """Angles are differences of unit vectors: beyond the grid they differ from processor to processor."""
+    """Angles are differences of unit vectors: beyond the grid they differ from
+    processor to processor."""
     return numbers(np.round(np.asarray(values, dtype=float) / GRID_RAD) * GRID_RAD, ANGLE_DIGITS)
 
 

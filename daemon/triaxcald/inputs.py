@@ -1,4 +1,5 @@
-"""Recordings, ours or as text, as still poses: what every measuring command begins with."""
+"""Recordings, ours or as text, as still poses: what every measuring command
+begins with."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ from triaxcald.tables.samples import Reading, Table, read_table
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
 PROFILE = "profile.toml"
-"""Name under which a recording carries the profile; the files it names stand beside it under ``profile/``."""
+"""Name under which a recording carries the profile; the files it names stand
+beside it under ``profile/``."""
 STATION_FILE = "station.toml"
 UNKNOWN_NOISE = "unknown_noise"
 CALIBRATION: Phase = "calibration"
@@ -47,9 +49,11 @@ VERIFICATION: Phase = "verification"
 class Measured:
     """The still poses of a recording. ``windows`` are for pictures.
 
-    ``profile``, ``signs`` of the scale factors and ``reference`` are what the recording was made with, where it says;
-    ``unit`` is its name and serial; ``output_unit`` what the header of a table says. ``remarks`` say how a table was
-    read. ``parted`` gives the same for another ``turn_s``, as for `find_spans`; None where poses are all that was read.
+    ``profile``, ``signs`` of the scale factors and ``reference`` are what the
+    recording was made with, where it says; ``unit`` is its name and serial;
+    ``output_unit`` what the header of a table says. ``remarks`` say how a table
+    was read. ``parted`` gives the same for another ``turn_s``, as for
+    `find_spans`; None where poses are all that was read.
     """
 
     name: str
@@ -76,12 +80,14 @@ def measure(
     reading: Reading | None = None,
     turn_s: float | None = None,
 ) -> Measured:
-    """``name`` is a path to an `.mcap`, a text table or a Parquet file, or `-`; ``reading`` says how a table is to be
-    read. Raises InputError, RecordingError.
+    """``name`` is a path to an `.mcap`, a text table or a Parquet file, or `-`;
+    ``reading`` says how a table is to be read. Raises InputError,
+    RecordingError.
 
-    ``moments`` are fed all raw samples and their temperature on the way, block by block: of a unit that turns, where
-    what turns slowly enough would pass for a pose that creeps. ``turn_s``: the unit may turn in
-    place, as for `find_spans`.
+    ``moments`` are fed all raw samples and their temperature on the way, block
+    by block: of a unit that turns, where what turns slowly enough would pass
+    for a pose that creeps. ``turn_s``: the unit may turn in place, as for
+    `find_spans`.
     """
     if name.endswith(".mcap"):
         with Recording.open(Path(name)) as recording:
@@ -115,8 +121,8 @@ def measure(
 
 
 def require_same_outputs(calibration: Calibration, name: str, unit: str) -> None:
-    """Raises InputError where the outputs of the recording ``name`` are in another ``unit`` than those that were
-    calibrated, as far as both say."""
+    """Raises InputError where the outputs of the recording ``name`` are in
+    another ``unit`` than those that were calibrated, as far as both say."""
     if unit and calibration.output_unit and not same_unit(unit, calibration.output_unit):
         raise InputError(
             f"{name}: outputs in {unit}, and the calibration is of outputs in {calibration.output_unit}; "
@@ -174,7 +180,8 @@ def _measure_recording(
 
 
 def require_unit(document: Mapping[str, Any], measured: Measured, *, where: str) -> None:
-    """Raises InputError where a calibration document, ``where``, is of another unit than the recording."""
+    """Raises InputError where a calibration document, ``where``, is of another
+    unit than the recording."""
     held = document.get("unit")
     theirs, ours = held.get("serial") if isinstance(held, Mapping) else None, (measured.unit or {}).get("serial")
     if theirs and ours and theirs != ours:
@@ -190,7 +197,8 @@ def signs_of(recording: Recording) -> tuple[int, int, int] | None:
 
 
 def preview_channels(profile: Profile) -> list[str]:
-    """Auxiliary channels that the previews of a recording have beside the three outputs."""
+    """Auxiliary channels that the previews of a recording have beside the three
+    outputs."""
     names: dict[str, None] = {}
     for stream in profile.streams.values():
         names |= dict.fromkeys(n for n in getattr(stream, "channels", {}) if n not in ("ux", "uy", "uz"))
@@ -198,7 +206,8 @@ def preview_channels(profile: Profile) -> list[str]:
 
 
 def losses_of(recording: Recording) -> list[str]:
-    """What did not get into the recording, or was lost from it since, one line each."""
+    """What did not get into the recording, or was lost from it since, one line
+    each."""
     lost = sum(loss.records for loss in recording.losses())
     found = [f"missing_samples: {lost} records were lost between bus and disk"] if lost else []
     mended = recording.metadata.get(RECOVERY_RECORD, {})
@@ -228,7 +237,8 @@ def read_document(path: str) -> Mapping[str, Any]:
 
 
 def parse_document(data: bytes, *, where: str) -> Mapping[str, Any]:
-    """An object of JSON in which no key is given twice. Raises InputError with the line at fault."""
+    """An object of JSON in which no key is given twice. Raises InputError with
+    the line at fault."""
     try:
         text = data.decode()
         document = json.loads(text, object_pairs_hook=_each_key_once)

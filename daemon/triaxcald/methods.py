@@ -1,4 +1,5 @@
-"""Calibrations that come by other ways than still poses of unknown attitude: their documents, and datasheets as read.
+"""Calibrations that come by other ways than still poses of unknown attitude:
+their documents, and datasheets as read.
 
 All are `triaxcal.calibration/1`, with what the way adds under a key of its own.
 """
@@ -102,11 +103,13 @@ def datasheet_document(found: Refinement, *, output_unit: str, reference_unit: s
 def read_datasheet(
     document: Mapping[str, Any], *, where: str, errors: tuple[float, float, float] | None, reference: float | None
 ) -> tuple[Datasheet, Mapping[str, str]]:
-    """The datasheet values in a calibration, loop or certificate document, and its units.
+    """The datasheet values in a calibration, loop or certificate document, and
+    its units.
 
-    ``errors`` stand for the document's, and for its correlation: of the scale factors relative to them, of the
-    misalignments in rad, of the biases in the unit of the reference. ``reference`` is the magnitude in the
-    poses, where it is not the document's. Raises InputError.
+    ``errors`` stand for the document's, and for its correlation: of the scale
+    factors relative to them, of the misalignments in rad, of the biases in the
+    unit of the reference. ``reference`` is the magnitude in the poses, where it
+    is not the document's. Raises InputError.
     """
     sensor, channel_reference, own = sensor_of(document, where=where)
     part = calibration_part(document, where=where)

@@ -1,4 +1,5 @@
-"""The final word on a unit: what a run or a provisioning ends with (`triaxcal.outcome/1`)."""
+"""The final word on a unit: what a run or a provisioning ends with
+(`triaxcal.outcome/1`)."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Ending:
-    """How the work on one unit ended. ``reason`` is one sentence for people; ``exit_code`` as the command owes it."""
+    """How the work on one unit ended. ``reason`` is one sentence for people;
+    ``exit_code`` as the command owes it."""
 
     verdict: Verdict
     reason: str
@@ -39,8 +41,9 @@ class Ending:
 class Papers:
     """What an ending rests on, as documents, as far as there is any.
 
-    ``measured`` are figures of the fit; ``digests`` of what was made, by name, None where it was not; ``contents``
-    the inventory of the recording that the outcome is the last part of.
+    ``measured`` are figures of the fit; ``digests`` of what was made, by name,
+    None where it was not; ``contents`` the inventory of the recording that the
+    outcome is the last part of.
     """
 
     measured: Document | None = None
@@ -66,8 +69,9 @@ def outcome_document(
     journal: str | None = None,
     forced: str | None = None,
 ) -> Document:
-    """``ended`` is a time in words; ``supersedes`` the digest of the outcome that this one replaces, ``journal`` the
-    path of a journal that is still needed, ``forced`` the reason for which doubts were overruled."""
+    """``ended`` is a time in words; ``supersedes`` the digest of the outcome
+    that this one replaces, ``journal`` the path of a journal that is still
+    needed, ``forced`` the reason for which doubts were overruled."""
     return {
         "format": FORMAT,
         "unit": unit,
@@ -124,7 +128,8 @@ def digest_of(data: bytes) -> str:
 
 
 def latest_of(folder: Path, serial: str | None) -> str | None:
-    """The digest of the latest outcome of a unit in the station's folder; None where there is none."""
+    """The digest of the latest outcome of a unit in the station's folder; None
+    where there is none."""
     if serial is None:
         return None
     found: list[tuple[str, str]] = []

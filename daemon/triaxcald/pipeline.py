@@ -1,4 +1,5 @@
-"""From raw records to still poses: the one way that a live bus and a recording share."""
+"""From raw records to still poses: the one way that a live bus and a recording
+share."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_or
 
 @dataclass
 class Pipeline:
-    """Decoder, stillness and quality detector of one stream of one unit; counts whatever does not come through."""
+    """Decoder, stillness and quality detector of one stream of one unit; counts
+    whatever does not come through."""
 
     bundle: Bundle
     stream: str
@@ -91,7 +93,8 @@ class Pipeline:
         return [] if windows is None else poses_of(windows, self._still(windows))
 
     def held(self) -> list[StillSpan]:
-        """The same without their noise, which takes longer than all the rest: enough to guide an operator by."""
+        """The same without their noise, which takes longer than all the rest:
+        enough to guide an operator by."""
         windows = self.windows
         return [] if windows is None else still_spans_of(windows, self._still(windows))
 
@@ -112,7 +115,8 @@ class Pipeline:
         self._quality.finish()
 
     def parted(self, turn_s: float | None) -> list[Pose]:
-        """The still poses of the whole stream once that is closed, for another ``turn_s``."""
+        """The still poses of the whole stream once that is closed, for another
+        ``turn_s``."""
         self.turn_s, self._spans, self._findings = turn_s, (0, []), None
         windows = self.windows
         return [] if windows is None else poses_of(windows, self._still(windows), untrusted_poses(self._seen(windows)))
@@ -143,8 +147,9 @@ class Pipeline:
 
 
 def together(counted: Mapping[str, str], seen: Iterable[Finding], unit: str = "") -> list[str]:
-    """What was ``counted`` on the way here, by name, and what is ``seen`` in the samples, whose outputs are in
-    ``unit``: one line for each kind of fault. What was counted as missing leaves the gaps that are seen, which are not
+    """What was ``counted`` on the way here, by name, and what is ``seen`` in
+    the samples, whose outputs are in ``unit``: one line for each kind of fault.
+    What was counted as missing leaves the gaps that are seen, which are not
     said again.
     """
     said = dict(counted)

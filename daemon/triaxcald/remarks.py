@@ -1,4 +1,5 @@
-"""Sentences that console and report add to what the metrology says: what it assumes, what its shares are shares of."""
+"""Sentences that console and report add to what the metrology says: what it
+assumes, what its shares are shares of."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from triaxcal.uncertainty import SENSITIVITY_PER_K
 
 
 def assumption(effects: Collection[str], reference_unit: str = "g") -> str:
-    """On a line of the budget that assumes the size of these, empty where it assumes nothing."""
+    """On a line of the budget that assumes the size of these, empty where it
+    assumes nothing."""
     said = {
         "temperature_bias": f"bias {{:g}} {'µg/K' if reference_unit == 'g' else 'ppm of the reference per K'}",
         "temperature_scale_factor": "scale factor {:g} ppm/K",
@@ -25,6 +27,7 @@ def assumption(effects: Collection[str], reference_unit: str = "g") -> str:
 
 
 def none_could_show(blind_to: Collection[str]) -> bool:
-    """Whether a search that found nothing could hardly find anything: no effect that goes with direction or time, which
-    every recording has, shows in full."""
+    """Whether a search that found nothing could hardly find anything: no effect
+    that goes with direction or time, which every recording has, shows in
+    full."""
     return {e.name for e in CATALOGUE if set(e.needs) <= {*CLOCKS, *BEFORE}} <= set(blind_to)

@@ -1,7 +1,9 @@
-"""Whether recordings are of one unit: by the shape of its triad, which age and temperature hardly change.
+"""Whether recordings are of one unit: by the shape of its triad, which age and
+temperature hardly change.
 
-A bias comes back anew at every start, and temperature scales all axes alike first of all. What stays with a unit is how
-its axes stand to each other and which of them is the more sensitive.
+A bias comes back anew at every start, and temperature scales all axes alike
+first of all. What stays with a unit is how its axes stand to each other and
+which of them is the more sensitive.
 """
 
 from __future__ import annotations
@@ -22,10 +24,12 @@ from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 
 MISALIGNMENT_RAD, SCALE_FACTOR = 1e-3, 6e-3
-"""Standard deviations, of each, by which one mass-market unit differs from itself in another recording: scale factors
-by what 20 K make of them where nothing corrects that (`triaxcal.uncertainty`, 3e-4/K)."""
+"""Standard deviations, of each, by which one mass-market unit differs from
+itself in another recording: scale factors by what 20 K make of them where
+nothing corrects that (`triaxcal.uncertainty`, 3e-4/K)."""
 POSES_LEAST = 12
-"""Fewer tell hardly more than nine parameters: what the model lacks goes into these."""
+"""Fewer tell hardly more than nine parameters: what the model lacks goes into
+these."""
 BY_CHANCE = 1e-4
 """The probability that one unit is asked about."""
 _RATIOS = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]])
@@ -34,8 +38,8 @@ _RATIOS.flags.writeable = False
 
 @dataclass(frozen=True)
 class Shape:
-    """Logarithms of two ratios of scale factors, and the misalignments [rad]: (5,), with their covariance (5,5) and the
-    degrees of freedom behind it."""
+    """Logarithms of two ratios of scale factors, and the misalignments [rad]:
+    (5,), with their covariance (5,5) and the degrees of freedom behind it."""
 
     values: Floats
     covariance: Floats
@@ -56,7 +60,8 @@ def shape_of(c: Calibration) -> Shape:
 
 
 def shape_by_poses(poses: Sequence[Pose], signs: Sequence[float], reference: float) -> Shape | None:
-    """By a fit of the linear model to these poses alone; None where they do not carry one, or are few."""
+    """By a fit of the linear model to these poses alone; None where they do not
+    carry one, or are few."""
     try:
         found = fit(poses, signs=signs, reference=reference)
     except (Refused, InvalidData):
@@ -65,7 +70,8 @@ def shape_by_poses(poses: Sequence[Pose], signs: Sequence[float], reference: flo
 
 
 def shape_beside(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
-    """The same by what the outputs would be without the effects that ``held`` has."""
+    """The same by what the outputs would be without the effects that ``held``
+    has."""
     sensor = held.sensor
     if sensor.effects:
         try:
@@ -78,7 +84,8 @@ def shape_beside(held: Calibration, poses: Sequence[Pose]) -> Shape | None:
 
 
 def shape_in(calibration: Mapping[str, Any]) -> Shape | None:
-    """Of a `triaxcal.calibration/1` document; None where it does not say how well its shape is known."""
+    """Of a `triaxcal.calibration/1` document; None where it does not say how
+    well its shape is known."""
     try:
         k, m = (np.array(calibration[name], dtype=float) for name in ("scale_factor", "misalignment"))
         errors = [calibration["standard_error"][name] for name in ("scale_factor", "misalignment")]
@@ -91,8 +98,8 @@ def shape_in(calibration: Mapping[str, Any]) -> Shape | None:
 
 
 def unlike_shapes(name: str, other: str, one: Shape | None, another: Shape | None) -> list[str]:
-    """A line where two recordings, or a calibration and a recording, can hardly be of one unit; none where one of the
-    shapes is not known."""
+    """A line where two recordings, or a calibration and a recording, can hardly
+    be of one unit; none where one of the shapes is not known."""
     if one is None or another is None:
         return []
     apart = one.values - another.values
@@ -101,7 +108,8 @@ def unlike_shapes(name: str, other: str, one: Shape | None, another: Shape | Non
     of_one_unit[2:, 2:] = MISALIGNMENT_RAD**2 * np.eye(3)
     weight = one.covariance + another.covariance + of_one_unit
     squares = float(apart @ np.linalg.solve(weight, apart))
-    # Welch–Satterthwaite: what a unit may differ from itself is known, what the fits are off by is estimated.
+    # Welch–Satterthwaite: what a unit may differ from itself is known, what the
+    # fits are off by is estimated.
     shares = [(np.trace(np.linalg.solve(weight, s.covariance)) / len(apart), s.dof) for s in (one, another)]
     dof = 1 / max(sum(share**2 / dof for share, dof in shares), 1e-9)
     if not f_sf(squares / len(apart), len(apart), dof) < BY_CHANCE:

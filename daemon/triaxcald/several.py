@@ -1,4 +1,5 @@
-"""Several recordings in one diagnosis: of one unit, or of several units side by side (`triaxcal.agreement/1`)."""
+"""Several recordings in one diagnosis: of one unit, or of several units side by
+side (`triaxcal.agreement/1`)."""
 
 from __future__ import annotations
 
@@ -15,11 +16,13 @@ from triaxcal.text.pooling import verdict
 from triaxcal.units import in_units_of
 
 NO_LONGER_OF_AN_EFFECT = ("worse", "gain", "units_gain", "shown_by")
-"""Keys of 0.1 that mean nothing since effects have probabilities: others read them, and find null."""
+"""Keys of 0.1 that mean nothing since effects have probabilities: others read
+them, and find null."""
 
 
 def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Document:
-    """A `triaxcal.loop/1` of several recordings: which pose is of which, and the residual of each."""
+    """A `triaxcal.loop/1` of several recordings: which pose is of which, and
+    the residual of each."""
     by_recording = [
         {
             "recording": name,
@@ -38,7 +41,8 @@ def with_recordings(document: Document, loop: Loop, names: Sequence[str]) -> Doc
 def agreement_document(
     found: PooledAnalysis, names: Sequence[str], results: Sequence[Document], reference_unit: str = "g"
 ) -> Document:
-    """``results`` are the units' own, `triaxcal.loop/1`, and ``names`` their recordings."""
+    """``results`` are the units' own, `triaxcal.loop/1`, and ``names`` their
+    recordings."""
     return {
         "format": "triaxcal.agreement/1",
         "verdict": verdict(found),

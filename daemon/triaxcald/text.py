@@ -1,4 +1,5 @@
-"""What the daemon says of devices and provisionings, in English. Nothing reads these sentences back."""
+"""What the daemon says of devices and provisionings, in English. Nothing reads
+these sentences back."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ def held(of: Held) -> str:
 
 
 def settling(p: Provisioning, station: Path) -> str:
-    """The command that clears up what the device holds; empty where nothing is left to be cleared up."""
+    """The command that clears up what the device holds; empty where nothing is
+    left to be cleared up."""
     return "" if p.settled else to_settle(p.held, p.open_journal, p.unit, station)
 
 

@@ -1,7 +1,8 @@
-"""Verification by physics: |a| in check poses, from the device's own corrected output or under a calibration.
+"""Verification by physics: |a| in check poses, from the device's own corrected
+output or under a calibration.
 
-Poses in which the outputs do not follow the acceleration (`triaxcal.poses.quality`) stay in the documents, marked, and
-count for nothing.
+Poses in which the outputs do not follow the acceleration
+(`triaxcal.poses.quality`) stay in the documents, marked, and count for nothing.
 """
 
 from __future__ import annotations
@@ -24,16 +25,19 @@ from triaxcald.station.guidance import ups
 WITHIN, OUTSIDE, UNJUDGED, WORSE = "within limits", "outside limits", "not judged", "worse than before"
 BY_CHANCE = 0.01
 UNLIKE = 0.05
-"""rms error of the magnitude, as a share of the reference, above which another unit is likelier than a change of this
-one: 60 K away, the sensitivities of mass-market data sheets (`triaxcal.uncertainty`) make 0.035."""
+"""rms error of the magnitude, as a share of the reference, above which another
+unit is likelier than a change of this one: 60 K away, the sensitivities of
+mass-market data sheets (`triaxcal.uncertainty`) make 0.035."""
 
 
 @dataclass(frozen=True)
 class Verification:
-    """Errors of the magnitude, (n,) in the unit of the reference, and their standard errors from noise.
+    """Errors of the magnitude, (n,) in the unit of the reference, and their
+    standard errors from noise.
 
-    The figures are over the poses that can be trusted, None where there are none. ``data_quality`` is what the stream
-    is to be blamed for, one line each.
+    The figures are over the poses that can be trusted, None where there are
+    none. ``data_quality`` is what the stream is to be blamed for, one line
+    each.
     """
 
     poses: Sequence[Pose]
@@ -62,8 +66,8 @@ class Verification:
     def expanded_uncertainty_g(self) -> float | None:
         """Of the rms, from the noise of the poses, with a coverage factor of 2.
 
-        An error m measured as e with the standard error s: e² has the variance 4 m² s² + 2 s⁴, and m² is e² − s² on
-        average.
+        An error m measured as e with the standard error s: e² has the variance
+        4 m² s² + 2 s⁴, and m² is e² − s² on average.
         """
         rms_g, e, s = self.rms_g, self._trusted(self.error_g), self._trusted(self.standard_error_g)
         if not rms_g:
@@ -88,8 +92,8 @@ def verify(poses: Sequence[Pose], reference: float) -> Verification:
 
 @dataclass(frozen=True)
 class Apart:
-    """``fitted`` (n,3) are the directions of up of the fit's poses; a check pose ``apart_deg`` from all of them is in
-    another attitude."""
+    """``fitted`` (n,3) are the directions of up of the fit's poses; a check
+    pose ``apart_deg`` from all of them is in another attitude."""
 
     fitted: Floats
     apart_deg: float
@@ -103,15 +107,17 @@ class Apart:
 
 
 def fitted_attitudes(readings: Pipeline, signs: Sequence[int]) -> Floats:
-    """(n,3): the directions of up of the poses that a calibration is made of, to a degree or so. ``signs`` of the
-    outputs, where the profile has no nominal scale factors."""
+    """(n,3): the directions of up of the poses that a calibration is made of,
+    to a degree or so. ``signs`` of the outputs, where the profile has no
+    nominal scale factors."""
     nominal = readings.bundle.profile.output.nominal_scale_factor
     up = ups(readings.poses(), nominal)
     return up if nominal is not None else up * np.asarray(signs)
 
 
 def verified(pipeline: Pipeline, reference: float) -> Verification:
-    """The whole of a corrected stream, with what it is to be blamed for. Finishes the ``pipeline``."""
+    """The whole of a corrected stream, with what it is to be blamed for.
+    Finishes the ``pipeline``."""
     poses = pipeline.finish()
     quality = pipeline.data_quality() + creeping(poses)
     return replace(verify(poses, reference), data_quality=tuple(quality))
@@ -122,7 +128,8 @@ def _rms(values: Floats) -> float | None:
 
 
 def unlike(name: str, rms_g: float, reference: float, said: str = "does not look like this unit") -> list[str]:
-    """A line where the poses of the recording ``name`` can hardly be of the unit of the calibration."""
+    """A line where the poses of the recording ``name`` can hardly be of the
+    unit of the calibration."""
     if not rms_g > UNLIKE * reference:
         return []
     return [
@@ -157,8 +164,9 @@ def _verdict(before: Verification, after: Verification, limit_g: float | None) -
 
 
 def _is_worse(before: Verification, after: Verification) -> bool:
-    """Whether errors so much larger would be chance in less than `BY_CHANCE` of poses no worse than before (F-test),
-    where noisier poses have more to be forgiven."""
+    """Whether errors so much larger would be chance in less than `BY_CHANCE` of
+    poses no worse than before (F-test), where noisier poses have more to be
+    forgiven."""
     old, new, floor, noise = before.rms_g, after.rms_g, before.noise_floor_g, after.noise_floor_g
     if old is None or new is None or floor is None or noise is None:
         return False
@@ -170,10 +178,11 @@ def _is_worse(before: Verification, after: Verification) -> bool:
 def verification_document(
     before: Verification, after: Verification, *, limit_g: float | None, raw_sha256: str, apart: Apart | None
 ) -> Document:
-    """``before``: the device's output with its old registers; ``after``: with the new ones, after a restart.
+    """``before``: the device's output with its old registers; ``after``: with
+    the new ones, after a restart.
 
-    Without ``apart`` the document is as before there were outcomes: it says nothing of attitudes, and has no
-    uncertainty.
+    Without ``apart`` the document is as before there were outcomes: it says
+    nothing of attitudes, and has no uncertainty.
     """
     rms = after.rms_g
     document: Document = {

@@ -1,9 +1,12 @@
-"""Time-outs that count attention: time in which this process looked, and not that in which it was kept from it.
+"""Time-outs that count attention: time in which this process looked, and not
+that in which it was kept from it.
 
-A process that gets no processor, or computes for long, comes back to an event loop with replies waiting unread. By the
-wall clock they are late; the device was not. So a silence is measured by a clock that goes on no further than
-`MOST_S` from one turn of the event loop to the next: it runs out only where the loop has gone round often, and found
-nothing each time. On a machine with time to spare it keeps to the wall clock.
+A process that gets no processor, or computes for long, comes back to an event
+loop with replies waiting unread. By the wall clock they are late; the device
+was not. So a silence is measured by a clock that goes on no further than
+`MOST_S` from one turn of the event loop to the next: it runs out only where the
+loop has gone round often, and found nothing each time. On a machine with time
+to spare it keeps to the wall clock.
 """
 
 from __future__ import annotations
@@ -14,13 +17,16 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 TICK_S = 0.02
-"""The loop is looked at so often: some ten times in the shortest time-out that a bus is given."""
+"""The loop is looked at so often: some ten times in the shortest time-out that
+a bus is given."""
 MOST_S = 0.05
-"""A turn of the loop counts no more than this: an idle machine is never so late, so that nothing is lost there."""
+"""A turn of the loop counts no more than this: an idle machine is never so
+late, so that nothing is lost there."""
 
 
 class Looks:
-    """Sums the time between looks, each interval no more than ``most_s``. Pure: time is an argument [s]."""
+    """Sums the time between looks, each interval no more than ``most_s``. Pure:
+    time is an argument [s]."""
 
     def __init__(self, now_s: float, most_s: float) -> None:
         self._most_s = most_s
@@ -38,9 +44,11 @@ class Looks:
 
 
 class Attention:
-    """The attention of one event loop as a clock, from when it is made until `close`.
+    """The attention of one event loop as a clock, from when it is made until
+    `close`.
 
-    Once it is closed, or its loop is, every time-out has run out: nobody looks any more.
+    Once it is closed, or its loop is, every time-out has run out: nobody looks
+    any more.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -63,7 +71,8 @@ class Attention:
 
     @asynccontextmanager
     async def timeout(self, seconds: float) -> AsyncIterator[None]:
-        """As `asyncio.timeout`. What is there when the time runs out still counts as in time."""
+        """As `asyncio.timeout`. What is there when the time runs out still
+        counts as in time."""
         async with asyncio.timeout(None) as inner:
             self._running[inner] = self.now_s() + seconds
             if self._closed:
@@ -80,5 +89,6 @@ class Attention:
     def _expire(self, now_s: float) -> None:
         for timeout in [t for t, due_s in self._running.items() if not due_s > now_s]:
             del self._running[timeout]
-            # In the next turn: what this one has read from the bus reaches first who waits for it.
+            # In the next turn: what this one has read from the bus reaches
+            # first who waits for it.
             timeout.reschedule(self.loop.time())

@@ -1,4 +1,5 @@
-"""The drivers that are installed, found by entry point; none is imported until asked for."""
+"""The drivers that are installed, found by entry point; none is imported until
+asked for."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ GROUP = "triaxcal.drivers"
 
 @dataclass(frozen=True)
 class Listed:
-    """An installed driver; ``fault`` says why it cannot be used, where it cannot."""
+    """An installed driver; ``fault`` says why it cannot be used, where it
+    cannot."""
 
     name: str
     target: str
@@ -32,7 +34,8 @@ def _points() -> dict[str, EntryPoint]:
 
 
 def driver_named(name: str, *, where: str = "") -> Driver:
-    """Raises DriverMissing with the nearest name, or with the reason why it cannot be imported."""
+    """Raises DriverMissing with the nearest name, or with the reason why it
+    cannot be imported."""
     lead = f"{where}: " if where else ""
     points = _points()
     if name not in points:

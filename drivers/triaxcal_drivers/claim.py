@@ -1,6 +1,8 @@
-"""What a process claims for itself while it has a unit open, by names that do not depend on the spelling.
+"""What a process claims for itself while it has a unit open, by names that do
+not depend on the spelling.
 
-A driver's bus model says it by a method ``claim``; `claim_of` asks for it. No I/O but the links of the file system.
+A driver's bus model says it by a method ``claim``; `claim_of` asks for it. No
+I/O but the links of the file system.
 """
 
 from __future__ import annotations
@@ -19,10 +21,12 @@ LOCALHOST = "localhost"
 class Claim:
     """Claims that are equal are of one device.
 
-    ``device`` names the unit, and begins or completes a message: "node 5 on socketcan can0". ``host`` is the network
-    host that it is reached by, where it is one; it stands apart because a name and an address may be the same host.
-    ``serial_port`` is the port, as `canonical_port` has it, where only one process may have it open; what several
-    processes can share, such as a CAN bus or a gateway, is no part of a claim.
+    ``device`` names the unit, and begins or completes a message: "node 5 on
+    socketcan can0". ``host`` is the network host that it is reached by, where
+    it is one; it stands apart because a name and an address may be the same
+    host. ``serial_port`` is the port, as `canonical_port` has it, where only
+    one process may have it open; what several processes can share, such as a
+    CAN bus or a gateway, is no part of a claim.
     """
 
     device: str
@@ -35,7 +39,8 @@ class Claim:
 
 
 def claim_of(bus: BaseModel) -> Claim:
-    """All settings together name the device where the driver's model has no ``claim``."""
+    """All settings together name the device where the driver's model has no
+    ``claim``."""
     claim: Callable[[], Claim] | None = getattr(bus, "claim", None)
     if claim is not None:
         return claim()
@@ -64,7 +69,8 @@ def is_name(host: str) -> bool:
 
 
 def canonical_port(port: str) -> str:
-    """A serial port behind links such as those in /dev/serial/by-id. What is no path, as a URL of pyserial's, stays."""
+    """A serial port behind links such as those in /dev/serial/by-id. What is no
+    path, as a URL of pyserial's, stays."""
     if "://" in port or "\0" in port:
         return port
     return os.path.normcase(os.path.realpath(port))

@@ -1,6 +1,7 @@
 """What can go wrong between the profile, the bus and the device.
 
-The leaf names whose fault it is; the message is one line that says what, where, and what was expected.
+The leaf names whose fault it is; the message is one line that says what, where,
+and what was expected.
 """
 
 
@@ -25,13 +26,15 @@ class DeviceAbsent(DriverError):
 
 
 class DeviceSilent(DriverError):
-    """The device answered before and does not any more, or its stream has stopped."""
+    """The device answered before and does not any more, or its stream has
+    stopped."""
 
 
 class RegisterRefused(DriverError):
     """The device refused to read or write a register.
 
-    ``register`` is the profile's name of it, ``code`` the device's own code (SDO abort, Modbus exception).
+    ``register`` is the profile's name of it, ``code`` the device's own code
+    (SDO abort, Modbus exception).
     """
 
     def __init__(self, message: str, *, register: str, code: int) -> None:
@@ -41,7 +44,8 @@ class RegisterRefused(DriverError):
 
 
 class DeviceBusy(RegisterRefused):
-    """The device refuses for now: it is at work, and the same request may be taken later."""
+    """The device refuses for now: it is at work, and the same request may be
+    taken later."""
 
 
 class RegisterValueError(DriverError):

@@ -19,7 +19,8 @@ CALLED = {"can": "python-can", "serial": "pyserial"}
 
 
 def absent(modules: Iterable[str]) -> str | None:
-    """What to install, of modules by the names that are imported; None where all are there."""
+    """What to install, of modules by the names that are imported; None where
+    all are there."""
     missing = [m for m in modules if importlib.util.find_spec(m) is None]
     if not missing:
         return None

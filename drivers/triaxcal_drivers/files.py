@@ -1,4 +1,5 @@
-"""Files that somebody else may have made: opened without waiting, read up to a size, kept inside their folder."""
+"""Files that somebody else may have made: opened without waiting, read up to a
+size, kept inside their folder."""
 
 from __future__ import annotations
 
@@ -10,10 +11,11 @@ from typing import BinaryIO
 
 
 def open_file(path: Path, *, pipe: bool = False) -> BinaryIO:
-    """A file to read from; with ``pipe`` also a pipe, where the user gave the name: `<(…)` of the shell is one.
+    """A file to read from; with ``pipe`` also a pipe, where the user gave the
+    name: `<(…)` of the shell is one.
 
-    A device is not even opened, and a pipe that nobody writes to is empty instead of being waited for.
-    Raises OSError with a reason to show.
+    A device is not even opened, and a pipe that nobody writes to is empty
+    instead of being waited for. Raises OSError with a reason to show.
     """
     try:
         _require_file(path.stat().st_mode, pipe)
@@ -41,7 +43,8 @@ def _require_file(mode: int, pipe: bool) -> None:
 
 
 def read_whole(path: Path, most: int, *, pipe: bool = False) -> bytes:
-    """All of a file of at most ``most`` bytes. Raises OSError with a reason to show."""
+    """All of a file of at most ``most`` bytes. Raises OSError with a reason to
+    show."""
     with open_file(path, pipe=pipe) as file:
         data = file.read(most + 1)
     if len(data) > most:
@@ -55,7 +58,8 @@ def size(count: int) -> str:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The file ``name`` of ``folder``, wherever symbolic links lead. Raises OSError where that is outside of it."""
+    """The file ``name`` of ``folder``, wherever symbolic links lead. Raises
+    OSError where that is outside of it."""
     if "\0" in name:
         raise OSError(errno.EINVAL, "no file has such a name")
     try:

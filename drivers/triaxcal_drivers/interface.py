@@ -1,7 +1,9 @@
-"""The one interface behind which every device stands, be it on CAN, on Modbus or in a recording.
+"""The one interface behind which every device stands, be it on CAN, on Modbus
+or in a recording.
 
-A driver is code for one transport. It validates its own part of a profile, opens devices, and makes decoders.
-A decoder is pure: raw batches in, samples out, no I/O, the same from a live bus and from a recording.
+A driver is code for one transport. It validates its own part of a profile,
+opens devices, and makes decoders. A decoder is pure: raw batches in, samples
+out, no I/O, the same from a live bus and from a recording.
 """
 
 from __future__ import annotations
@@ -33,10 +35,11 @@ class RawFlag(IntFlag):
 class RawBatch:
     """Records as they came off the bus, undecoded.
 
-    ``time_ns`` (n,) int64 host receive time since the epoch; ``source`` (n,) uint32 CAN identifier, or for
-    Modbus ``function << 16 | first address``; ``flags`` (n,) uint8 of `RawFlag`; ``length`` (n,) uint16 bytes
-    of each record; ``payload`` the records' bytes, one after the other (CAN data; Modbus register bytes as on
-    the wire, most significant first).
+    ``time_ns`` (n,) int64 host receive time since the epoch; ``source`` (n,)
+    uint32 CAN identifier, or for Modbus ``function << 16 | first address``;
+    ``flags`` (n,) uint8 of `RawFlag`; ``length`` (n,) uint16 bytes of each
+    record; ``payload`` the records' bytes, one after the other (CAN data;
+    Modbus register bytes as on the wire, most significant first).
     """
 
     time_ns: NDArray[np.int64]
@@ -71,12 +74,13 @@ class RawBatch:
 class SampleBlock:
     """Decoded samples of one stream, in order.
 
-    ``time_ns`` (n,) int64: the device's own time base (its time stamp, else counter times period, else host
-    receive time), laid on the host epoch at the first sample. ``counter`` (n,) int64, unwrapped.
-    ``readings``
-    (n,3) in the profile's output unit (for a corrected stream: g). ``channels`` the auxiliary ones, each (n,).
-    The counts are of this block: samples missing by the counter, repeated samples dropped, samples that could
-    not be put together from their parts, records with an error flag.
+    ``time_ns`` (n,) int64: the device's own time base (its time stamp, else
+    counter times period, else host receive time), laid on the host epoch at the
+    first sample. ``counter`` (n,) int64, unwrapped. ``readings`` (n,3) in the
+    profile's output unit (for a corrected stream: g). ``channels`` the
+    auxiliary ones, each (n,). The counts are of this block: samples missing by
+    the counter, repeated samples dropped, samples that could not be put
+    together from their parts, records with an error flag.
     """
 
     time_ns: NDArray[np.int64]
@@ -93,7 +97,8 @@ class SampleBlock:
 
 
 class Decoder(Protocol):
-    """Turns one stream's raw records into samples; keeps what it needs between batches.
+    """Turns one stream's raw records into samples; keeps what it needs between
+    batches.
 
     The samples are the same however the records are cut into batches.
     """
@@ -102,7 +107,8 @@ class Decoder(Protocol):
 
 
 class Device(Protocol):
-    """An opened unit. Registers go by their names in the profile, as raw bytes in the order on the wire."""
+    """An opened unit. Registers go by their names in the profile, as raw bytes
+    in the order on the wire."""
 
     async def open(self) -> None:
         """Raises BusError, DeviceAbsent."""
@@ -112,26 +118,33 @@ class Device(Protocol):
     def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
         """Raw records of the named streams until the iterator is closed.
 
-        Nothing is among them that was sampled before the call, in a device's FIFO or a receive buffer: an operator
-        starts a recording, and what the unit did before is no pose.
+        Nothing is among them that was sampled before the call, in a device's
+        FIFO or a receive buffer: an operator starts a recording, and what the
+        unit did before is no pose.
 
-        Raises DeviceSilent when nothing has come for the profile's ``silence_timeout_s``.
+        Raises DeviceSilent when nothing has come for the profile's
+        ``silence_timeout_s``.
         """
 
     async def read(self, register: str) -> bytes:
-        """One request. Raises RegisterRefused (DeviceBusy among them), DeviceSilent, BusError."""
+        """One request. Raises RegisterRefused (DeviceBusy among them),
+        DeviceSilent, BusError."""
 
     async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
-        """One request; ``timeout_s`` takes the place of the profile's ``reply_timeout_s``. Raises as `read` does."""
+        """One request; ``timeout_s`` takes the place of the profile's
+        ``reply_timeout_s``. Raises as `read` does."""
 
 
 class Driver(Protocol):
-    """What an entry point of group ``triaxcal.drivers`` names: a class with these.
+    """What an entry point of group ``triaxcal.drivers`` names: a class with
+    these.
 
-    A ``bus_model`` says by a method ``claim`` what one process has for itself while it works with a unit (see
-    `triaxcal_drivers.claim`); without it all settings together name the device. A driver may name the ``packages`` that
-    it imports only when a device is opened, so that `triaxcal devices` can say which are not there. By a method
-    ``loads(bundle, bus)`` it may say what each stream takes of a line on which units are asked in turn
+    A ``bus_model`` says by a method ``claim`` what one process has for itself
+    while it works with a unit (see `triaxcal_drivers.claim`); without it all
+    settings together name the device. A driver may name the ``packages`` that
+    it imports only when a device is opened, so that `triaxcal devices` can say
+    which are not there. By a method ``loads(bundle, bus)`` it may say what each
+    stream takes of a line on which units are asked in turn
     (`triaxcal_drivers.load.LineLoad`, by stream).
     """
 
@@ -142,4 +155,5 @@ class Driver(Protocol):
         """``bus`` is an instance of ``bus_model``: where the unit is."""
 
     def decoder(self, bundle: Bundle, stream: str) -> Decoder:
-        """Raises ProfileError where the profile's files do not hold what it names."""
+        """Raises ProfileError where the profile's files do not hold what it
+        names."""

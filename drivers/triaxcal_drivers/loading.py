@@ -1,4 +1,5 @@
-"""From the text of a profile to a `Bundle`: the driver that it names validates it, and its files are read."""
+"""From the text of a profile to a `Bundle`: the driver that it names validates
+it, and its files are read."""
 
 from __future__ import annotations
 
@@ -16,13 +17,16 @@ from triaxcal_drivers.validation import validate
 
 BUILT_IN = Path(__file__).parent / "profiles"
 FILE_MOST = 16 * 2**20
-"""Bytes of a DBC or EDS file; the DBC of a whole vehicle, comments and all, has some ten million."""
+"""Bytes of a DBC or EDS file; the DBC of a whole vehicle, comments and all, has
+some ten million."""
 
 
 def parse_bundle(text: bytes, files: Mapping[str, bytes] | None, *, where: str, folder: Path | None = None) -> Bundle:
-    """Validate a profile's text. Files come from ``files`` where given, else from ``folder``.
+    """Validate a profile's text. Files come from ``files`` where given, else
+    from ``folder``.
 
-    Raises ProfileError (one line: where, line, field, what was expected), DriverMissing.
+    Raises ProfileError (one line: where, line, field, what was expected),
+    DriverMissing.
     """
     data = parse_toml(text, where=where)
     name = data.get("driver")
@@ -49,7 +53,8 @@ def _held(file: str, files: Mapping[str, bytes] | None, folder: Path | None, whe
 
 
 def load_bundle(path: Path) -> Bundle:
-    """The profile at ``path``, or a built-in one where ``path`` is a bare name such as ``triax-ref-can``."""
+    """The profile at ``path``, or a built-in one where ``path`` is a bare name
+    such as ``triax-ref-can``."""
     if "\0" in str(path):
         raise ProfileError(f"{str(path)!r}: no file has such a name")
     if not os.path.exists(path) and path.suffix in ("", ".toml") and path.parent == Path():

@@ -1,7 +1,9 @@
-"""A device as data: the model of the TOML profile, and a profile with the files it names.
+"""A device as data: the model of the TOML profile, and a profile with the files
+it names.
 
-The parts every device has stand here; a driver subclasses `Profile` and narrows ``streams`` and ``registers``
-to its transport. An unknown key is an error that names the nearest right one.
+The parts every device has stand here; a driver subclasses `Profile` and narrows
+``streams`` and ``registers`` to its transport. An unknown key is an error that
+names the nearest right one.
 """
 
 from __future__ import annotations
@@ -74,10 +76,11 @@ class Sampling(Strict):
 class Register(Strict):
     """A number in the device. ``role`` says what it is to a calibration.
 
-    Roles: ``scale_factor.x`` [output unit/g], ``misalignment.x`` [rad], ``bias.x`` [g], any effect's
-    coefficient (``second_order_nonlinearity.x``, ``temperature_bias.y``…), ``reference_temperature`` [°C],
-    ``calibration_date`` (days since 1970-01-01), ``calibration_crc``, ``serial_number``, ``write_counter``.
-    The value is ``raw * scale + offset``.
+    Roles: ``scale_factor.x`` [output unit/g], ``misalignment.x`` [rad],
+    ``bias.x`` [g], any effect's coefficient (``second_order_nonlinearity.x``,
+    ``temperature_bias.y``…), ``reference_temperature`` [°C],
+    ``calibration_date`` (days since 1970-01-01), ``calibration_crc``,
+    ``serial_number``, ``write_counter``. The value is ``raw * scale + offset``.
     """
 
     type: RawType
@@ -128,7 +131,8 @@ Steps = Annotated[tuple[Step, ...], Field(max_length=STEPS_MOST), FailFast()]  #
 
 
 class Sequences(Strict):
-    """What to do before writing, to make it permanent, after writing, and to start the device afresh."""
+    """What to do before writing, to make it permanent, after writing, and to
+    start the device afresh."""
 
     unlock: Steps = ()
     store: Steps = ()
@@ -193,8 +197,9 @@ class Profile(Strict):
         return next((name for name, r in self.registers.items() if r.role == role), None)
 
     def encode(self, name: str, value: float) -> bytes:
-        """``value`` as the bytes of register ``name`` on the wire: most significant first, where the
-        transport's profile does not say otherwise. Raises RegisterValueError."""
+        """``value`` as the bytes of register ``name`` on the wire: most
+        significant first, where the transport's profile does not say otherwise.
+        Raises RegisterValueError."""
         return codec.encode(self.registers[name], value, order="big", name=name)
 
     def decode(self, name: str, raw: bytes) -> float:
@@ -204,9 +209,11 @@ class Profile(Strict):
 
 @dataclass(frozen=True)
 class Bundle:
-    """A validated profile with its own text and the bytes of every file it names.
+    """A validated profile with its own text and the bytes of every file it
+    names.
 
-    A recording carries one, so that a replay decodes with what the station decoded with.
+    A recording carries one, so that a replay decodes with what the station
+    decoded with.
     """
 
     profile: Profile

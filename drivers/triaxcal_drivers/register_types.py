@@ -1,4 +1,5 @@
-"""The types of raw numbers: how a register or a field of a stream holds a number in bytes.
+"""The types of raw numbers: how a register or a field of a stream holds a
+number in bytes.
 
 `TYPES` is the one table of them. What a profile may declare, its JSON Schema,
 the bytes written and read, the samples decoded and the page of the reference
@@ -31,10 +32,12 @@ class RegisterType(Protocol):
     def highest(self) -> float: ...
 
     def encode(self, raw: float) -> bytes:
-        """The number nearest to ``raw``. Raises OverflowError or ValueError where there is none."""
+        """The number nearest to ``raw``. Raises OverflowError or ValueError
+        where there is none."""
 
     def decode(self, data: bytes) -> float:
-        """The number that ``size`` bytes hold; an int where the type holds whole numbers."""
+        """The number that ``size`` bytes hold; an int where the type holds
+        whole numbers."""
 
     def decode_all(self, data: NDArray[np.uint8]) -> NDArray[Any]:
         """The numbers (n,) that rows of bytes (n, size) hold."""
@@ -77,7 +80,8 @@ class Whole:
 
 @dataclass(frozen=True)
 class Floating:
-    """IEEE 754 numbers: ``code`` is the letter of `struct`, ``digits`` the bits of the significand."""
+    """IEEE 754 numbers: ``code`` is the letter of `struct`, ``digits`` the bits
+    of the significand."""
 
     code: str
     digits: int
@@ -131,13 +135,15 @@ def in_words(name: str) -> bool:
 
 
 def counts(name: str) -> bool:
-    """Whether the type can be a counter's or a clock's: it fills registers and wraps to zero."""
+    """Whether the type can be a counter's or a clock's: it fills registers and
+    wraps to zero."""
     type_ = TYPES[name]
     return in_words(name) and isinstance(type_, Whole) and not type_.signed
 
 
 def next_in_words(name: str) -> str | None:
-    """The shortest longer type of the same kind that fills registers of 16 bits."""
+    """The shortest longer type of the same kind that fills registers of 16
+    bits."""
     short = TYPES[name]
 
     def serves(other: RegisterType) -> bool:

@@ -1,4 +1,5 @@
-"""Numbers to raw register bytes and back, and what the register's format costs. No I/O."""
+"""Numbers to raw register bytes and back, and what the register's format costs.
+No I/O."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class Format(Protocol):
 
 
 def encode(register: Format, value: float, *, order: ByteOrder, name: str) -> bytes:
-    """``value`` in the register's unit as raw bytes, most or least significant first.
+    """``value`` in the register's unit as raw bytes, most or least significant
+    first.
 
     Raises RegisterValueError where it is outside the register's limits or type.
     """
@@ -49,12 +51,14 @@ def encode(register: Format, value: float, *, order: ByteOrder, name: str) -> by
 
 
 def step(register: Format, value: float) -> float:
-    """How far apart the numbers are that a register can hold near ``value``, in its unit."""
+    """How far apart the numbers are that a register can hold near ``value``, in
+    its unit."""
     return abs(register.scale) * TYPES[register.type].step((value - register.offset) / register.scale)
 
 
 def decode(register: Format, raw: bytes, *, order: ByteOrder, name: str) -> float:
-    """Raw bytes as a value in the register's unit. Raises RegisterValueError on a wrong length."""
+    """Raw bytes as a value in the register's unit. Raises RegisterValueError on
+    a wrong length."""
     type_ = TYPES[register.type]
     if len(raw) != type_.size:
         raise RegisterValueError(f"register {name}: {len(raw)} bytes, expected {type_.size} ({register.type})")
@@ -65,7 +69,8 @@ def decode(register: Format, raw: bytes, *, order: ByteOrder, name: str) -> floa
 
 
 def crc(algorithm: str, data: bytes) -> int:
-    """``crc-16/modbus`` (reflected 0x8005, initial 0xFFFF; check value 0x4B37) or ``crc-32`` (zlib's)."""
+    """``crc-16/modbus`` (reflected 0x8005, initial 0xFFFF; check value 0x4B37)
+    or ``crc-32`` (zlib's)."""
     if algorithm == "crc-32":
         return zlib.crc32(data)
     value = 0xFFFF

@@ -1,4 +1,5 @@
-"""The JSON Schema of a driver's profiles: ``python -m triaxcal_drivers.schema modbus``."""
+"""The JSON Schema of a driver's profiles: ``python -m triaxcal_drivers.schema
+modbus``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""TOML of whoever wrote it, bounded before it is parsed: time and memory of the parser go with the square of a key's
-parts, and it calls itself for each level of nesting."""
+"""TOML of whoever wrote it, bounded before it is parsed: time and memory of the
+parser go with the square of a key's parts, and it calls itself for each level
+of nesting."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from typing import Any
 from triaxcal_drivers.errors import ProfileError
 
 SIZE_MOST = 256 * 2**10
-"""Bytes. A profile of a hundred registers has 15 KiB, a unit in a station file 200 bytes."""
+"""Bytes. A profile of a hundred registers has 15 KiB, a unit in a station file
+200 bytes."""
 DEPTH_MOST = 16  # brackets within brackets; ours are at most 5 deep
 PARTS_MOST = 16  # of a dotted key; ours have at most 4
 WORD_MOST = 128  # characters of a bare key or a number, which has some 20
@@ -35,7 +37,8 @@ def parse_toml(text: bytes, *, where: str) -> dict[str, Any]:
 
 
 def _bound(text: str, where: str) -> None:
-    """Raises ProfileError where the parser would be at it for long; what is no TOML at all is left to the parser."""
+    """Raises ProfileError where the parser would be at it for long; what is no
+    TOML at all is left to the parser."""
     if len(text) > SIZE_MOST:
         raise ProfileError(f"{where}: {len(text)} characters, expected at most {SIZE_MOST}")
     depth = parts = 0

@@ -1,4 +1,5 @@
-"""Data as a model: the first fault of a profile, station or device file as one line, with the line it is in."""
+"""Data as a model: the first fault of a profile, station or device file as one
+line, with the line it is in."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ M = TypeVar("M", bound=BaseModel)
 def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str) -> M:
     """``data`` as ``model``; the first fault as a ProfileError of one line."""
     try:
-        # As JSON, because strict mode takes a TOML array for a tuple only there.
+        # As JSON, because strict mode takes a TOML array for a tuple only
+        # there.
         return model.model_validate_json(json.dumps(data, default=str))
     except ValidationError as e:
         errors = e.errors()
@@ -42,7 +44,8 @@ def validate(model: type[M], data: Mapping[str, Any], text: bytes, *, where: str
 
 
 def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:
-    """Whether a part of pydantic's location is the name of a union member rather than a key of the data."""
+    """Whether a part of pydantic's location is the name of a union member
+    rather than a key of the data."""
     at = data
     for p in loc:
         inside = (isinstance(at, Mapping) and p in at) or (
@@ -56,7 +59,8 @@ def _is_tag(part: int | str, data: Any, loc: tuple[int | str, ...]) -> bool:
 
 
 def _keys_at(annotation: Any, loc: tuple[int | str, ...]) -> set[str]:
-    """The keys that ``annotation`` allows at ``loc``, all union members together."""
+    """The keys that ``annotation`` allows at ``loc``, all union members
+    together."""
     if typing.get_origin(annotation) is Annotated:
         return _keys_at(typing.get_args(annotation)[0], loc)
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
@@ -75,7 +79,8 @@ def _keys_at(annotation: Any, loc: tuple[int | str, ...]) -> set[str]:
 
 
 def _line_of(text: bytes, path: list[str]) -> int | None:
-    """The line of the last key of ``path`` that the text shows, found by table headers and keys."""
+    """The line of the last key of ``path`` that the text shows, found by table
+    headers and keys."""
     table: list[str] = []
     best: tuple[int, int] | None = None
     counts: dict[str, int] = {}

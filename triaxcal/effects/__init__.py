@@ -1,4 +1,5 @@
-"""The effects that are known: our own, those of other packages, and those of any logged channel."""
+"""The effects that are known: our own, those of other packages, and those of
+any logged channel."""
 
 from __future__ import annotations
 
@@ -17,15 +18,17 @@ from triaxcal.effects.run_bias import BETWEEN_RUNS
 
 TEMPERATURE = "temp_c"
 OWN: tuple[Effect, ...] = (*CATALOGUE, *BETWEEN_RUNS, Empirical())
-"""All effects of this package that have a name of their own, those of old documents among them."""
+"""All effects of this package that have a name of their own, those of old
+documents among them."""
 
 
 def catalogue_for(covariates: Collection[str]) -> tuple[Effect, ...]:
-    """All effects that a recording with these covariates might show: the catalogue, the plugins, and bias and scale
-    factor by every other channel.
+    """All effects that a recording with these covariates might show: the
+    catalogue, the plugins, and bias and scale factor by every other channel.
     """
     effects = (*CATALOGUE, *plugins()[0])
-    # A channel that an effect of somebody else needs is that effect's business, and may be any other's too.
+    # A channel that an effect of somebody else needs is that effect's business,
+    # and may be any other's too.
     others = sorted(channel_of(c) for c in covariates if c != TEMPERATURE and not is_derived(c))
     return (*effects, *(made(c) for c in others for made in (ChannelBias, ChannelScaleFactor)))
 
@@ -39,7 +42,8 @@ def effect_named(name: str) -> Effect:
 
 
 def meaning_of(name: str) -> Meaning | None:
-    """What an effect says that it is; None where it says nothing, or is not known."""
+    """What an effect says that it is; None where it says nothing, or is not
+    known."""
     between = next((e for e in BETWEEN_RUNS if e.name == name), None)
     try:
         return (between or effect_named(name)).meaning
@@ -48,7 +52,8 @@ def meaning_of(name: str) -> Meaning | None:
 
 
 def effect_of(name: str, values: Mapping[str, float]) -> tuple[Effect, Floats]:
-    """An effect by its name and its coefficients and shape by theirs; coefficients not given are zero.
+    """An effect by its name and its coefficients and shape by theirs;
+    coefficients not given are zero.
 
     Raises KeyError for a name that is not known.
     """

@@ -11,8 +11,8 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning, no_slope, on_each_axis, xyz
 
 DEGREES = (1, 2, 3)
-"""Straight, bent once, bent twice; a higher degree would follow anything that is
-slow."""
+"""Straight, bent once, bent twice; a higher degree would follow anything that
+is slow."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""Bias that jumps once, at a moment that nobody knows: a knock, a supply that switched, a loose part."""
+"""Bias that jumps once, at a moment that nobody knows: a knock, a supply that
+switched, a loose part."""
 
 from __future__ import annotations
 
@@ -14,9 +15,11 @@ from triaxcal.effects.contract import DURATION, SINCE_START, Coefficient, Effect
 
 @dataclass(frozen=True)
 class BiasStep(Effect):
-    """``e_i = −q_i`` before the step, zero after it: what the unit is after the step is the reference.
+    """``e_i = −q_i`` before the step, zero after it: what the unit is after the
+    step is the reference.
 
-    ``at_s`` counts from the start of the recording. In a pose that the step falls into the part before it counts.
+    ``at_s`` counts from the start of the recording. In a pose that the step
+    falls into the part before it counts.
     """
 
     at_s: float = 0.0
@@ -53,7 +56,8 @@ class BiasStep(Effect):
         return {"at": (self.at_s, "s")}
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """Between any two poses, and in the middle of any but the first and the last."""
+        """Between any two poses, and in the middle of any but the first and the
+        last."""
         t, held = covariates[SINCE_START], covariates[DURATION]
         order = np.argsort(t)
         begin, end = (t - held / 2)[order], (t + held / 2)[order]

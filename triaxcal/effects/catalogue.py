@@ -1,4 +1,5 @@
-"""The effects of our own. A new one is one file and one line here, or an entry point of another package."""
+"""The effects of our own. A new one is one file and one line here, or an entry
+point of another package."""
 
 from __future__ import annotations
 

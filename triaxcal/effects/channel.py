@@ -1,4 +1,5 @@
-"""Bias and scale factor that change with any other logged channel: a supply voltage, a magnetic field, humidity."""
+"""Bias and scale factor that change with any other logged channel: a supply
+voltage, a magnetic field, humidity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Output that gives way towards the ends of the range, beyond a knee, as one that begins to saturate."""
+"""Output that gives way towards the ends of the range, beyond a knee, as one
+that begins to saturate."""
 
 from __future__ import annotations
 
@@ -13,27 +14,34 @@ from triaxcal.effects.contract import BEFORE, Coefficient, Effect, Meaning, per_
 
 KINDS = {"odd": "", "even": "even_"}
 KNEES = (0.5, 0.6, 0.7, 0.8, 0.9)
-"""In parts of the reference. Below these it is a cube, and above them only poses along the axis feel it."""
+"""In parts of the reference. Below these it is a cube, and above them only
+poses along the axis feel it."""
 ROUNDED = 0.1
 """Width of the bend at the knee, in parts of it."""
 
 
 @dataclass(frozen=True)
 class Compression(Effect):
-    """``e_i = −q_i (h(s_i) − h(−s_i))`` ("odd": both ends give way alike) or ``e_i = −q_i (h(s_i) + h(−s_i))`` ("even":
-    the upper end gives way, and the lower one gains as much, beside what "odd" says of both).
+    """``e_i = −q_i (h(s_i) − h(−s_i))`` ("odd": both ends give way alike) or
+    ``e_i = −q_i (h(s_i) + h(−s_i))`` ("even": the upper end gives way, and the
+    lower one gains as much, beside what "odd" says of both).
 
-    h(s) is s − κ beyond the knee κ and nothing below it, with a bend of the width w = κ/10 between:
-    h(s) = w (ln(1 + exp((s − κ)/w)) − ln(1 + exp(−κ/w))). So q_i is the share of the slope that is lost beyond the
-    knee, positive where the output falls behind: 0 none of it, 1 a stop. The scale factor is that below the knee.
+    h(s) is s − κ beyond the knee κ and nothing below it, with a bend of the
+    width w = κ/10 between: h(s) = w (ln(1 + exp((s − κ)/w)) − ln(1 +
+    exp(−κ/w))). So q_i is the share of the slope that is lost beyond the knee,
+    positive where the output falls behind: 0 none of it, 1 a stop. The scale
+    factor is that below the knee.
 
-    An amplifier whose output nears its supply, or a torquer whose current nears its limit, keeps its gain up to some
-    load and loses it there within a short way, which a cube does not follow: that bends everywhere, and most in the
-    middle between the ends. Where the range lies evenly about zero both ends give way (odd); bias, or a supply with
-    unequal halves, brings one end nearer (odd and even by half each, where it is one alone). The bend's width is
+    An amplifier whose output nears its supply, or a torquer whose current nears
+    its limit, keeps its gain up to some load and loses it there within a short
+    way, which a cube does not follow: that bends everywhere, and most in the
+    middle between the ends. Where the range lies evenly about zero both ends
+    give way (odd); bias, or a supply with unequal halves, brings one end nearer
+    (odd and even by half each, where it is one alone). The bend's width is
     assumed, since poses that are few along any axis could not tell it.
 
-    The knee is in units of the reference vector; the search tries some parts of it, whatever the unit.
+    The knee is in units of the reference vector; the search tries some parts of
+    it, whatever the unit.
     """
 
     kind: str = "odd"
@@ -78,7 +86,8 @@ class Compression(Effect):
         return tuple(Compression(kind, self.knee) for kind in KINDS)
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """Both forms with every knee. How long the reference vector is, the poses before tell."""
+        """Both forms with every knee. How long the reference vector is, the
+        poses before tell."""
         before = [covariates[n] for n in BEFORE if n in covariates]
         reference = float(np.median(np.linalg.norm(before, axis=0))) if len(before) == len(BEFORE) else 1.0
         return tuple(Compression(kind, float(f"{k * reference:.4g}")) for kind in KINDS for k in KNEES)

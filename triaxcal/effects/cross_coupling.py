@@ -1,4 +1,5 @@
-"""Output that changes with the product of two components of the input (IEEE Std 1293: Kip, Kio, Kpo)."""
+"""Output that changes with the product of two components of the input (IEEE Std
+1293: Kip, Kio, Kpo)."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 class CrossCoupling(Effect):
     """``e_i = q_ij s_i s_j + q_xyz s_j s_k``.
 
-    The three products of the two other components change |a| in one way, by their sum, so no still pose tells them
-    apart; they share one coefficient.
+    The three products of the two other components change |a| in one way, by
+    their sum, so no still pose tells them apart; they share one coefficient.
     """
 
     name: str = "cross_coupling"

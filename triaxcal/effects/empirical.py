@@ -13,19 +13,22 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning
 
 KINDS = {"odd": 3, "even": 4, "time": 4}
-"""Degree of each: the lowest odd and even ones that the nine parameters do not absorb,
-and of time a curve that bends three times; with more it would follow the noise."""
+"""Degree of each: the lowest odd and even ones that the nine parameters do not
+absorb, and of time a curve that bends three times; with more it would follow
+the noise."""
 Terms = tuple[tuple[float, int, int, int], ...]
 """A polynomial: (factor, powers of x, y, z)."""
 Table = tuple[Ints, Floats]
-"""Polynomials side by side: the powers (m,3) of the monomials in them, and each one's factors (m,p)."""
+"""Polynomials side by side: the powers (m,3) of the monomials in them, and each
+one's factors (m,p)."""
 
 
 @dataclass(frozen=True)
 class Empirical(Effect):
-    """``e = s f``: the magnitude is off by the share f, as a smooth function of the direction ("odd" and "even": the
-    solid harmonics of degree 3 and 4 on the unit sphere, the lowest that the nine parameters do not absorb), or of the
-    time ("time": a polynomial of degree 4 in thousands of seconds).
+    """``e = s f``: the magnitude is off by the share f, as a smooth function of
+    the direction ("odd" and "even": the solid harmonics of degree 3 and 4 on
+    the unit sphere, the lowest that the nine parameters do not absorb), or of
+    the time ("time": a polynomial of degree 4 in thousands of seconds).
     """
 
     kind: str = "odd"
@@ -75,7 +78,8 @@ class Empirical(Effect):
         )
 
     def _on_sphere(self, s: Floats) -> tuple[Floats, Floats]:
-        """Harmonics (n,p) of the direction of s, and their gradient (n,3,p) by s."""
+        """Harmonics (n,p) of the direction of s, and their gradient (n,3,p) by
+        s."""
         degree = KINDS[self.kind]
         length = np.linalg.norm(s, axis=1)
         of_values, of_gradient = _tables(degree)
@@ -89,7 +93,8 @@ class Empirical(Effect):
 
 @cache
 def harmonics(degree: int) -> tuple[Terms, ...]:
-    """The 2d + 1 harmonic polynomials that begin with p = x^i y^j, Σ (−1)^k z^2k Δ^k p / (2k)!, or with z p, alike."""
+    """The 2d + 1 harmonic polynomials that begin with p = x^i y^j, Σ (−1)^k
+    z^2k Δ^k p / (2k)!, or with z p, alike."""
     out = []
     for first in (0, 1):
         for i in range(degree - first + 1):
@@ -130,7 +135,8 @@ def _table(polynomials: Sequence[Terms]) -> Table:
 
 
 def _valued(table: Table, powers: Floats) -> Floats:
-    """The polynomials (n,p) where the coordinates have the ``powers`` (n,3,d+1)."""
+    """The polynomials (n,p) where the coordinates have the ``powers``
+    (n,3,d+1)."""
     (i, j, k), factors = table[0].T, table[1]
     return np.asarray((powers[:, 0, i] * powers[:, 1, j] * powers[:, 2, k]) @ factors)
 

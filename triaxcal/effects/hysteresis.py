@@ -12,14 +12,16 @@ from triaxcal.effects.contract import BEFORE, CHANGE, Coefficient, Effect, Meani
 
 KINDS = {"memory": "", "reversal": "sign_"}
 REVERSAL = 1e-3
-"""The change along an axis at which its sign is certain, in parts of the specific force's order of magnitude; below it
-the effect goes through zero in a straight line."""
+"""The change along an axis at which its sign is certain, in parts of the
+specific force's order of magnitude; below it the effect goes through zero in a
+straight line."""
 
 
 @dataclass(frozen=True)
 class Hysteresis(Effect):
-    """``e_i = q_i p_i``, of the specific force p_i in the pose before ("memory"), or ``q_i sign(Δ_i)``, of the change
-    Δ_i since then, the way on which the pose was reached ("reversal").
+    """``e_i = q_i p_i``, of the specific force p_i in the pose before
+    ("memory"), or ``q_i sign(Δ_i)``, of the change Δ_i since then, the way on
+    which the pose was reached ("reversal").
     """
 
     kind: str = "memory"

@@ -1,4 +1,5 @@
-"""An effect of the clocks in some of several recordings of a unit, with coefficients of its own in each."""
+"""An effect of the clocks in some of several recordings of a unit, with
+coefficients of its own in each."""
 
 from __future__ import annotations
 
@@ -16,14 +17,16 @@ NAMED = re.compile(r"(.+)_run([1-9]\d*)")
 
 
 def of_clocks(effect: Effect) -> bool:
-    """Whether an effect depends on nothing but the clocks, which start anew in every recording."""
+    """Whether an effect depends on nothing but the clocks, which start anew in
+    every recording."""
     return bool(effect.needs) and set(effect.needs) <= set(CLOCKS)
 
 
 @dataclass(frozen=True)
 class InRuns(Wrapped):
-    """``whole`` in ``runs`` (0-based); in the others it is zero, or, where it is `Effect.lasting`, what it was before
-    in earlier ones. Coefficients are named ``x_run2`` for x in the second recording.
+    """``whole`` in ``runs`` (0-based); in the others it is zero, or, where it
+    is `Effect.lasting`, what it was before in earlier ones. Coefficients are
+    named ``x_run2`` for x in the second recording.
     """
 
     runs: tuple[int, ...]
@@ -53,7 +56,8 @@ class InRuns(Wrapped):
         return np.concatenate(parts, axis=-1)
 
     def _by_run(self, covariates: Mapping[str, Floats]) -> Iterator[tuple[Bools, Mapping[str, Floats]]]:
-        """For each run: where it acts (n,), and covariates whose clocks stand outside the run as they do in use."""
+        """For each run: where it acts (n,), and covariates whose clocks stand
+        outside the run as they do in use."""
         index = covariates[RUN]
         for run in self.runs:
             outside = np.where((index < run) & self.whole.lasting, -np.inf, np.inf)
@@ -76,6 +80,7 @@ def longest(covariates: Mapping[str, Floats], runs: Iterable[int]) -> dict[str, 
 
 
 def runs_named(coefficients: Iterable[str]) -> tuple[int, ...]:
-    """The runs (0-based) that names of coefficients speak of; none where they speak of all alike."""
+    """The runs (0-based) that names of coefficients speak of; none where they
+    speak of all alike."""
     found = {int(match[2]) - 1 for name in coefficients if (match := NAMED.fullmatch(name))}
     return tuple(sorted(found))

@@ -1,5 +1,5 @@
-"""Effects of other packages: entry points of the group ``triaxcal.effects``, each an `Effect` or a class that makes one
-without arguments.
+"""Effects of other packages: entry points of the group ``triaxcal.effects``,
+each an `Effect` or a class that makes one without arguments.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ T = TypeVar("T")
 
 
 class EffectFault(InvalidData):
-    """An effect of another ``package`` cannot be used as it is, for this ``reason``."""
+    """An effect of another ``package`` cannot be used as it is, for this
+    ``reason``."""
 
     def __init__(self, name: str, package: str, reason: str) -> None:
         super().__init__(f"the effect {name} of {package}: {reason}")
@@ -42,7 +43,8 @@ class EffectFault(InvalidData):
 
 @dataclass(frozen=True)
 class Foreign(Wrapped):
-    """An effect of another package. Raises EffectFault, and nothing else, where that fails or gives no numbers."""
+    """An effect of another package. Raises EffectFault, and nothing else, where
+    that fails or gives no numbers."""
 
     package: str = UNKNOWN
 
@@ -143,7 +145,8 @@ def _loaded(point: EntryPoint, others: Collection[str]) -> tuple[Effect | None, 
 
 
 def package_of(name: str) -> str:
-    """The package that an effect is of, or an entry point that is broken, by its name."""
+    """The package that an effect is of, or an entry point that is broken, by
+    its name."""
     effect = next((e for e in plugins()[0] if e.name == name), None)
     if isinstance(effect, Foreign):
         return effect.package
@@ -171,7 +174,8 @@ def _check(effect: Any) -> None:
 
 
 def _try(effect: Foreign) -> None:
-    """Raises EffectFault where an effect cannot be reckoned with, in a recording or at its reference."""
+    """Raises EffectFault where an effect cannot be reckoned with, in a
+    recording or at its reference."""
     n = 4
     names = {*DERIVED, *effect.needs}
     recorded = {name: np.linspace(0.5, 1.5, n) for name in names}

@@ -11,23 +11,28 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import BEFORE, Coefficient, Effect, Meaning, no_slope, per_axis, signs, xyz
 
 DRIVEN = 0.05
-"""The specific force along an axis that leaves the whole offset, in parts of its order of magnitude; below it the
-offset goes through zero in a straight line. Bias and noise, which are far smaller, must not decide a sign."""
+"""The specific force along an axis that leaves the whole offset, in parts of
+its order of magnitude; below it the offset goes through zero in a straight
+line. Bias and noise, which are far smaller, must not decide a sign."""
 
 
 @dataclass(frozen=True)
 class Remanence(Effect):
-    """``e_i = q_i sign(p_i)`` of the specific force p_i in the pose before; positive where the reading stays on that
-    side.
+    """``e_i = q_i sign(p_i)`` of the specific force p_i in the pose before;
+    positive where the reading stays on that side.
 
-    What has been driven to one side and let go keeps an offset of that side, whose size hardly depends on how far it
-    was driven once that was far enough: magnetised iron in the torquer of a servo accelerometer, a charged dielectric
-    beside a capacitive proof mass, a spring or a joint that slipped. `Hysteresis` has the two neighbours of this: an
-    offset in proportion to p_i, and one by the way on which the pose was reached.
+    What has been driven to one side and let go keeps an offset of that side,
+    whose size hardly depends on how far it was driven once that was far enough:
+    magnetised iron in the torquer of a servo accelerometer, a charged
+    dielectric beside a capacitive proof mass, a spring or a joint that slipped.
+    `Hysteresis` has the two neighbours of this: an offset in proportion to p_i,
+    and one by the way on which the pose was reached.
 
-    In the first pose p_i is that of the pose itself, as if the unit had rested there before, and the fit may leave it
-    out (`triaxcal.poses.covariates.of_unknown_history`). A pose with next to no force along the axis leaves next to
-    nothing, though what was before that one may still be there.
+    In the first pose p_i is that of the pose itself, as if the unit had rested
+    there before, and the fit may leave it out
+    (`triaxcal.poses.covariates.of_unknown_history`). A pose with next to no
+    force along the axis leaves next to nothing, though what was before that one
+    may still be there.
     """
 
     name: str = "remanence"

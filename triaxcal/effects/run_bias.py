@@ -1,4 +1,5 @@
-"""Bias and scale factor that differ from recording to recording of a unit: their repeatability from start to start."""
+"""Bias and scale factor that differ from recording to recording of a unit:
+their repeatability from start to start."""
 
 from __future__ import annotations
 
@@ -19,10 +20,12 @@ ALONE = re.compile(r"[xyz]_run([1-9]\d*)_alone")
 
 @dataclass(frozen=True)
 class RunBias(Effect):
-    """``e_i = q_ik`` in run k of ``runs``, but for the first, where it is minus the sum of the others: the unit's bias
-    is the mean over the recordings. ``x_run2`` is that of x in the second.
+    """``e_i = q_ik`` in run k of ``runs``, but for the first, where it is minus
+    the sum of the others: the unit's bias is the mean over the recordings.
+    ``x_run2`` is that of x in the second.
 
-    With ``alone`` (0-based), e_i = q_i in that run and zero in all others, whose bias is the unit's: ``x_run2_alone``.
+    With ``alone`` (0-based), e_i = q_i in that run and zero in all others,
+    whose bias is the unit's: ``x_run2_alone``.
     """
 
     runs: int = 2
@@ -85,14 +88,16 @@ class RunBias(Effect):
         return [(index == k).astype(float) - (index == 0) for k in range(1, self.runs)]
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """In every run another, and in one run alone where there are more than two."""
+        """In every run another, and in one run alone where there are more than
+        two."""
         single = range(self.runs) if self.runs > 2 else ()
         return (self, *(replace(self, alone=run) for run in single))
 
 
 @dataclass(frozen=True)
 class RunScaleFactor(RunBias):
-    """``e_i = q_ik s_i`` likewise: the unit's scale factor is the mean over the recordings."""
+    """``e_i = q_ik s_i`` likewise: the unit's scale factor is the mean over the
+    recordings."""
 
     name: str = "run_scale_factor"
     unit: str = "g/g"

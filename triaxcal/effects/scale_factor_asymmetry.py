@@ -1,4 +1,5 @@
-"""Scale factor that differs between positive and negative input (IEEE Std 1293: scale-factor asymmetry)."""
+"""Scale factor that differs between positive and negative input (IEEE Std 1293:
+scale-factor asymmetry)."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from triaxcal.effects.contract import Coefficient, Effect, Meaning, per_axis, pe
 
 @dataclass(frozen=True)
 class ScaleFactorAsymmetry(Effect):
-    """``e_i = q_i |s_i|``: the scale factor is 1 + q above zero and 1 − q below it."""
+    """``e_i = q_i |s_i|``: the scale factor is 1 + q above zero and 1 − q below
+    it."""
 
     name: str = "scale_factor_asymmetry"
     coefficients: tuple[Coefficient, ...] = xyz("1")

@@ -13,8 +13,8 @@ from triaxcal.effects.contract import TIME, Coefficient, Effect, Meaning, per_ax
 
 @dataclass(frozen=True)
 class ScaleFactorDrift(Effect):
-    """``e_i = q_i (t − t_ref) s_i``: the scale factor grows by the share q_i a second, as a reference voltage or a
-    magnet that warms or ages makes it."""
+    """``e_i = q_i (t − t_ref) s_i``: the scale factor grows by the share q_i a
+    second, as a reference voltage or a magnet that warms or ages makes it."""
 
     name: str = "scale_factor_drift"
     coefficients: tuple[Coefficient, ...] = xyz("1/s")

@@ -13,7 +13,8 @@ from triaxcal.effects.contract import T_REFERENCE, Coefficient, Effect, Meaning,
 
 @dataclass(frozen=True)
 class TemperatureBiasQuadratic(Effect):
-    """``e_i = p_i (T − T_ref) + q_i (T − T_ref)²``; the linear part belongs to it, as a parabola has one."""
+    """``e_i = p_i (T − T_ref) + q_i (T − T_ref)²``; the linear part belongs to
+    it, as a parabola has one."""
 
     name: str = "temperature_bias_quadratic"
     coefficients: tuple[Coefficient, ...] = (

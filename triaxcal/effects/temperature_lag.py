@@ -1,4 +1,5 @@
-"""Bias that follows the temperature late, as what makes it warms later than the thermometer."""
+"""Bias that follows the temperature late, as what makes it warms later than the
+thermometer."""
 
 from __future__ import annotations
 
@@ -26,25 +27,29 @@ from triaxcal.effects.contract import (
 
 CHANNEL = "temp_c"
 SLOWEST = 2.0
-"""Lengths of the recording. The lag of such a time constant has followed an early step
-by 39 % at the end; a slower one is a drift to these poses."""
+"""Lengths of the recording. The lag of such a time constant has followed an
+early step by 39 % at the end; a slower one is a drift to these poses."""
 
 
 @dataclass(frozen=True)
 class TemperatureLag(Effect):
-    """``e_i = q_i (θ − T_ref)`` of a temperature θ that follows that of the thermometer by a first-order lag,
-    τ dθ/dt = T − θ.
+    """``e_i = q_i (θ − T_ref)`` of a temperature θ that follows that of the
+    thermometer by a first-order lag, τ dθ/dt = T − θ.
 
-    To the first order θ = T − τ dT/dt, which is a bias by temperature beside one by its rate (`ThermalGradient`); once
-    the temperature changes within τ, θ depends on what it was before. A pose does not know that by itself, so θ − T is
-    a covariate of the poses, derived from all of a recording for certain time constants
-    (`triaxcal.effects.contract.lag_of`, `triaxcal.poses.covariates.behind`): the temperature goes straight from the
-    middle of one pose to that of the next, and stood still before the first. What it did there, nobody knows; that goes
-    out by exp(−t/τ), as a `WarmUp` of the same time constant would. In use, where no lag is given, the temperature
-    counts as settled: θ = T.
+    To the first order θ = T − τ dT/dt, which is a bias by temperature beside
+    one by its rate (`ThermalGradient`); once the temperature changes within τ,
+    θ depends on what it was before. A pose does not know that by itself, so θ −
+    T is a covariate of the poses, derived from all of a recording for certain
+    time constants (`triaxcal.effects.contract.lag_of`,
+    `triaxcal.poses.covariates.behind`): the temperature goes straight from the
+    middle of one pose to that of the next, and stood still before the first.
+    What it did there, nobody knows; that goes out by exp(−t/τ), as a `WarmUp`
+    of the same time constant would. In use, where no lag is given, the
+    temperature counts as settled: θ = T.
 
-    A time constant between two of those known has the mean of theirs, weighted by its logarithm, which is right within
-    three per cent of the lag; beyond them it counts as the nearest.
+    A time constant between two of those known has the mean of theirs, weighted
+    by its logarithm, which is right within three per cent of the lag; beyond
+    them it counts as the nearest.
     """
 
     time_constant_s: float = 330.0
@@ -88,7 +93,8 @@ class TemperatureLag(Effect):
         return {"time_constant": (self.time_constant_s, "s")}
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """Those known, from what a few poses show to where the lag has hardly begun to follow at the end."""
+        """Those known, from what a few poses show to where the lag has hardly
+        begun to follow at the end."""
         shortest, whole = span_of(covariates[SINCE_START])
         tried = [c for c in LAGS_S if shortest <= c <= SLOWEST * whole]
         return tuple(self.shaped({"time_constant": float(c)}) for c in tried) or (self,)

@@ -1,4 +1,5 @@
-"""Bias that changes with the rate of temperature: gradients inside the unit while it warms or cools."""
+"""Bias that changes with the rate of temperature: gradients inside the unit
+while it warms or cools."""
 
 from __future__ import annotations
 

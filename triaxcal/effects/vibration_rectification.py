@@ -1,4 +1,5 @@
-"""Bias that vibration makes, as nonlinearity turns its variance into a mean (IEEE Std 1293: VRE)."""
+"""Bias that vibration makes, as nonlinearity turns its variance into a mean
+(IEEE Std 1293: VRE)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Bias that settles exponentially after the start, as a unit that warms up does."""
+"""Bias that settles exponentially after the start, as a unit that warms up
+does."""
 
 from __future__ import annotations
 
@@ -13,16 +14,18 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import SINCE_START, Coefficient, Effect, Meaning, no_slope, on_each_axis, span_of, xyz
 
 CONSTANTS = 8
-"""Time constants tried, evenly in the logarithm: a factor of 1.8 apart in 27 poses.
-More cost time for each hypothesis; fewer leave gaps between the shapes."""
+"""Time constants tried, evenly in the logarithm: a factor of 1.8 apart in 27
+poses. More cost time for each hypothesis; fewer leave gaps between the
+shapes."""
 SLOWEST = 4.0
-"""Lengths of the recording. Over a quarter of its time constant an exponential is off
-its chord by 3 % of its change: what is slower is a straight drift."""
+"""Lengths of the recording. Over a quarter of its time constant an exponential
+is off its chord by 3 % of its change: what is slower is a straight drift."""
 
 
 @dataclass(frozen=True)
 class WarmUp(Effect):
-    """``e_i = q_i exp(−t/τ)`` at t after the start of the recording; the settled unit is the reference."""
+    """``e_i = q_i exp(−t/τ)`` at t after the start of the recording; the
+    settled unit is the reference."""
 
     time_constant_s: float = 300.0
     name: str = "warm_up"
@@ -44,8 +47,9 @@ class WarmUp(Effect):
         return no_slope(s)
 
     def advice(self, largest: float, floor: float) -> str:
-        """After how long no more than the floor is left. Whoever records from the moment of switching on waits as
-        long; who began later has waited before."""
+        """After how long no more than the floor is left. Whoever records from
+        the moment of switching on waits as long; who began later has waited
+        before."""
         if not 0 < floor < abs(largest):
             return self.remedy
         wait_s = self.time_constant_s * math.log(abs(largest) / floor)
@@ -57,7 +61,8 @@ class WarmUp(Effect):
         return {"time_constant": (self.time_constant_s, "s")}
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
-        """From what three poses show to what is straight over the recording but for a few per cent."""
+        """From what three poses show to what is straight over the recording but
+        for a few per cent."""
         shortest, whole = span_of(covariates[SINCE_START])
         return tuple(
             self.shaped({"time_constant": float(c)}) for c in np.geomspace(shortest, SLOWEST * whole, CONSTANTS)

@@ -12,7 +12,8 @@ from triaxcal.effects.contract import Coefficient, Effect, Meaning
 
 @dataclass(frozen=True, eq=False)
 class Wrapped(Effect):
-    """``whole`` in another guise. It comes in no other forms than this, unless said otherwise."""
+    """``whole`` in another guise. It comes in no other forms than this, unless
+    said otherwise."""
 
     whole: Effect
 

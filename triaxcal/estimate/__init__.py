@@ -1,1 +1,2 @@
-"""From poses to a calibration: closed form, maximum likelihood, outliers, cross-validation."""
+"""From poses to a calibration: closed form, maximum likelihood, outliers,
+cross-validation."""

@@ -23,9 +23,10 @@ from triaxcal.poses.pose import Pose
 class Residual:
     """How well the magnitude comes out, in units of the reference vector (g).
 
-    ``noise_floor_g`` is the rms of the standard errors of the pose means along the measured vector, from the scatter
-    inside the poses alone; ``lack_of_fit_p`` the probability of residuals as large as these if the model were
-    complete and that noise were all.
+    ``noise_floor_g`` is the rms of the standard errors of the pose means along
+    the measured vector, from the scatter inside the poses alone;
+    ``lack_of_fit_p`` the probability of residuals as large as these if the
+    model were complete and that noise were all.
     """
 
     rms_g: float
@@ -37,10 +38,13 @@ class Residual:
 
 @dataclass(frozen=True)
 class HoldsAt:
-    """The moment for which effects of time are evaluated in another recording, whose clock is its own.
+    """The moment for which effects of time are evaluated in another recording,
+    whose clock is its own.
 
-    ``t_s`` in seconds from the first sample of the recording that was fitted, of the last one where these are several;
-    ``time_s`` the same as the covariate `TIME` counts it, which of several recordings is from the middle of each.
+    ``t_s`` in seconds from the first sample of the recording that was fitted,
+    of the last one where these are several; ``time_s`` the same as the
+    covariate `TIME` counts it, which of several recordings is from the middle
+    of each.
     """
 
     moment: Moment
@@ -49,8 +53,8 @@ class HoldsAt:
 
     @classmethod
     def of(cls, poses: Sequence[Pose], at: Moment | float = Moment.END) -> HoldsAt | None:
-        """None where there are no poses. A number is a moment in seconds. Raises InvalidData for one before the
-        start."""
+        """None where there are no poses. A number is a moment in seconds.
+        Raises InvalidData for one before the start."""
         if not poses:
             return None
         last = max(p.run.index for p in poses)
@@ -80,13 +84,15 @@ class Exclusion(StrEnum):
     CALLER = "caller"
     """The caller wanted it so."""
     UNKNOWN_HISTORY = "unknown_history"
-    """An effect goes with the pose before, and nobody knows that one: this one need not be taken again."""
+    """An effect goes with the pose before, and nobody knows that one: this one
+    need not be taken again."""
 
 
 @dataclass(frozen=True)
 class PoseResult:
-    """One pose under the fit. ``direction`` (3,) is up in the sensor's frame; ``residual_g`` is |a| − reference;
-    ``standard_error_g`` that of its noise, ``total_standard_error_g`` with what residuals show beyond noise, where that
+    """One pose under the fit. ``direction`` (3,) is up in the sensor's frame;
+    ``residual_g`` is |a| − reference; ``standard_error_g`` that of its noise,
+    ``total_standard_error_g`` with what residuals show beyond noise, where that
     is known.
     """
 
@@ -115,17 +121,23 @@ class PoseResult:
 class Calibration:
     """A fitted sensor. ``covariance`` is of `parameters`, in that order.
 
-    ``reference`` is the magnitude of the reference vector; ``channel_reference`` the values from which the effects'
-    covariates are counted. Residuals that exceed the noise raise the standard errors: by a factor on all errors,
-    ``birge_ratio``, at least 1 unless no pose knows its noise (then the residuals alone set it); or by ``excess_g``, a
-    standard deviation of |a| that every pose has beside its noise (`triaxcal.estimate.excess`). ``dof`` are the
-    effective degrees of freedom behind the standard errors. ``shape_errors`` are standard errors of the effects'
-    shapes, by "effect.name". ``slopes``: how |a| goes inside the poses was fitted along with their means.
-    ``weights`` is the probability of each effect where the coefficients are means over all that may act. Then
-    ``prior_sd`` (p,) are the standard deviations of the coefficients before the poses were seen, and ``thermal``
-    (9+p,9+p) is the part of the covariance that thermal effects make which the model has not.
-    ``holds_at`` None: effects of time count as long after the start, as in documents of 0.1. ``linear_only`` is the
-    linear model fitted by itself, where there are effects and somebody asked for it.
+    ``reference`` is the magnitude of the reference vector;
+    ``channel_reference`` the values from which the effects' covariates are
+    counted. Residuals that exceed the noise raise the standard errors: by a
+    factor on all errors, ``birge_ratio``, at least 1 unless no pose knows its
+    noise (then the residuals alone set it); or by ``excess_g``, a standard
+    deviation of |a| that every pose has beside its noise
+    (`triaxcal.estimate.excess`). ``dof`` are the effective degrees of freedom
+    behind the standard errors. ``shape_errors`` are standard errors of the
+    effects' shapes, by "effect.name". ``slopes``: how |a| goes inside the poses
+    was fitted along with their means. ``weights`` is the probability of each
+    effect where the coefficients are means over all that may act. Then
+    ``prior_sd`` (p,) are the standard deviations of the coefficients before the
+    poses were seen, and ``thermal`` (9+p,9+p) is the part of the covariance
+    that thermal effects make which the model has not. ``holds_at`` None:
+    effects of time count as long after the start, as in documents of 0.1.
+    ``linear_only`` is the linear model fitted by itself, where there are
+    effects and somebody asked for it.
     """
 
     sensor: Sensor
@@ -175,10 +187,11 @@ class Calibration:
         return np.sqrt(np.diag(self.covariance))
 
     def coefficients_of(self, name: str) -> dict[str, tuple[float, float | None, str]]:
-        """name → (value, standard error, unit) of the coefficients of the effect of that name, and of its shape.
+        """name → (value, standard error, unit) of the coefficients of the
+        effect of that name, and of its shape.
 
-        The standard error is None where the poses do not tell it. That of the moment of a step holds that it may have
-        been anywhere between two poses.
+        The standard error is None where the poses do not tell it. That of the
+        moment of a step holds that it may have been anywhere between two poses.
         Raises KeyError for an effect that is not in the model.
         """
         errors = dict(zip(self.parameters, self.standard_errors, strict=True))
@@ -192,31 +205,36 @@ class Calibration:
         return out
 
     def coverage_factor(self, level: float = 0.95) -> float:
-        """By what a standard error is multiplied for an interval that holds the truth with probability ``level``.
+        """By what a standard error is multiplied for an interval that holds the
+        truth with probability ``level``.
 
-        Student's t for `dof`, as JCGM 100, G.3, has it. Raises InvalidData for a level outside 0 to 1.
+        Student's t for `dof`, as JCGM 100, G.3, has it. Raises InvalidData for
+        a level outside 0 to 1.
         """
         if not 0 < level < 1:
             raise InvalidData(f"a level of confidence lies between 0 and 1, not at {level}")
         return float(t_ppf((1 + level) / 2, self.dof))
 
     def interval(self, level: float = 0.95) -> tuple[Floats, Floats]:
-        """Lower and upper ends for `parameters`, each of which holds its truth with probability ``level``."""
+        """Lower and upper ends for `parameters`, each of which holds its truth
+        with probability ``level``."""
         half = self.coverage_factor(level) * self.standard_errors
         return self.values - half, self.values + half
 
     def specific_force(self, readings: Floats, channels: Mapping[str, Floats]) -> Floats:
-        """a (n,3) of single readings (n,3) in output units, with the ``channels`` (n,) that are known of them. Raises
-        Refused where the model has no inverse there."""
+        """a (n,3) of single readings (n,3) in output units, with the
+        ``channels`` (n,) that are known of them. Raises Refused where the model
+        has no inverse there."""
         covariates, _ = self.covariates_of_readings(len(readings), channels)
         return self.sensor.specific_force(readings, covariates)
 
     def covariates_of_readings(
         self, n: int, channels: Mapping[str, Floats], t_s: Floats | None = None
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
-        """Of n single readings with the ``channels`` (n,) that are known of them: and the covariates that are needed
-        and not known, which count as at their reference. Effects of time at the times ``t_s`` (n,) of the recording
-        that was fitted, at `holds_at` where that is None."""
+        """Of n single readings with the ``channels`` (n,) that are known of
+        them: and the covariates that are needed and not known, which count as
+        at their reference. Effects of time at the times ``t_s`` (n,) of the
+        recording that was fitted, at `holds_at` where that is None."""
         if t_s is None:
             clocks: Mapping[str, Floats | float] = of_moment(self.channel_reference, self.moment)
         else:

@@ -1,6 +1,8 @@
-"""Reasons not to trust a result, as values with their figures. `triaxcal.text` says them in English.
+"""Reasons not to trust a result, as values with their figures. `triaxcal.text`
+says them in English.
 
-Those of the fit to still poses are here; a fit by another method has its own beside it.
+Those of the fit to still poses are here; a fit by another method has its own
+beside it.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ class Caution:
 
 @dataclass(frozen=True)
 class ExcludedPose:
-    """A pose that a fit excludes, when it began and how many standard errors off it is."""
+    """A pose that a fit excludes, when it began and how many standard errors
+    off it is."""
 
     began: PoseStart
     studentized: float
@@ -25,7 +28,8 @@ class ExcludedPose:
 
 @dataclass(frozen=True)
 class FaultyPosesExcluded(Caution):
-    """The outputs did not follow the acceleration; ``faults`` by data-quality name."""
+    """The outputs did not follow the acceleration; ``faults`` by data-quality
+    name."""
 
     faults: tuple[tuple[PoseStart, str], ...]
 
@@ -44,8 +48,9 @@ class PosesExcludedByCaller(Caution):
 
 @dataclass(frozen=True)
 class OutliersExcluded(Caution):
-    """``doubtful``: the other residuals leave it open whether all poses repeat less well than their noise says, and the
-    standard errors allow for that, by ``excess`` (in the reference) where it is not 0."""
+    """``doubtful``: the other residuals leave it open whether all poses repeat
+    less well than their noise says, and the standard errors allow for that, by
+    ``excess`` (in the reference) where it is not 0."""
 
     poses: tuple[ExcludedPose, ...]
     doubtful: bool
@@ -54,14 +59,16 @@ class OutliersExcluded(Caution):
 
 @dataclass(frozen=True)
 class OutlierSetsTied(Caution):
-    """Any of these sets of poses may be outliers, or something else acts; none is excluded."""
+    """Any of these sets of poses may be outliers, or something else acts; none
+    is excluded."""
 
     sets: tuple[tuple[PoseStart, ...], ...]
 
 
 @dataclass(frozen=True)
 class PoorSpread(Caution):
-    """Some combination of parameters is ``dilution`` times as uncertain as one pose; poses ``wanted`` would mend it."""
+    """Some combination of parameters is ``dilution`` times as uncertain as one
+    pose; poses ``wanted`` would mend it."""
 
     dilution: float
     wanted: tuple[str, ...]
@@ -83,16 +90,17 @@ class HighLeverage(Caution):
 
 @dataclass(frozen=True)
 class ExcessVariance(Caution):
-    """Residuals show an ``excess`` standard deviation of |a|, in the reference, that every pose has beside its noise;
-    the standard errors allow for it."""
+    """Residuals show an ``excess`` standard deviation of |a|, in the reference,
+    that every pose has beside its noise; the standard errors allow for it."""
 
     excess: float
 
 
 @dataclass(frozen=True)
 class BirgeRatio(Caution):
-    """Residuals are ``ratio`` times what noise explains, which raises the standard errors. ``attitudes``: what noise
-    and the error of the attitudes explain."""
+    """Residuals are ``ratio`` times what noise explains, which raises the
+    standard errors. ``attitudes``: what noise and the error of the attitudes
+    explain."""
 
     ratio: float
     attitudes: bool = False
@@ -100,4 +108,5 @@ class BirgeRatio(Caution):
 
 @dataclass(frozen=True)
 class ResidualsTooSmall(Caution):
-    """Residuals are smaller than noise and creep explain: the standard errors are too large rather than too small."""
+    """Residuals are smaller than noise and creep explain: the standard errors
+    are too large rather than too small."""

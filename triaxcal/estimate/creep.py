@@ -1,7 +1,9 @@
-"""Poses that creep: an error of their means as long as nobody knows why, none once an effect explains it.
+"""Poses that creep: an error of their means as long as nobody knows why, none
+once an effect explains it.
 
-The mean of the outputs over a pose goes with the mean of the time and of the channels over it, so an effect that
-follows them is not disturbed by their moving inside the pose; a model that lacks the effect is.
+The mean of the outputs over a pose goes with the mean of the time and of the
+channels over it, so an effect that follows them is not disturbed by their
+moving inside the pose; a model that lacks the effect is.
 """
 
 from __future__ import annotations
@@ -19,17 +21,20 @@ from triaxcal.poses.covariates import covariates_elsewhere, rate_of_lag
 from triaxcal.poses.pose import Pose
 
 ASLANT = 0.05
-"""How far the direction of the measured vector that poses know of themselves is off, at most."""
+"""How far the direction of the measured vector that poses know of themselves is
+off, at most."""
 
 
 def without_creep(poses: Sequence[Pose]) -> list[Pose]:
-    """The same poses with the scatter about their creep alone in their covariance."""
+    """The same poses with the scatter about their creep alone in their
+    covariance."""
     return [_with(p, np.zeros(3)) if p.creep.any() else p for p in poses]
 
 
 def with_unexplained_creep(poses: Sequence[Pose], model: Calibration, *, elsewhere: bool = False) -> list[Pose]:
-    """The same poses with so much of their creep as the model's effects do not explain. ``elsewhere``: they are of
-    another recording than the model, of whose clocks it knows nothing.
+    """The same poses with so much of their creep as the model's effects do not
+    explain. ``elsewhere``: they are of another recording than the model, of
+    whose clocks it knows nothing.
     """
     if not any(p.creep.any() for p in poses) or not model.sensor.effects:
         return list(poses)
@@ -46,8 +51,9 @@ def with_unexplained_creep(poses: Sequence[Pose], model: Calibration, *, elsewhe
 
 
 def _beside(creep: Floats, change: Floats, outward: Floats) -> Floats:
-    """What ``change`` leaves of a pose's creep. Of a pose that only turns, whose |a| stays within its noise, only the
-    turn was taken for creep (`triaxcal.poses.pose`), and so is what is left."""
+    """What ``change`` leaves of a pose's creep. Of a pose that only turns,
+    whose |a| stays within its noise, only the turn was taken for creep
+    (`triaxcal.poses.pose`), and so is what is left."""
     left = creep - change
     turns = abs(creep @ outward) <= ASLANT * np.linalg.norm(creep)
     return np.asarray(left - (left @ outward) * outward if turns else left)
@@ -67,7 +73,8 @@ def _covariates(poses: Sequence[Pose], model: Calibration, elsewhere: bool) -> d
 
 
 def _change(poses: Sequence[Pose], model: Calibration, covariates: Mapping[str, Floats], elsewhere: bool) -> Floats:
-    """(n,3) by how much the model's effects change the outputs from the beginning of each pose to its end."""
+    """(n,3) by how much the model's effects change the outputs from the
+    beginning of each pose to its end."""
     sensor = model.sensor
     length = np.array([p.end_s - p.start_s for p in poses])
     ends = []

@@ -2,9 +2,10 @@
 
 Paper, eq. 11–20; Li and Griffiths 2004.
 
-Written after the corrections of the printed formulas: undoubled cross terms with the constraint matrix that
-goes with them, normalisation by ``cᵀBc − β₁₀``, the upper Cholesky factor, and each axis scaled first, so that
-axes of very different sensitivity are fitted too.
+Written after the corrections of the printed formulas: undoubled cross terms
+with the constraint matrix that goes with them, normalisation by ``cᵀBc − β₁₀``,
+the upper Cholesky factor, and each axis scaled first, so that axes of very
+different sensitivity are fitted too.
 """
 
 from __future__ import annotations
@@ -15,16 +16,19 @@ import scipy.linalg
 from triaxcal.arrays import Floats
 from triaxcal.errors import Refused
 
-# 4 J − I² = 1 for β₁ = (a, b, c, d, e, f) of a x² + b y² + c z² + d xy + e yz + f xz.
+# 4 J − I² = 1 for β₁ = (a, b, c, d, e, f) of a x² + b y² + c z² + d xy + e yz +
+# f xz.
 _CONSTRAINT = np.zeros((6, 6))
 _CONSTRAINT[:3, :3] = 1.0 - 2.0 * np.eye(3)
 _CONSTRAINT[range(3, 6), range(3, 6)] = -1.0
 
 
 def closed_form(u: Floats) -> tuple[Floats, Floats]:
-    """``A`` (3,3) upper triangular with positive diagonal and ``c`` (3,) such that ``|A (u − c)| = 1``.
+    """``A`` (3,3) upper triangular with positive diagonal and ``c`` (3,) such
+    that ``|A (u − c)| = 1``.
 
-    ``u`` (n,3), at least nine. Raises Refused where the outputs lie on no ellipsoid.
+    ``u`` (n,3), at least nine. Raises Refused where the outputs lie on no
+    ellipsoid.
     """
     middle = (u.max(axis=0) + u.min(axis=0)) / 2
     half = (u.max(axis=0) - u.min(axis=0)) / 2
@@ -53,7 +57,8 @@ def closed_form(u: Floats) -> tuple[Floats, Floats]:
 
 
 def coefficients(A: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Scale factor (3,), misalignment (ax, ay, az), bias (3,) from ``A`` and ``c`` (eq. 4, 5)."""
+    """Scale factor (3,), misalignment (ax, ay, az), bias (3,) from ``A`` and
+    ``c`` (eq. 4, 5)."""
     KR = np.linalg.inv(A)
     k = np.diag(KR).copy()
     return k, np.array([KR[1, 2] / k[1], KR[0, 2] / k[0], KR[0, 1] / k[0]]), c / k

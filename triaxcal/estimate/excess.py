@@ -1,11 +1,14 @@
-"""What residuals show beyond the noise inside the poses, and what it makes of the errors.
+"""What residuals show beyond the noise inside the poses, and what it makes of
+the errors.
 
-Residuals that are more than noise come from an effect that the model lacks, a stand that does not come back, a room
-that acts on the unit. None of these asks how noisy a pose was, nor how much it crept. To multiply all errors by a
-factor would keep the weights as they are: a pose that was quieter than others, or did not creep because what moves the
-unit just turned back, would then carry a fit that is off for another reason. So it is one standard deviation that all
-poses have beside their noise. Where residuals exceed the noise by no more than chance may bring about, it is a factor,
-and the noise keeps the weights.
+Residuals that are more than noise come from an effect that the model lacks, a
+stand that does not come back, a room that acts on the unit. None of these asks
+how noisy a pose was, nor how much it crept. To multiply all errors by a factor
+would keep the weights as they are: a pose that was quieter than others, or did
+not creep because what moves the unit just turned back, would then carry a fit
+that is off for another reason. So it is one standard deviation that all poses
+have beside their noise. Where residuals exceed the noise by no more than chance
+may bring about, it is a factor, and the noise keeps the weights.
 """
 
 from __future__ import annotations
@@ -22,30 +25,35 @@ from triaxcal.estimate.pose_slopes import residual_chi2
 from triaxcal.poses.pure_error import lack_of_fit_p
 
 NO_CHANCE = 1e-4
-"""Lack-of-fit p below which an excess variance is added, which changes the weights. Above it, a Birge ratio multiplies
-all errors. It is small because other weights cost a hundredfold in variance where poses differ much in noise and no
-excess was there."""
+"""Lack-of-fit p below which an excess variance is added, which changes the
+weights. Above it, a Birge ratio multiplies all errors. It is small because
+other weights cost a hundredfold in variance where poses differ much in noise
+and no excess was there."""
 EXACT = 1e-10
 """To which share the excess is sought."""
 
 
 @dataclass(frozen=True)
 class Excess:
-    """``birge_ratio`` is a factor on all errors, or ``excess_g`` a standard deviation of |a|, in units of the reference
-    vector, that all poses have beside their noise."""
+    """``birge_ratio`` is a factor on all errors, or ``excess_g`` a standard
+    deviation of |a|, in units of the reference vector, that all poses have
+    beside their noise."""
 
     birge_ratio: float = 1.0
     excess_g: float = 0.0
 
     @classmethod
     def estimated(cls, left_by: Linearised, n: int, left: int, pure_dof: float) -> Excess:
-        """That with which the sum of squares that a fit leaves is its ``left`` degrees of freedom, in linear reckoning
-        from residuals, derivatives and errors near its minimum, of which the first ``n`` are the means of the poses.
-        ``pure_dof`` are the degrees of freedom of the noise inside the poses.
+        """That with which the sum of squares that a fit leaves is its ``left``
+        degrees of freedom, in linear reckoning from residuals, derivatives and
+        errors near its minimum, of which the first ``n`` are the means of the
+        poses. ``pure_dof`` are the degrees of freedom of the noise inside the
+        poses.
 
-        The excess is that of Mandel and Paule (1970, Anal. Chem. 42:1194), here for a fit of several parameters; the
-        factor that of Birge (1932, Phys. Rev. 40:207), at least 1 unless no pose knows its noise. Raises Refused where
-        the fit ran away.
+        The excess is that of Mandel and Paule (1970, Anal. Chem. 42:1194), here
+        for a fit of several parameters; the factor that of Birge (1932, Phys.
+        Rev. 40:207), at least 1 unless no pose knows its noise. Raises Refused
+        where the fit ran away.
         """
         r, J, s = left_by
 
@@ -65,8 +73,9 @@ class Excess:
         return cls(excess_g=float(scipy.optimize.brentq(lambda e: ratio(e) - 1, 0.0, high, xtol=EXACT * high)))
 
     def added_to(self, problem: Problem, state: State) -> Problem:
-        """The problem with the excess; ``state`` is near its minimum. What else a pose tells is widened as its
-        mean is: what acts between poses may act inside them as well."""
+        """The problem with the excess; ``state`` is near its minimum. What else
+        a pose tells is widened as its mean is: what acts between poses may act
+        inside them as well."""
         if not self.excess_g:
             return problem
         slopes = problem.slopes and problem.slopes.widened(_widened(linearise(problem, state)[2], self.excess_g))

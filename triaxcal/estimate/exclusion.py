@@ -1,4 +1,5 @@
-"""The poses that a fit excludes: which these are, and what the calibration of the others says of them."""
+"""The poses that a fit excludes: which these are, and what the calibration of
+the others says of them."""
 
 from __future__ import annotations
 
@@ -26,17 +27,18 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import combined_dof, pose_dof, pure_error_dof
 
 OUTLIER_ROUNDS = 4
-"""The search is repeated without the outliers found, since large ones bend the fit
-beyond linear reckoning; it ends sooner once the set stays the same. The last set
-stands."""
+"""The search is repeated without the outliers found, since large ones bend the
+fit beyond linear reckoning; it ends sooner once the set stays the same. The
+last set stands."""
 
 
 def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> OutlierSet:
-    """Indices of outliers, from the fit to all. Sought anew without those found, until the same are found again:
-    a pose off by a thousand times its noise bends the fit so far that linear reckoning is off.
+    """Indices of outliers, from the fit to all. Sought anew without those
+    found, until the same are found again: a pose off by a thousand times its
+    noise bends the fit so far that linear reckoning is off.
 
-    What the others show beside their noise, all are taken to have: by the noise alone the quietest would look like
-    outliers.
+    What the others show beside their noise, all are taken to have: by the noise
+    alone the quietest would look like outliers.
     """
     own, together = pose_dof(poses), pure_error_dof(poses)
     dof, pure, judged, found = own, together, problem, OutlierSet()
@@ -58,7 +60,8 @@ def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> Out
 def with_unknown_history(
     problem: Problem, state: State, poses: Sequence[Pose], excluded: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """Poses, besides those ``excluded``, that are not as if the unit had rested there before; what was is not known."""
+    """Poses, besides those ``excluded``, that are not as if the unit had rested
+    there before; what was is not known."""
     if not (unknown := set(of_unknown_history(poses, state.effects)) - set(excluded)):
         return ()
     rest: Ints = np.delete(np.arange(len(poses)), excluded)
@@ -70,7 +73,8 @@ def with_unknown_history(
 
 
 def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
-    """A calibration from the sound ones of ``poses`` with the faulty ones among its results, and a caution."""
+    """A calibration from the sound ones of ``poses`` with the faulty ones among
+    its results, and a caution."""
     faulty = [i for i, p in enumerate(poses) if p.fault]
     if not faulty:
         return calibration
@@ -82,7 +86,8 @@ def with_faulty(calibration: Calibration, poses: Sequence[Pose]) -> Calibration:
 def _among(
     calibration: Calibration, poses: Sequence[Pose], reasons: Mapping[int, Exclusion]
 ) -> tuple[tuple[PoseResult, ...], list[PoseResult]]:
-    """The results of a calibration with those of further, excluded poses among them, by rows of all; and these."""
+    """The results of a calibration with those of further, excluded poses among
+    them, by rows of all; and these."""
     u = np.array([p.mean for p in poses])
     covariates = calibration.covariates_of(poses)
     length, by_u = calibration.sensor.magnitude(u, covariates)
@@ -100,8 +105,9 @@ def _among(
 def with_excluded(
     calibration: Calibration, poses: Sequence[Pose], rows: Sequence[int], verdict: OutlierSet, why: Exclusion
 ) -> Calibration:
-    """The calibration with the excluded poses among its results, in order of time, and cautions that name them: those
-    that an effect knows no history of, and else as ``why`` says."""
+    """The calibration with the excluded poses among its results, in order of
+    time, and cautions that name them: those that an effect knows no history of,
+    and else as ``why`` says."""
     unknown = of_unknown_history(poses, [e for e, _ in calibration.sensor.effects]) if why != Exclusion.CALLER else ()
     results, added = _among(calibration, poses, {i: Exclusion.UNKNOWN_HISTORY if i in unknown else why for i in rows})
 
@@ -119,8 +125,8 @@ def with_excluded(
 
 
 def with_tied_sets(calibration: Calibration, poses: Sequence[Pose], verdict: OutlierSet) -> Calibration:
-    """The calibration with a caution of sets of poses one of which may hold the outliers, where the data do not tell
-    which."""
+    """The calibration with a caution of sets of poses one of which may hold the
+    outliers, where the data do not tell which."""
     if not verdict.tied:
         return calibration
     tied = OutlierSetsTied(tuple(tuple(poses[i].began for i in rows) for rows in verdict.tied))

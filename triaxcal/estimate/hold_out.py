@@ -16,7 +16,8 @@ from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 
 CLEARLY = 2.0
-"""Standard errors of the mean difference of the squares, pose by pose: by chance in one recording of forty."""
+"""Standard errors of the mean difference of the squares, pose by pose: by
+chance in one recording of forty."""
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,16 @@ class HoldOut:
     before_rms_g: float
     after_rms_g: float
     noise_floor_g: float
-    """What the noise of these poses leaves, with so much of their creep as the extended model does not explain."""
+    """What the noise of these poses leaves, with so much of their creep as the
+    extended model does not explain."""
     poses: int
     worse: bool = False
     """Whether the linear calibration is clearly better in these poses."""
 
 
 def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> HoldOut:
-    """Raises InvalidData where there is no check pose, or where these lack a channel that the effects need."""
+    """Raises InvalidData where there is no check pose, or where these lack a
+    channel that the effects need."""
     if not check:
         raise InvalidData("the check recording has no still pose")
     try:
@@ -53,11 +56,13 @@ def magnitude_errors(
     reference: float,
     moment: tuple[float, float] | None = None,
 ) -> tuple[Floats, Floats]:
-    """|a| − reference (n,) of poses under a sensor's model, and its standard error (n,) from their noise.
+    """|a| − reference (n,) of poses under a sensor's model, and its standard
+    error (n,) from their noise.
 
-    The poses are of another recording than the model's, whose clock is its own: effects of time count as at one
-    ``moment`` (`triaxcal.poses.covariates.of_moment`). Raises InvalidData where a channel that the effects need is
-    missing.
+    The poses are of another recording than the model's, whose clock is its own:
+    effects of time count as at one ``moment``
+    (`triaxcal.poses.covariates.of_moment`). Raises InvalidData where a channel
+    that the effects need is missing.
     """
     u = np.array([p.mean for p in poses])
     covariates = covariates_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)

@@ -1,4 +1,5 @@
-"""Where the fit begins: poses as a problem, its closed form, and the refusal of poses that cannot carry one."""
+"""Where the fit begins: poses as a problem, its closed form, and the refusal of
+poses that cannot carry one."""
 
 from __future__ import annotations
 
@@ -18,16 +19,20 @@ from triaxcal.poses.covariates import channels_of, lags_for, references, with_sc
 from triaxcal.poses.pose import Pose
 
 DILUTION_LIMIT = 100.0
-"""Above this a set of poses is refused: some combination of parameters is a hundred times worse than one pose."""
+"""Above this a set of poses is refused: some combination of parameters is a
+hundred times worse than one pose."""
 NOISE_LIMIT = 0.05
-"""Poses are refused where noise alone, times the dilution, is this share of the reference."""
+"""Poses are refused where noise alone, times the dilution, is this share of the
+reference."""
 ROUGH_LEAST, ROUGH_APART_DEG, ROUGH_LIMIT_RAD, TRIAD_UNLIKE_SPHERE = 6, 10.0, 0.2, 0.03
-"""Directions are determined without a fit from so many poses so far apart, where they are not less sure than this; and
-by how much at least scale factors of the axes are taken to differ."""
+"""Directions are determined without a fit from so many poses so far apart,
+where they are not less sure than this; and by how much at least scale factors
+of the axes are taken to differ."""
 
 
 class Underdetermined(Refused):
-    """The poses cannot carry nine parameters; ``a`` (n,3) are what is known of their directions."""
+    """The poses cannot carry nine parameters; ``a`` (n,3) are what is known of
+    their directions."""
 
     def __init__(self, why: str, a: Floats, wanted: Sequence[str]) -> None:
         super().__init__(f"{why}; {len(a)} poses in {distinct(a)} distinct directions", wanted=wanted)
@@ -40,8 +45,8 @@ def problem_of(
     reference: float = 1.0,
     effects: Sequence[Effect] = (),
 ) -> Problem:
-    """With the lags of channels that the ``effects`` need. Raises InvalidData, Refused where there are fewer than nine
-    poses."""
+    """With the lags of channels that the ``effects`` need. Raises InvalidData,
+    Refused where there are fewer than nine poses."""
     if len(poses) < LINEAR:
         raise Refused(
             f"{len(poses)} still pose{'s' * (len(poses) != 1)}; nine parameters need at least {LINEAR}, "
@@ -71,7 +76,8 @@ def problem_of(
 
 
 def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> State:
-    """The closed form as a starting point, after it is sure that the poses can carry nine parameters."""
+    """The closed form as a starting point, after it is sure that the poses can
+    carry nine parameters."""
     x = (problem.u - problem.middle) / problem.half
     rough = x / np.linalg.norm(x, axis=1, keepdims=True)
     try:
@@ -105,33 +111,38 @@ def start(problem: Problem, poses: Sequence[Pose], signs: Sequence[float]) -> St
 
 
 def with_history(problem: Problem, poses: Sequence[Pose], sensor: Sensor) -> Problem:
-    """The problem with the covariates that need the scale of the outputs: the pose before, the scatter."""
+    """The problem with the covariates that need the scale of the outputs: the
+    pose before, the scatter."""
     return problem.with_channels(with_scale(problem.channels, poses, sensor.scale_factor, sensor.bias))
 
 
 def started_problem(
     poses: Sequence[Pose], *, signs: Sequence[float], reference: float, effects: Sequence[Effect] = ()
 ) -> tuple[Problem, State]:
-    """The problem with the history of its poses and what the ``effects`` need, and where the fit begins. Raises as
-    `problem_of` and `start` do."""
+    """The problem with the history of its poses and what the ``effects`` need,
+    and where the fit begins. Raises as `problem_of` and `start` do."""
     problem = problem_of(poses, signs=signs, reference=reference, effects=effects)
     state = start(problem, poses, signs)
     return with_history(problem, poses, state.sensor(problem)), state
 
 
 def wanted_for(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[str, ...]:
-    """The poses that would mend a set, as far as its directions can be determined without a fit.
+    """The poses that would mend a set, as far as its directions can be
+    determined without a fit.
 
-    Where they cannot, a whole set is wanted, which carries nine parameters whatever the poses there are.
+    Where they cannot, a whole set is wanted, which carries nine parameters
+    whatever the poses there are.
     """
     up, unsure_rad = rough_directions(poses, signs)
     return _labels(up, unsure_rad)
 
 
 def rough_directions(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[Floats, float]:
-    """Up (n,3) in poses that need not carry a fit, and how unsure it is; (0,3) where it cannot be determined.
+    """Up (n,3) in poses that need not carry a fit, and how unsure it is; (0,3)
+    where it cannot be determined.
 
-    By a sphere through the outputs. How far a triad is from a sphere shows in the residual, given poses to spare.
+    By a sphere through the outputs. How far a triad is from a sphere shows in
+    the residual, given poses to spare.
     """
     nothing = np.zeros((0, 3)), 0.0
     if len(poses) < ROUGH_LEAST:
@@ -149,7 +160,8 @@ def rough_directions(poses: Sequence[Pose], signs: Sequence[float]) -> tuple[Flo
     smallest = float(np.linalg.svd(np.concatenate([a, np.ones((len(a), 1))], axis=1), compute_uv=False)[-1])
     if (many := distinct(a, ROUGH_APART_DEG)) < ROUGH_LEAST:
         return nothing
-    # With few degrees of freedom left a triad that is no sphere may pass for one: the least that 5 % of them show.
+    # With few degrees of freedom left a triad that is no sphere may pass for
+    # one: the least that 5 % of them show.
     shown = float(np.sqrt(many / chi2_ppf(0.05, many - 4)))
     unlike = max(TRIAD_UNLIKE_SPHERE, shown * float(np.std(radii) / np.mean(radii)))
     unsure_rad = unlike / max(smallest, 1e-9)

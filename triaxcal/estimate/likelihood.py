@@ -1,11 +1,14 @@
-"""The likelihood of still poses under a model, its derivatives, and the search for its maximum.
+"""The likelihood of still poses under a model, its derivatives, and the search
+for its maximum.
 
-Every pose says that ``|a| = reference``; its attitude is a nuisance. With the attitude profiled out, the likelihood
-of a pose is that of ``r = |a(u)| − reference`` with the variance that the noise of its mean has along the gradient
+Every pose says that ``|a| = reference``; its attitude is a nuisance. With the
+attitude profiled out, the likelihood of a pose is that of ``r = |a(u)| −
+reference`` with the variance that the noise of its mean has along the gradient
 of r. What this neglects is of the order of the noise squared.
 
-The parameters of the search are ``v = D x − w`` (x the outputs scaled to the range of the data), the three angles
-and the effects' coefficients; all derivatives are exact.
+The parameters of the search are ``v = D x − w`` (x the outputs scaled to the
+range of the data), the three angles and the effects' coefficients; all
+derivatives are exact.
 """
 
 from __future__ import annotations
@@ -24,21 +27,26 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import covariates, references
 
 Linearised = tuple[Floats, Floats, Floats]
-"""Residuals (n,), their derivatives by theta (n, 9+p), their standard errors (n,)."""
+"""Residuals (n,), their derivatives by theta (n, 9+p), their standard errors
+(n,)."""
 STEPS_MOST = 60
-"""Three or four do from the closed form; so many mean that the search runs away."""
+"""Three or four do from the closed form; so many mean that the search runs
+away."""
 FAR = 1e6
-"""Times the reference vector: what no unit has as bias, nor as the half of its range."""
+"""Times the reference vector: what no unit has as bias, nor as the half of its
+range."""
 HALVES = 0.5 ** np.arange(13)
 """Shares of a step that are tried, until one is no worse."""
 NEARBY = 1e-6
 """Share of a shape by which it is moved to find the derivative."""
 CONVERGED = 1e-12
-"""Relative step at which the search ends; the noise of any real pose is a million times larger."""
+"""Relative step at which the search ends; the noise of any real pose is a
+million times larger."""
 
 
 class SlopeData(Protocol):
-    """What poses tell beside their means: a residual of each, which the model should make zero."""
+    """What poses tell beside their means: a residual of each, which the model
+    should make zero."""
 
     @property
     def inside(self) -> Problem:
@@ -62,8 +70,10 @@ class SlopeData(Protocol):
 
 @dataclass(frozen=True)
 class Problem:
-    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the means, ``channels`` (n,) each. ``slopes`` is
-    fitted along with the means. ``excess`` is a standard deviation of |a| that all have beside their covariance."""
+    """Poses as arrays, scaled. ``u`` (n,3), ``covariance`` (n,3,3) of the
+    means, ``channels`` (n,) each. ``slopes`` is fitted along with the means.
+    ``excess`` is a standard deviation of |a| that all have beside their
+    covariance."""
 
     u: Floats
     covariance: Floats
@@ -93,7 +103,8 @@ class Problem:
 
 @dataclass(frozen=True)
 class State:
-    """A point of the search: ``theta`` (9 + p,) as D (3), w (3), angles (3), effects' coefficients."""
+    """A point of the search: ``theta`` (9 + p,) as D (3), w (3), angles (3),
+    effects' coefficients."""
 
     theta: Floats
     effects: tuple[Effect, ...]
@@ -122,9 +133,11 @@ class State:
 
 
 def solve(problem: Problem, state: State, effects: tuple[Effect, ...], steps: int = STEPS_MOST) -> State:
-    """Gauss–Newton with halved steps; the weights follow the gradient of r from step to step.
+    """Gauss–Newton with halved steps; the weights follow the gradient of r from
+    step to step.
 
-    Raises Refused where it does not converge within the limit (with ``steps`` at its default).
+    Raises Refused where it does not converge within the limit (with ``steps``
+    at its default).
     """
     extra = sum(len(e.coefficients) for e in effects) - (len(state.theta) - 9)
     theta = np.concatenate([state.theta, np.zeros(max(extra, 0))])
@@ -146,7 +159,8 @@ def _solved(problem: Problem, theta: Floats, effects: tuple[Effect, ...], steps:
             return State(theta + step, effects)
         cost = float(np.sum((r / s) ** 2))
         for scale in HALVES:
-            # Hardly any step is halved: a trial brings the derivatives along, unless none are wanted after it.
+            # Hardly any step is halved: a trial brings the derivatives along,
+            # unless none are wanted after it.
             here = _tried(problem, State(theta + scale * step, effects), jacobian=left > 0)
             if here is not None and float(np.sum((here[0] / s) ** 2)) <= cost * (1 + 1e-9) + 1e-12:
                 break
@@ -165,7 +179,8 @@ def _tried(problem: Problem, state: State, jacobian: bool) -> Linearised | None:
 
 
 def linearise_all(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
-    """`linearise`, and where the problem has something further the same of that, after the means of all poses."""
+    """`linearise`, and where the problem has something further the same of
+    that, after the means of all poses."""
     means = linearise(problem, state, jacobian)
     if problem.slopes is None:
         return means
@@ -174,8 +189,8 @@ def linearise_all(problem: Problem, state: State, jacobian: bool = True) -> Line
 
 
 def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearised:
-    """Residuals r (n,), their derivatives by theta (n, 9+p), their standard errors from the poses' noise, and what is
-    beside it (n,)."""
+    """Residuals r (n,), their derivatives by theta (n, 9+p), their standard
+    errors from the poses' noise, and what is beside it (n,)."""
     sensor = state.sensor(problem)
     covariates = problem.covariates
     if not jacobian:
@@ -188,7 +203,8 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearis
     J = np.concatenate([by_v * x, -by_v, angles, *effects], axis=1)
     by_u = by_v / sensor.scale_factor
     variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
-    # Poses without any scatter (made up, or below the resolution) would otherwise weigh infinitely.
+    # Poses without any scatter (made up, or below the resolution) would
+    # otherwise weigh infinitely.
     variance = np.maximum(variance, (1e-12 * problem.reference) ** 2) + problem.excess**2
     return length - problem.reference, J, np.sqrt(variance)
 
@@ -199,8 +215,8 @@ def by_coefficients(by_v: Floats, basis: Floats) -> Floats:
 
 
 def by_shape(problem: Problem, state: State) -> Floats:
-    """Derivatives of all residuals (`linearise_all`) by the shapes of the effects (`Effect.shape`), (n,m), in
-    thousandths of each."""
+    """Derivatives of all residuals (`linearise_all`) by the shapes of the
+    effects (`Effect.shape`), (n,m), in thousandths of each."""
     columns = []
     for i, effect in enumerate(state.effects):
         for name, (value, _) in effect.shape.items():
@@ -214,7 +230,8 @@ def by_shape(problem: Problem, state: State) -> Floats:
 
 
 def parameters_by_theta(problem: Problem, state: State) -> Floats:
-    """(9+p, 9+p) derivative of scale factor, misalignment, bias and the effects' coefficients by theta."""
+    """(9+p, 9+p) derivative of scale factor, misalignment, bias and the
+    effects' coefficients by theta."""
     D = state.theta[:3]
     G = np.eye(len(state.theta))
     G[0:9, 0:9] = 0

@@ -1,10 +1,14 @@
-"""Outliers among the poses: a knock, a hand on the table, a unit that was not at rest.
+"""Outliers among the poses: a knock, a hand on the table, a unit that was not
+at rest.
 
-A pose's own weight in the fit is high (9/14 on average for the paper's plan), so an outlier bends the fit towards
-itself, and its plain residual shrinks to a third. What a set of poses S takes out of the sum of squares when it is left
-out is, exactly for a linear problem, ``r_Sᵀ (1 − H)_SS⁻¹ r_S``; that is compared with the noise inside the poses, and
-with what is left of the residuals where that is more than noise. Every pose and every pair is tried, because two
-outliers can hide each other. Where other sets explain it as well, none is named.
+A pose's own weight in the fit is high (9/14 on average for the paper's plan),
+so an outlier bends the fit towards itself, and its plain residual shrinks to a
+third. What a set of poses S takes out of the sum of squares when it is left out
+is, exactly for a linear problem, ``r_Sᵀ (1 − H)_SS⁻¹ r_S``; that is compared
+with the noise inside the poses, and with what is left of the residuals where
+that is more than noise. Every pose and every pair is tried, because two
+outliers can hide each other. Where other sets explain it as well, none is
+named.
 """
 
 from __future__ import annotations
@@ -20,28 +24,35 @@ from triaxcal.distributions import f_sf
 ALARM = 0.005
 """Probability that a clean set loses a pose, or a pair."""
 LEFT_LEAST = 3
-"""So many degrees of freedom must be left, or there is nothing to judge a pose by."""
+"""So many degrees of freedom must be left, or there is nothing to judge a pose
+by."""
 TIED = 2.2
-"""Sums of squares that differ by less than this for each pose of a set (a likelihood ratio of 3) do not tell one set
-from another."""
+"""Sums of squares that differ by less than this for each pose of a set (a
+likelihood ratio of 3) do not tell one set from another."""
 LEAST = 6.0
-"""Poses that are off by less than so many standard errors stay: that may be a stand that does not come back."""
+"""Poses that are off by less than so many standard errors stay: that may be a
+stand that does not come back."""
 EXCESS = 0.003
-"""Where what is left of the residuals has less than this probability, it is more than noise."""
+"""Where what is left of the residuals has less than this probability, it is
+more than noise."""
 DOUBT = 0.01
 """Probability above which a pose does not stand out from the others' residuals."""
 PAIRED_MOST = 300
-"""So many poses are tried in pairs; where there are more, hardly any hides another."""
+"""So many poses are tried in pairs; where there are more, hardly any hides
+another."""
 FREE_LEAST = 1e-6
-"""Poses whose share of (1 − H) is below this alone carry a parameter, and cannot be judged."""
+"""Poses whose share of (1 − H) is below this alone carry a parameter, and
+cannot be judged."""
 
 
 @dataclass(frozen=True)
 class OutlierSet:
-    """``rows`` are outliers. Besides, one of ``tied`` is: sets of rows that explain it as well as each other.
+    """``rows`` are outliers. Besides, one of ``tied`` is: sets of rows that
+    explain it as well as each other.
 
-    Where only the noise inside the poses says so, because the rows do not stand out from the other residuals, it is
-    ``doubtful``: it may be that the poses come back less well than that.
+    Where only the noise inside the poses says so, because the rows do not stand
+    out from the other residuals, it is ``doubtful``: it may be that the poses
+    come back less well than that.
     """
 
     rows: tuple[int, ...] = ()
@@ -51,10 +62,12 @@ class OutlierSet:
 
 @dataclass(frozen=True)
 class _DeletionDiagnostics:
-    """Residuals ``residuals`` (n,) after the fit in units of the poses' standard errors, ``q`` (n,p) whose product with
-    its transpose is the hat matrix H.
+    """Residuals ``residuals`` (n,) after the fit in units of the poses'
+    standard errors, ``q`` (n,p) whose product with its transpose is the hat
+    matrix H.
 
-    ``dof`` (n,) behind each standard error, ``pure_dof`` behind them together; zero where the noise is not known.
+    ``dof`` (n,) behind each standard error, ``pure_dof`` behind them together;
+    zero where the noise is not known.
     """
 
     residuals: Floats
@@ -87,7 +100,8 @@ class _DeletionDiagnostics:
         return np.stack([i, j], axis=1), np.where(sound, taken, 0.0)
 
     def deleted_residuals(self, rows: Ints) -> Floats:
-        """By how much the poses in ``rows`` are off, from the fit to the others."""
+        """By how much the poses in ``rows`` are off, from the fit to the
+        others."""
         return np.linalg.solve(self.free(rows), self.residuals[rows])
 
     def free(self, rows: Ints) -> Floats:
@@ -95,17 +109,20 @@ class _DeletionDiagnostics:
         return np.eye(len(rows)) - self.q[rows] @ self.q[rows].T
 
     def excess(self, after: float, left: int) -> float:
-        """What is left, ``after`` in ``residual_dof`` degrees of freedom, over the noise; 1 where that explains it."""
+        """What is left, ``after`` in ``residual_dof`` degrees of freedom, over
+        the noise; 1 where that explains it."""
         known = self.pure_dof >= 1
         return 1.0 if known and f_sf(after / left, left, self.pure_dof) >= EXCESS else after / left
 
     def by_rest(self, taken: float, size: int) -> float:
-        """Probability that ``size`` rows take so much, against what is left without them alone."""
+        """Probability that ``size`` rows take so much, against what is left
+        without them alone."""
         after, left = max(self.chi2 - taken, 1e-300), self.residual_dof - size
         return float(f_sf(taken / size / (after / left), size, left))
 
     def p(self, taken: float, rows: Ints, before: float, left: int) -> float:
-        """Of ``rows`` that take so much of ``before``: against the noise, or what is left where that is more."""
+        """Of ``rows`` that take so much of ``before``: against the noise, or
+        what is left where that is more."""
         size = len(rows)
         after, left_after = max(before - taken, 0.0), left - size
         excess = self.excess(after, left_after)
@@ -119,8 +136,9 @@ class _DeletionDiagnostics:
 def outlier_set(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> OutlierSet:
     """Rows that are outliers, at most two; often none.
 
-    ``r`` (n,) residuals and ``J`` (n,p) their derivatives, both in units of each pose's standard error; ``dof`` (n,)
-    degrees of freedom behind each of these, ``pure_dof`` behind them together.
+    ``r`` (n,) residuals and ``J`` (n,p) their derivatives, both in units of
+    each pose's standard error; ``dof`` (n,) degrees of freedom behind each of
+    these, ``pure_dof`` behind them together.
     """
     n, parameters = J.shape
     left = n - parameters
@@ -138,8 +156,9 @@ def outlier_set(r: Floats, J: Floats, dof: Floats, pure_dof: float) -> OutlierSe
 
 
 def not_as_predicted(r: Floats, J: Floats, pure_dof: float, rows: Sequence[int]) -> tuple[int, ...]:
-    """Those of a few ``rows`` of which something that they alone have is not known, and that show it: each takes more
-    out of the sum of squares than a coefficient of its own costs. Arguments are those of `outlier_set`."""
+    """Those of a few ``rows`` of which something that they alone have is not
+    known, and that show it: each takes more out of the sum of squares than a
+    coefficient of its own costs. Arguments are those of `outlier_set`."""
     n, parameters = J.shape
     q, _ = np.linalg.qr(J)
     judge = _DeletionDiagnostics(r - q @ (q.T @ r), q, n - parameters, np.zeros(n), pure_dof)
@@ -162,7 +181,8 @@ def _unless_tied(judge: _DeletionDiagnostics, rows: Ints, taken: Floats) -> Outl
 
 
 def _each_stands_alone(judge: _DeletionDiagnostics, rows: Ints, both: float) -> bool:
-    """Whether each is off by enough, and either of a pair would be suspect if the other had never been there."""
+    """Whether each is off by enough, and either of a pair would be suspect if
+    the other had never been there."""
     excess = judge.excess(max(judge.chi2 - both, 0.0), judge.residual_dof - len(rows))
     if np.min(np.abs(judge.deleted_residuals(rows))) < LEAST * np.sqrt(excess):
         return False

@@ -1,4 +1,5 @@
-"""The weighted maximum-likelihood fit of a triad's model to still poses, and how far it may be trusted."""
+"""The weighted maximum-likelihood fit of a triad's model to still poses, and
+how far it may be trusted."""
 
 from __future__ import annotations
 
@@ -44,16 +45,19 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import SIGNIFICANT, lack_of_fit_p, pure_error_dof, raised_dof
 
 DILUTION_WARNING = 10.0
-"""A tenth of `DILUTION_LIMIT`, at which a fit is refused: errors still hold, but are
-large."""
+"""A tenth of `DILUTION_LIMIT`, at which a fit is refused: errors still hold,
+but are large."""
 SPREAD_WARNING = 15.0
-"""Dilution times the root of the number of poses: about 5 where they are all over the sphere, 25 over half of it."""
+"""Dilution times the root of the number of poses: about 5 where they are all
+over the sphere, 25 over half of it."""
 LEFT_LEAST = 3
-"""Degrees of freedom below which a residual proves little: its standard deviation is known to about 40 % by three."""
+"""Degrees of freedom below which a residual proves little: its standard
+deviation is known to about 40 % by three."""
 LEVERAGE_WARNING = 0.95
 """Such a pose shows no more than a twentieth of its own error as a residual."""
 CONTRADICTED = 0.01
-"""p of the slopes within the poses below which the coefficients are left to the means."""
+"""p of the slopes within the poses below which the coefficients are left to the
+means."""
 
 
 def fit(
@@ -67,12 +71,13 @@ def fit(
 ) -> Calibration:
     """Fit the linear model, and the effects given, to still poses.
 
-    ``signs`` (3,) of the scale factors, which |a| does not show. ``excluded`` are indices of poses to exclude, and
-    ``why``; where it is None, outliers are found and excluded (`triaxcal.estimate.outliers`), and
-    where an effect goes with the pose before, a first pose in which the unit had not rested before. Poses with a fault
-    are excluded in any case.
-    Raises Refused where the poses cannot carry the parameters, InvalidData where a channel that an effect needs is not
-    there.
+    ``signs`` (3,) of the scale factors, which |a| does not show. ``excluded``
+    are indices of poses to exclude, and ``why``; where it is None, outliers are
+    found and excluded (`triaxcal.estimate.outliers`), and where an effect goes
+    with the pose before, a first pose in which the unit had not rested before.
+    Poses with a fault are excluded in any case. Raises Refused where the poses
+    cannot carry the parameters, InvalidData where a channel that an effect
+    needs is not there.
     """
     sound = [i for i, p in enumerate(poses) if not p.fault]
     if len(sound) < len(poses):
@@ -99,7 +104,8 @@ def fit(
         kept = [p for i, p in enumerate(poses) if i not in found]
         problem, begin = started_problem(kept, signs=signs, reference=reference, effects=effects)
         by_means = None
-    # What may be no worse than the others shows by how much all come back less well than their noise.
+    # What may be no worse than the others shows by how much all come back less
+    # well than their noise.
     judged = whole.only(np.setdiff1d(np.arange(len(poses)), unknown)) if verdict.doubtful else None
     calibration = _conclude(*_solved(problem, kept, begin, effects, by_means), kept, judged)
     if found:
@@ -110,10 +116,12 @@ def fit(
 def _solved(
     problem: Problem, poses: Sequence[Pose], begin: State, effects: Sequence[Effect], by_means: State | None
 ) -> tuple[Problem, State]:
-    """What was fitted, and the fit: to the means (``by_means``, where that is known already), and to the slopes inside
-    the poses as far as these agree with them.
+    """What was fitted, and the fit: to the means (``by_means``, where that is
+    known already), and to the slopes inside the poses as far as these agree
+    with them.
 
-    Slopes that do not agree go with something else, or the effect acts later than its channel says.
+    Slopes that do not agree go with something else, or the effect acts later
+    than its channel says.
     """
     both = with_slopes(problem, poses, effects)
     contradicted = False
@@ -126,7 +134,8 @@ def _solved(
         if state is not None and not contradicted:
             return both, state
     state = by_means or solve(problem, begin, tuple(effects))
-    # Means that leave nothing agree with any model: what speaks against it is all that there is to judge it by.
+    # Means that leave nothing agree with any model: what speaks against it is
+    # all that there is to judge it by.
     if len(state.theta) > len(poses) - contradicted:
         raise Refused(f"{len(poses)} poses cannot carry {len(state.theta)} parameters")
     return problem, state
@@ -134,9 +143,10 @@ def _solved(
 
 @dataclass(frozen=True)
 class _ResidualChi2:
-    """``chi2``, in units of the noise inside the poses, that a fit leaves in ``left`` degrees of freedom;
-    ``with_doubtful`` the same with excluded poses whose residuals tell how well all come back, and what these show
-    ``excess`` noise."""
+    """``chi2``, in units of the noise inside the poses, that a fit leaves in
+    ``left`` degrees of freedom; ``with_doubtful`` the same with excluded poses
+    whose residuals tell how well all come back, and what these show ``excess``
+    noise."""
 
     chi2: float
     left: int
@@ -147,10 +157,11 @@ class _ResidualChi2:
     def of(
         cls, everything_left: Linearised, problem: Problem, state: State, judged: Problem | None, pure: float
     ) -> _ResidualChi2:
-        """``judged`` are the means of all those poses where they are more; ``pure`` the degrees of freedom of the noise
-        inside them."""
+        """``judged`` are the means of all those poses where they are more;
+        ``pure`` the degrees of freedom of the noise inside them."""
         n = len(problem.u)
-        # What the shape of an effect was chosen by is spent, though no column of the Jacobian stands for it.
+        # What the shape of an effect was chosen by is spent, though no column
+        # of the Jacobian stands for it.
         spent = len(state.theta) + sum(len(e.shape) for e in state.effects)
         by_means = problem.slopes is None or n > spent
         r, J, s = everything_left
@@ -188,7 +199,8 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
     design = linear_design(direction, in_range(problem.u))
     spread = dilution(direction, design)
     if not spread < DILUTION_LIMIT:
-        # No scale factor and a bias of one reference fit anything: |a| is right everywhere and means nothing.
+        # No scale factor and a bias of one reference fit anything: |a| is right
+        # everywhere and means nothing.
         raise NotStill(f"the fit ran away, to a dilution of {spread:.3g}")
     norms = np.linalg.norm(weighted, axis=0)
     shapes = by_shape(problem, state)
@@ -230,8 +242,9 @@ def _conclude(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
 
 
 def _covariance(problem: Problem, state: State, weighted: Floats) -> Floats:
-    """Of scale factor, misalignment, bias and the effects' coefficients, from the weighted Jacobian; further columns
-    are of what was estimated beside them."""
+    """Of scale factor, misalignment, bias and the effects' coefficients, from
+    the weighted Jacobian; further columns are of what was estimated beside
+    them."""
     norms = np.linalg.norm(weighted, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
     inverse = np.linalg.pinv((weighted / norms).T @ (weighted / norms), rcond=1e-14)

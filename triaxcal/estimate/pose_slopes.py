@@ -1,9 +1,11 @@
 """How |a| goes inside the poses: data of its own beside the means.
 
-What moves the bias from pose to pose moves it inside the poses as well, unless it is something that a pose has all
-along. So an effect that explains the means predicts a slope for every pose; and of two that explain the means as well,
-often because the linear parameters make up for what they get wrong, one predicts slopes that are not there. As with
-the means, only the length of the vector is looked at: a unit may turn on its stand as it likes.
+What moves the bias from pose to pose moves it inside the poses as well, unless
+it is something that a pose has all along. So an effect that explains the means
+predicts a slope for every pose; and of two that explain the means as well,
+often because the linear parameters make up for what they get wrong, one
+predicts slopes that are not there. As with the means, only the length of the
+vector is looked at: a unit may turn on its stand as it likes.
 """
 
 from __future__ import annotations
@@ -21,14 +23,17 @@ from triaxcal.poses.covariates import rate_of_lag
 from triaxcal.poses.pose import Pose
 
 PLACES = np.linspace(-0.5, 0.5, 6)
-"""Where in a pose the model is asked, from its beginning to its end: enough to follow a step or a steep decay."""
+"""Where in a pose the model is asked, from its beginning to its end: enough to
+follow a step or a steep decay."""
 
 
 @dataclass(frozen=True)
 class PoseSlopes:
-    """``inside`` are the poses at all `PLACES`, one place after the other, ``middle`` as they are in the middle, both
-    with the covariance of the slopes; ``errors`` (n,) by covariate those of the changes that the covariates are said to
-    have gone through, and ``moving`` the covariates that go through any."""
+    """``inside`` are the poses at all `PLACES`, one place after the other,
+    ``middle`` as they are in the middle, both with the covariance of the
+    slopes; ``errors`` (n,) by covariate those of the changes that the
+    covariates are said to have gone through, and ``moving`` the covariates that
+    go through any."""
 
     inside: Problem
     middle: Problem
@@ -59,8 +64,8 @@ class PoseSlopes:
         return cls(inside, middle, errors, moving)
 
     def linearise(self, state: State, jacobian: bool = True) -> Linearised:
-        """By how much |a| goes along each pose where it should stay, as `triaxcal.estimate.likelihood.linearise` has
-        it."""
+        """By how much |a| goes along each pose where it should stay, as
+        `triaxcal.estimate.likelihood.linearise` has it."""
         everywhere, by_theta, _ = linearise(self.inside, state, jacobian)
         r = self.along(everywhere)
         if not jacobian:
@@ -68,7 +73,8 @@ class PoseSlopes:
         J = self.along(by_theta)
         here, _, error = linearise(self.middle, state)
         variance = error**2
-        # In one order whatever the process, or audits would differ in the last digits.
+        # In one order whatever the process, or audits would differ in the last
+        # digits.
         for name in sorted({c for e in state.effects for c in e.needs} & self.errors.keys()):
             channels = dict(self.middle.channels) | {name: self.middle.channels[name] + self.errors[name]}
             there, _, _ = linearise(replace(self.middle, channels=channels), state, jacobian=False)
@@ -76,7 +82,8 @@ class PoseSlopes:
         return r, J, self.widening * np.sqrt(variance)
 
     def along(self, values: Floats) -> Floats:
-        """(n,…) by how much ``values`` (k·n,…) at all `PLACES` go up along each pose."""
+        """(n,…) by how much ``values`` (k·n,…) at all `PLACES` go up along each
+        pose."""
         slope = PLACES / (PLACES @ PLACES)
         return np.tensordot(slope, values.reshape(len(slope), -1, *values.shape[1:]), 1)
 
@@ -93,19 +100,22 @@ class PoseSlopes:
         return replace(self, inside=inside, middle=self.middle.only(rows), errors=errors, widening=widening)
 
     def inform(self, effects: Sequence[Effect]) -> bool:
-        """Whether any of the effects goes with something that moves inside the poses."""
+        """Whether any of the effects goes with something that moves inside the
+        poses."""
         return any(n in self.moving for e in effects for n in e.needs)
 
 
 def with_slopes(problem: Problem, poses: Sequence[Pose], effects: Sequence[Effect]) -> Problem | None:
-    """The problem with the slopes beside the means; None where they tell nothing of the effects."""
+    """The problem with the slopes beside the means; None where they tell
+    nothing of the effects."""
     slopes = PoseSlopes.of(problem, poses) if effects else None
     return replace(problem, slopes=slopes) if slopes is not None and slopes.inform(effects) else None
 
 
 def slopes_p(problem: Problem, state: State, pure: float) -> float:
-    """Probability of slopes as far as these from those that the model predicts, by the noise inside the poses, of
-    which ``pure`` degrees of freedom are known; ``state`` is that of a fit to everything."""
+    """Probability of slopes as far as these from those that the model predicts,
+    by the noise inside the poses, of which ``pure`` degrees of freedom are
+    known; ``state`` is that of a fit to everything."""
     left = len(problem.u) - max(len(state.theta) - len(problem.u), 0)
     if left <= 0:
         return 0.0
@@ -113,26 +123,30 @@ def slopes_p(problem: Problem, state: State, pure: float) -> float:
 
 
 def left_by_slopes(problem: Problem, state: State) -> float:
-    """By how much the sum of squares of a fit to everything is larger than that of a fit to the means alone."""
+    """By how much the sum of squares of a fit to everything is larger than that
+    of a fit to the means alone."""
     r, _, s = linearise_all(problem, state)
     apart = float(np.sum((r / s) ** 2)) - left_by_means(problem, state)
     return max(apart, 0.0) if np.isfinite(apart) else np.inf
 
 
 def left_by_means(problem: Problem, state: State) -> float:
-    """The sum of squares that a fit to the means alone leaves; ``state`` is that of a fit to everything."""
+    """The sum of squares that a fit to the means alone leaves; ``state`` is
+    that of a fit to everything."""
     return residual_chi2(linearise(problem, state))
 
 
 def residual_chi2(linearised: Linearised) -> float:
-    """The sum of squares that is left of residuals at the minimum, in linear reckoning from near it."""
+    """The sum of squares that is left of residuals at the minimum, in linear
+    reckoning from near it."""
     r, J, s = linearised
     return residual_sum_of_squares(J / s[:, None], r / s)
 
 
 def residual_sum_of_squares(columns: Floats, misses: Floats) -> float:
-    """Sum of squares of what is left of misses (n,) beside columns (n,p), however different these are in size; infinite
-    where the model does not hold."""
+    """Sum of squares of what is left of misses (n,) beside columns (n,p),
+    however different these are in size; infinite where the model does not
+    hold."""
     if not (np.isfinite(columns).all() and np.isfinite(misses).all()):
         return np.inf
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -146,7 +160,8 @@ def _moved(values: Floats, change: Floats) -> Floats:
 
 
 def _changes(problem: Problem, poses: Sequence[Pose], length: Floats) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    """By covariate, (n,) each: by how much it changes along each pose, and the standard error of that."""
+    """By covariate, (n,) each: by how much it changes along each pose, and the
+    standard error of that."""
     change = dict.fromkeys((TIME, SINCE_START), length)
     errors: dict[str, Floats] = {}
     for name in problem.channels:

@@ -1,4 +1,5 @@
-"""Poses of which only the means are known, as others publish them and old test benches keep them."""
+"""Poses of which only the means are known, as others publish them and old test
+benches keep them."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from triaxcal.poses.pose import Pose
 NOISE_FIRST = 1e-4
 """Of the outputs' size: a noise to begin with, far below what turning changes."""
 ROUNDS, SETTLED = 10, 0.05
-"""The noise is estimated until it changes by less than so much; two or three rounds do."""
+"""The noise is estimated until it changes by less than so much; two or three
+rounds do."""
 
 
 def poses_of_means(
@@ -25,11 +27,13 @@ def poses_of_means(
     standard_errors: Floats | None = None,
     channels: Mapping[str, Floats] | None = None,
 ) -> list[Pose]:
-    """One pose a row: ``u`` (n,3) means in output units, ``t_s`` (n,) s when it was held, one a second where that is
-    not known, ``standard_errors`` (n,3) of the means, output units.
+    """One pose a row: ``u`` (n,3) means in output units, ``t_s`` (n,) s when it
+    was held, one a second where that is not known, ``standard_errors`` (n,3) of
+    the means, output units.
 
-    Without standard errors the noise is the residual of the linear model, alike on all axes, with the degrees of
-    freedom that the fit leaves: then no lack of fit can show, and an effect only against all the others. Raises Refused
+    Without standard errors the noise is the residual of the linear model, alike
+    on all axes, with the degrees of freedom that the fit leaves: then no lack
+    of fit can show, and an effect only against all the others. Raises Refused
     where nothing is left to tell it by, InvalidData.
     """
     n = len(u)

@@ -1,7 +1,9 @@
-"""Several recordings of one unit as one set of poses: one linear model, and effects of the clocks run by run.
+"""Several recordings of one unit as one set of poses: one linear model, and
+effects of the clocks run by run.
 
-Every recording has its own clock, and the unit was switched on anew before it: a drift, a warm-up or a step may be in
-one run alone, alike in all, or in each its own; and the bias may come back a little different at every start.
+Every recording has its own clock, and the unit was switched on anew before it:
+a drift, a warm-up or a step may be in one run alone, alike in all, or in each
+its own; and the bias may come back a little different at every start.
 """
 
 from __future__ import annotations
@@ -21,11 +23,13 @@ from triaxcal.estimate.calibration import Calibration
 from triaxcal.poses.pose import Pose, Run
 
 POSES_A_COEFFICIENT = 4.0
-"""Forms with more coefficients of a run than one for so many of its poses are not tried."""
+"""Forms with more coefficients of a run than one for so many of its poses are
+not tried."""
 
 
 def together(recordings: Sequence[Sequence[Pose]]) -> list[Pose]:
-    """The poses of several recordings of one unit, in that order, each with its `Run`. One recording's as they are.
+    """The poses of several recordings of one unit, in that order, each with its
+    `Run`. One recording's as they are.
 
     Raises InvalidData where a recording of several has no pose.
     """
@@ -42,8 +46,8 @@ def together(recordings: Sequence[Sequence[Pose]]) -> list[Pose]:
 
 
 def by_run(catalogue: Sequence[Effect], poses: Sequence[Pose]) -> tuple[Effect, ...]:
-    """The effects to look for: of several runs, those of the clocks run by run, and what differs between
-    runs; else as they are."""
+    """The effects to look for: of several runs, those of the clocks run by run,
+    and what differs between runs; else as they are."""
     runs = poses[0].run.of if poses else 1
     if runs == 1:
         return tuple(catalogue)
@@ -52,8 +56,9 @@ def by_run(catalogue: Sequence[Effect], poses: Sequence[Pose]) -> tuple[Effect, 
 
 @dataclass(frozen=True)
 class ByRun(Wrapped):
-    """An effect of the clocks, of which the search tries: alike in all ``runs``; in one alone; in each, and in all but
-    one, by coefficients of their own. One that lasts begins in one run.
+    """An effect of the clocks, of which the search tries: alike in all
+    ``runs``; in one alone; in each, and in all but one, by coefficients of
+    their own. One that lasts begins in one run.
     """
 
     runs: int
@@ -84,7 +89,8 @@ class ByRun(Wrapped):
 
 @dataclass(frozen=True)
 class RunResidual:
-    """How well the magnitude comes out in the poses of one run, before and after, rms in units of the reference."""
+    """How well the magnitude comes out in the poses of one run, before and
+    after, rms in units of the reference."""
 
     poses: int
     before_rms_g: float
@@ -93,7 +99,8 @@ class RunResidual:
 
 
 def residuals_by_run(before: Calibration, after: Calibration) -> list[RunResidual]:
-    """Of the poses that the fits used, by run. ``before`` and ``after`` are of the same poses."""
+    """Of the poses that the fits used, by run. ``before`` and ``after`` are of
+    the same poses."""
     used: Mapping[int, list[int]] = {i: [] for i in range(after.poses[0].pose.run.of)}
     for i, (old, new) in enumerate(zip(before.poses, after.poses, strict=True)):
         if old.used and new.used:

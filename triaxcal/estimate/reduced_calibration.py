@@ -1,8 +1,10 @@
-"""The correction of a calibration, as nearly as a device can hold it that knows fewer effects.
+"""The correction of a calibration, as nearly as a device can hold it that knows
+fewer effects.
 
-A device corrects by its registers alone. So what it holds is the whole correction at the moment for which that holds,
-projected onto its own terms: what an effect that it lacks does over the sphere goes into the nine parameters and the
-effects that it has, as far as these can take it.
+A device corrects by its registers alone. So what it holds is the whole
+correction at the moment for which that holds, projected onto its own terms:
+what an effect that it lacks does over the sphere goes into the nine parameters
+and the effects that it has, as far as these can take it.
 """
 
 from __future__ import annotations
@@ -20,26 +22,32 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import at_moment
 
 SPHERE = 50
-"""Directions: an effect of fifth order in the reading has no more than so many independent values over the sphere."""
+"""Directions: an effect of fifth order in the reading has no more than so many
+independent values over the sphere."""
 COVARIATES = 7
-"""Values of the logged channels, from the least to the most: more than any effect has coefficients for them."""
+"""Values of the logged channels, from the least to the most: more than any
+effect has coefficients for them."""
 STEPS = 4
-"""Of Gauss and Newton, from parameters that are right to a few parts in a thousand."""
+"""Of Gauss and Newton, from parameters that are right to a few parts in a
+thousand."""
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """``calibration`` has the kept effects alone; ``cost`` is the rms of what |a| then differs from the whole
-    correction over the sphere and the covariates of the poses, in the unit of the reference."""
+    """``calibration`` has the kept effects alone; ``cost`` is the rms of what
+    |a| then differs from the whole correction over the sphere and the
+    covariates of the poses, in the unit of the reference."""
 
     calibration: Calibration
     cost: float
 
 
 def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str, Floats] | None = None) -> Reduced:
-    """Nine parameters and the effects that ``keep`` says of; the same calibration where that is all of them.
+    """Nine parameters and the effects that ``keep`` says of; the same
+    calibration where that is all of them.
 
-    ``logged`` are channels as they were in the poses, (n,) each, where the calibration has no poses of its own."""
+    ``logged`` are channels as they were in the poses, (n,) each, where the
+    calibration has no poses of its own."""
     kept = [(effect, q) for effect, q in c.sensor.effects if keep(effect)]
     if len(kept) == len(c.sensor.effects):
         return Reduced(c, 0.0)
@@ -50,7 +58,8 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
         off = np.linalg.norm(sensor.specific_force(u, covariates), axis=1) - c.reference
         sensor = sensor.moved(-_gain(_by_parameters(sensor, u, covariates)) @ off)
     off = np.linalg.norm(sensor.specific_force(u, covariates), axis=1) - c.reference
-    # What an error of the whole calibration becomes: the kept parameters follow |a| as nearly as they can.
+    # What an error of the whole calibration becomes: the kept parameters follow
+    # |a| as nearly as they can.
     through = _gain(_by_parameters(sensor, u, covariates)) @ _by_parameters(c.sensor, u, covariates)
     own = np.concatenate([np.ones(9, bool), *(np.full(len(q), keep(e)) for e, q in c.sensor.effects)])
     names = {effect.name for effect, _ in kept}
@@ -68,7 +77,8 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
 
 
 def _with_residual(c: Calibration) -> Calibration:
-    """In the recording's own poses. How well it would do without one of them nobody asked."""
+    """In the recording's own poses. How well it would do without one of them
+    nobody asked."""
     used = [p for p in c.poses if p.used]
     u = np.array([p.pose.mean for p in used])
     off = c.sensor.magnitude(u, c.covariates_of([p.pose for p in used]))[0] - c.reference
@@ -78,8 +88,9 @@ def _with_residual(c: Calibration) -> Calibration:
 
 
 def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Mapping[str, Floats]]:
-    """(m,3) specific forces all over the sphere under the conditions that a unit in use meets: logged channels as they
-    were in some of the poses, every clock at the moment, everything else at its reference."""
+    """(m,3) specific forces all over the sphere under the conditions that a
+    unit in use meets: logged channels as they were in some of the poses, every
+    clock at the moment, everything else at its reference."""
     up = spiral(SPHERE) * c.reference
     in_use = at_moment(c.channel_reference, 1, c.moment)
     poses = [p.pose for p in c.poses if p.used]
@@ -94,7 +105,8 @@ def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Map
 
 
 def _by_parameters(sensor: Sensor, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
-    """(m,9+p) derivatives of |a| by scale factors, misalignments, biases and coefficients."""
+    """(m,9+p) derivatives of |a| by scale factors, misalignments, biases and
+    coefficients."""
     found = sensor.radius(u, covariates)
     s, a, by_s, by_v = found.s, found.a, found.by_s, found.by_v
     angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)

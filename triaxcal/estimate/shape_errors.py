@@ -1,4 +1,5 @@
-"""Standard errors of what the fit holds fixed: the shapes of effects (`Effect.shape`), which the search has chosen."""
+"""Standard errors of what the fit holds fixed: the shapes of effects
+(`Effect.shape`), which the search has chosen."""
 
 from __future__ import annotations
 
@@ -12,16 +13,21 @@ from triaxcal.estimate.likelihood import Problem, State, linearise_all
 from triaxcal.estimate.pose_slopes import residual_chi2
 
 UNLIKELY = 16.0
-"""Chi-square over its minimum beyond which a value, and what is next to it, needs no closer look."""
+"""Chi-square over its minimum beyond which a value, and what is next to it,
+needs no closer look."""
 STRAIGHT = 1.0
-"""The likelihood is looked at so closely that chi-square changes by no more from one value to the next."""
+"""The likelihood is looked at so closely that chi-square changes by no more
+from one value to the next."""
 HALVED_MOST = 8
-"""Halvings of an interval, to 1/256: a likelihood that is steeper still is an edge."""
+"""Halvings of an interval, to 1/256: a likelihood that is steeper still is an
+edge."""
 PARTS = 20
-"""Parts of an interval in the sum that stands for an integral: chi-square changes by
-about `STRAIGHT` over it, so that the weight changes little over a part."""
+"""Parts of an interval in the sum that stands for an integral: chi-square
+changes by about `STRAIGHT` over it, so that the weight changes little over a
+part."""
 NOTHING_LIKE = 1e300
-"""In place of infinity, between which and the next nothing could be interpolated."""
+"""In place of infinity, between which and the next nothing could be
+interpolated."""
 
 
 def shape_errors(
@@ -29,8 +35,9 @@ def shape_errors(
 ) -> dict[str, float]:
     """By "effect.name"; none of a shape that moves nothing at all.
 
-    ``columns`` (n,m) are the derivatives of the residuals by the shapes, ``thousandths`` (m,) the standard errors by
-    these, in thousandths of the shapes' values, raised by the ``birge_ratio`` already.
+    ``columns`` (n,m) are the derivatives of the residuals by the shapes,
+    ``thousandths`` (m,) the standard errors by these, in thousandths of the
+    shapes' values, raised by the ``birge_ratio`` already.
     """
     out = {}
     named = [(i, name, value) for i, e in enumerate(state.effects) for name, (value, _) in e.shape.items()]
@@ -44,17 +51,20 @@ def shape_errors(
 
 
 def has_edges(effect: Effect) -> bool:
-    """Whether it changes at the edges of poses, as a step does: the likelihood of its shape has kinks there, and is
-    flat between two poses, so that its curvature tells nothing."""
+    """Whether it changes at the edges of poses, as a step does: the likelihood
+    of its shape has kinks there, and is flat between two poses, so that its
+    curvature tells nothing."""
     return DURATION in effect.needs
 
 
 def spread(value: float, chi2_at: Callable[[float], float], tried: Sequence[float], edges: Floats) -> float | None:
-    """The rms distance from a shape's ``value`` to what it may be, each weighted by its likelihood, from the lowest to
-    the highest of those ``tried``; ``edges`` are those of the poses. None where only one was tried.
+    """The rms distance from a shape's ``value`` to what it may be, each
+    weighted by its likelihood, from the lowest to the highest of those
+    ``tried``; ``edges`` are those of the poses. None where only one was tried.
 
-    Of a step between two poses that is the rectangular distribution over the time between them (JCGM 100, 4.3.7), with
-    shoulders where it may have been inside a pose, and other gaps where the directions of the poses hide it.
+    Of a step between two poses that is the rectangular distribution over the
+    time between them (JCGM 100, 4.3.7), with shoulders where it may have been
+    inside a pose, and other gaps where the directions of the poses hide it.
     """
     profile = _Profile(chi2_at)
     profile.look_at(np.unique([value, *tried]))
@@ -113,8 +123,8 @@ class _Profile:
             self.look_at((self.x[:-1] + self.x[1:])[coarse] / 2)
 
     def spread_about(self, value: float) -> float:
-        """The rms distance from a value, each weighted by its likelihood, of which the logarithm is straight between
-        two."""
+        """The rms distance from a value, each weighted by its likelihood, of
+        which the logarithm is straight between two."""
         wide = np.diff(self.x)
         at = (self.x[:-1, None] + wide[:, None] * (np.arange(PARTS) + 0.5) / PARTS).ravel()
         weight = np.repeat(wide, PARTS) * np.exp((self.chi2.min() - np.interp(at, self.x, self.chi2)) / 2)
@@ -122,7 +132,8 @@ class _Profile:
 
 
 def _left(problem: Problem, state: State, i: int, name: str, value: float) -> float:
-    """Chi-square with another value of a shape, everything else fitted again, in linear reckoning."""
+    """Chi-square with another value of a shape, everything else fitted again,
+    in linear reckoning."""
     other = reshaped(state.effects[i], name, value)
     with np.errstate(over="ignore", invalid="ignore"):
         return residual_chi2(

@@ -1,6 +1,8 @@
-"""What acts beyond the linear model, with which probability: one evidence for effects, outliers and what has no name.
+"""What acts beyond the linear model, with which probability: one evidence for
+effects, outliers and what has no name.
 
-`triaxcal.diagnosis` tells what follows from it; `benchmarks.frozen` holds it against what went before.
+`triaxcal.diagnosis` tells what follows from it; `benchmarks.frozen` holds it
+against what went before.
 """
 
 from triaxcal.evidence.candidate_actions import Action, ActionKind

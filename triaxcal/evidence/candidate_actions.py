@@ -1,4 +1,5 @@
-"""What may be done next, and the pose that it would give: what a plan of more poses chooses among."""
+"""What may be done next, and the pose that it would give: what a plan of more
+poses chooses among."""
 
 from __future__ import annotations
 
@@ -17,24 +18,31 @@ from triaxcal.model.directions import cube_directions, elsewhere
 from triaxcal.poses.pose import Pose
 
 UNDECIDED_PROBABILITY = 0.02
-"""A name, or an outlier, of less probability is asked about by no action of its own."""
+"""A name, or an outlier, of less probability is asked about by no action of its
+own."""
 FAR = 3.0
-"""Standard errors from the linear fit from which on a pose is one to take again."""
+"""Standard errors from the linear fit from which on a pose is one to take
+again."""
 AGAIN = 4
 """Poses to take again by themselves, at most: those farthest off."""
 SAME = float(np.cos(np.radians(5.0)))
-"""The cosine between directions that are one: nobody points a unit much better by hand."""
+"""The cosine between directions that are one: nobody points a unit much better
+by hand."""
 POSE, MOVED, WAITED = 1.0, 5.0, 3.0
-"""The price of a pose; of one before which a channel is moved and settles, which takes minutes where a pose takes a
-part of one; and of one after a pause, which takes as long but no hands."""
+"""The price of a pose; of one before which a channel is moved and settles,
+which takes minutes where a pose takes a part of one; and of one after a pause,
+which takes as long but no hands."""
 FACES = 6
-"""Directions in which a moved channel, or a unit that rested, is asked about: what goes with them is a bias or a scale
-factor of an axis, and a face shows either best."""
+"""Directions in which a moved channel, or a unit that rested, is asked about:
+what goes with them is a bias or a scale factor of an axis, and a face shows
+either best."""
 BETWEEN = 24
-"""Directions farthest from all that were taken and from the cube's, on whose faces, vertices and edges an axis reads
-four values alone: two functions of that reading which agree there are distinguished between them."""
+"""Directions farthest from all that were taken and from the cube's, on whose
+faces, vertices and edges an axis reads four values alone: two functions of that
+reading which agree there are distinguished between them."""
 LONGER = 4.0
-"""Times as long a pose is to be held where each has an error of its own: half of what averages out is left."""
+"""Times as long a pose is to be held where each has an error of its own: half
+of what averages out is left."""
 
 
 class ActionKind(StrEnum):
@@ -54,10 +62,13 @@ class ActionKind(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Action:
-    """``up`` (3,) is the direction of up in the unit's frame, with the ``label`` that a plan has for it. ``repeat_of``
-    is the pose, among all that were given, whose direction it is. ``channel`` is moved ``by`` so much, in its unit, or
-    is to be logged; empty where nobody knows which. The pose begins ``pause_s`` later than it would, or is held for
-    ``hold_s``. ``information`` is what it is expected to bring, in nats, beside the actions before it."""
+    """``up`` (3,) is the direction of up in the unit's frame, with the
+    ``label`` that a plan has for it. ``repeat_of`` is the pose, among all that
+    were given, whose direction it is. ``channel`` is moved ``by`` so much, in
+    its unit, or is to be logged; empty where nobody knows which. The pose
+    begins ``pause_s`` later than it would, or is held for ``hold_s``.
+    ``information`` is what it is expected to bring, in nats, beside the actions
+    before it."""
 
     kind: ActionKind
     up: Floats | None = None
@@ -75,11 +86,14 @@ class Action:
 
 
 class Options:
-    """After the poses of a posterior and those that were chosen: the actions, each with the pose that it gives, held as
-    long and as quietly as is usual here. Covariates stay as they last were, and the pose before is the last one."""
+    """After the poses of a posterior and those that were chosen: the actions,
+    each with the pose that it gives, held as long and as quietly as is usual
+    here. Covariates stay as they last were, and the pose before is the last
+    one."""
 
     def __init__(self, posterior: Posterior, wanted: Sequence[int]) -> None:
-        """``wanted`` are poses that are to be taken again in any case, even if the unit has to leave one for that."""
+        """``wanted`` are poses that are to be taken again in any case, even if
+        the unit has to leave one for that."""
         self.rows = posterior.evidence.rows
         self.wanted = {int(self.rows.places[i]) for i in wanted}
         poses = self.rows.poses
@@ -105,7 +119,8 @@ class Options:
         ]
 
     def after(self, chosen: Sequence[Pose]) -> list[tuple[Action, Pose]]:
-        """Those in another direction than the last: a unit that stays where it is makes no pose of its own."""
+        """Those in another direction than the last: a unit that stays where it
+        is makes no pose of its own."""
         last = chosen[-1] if chosen else self.last
         here = reading_geometry(self.rows, last.mean[None]).up[0]
         return [
@@ -169,7 +184,8 @@ def _label(up: Floats) -> str:
 
 
 def _suspects(posterior: Posterior) -> list[int]:
-    """Poses that may be outliers, and then those that are far off the linear fit."""
+    """Poses that may be outliers, and then those that are far off the linear
+    fit."""
     rows, outlier = posterior.evidence.rows, posterior.outlier_probabilities
     spread = np.linalg.norm(rows.complement, axis=1)
     off = np.abs(rows.complement @ rows.z / np.maximum(spread, 1e-9))[: rows.n]

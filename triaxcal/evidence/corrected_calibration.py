@@ -1,4 +1,5 @@
-"""The calibration that is handed on: the average as a calibration, with what is left in the poses under it."""
+"""The calibration that is handed on: the average as a calibration, with what is
+left in the poses under it."""
 
 from __future__ import annotations
 
@@ -21,8 +22,10 @@ from triaxcal.uncertainty.propagation import gain_given_prior
 
 
 def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibration:
-    """With the likely effects at their mean coefficients. ``before`` is the linear calibration of all poses that were
-    given: where no effect is to be corrected (`refusal`), it stays, with the errors that all likely sets make of it."""
+    """With the likely effects at their mean coefficients. ``before`` is the
+    linear calibration of all poses that were given: where no effect is to be
+    corrected (`refusal`), it stays, with the errors that all likely sets make
+    of it."""
     solved = components(posterior)
     model_average = None if refusal(posterior) else average(posterior, at, solved)
     if model_average is None or not model_average.sensor.effects:
@@ -42,7 +45,8 @@ def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibra
         excess_g=0.0,
         dof=rows.noise.students_dof + len(rows.z),
         slopes=rows.slopes,
-        # What residuals show beyond noise is in the covariance, by the probability of whatever may have made it.
+        # What residuals show beyond noise is in the covariance, by the
+        # probability of whatever may have made it.
         cautions=tuple(c for c in before.cautions if not isinstance(c, BirgeRatio | ExcessVariance)),
         holds_at=at,
         linear_only=before if model_average.sensor.effects else None,
@@ -55,7 +59,8 @@ def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibra
 
 
 def _shape_errors(posterior: Posterior, model_average: Average) -> dict[str, float]:
-    """Of the shapes that stand for the effects, about what the posterior has of them."""
+    """Of the shapes that stand for the effects, about what the posterior has of
+    them."""
     out = {}
     for effect, _ in model_average.sensor.effects:
         for name, shape in shapes_of(posterior, effect.name).items():
@@ -66,7 +71,8 @@ def _shape_errors(posterior: Posterior, model_average: Average) -> dict[str, flo
 
 
 def _with_residuals(c: Calibration, rows: Rows, model_average: Average) -> Calibration:
-    """In the recording's own poses, at their own times. Of poses with a fault that lack a channel nothing is known."""
+    """In the recording's own poses, at their own times. Of poses with a fault
+    that lack a channel nothing is known."""
     logged = set.intersection(*(set(p.pose.channels) for p in c.poses if p.used))
     known = [i for i, p in enumerate(c.poses) if logged <= set(p.pose.channels)]
     nan = float("nan")
@@ -116,7 +122,8 @@ def _with_known_residuals(c: Calibration, rows: Rows, model_average: Average, pl
 
 
 def _leverage(rows: Rows, used: list[int], model_average: Average) -> Floats:
-    """(n,) of those poses: how much each decides its own prediction, where coefficients are held by their sizes."""
+    """(n,) of those poses: how much each decides its own prediction, where
+    coefficients are held by their sizes."""
     problem = replace(rows.problem.only(np.array(used)), slopes=None)
     _, J, error = linearise(problem, State.of(problem, model_average.sensor))
     weighted = J / error[:, None]

@@ -1,4 +1,5 @@
-"""What is read off the posterior: names that are known, names that are likely, outliers, and what has no name."""
+"""What is read off the posterior: names that are known, names that are likely,
+outliers, and what has no name."""
 
 from __future__ import annotations
 
@@ -13,8 +14,9 @@ from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 
 @dataclass(frozen=True)
 class Named:
-    """One of these effects acts for certain, each with its probability, the likeliest first; ``together`` is that of at
-    least one. A name alone is known."""
+    """One of these effects acts for certain, each with its probability, the
+    likeliest first; ``together`` is that of at least one. A name alone is
+    known."""
 
     probabilities: Mapping[str, float]
     together: float
@@ -30,8 +32,9 @@ class Named:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Something acts that no name describes: with which ``probability``, of which ``kind`` it is most likely, and how
-    large it then is, as an rms of |a| over the poses, in the unit of the reference."""
+    """Something acts that no name describes: with which ``probability``, of
+    which ``kind`` it is most likely, and how large it then is, as an rms of |a|
+    over the poses, in the unit of the reference."""
 
     probability: float
     kind: UnmodelledKind | None
@@ -50,9 +53,10 @@ class ChangePoint:
 
 @dataclass(frozen=True)
 class Findings:
-    """``candidates`` are likely names that are not certain, with their probability; ``nothing`` is the probability that
-    no effect, no outlier and nothing unmodelled acts. ``outliers`` are poses, each with its probability, counted among
-    all that were given."""
+    """``candidates`` are likely names that are not certain, with their
+    probability; ``nothing`` is the probability that no effect, no outlier and
+    nothing unmodelled acts. ``outliers`` are poses, each with its probability,
+    counted among all that were given."""
 
     named: tuple[Named, ...]
     candidates: Mapping[str, float]
@@ -97,6 +101,7 @@ def _unexplained(posterior: Posterior) -> Unexplained:
 
 
 def _nothing(posterior: Posterior) -> float:
-    """The empty set is always among the sets, and no unmodelled part always among its parts (`likely_sets`)."""
+    """The empty set is always among the sets, and no unmodelled part always
+    among its parts (`likely_sets`)."""
     weight, empty = next(pair for pair in zip(posterior.weight, posterior.sets, strict=True) if not pair[1].members)
     return float(weight * np.exp(empty.by_part[empty.parts.index(0)] - empty.total))

@@ -26,7 +26,8 @@ class Why(StrEnum):
     """The channel changes no faster in one pose than in another."""
     EVEN_SCATTER = "even_scatter"
     MOVED_ALONG = "moved_along"
-    """Too few poses, or what the effect goes with moved along with their directions."""
+    """Too few poses, or what the effect goes with moved along with their
+    directions."""
     FEW_DIRECTIONS = "few_directions"
 
 
@@ -45,7 +46,8 @@ def not_identifiable(evidence: Evidence, catalogue: Sequence[Effect]) -> Mapping
 
 
 def _in_full(evidence: Evidence, name: str) -> bool:
-    """Whether no combination of all the coefficients of some shape looks like the nine parameters."""
+    """Whether no combination of all the coefficients of some shape looks like
+    the nine parameters."""
     complement = evidence.rows.complement.T
     for term in evidence.terms:
         if term.name == name and term.effect is not None and len(term.kept) == len(term.effect.coefficients):

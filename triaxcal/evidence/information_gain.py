@@ -1,8 +1,11 @@
-"""Which poses next: those with the largest expected information on what acts (Lindley 1956, Ann. Math. Stat. 27:986).
+"""Which poses next: those with the largest expected information on what acts
+(Lindley 1956, Ann. Math. Stat. 27:986).
 
-The information of a pose is by how much it lowers the entropy of the hypotheses on average, over what the likely sets
-say that it will show. That average is taken over draws, as are the probabilities to expect. Poses are chosen one after
-the other, each beside those before it; the best is that with the most information for its price.
+The information of a pose is by how much it lowers the entropy of the hypotheses
+on average, over what the likely sets say that it will show. That average is
+taken over draws, as are the probabilities to expect. Poses are chosen one after
+the other, each beside those before it; the best is that with the most
+information for its price.
 """
 
 from __future__ import annotations
@@ -22,21 +25,27 @@ from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.poses.pose import Pose
 
 SHARE = 0.99
-"""Of the probability that the sets hold which are asked, if so few do (`evidence.mixture_components.CELLS`)."""
+"""Of the probability that the sets hold which are asked, if so few do
+(`evidence.mixture_components.CELLS`)."""
 DRAWS = 256
-"""Of what the poses may show: an expected entropy is then known to a few hundredths."""
+"""Of what the poses may show: an expected entropy is then known to a few
+hundredths."""
 LEAST = 0.05
-"""Nats for the price of a pose: what takes two hypotheses from even odds to two to one. Less is not worth a pose."""
+"""Nats for the price of a pose: what takes two hypotheses from even odds to two
+to one. Less is not worth a pose."""
 MOST = 6
-"""Poses at a time: what they show then tells so much that the draws are too few for one more."""
+"""Poses at a time: what they show then tells so much that the draws are too few
+for one more."""
 ALIKE = 0.02
-"""Actions that bring as much but for this share are alike, and the first of them is chosen: so much is the chance of
-the draws, and no processor's rounding decides."""
+"""Actions that bring as much but for this share are alike, and the first of
+them is chosen: so much is the chance of the draws, and no processor's rounding
+decides."""
 
 
 @dataclass(frozen=True)
 class Expected:
-    """The probability of a name ``now``, and the mean of what it will be after the actions ``if_it_acts``."""
+    """The probability of a name ``now``, and the mean of what it will be after
+    the actions ``if_it_acts``."""
 
     now: float
     if_it_acts: float
@@ -44,8 +53,9 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """``actions`` in the order to take them. ``entropy`` is that of the hypotheses, in nats, and ``entropy_after`` its
-    mean after the actions; ``expected`` has the names that are open, the likeliest first."""
+    """``actions`` in the order to take them. ``entropy`` is that of the
+    hypotheses, in nats, and ``entropy_after`` its mean after the actions;
+    ``expected`` has the names that are open, the likeliest first."""
 
     actions: tuple[Action, ...]
     entropy: float
@@ -54,8 +64,8 @@ class Advice:
 
 
 def advice(posterior: Posterior, most: int = 3) -> Advice:
-    """Up to so many poses, at best `MOST`, beside what to log and how long to hold them. Raises Refused where the
-    model does not hold in poses to come."""
+    """Up to so many poses, at best `MOST`, beside what to log and how long to
+    hold them. Raises Refused where the model does not hold in poses to come."""
     if decided(posterior):
         return Advice((), 0.0, 0.0, {})
     most = min(most, MOST)
@@ -85,7 +95,8 @@ def decided(posterior: Posterior) -> bool:
 
 
 def _influential_poses(posterior: Posterior) -> list[int]:
-    """Poses without which a name that is certain would not be: to be taken again, whatever the posterior expects."""
+    """Poses without which a name that is certain would not be: to be taken
+    again, whatever the posterior expects."""
     certain = posterior.evidence.odds.certain
     out = []
     for name, p in posterior.effect_probabilities.items():
@@ -96,7 +107,8 @@ def _influential_poses(posterior: Posterior) -> list[int]:
 
 
 def _given_poses(posterior: Posterior) -> Iterator[Action]:
-    """What no pose tells: a channel that nobody logs, and an error that every pose has of its own."""
+    """What no pose tells: a channel that nobody logs, and an error that every
+    pose has of its own."""
     if posterior.unmodelled_probability < posterior.evidence.odds.reported:
         return
     what = next(what for what in posterior.unmodelled_kind_probabilities if what is not UnmodelledKind.WITHIN_POSE)
@@ -109,8 +121,9 @@ def _given_poses(posterior: Posterior) -> Iterator[Action]:
 
 
 class _PredictiveDraws:
-    """Draws of what the actions taken so far will show: of draw s the rows ``shown`` (S,K), those of one pose side by
-    side, under the cell ``truth`` (S,)."""
+    """Draws of what the actions taken so far will show: of draw s the rows
+    ``shown`` (S,K), those of one pose side by side, under the cell ``truth``
+    (S,)."""
 
     def __init__(self, cells: Predictive) -> None:
         self.cells = cells
@@ -127,8 +140,8 @@ class _PredictiveDraws:
         self.entropy = self.entropy_after = self._entropy_of(self.weight)
 
     def take(self, options: Options, again: int | None = None) -> bool:
-        """The best action of all, if it is worth its price; or the best that takes a pose ``repeat_of``, whatever that
-        is worth."""
+        """The best action of all, if it is worth its price; or the best that
+        takes a pose ``repeat_of``, whatever that is worth."""
         found = options.after(self.poses)
         rows = options.rows.of_future_poses([*self.poses, *(pose for _, pose in found)])
         chances = _CellPredictions(self, rows, self.rng.standard_normal((DRAWS, len(rows.y) // rows.n)))
@@ -151,8 +164,8 @@ class _PredictiveDraws:
         return True
 
     def if_it_acts(self, name: str, p: float) -> float:
-        """The mean of p′² over that of p′, where p′ is the probability after the actions: draws in which the name acts
-        are as frequent as p′ says."""
+        """The mean of p′² over that of p′, where p′ is the probability after
+        the actions: draws in which the name acts are as frequent as p′ says."""
         after = self.cells.with_name(name) @ self.weight
         return float(np.mean(after**2) / np.mean(after)) if after.any() else p
 
@@ -161,8 +174,8 @@ class _PredictiveDraws:
 
 
 class _CellPredictions:
-    """Of the poses of ``rows``, those taken first, what every cell says beside what was shown; ``normal`` (S,r) are the
-    draws, the same for all."""
+    """Of the poses of ``rows``, those taken first, what every cell says beside
+    what was shown; ``normal`` (S,r) are the draws, the same for all."""
 
     def __init__(self, future: _PredictiveDraws, rows: Rows, normal: Floats) -> None:
         self.future, self.rows, self.normal = future, rows, normal
@@ -178,7 +191,8 @@ class _CellPredictions:
         return np.ravel([index, index + self.rows.n] if self.rows.slopes else index, order="F")
 
     def shown_with(self, pose: int) -> Floats:
-        """(S,K) what was shown and what this pose shows, by the cell that is true in each draw."""
+        """(S,K) what was shown and what this pose shows, by the cell that is
+        true in each draw."""
         at, truth = self._places([pose]), self.future.truth
         gain = self.gain[:, :, at]
         crossed = self.covariance[:, at[:, None], self.taken]
@@ -187,8 +201,9 @@ class _CellPredictions:
         return np.concatenate([self.future.shown, mean + np.einsum("srq,sq->sr", lower, self.normal)], axis=1)
 
     def weight(self, pose: int, shown: Floats) -> Floats:
-        """(C,S) of the cells after this pose too: by products of the precision of each cell with the squares of what is
-        shown, one product of matrices for all draws."""
+        """(C,S) of the cells after this pose too: by products of the precision
+        of each cell with the squares of what is shown, one product of matrices
+        for all draws."""
         at = np.concatenate([self.taken, self._places([pose])])
         mean, precision = self.mean[:, at], np.linalg.inv(self.covariance[:, at[:, None], at])
         scored = np.einsum("cij,cj->ci", precision, mean)

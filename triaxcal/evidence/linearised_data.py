@@ -1,4 +1,5 @@
-"""The data: misfits of |a| in the pose means and slopes of |a| inside the poses, linearised once for all hypotheses."""
+"""The data: misfits of |a| in the pose means and slopes of |a| inside the
+poses, linearised once for all hypotheses."""
 
 from __future__ import annotations
 
@@ -23,20 +24,25 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import noise_levels
 
 QUIETEST = 0.1
-"""Of the median: a pose without scatter (a logger's dead band) would weigh without end."""
+"""Of the median: a pose without scatter (a logger's dead band) would weigh
+without end."""
 CHI2_LOG = np.linspace(-8.0, 70.0, 12000)
 """Where the likelihood of a sum of squares is looked up, by its logarithm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """N rows, first the n means, then the n slopes where the poses know theirs, each over its standard error.
+    """N rows, first the n means, then the n slopes where the poses know theirs,
+    each over its standard error.
 
-    ``places`` (n,) are those of the poses among all that were given. ``y`` (N,) misfits, ``linear`` (N,9)
-    derivatives by the nine parameters with columns of length one, ``lengths`` (9,) what they were divided by,
-    ``error`` (N,) standard errors in units of the reference. ``complement`` (N,m) is an orthonormal basis of what the
-    nine leave, m = N − 9, and ``z`` (m,) the misfits in it. ``run`` (n,) is the recording that each pose is of.
-    ``point`` is where all was linearised, with effects where these are large, and ``state`` its nine parameters.
+    ``places`` (n,) are those of the poses among all that were given. ``y`` (N,)
+    misfits, ``linear`` (N,9) derivatives by the nine parameters with columns of
+    length one, ``lengths`` (9,) what they were divided by, ``error`` (N,)
+    standard errors in units of the reference. ``complement`` (N,m) is an
+    orthonormal basis of what the nine leave, m = N − 9, and ``z`` (m,) the
+    misfits in it. ``run`` (n,) is the recording that each pose is of. ``point``
+    is where all was linearised, with effects where these are large, and
+    ``state`` its nine parameters.
     """
 
     poses: Sequence[Pose]
@@ -57,9 +63,10 @@ class Rows:
     def of(
         cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], effects: Sequence[Effect] = ()
     ) -> Rows:
-        """About the ``linear`` fit of these poses, which excludes outliers, with the covariates that these
-        ``effects`` need. Poses with a fault are excluded. Raises
-        as `triaxcal.estimate.initial_estimate.started_problem` does; Refused where no degree of freedom is left."""
+        """About the ``linear`` fit of these poses, which excludes outliers,
+        with the covariates that these ``effects`` need. Poses with a fault are
+        excluded. Raises as `triaxcal.estimate.initial_estimate.started_problem`
+        does; Refused where no degree of freedom is left."""
         places = np.array([i for i, p in enumerate(poses) if not p.fault], dtype=int)
         sound = [poses[i] for i in places]
         poses = without_creep(sound) if np.isfinite([p.slope_error for p in sound]).all() else sound
@@ -69,7 +76,8 @@ class Rows:
         return cls._about(State.of(problem, replace(linear.sensor, effects=())), poses, places, problem)
 
     def relinearised_at(self, point: State) -> Rows:
-        """The same rows, linearised elsewhere: coefficients count from zero there too."""
+        """The same rows, linearised elsewhere: coefficients count from zero
+        there too."""
         return self._about(point, self.poses, self.places, self.problem)
 
     @classmethod
@@ -89,8 +97,8 @@ class Rows:
         return cls(poses, places, run, problem, point, y, columns, lengths, error, complement, z, noise, likelihood)
 
     def of_future_poses(self, poses: Sequence[Pose]) -> Rows:
-        """Of poses that nobody has taken, about the same point and in the same units: misfits are not known, and
-        nothing is ``complement``."""
+        """Of poses that nobody has taken, about the same point and in the same
+        units: misfits are not known, and nothing is ``complement``."""
         sensor = self.state.sensor(self.problem)
         every = channels_of([*self.poses, *poses], self.problem.channel_reference)
         channels = {name: values[self.n :] for name, values in every.items()}
@@ -128,13 +136,14 @@ class Rows:
 
     @cached_property
     def _known(self) -> dict[int, tuple[Effect, Floats]]:
-        """What was asked before, of effects that stay alive so long: those of other packages need not be equal to
-        themselves."""
+        """What was asked before, of effects that stay alive so long: those of
+        other packages need not be equal to themselves."""
         return {}
 
     @cached_property
     def _radii(self) -> list[tuple[Problem, Radius]]:
-        """Where effects are asked: in the means, and inside the poses where these know their slopes."""
+        """Where effects are asked: in the means, and inside the poses where
+        these know their slopes."""
         problems = [self.problem, *([] if self.problem.slopes is None else [self.problem.slopes.inside])]
         return [(p, self.point.sensor(p).radius(p.u, p.covariates)) for p in problems]
 
@@ -152,7 +161,8 @@ class Rows:
 
     @property
     def median_standard_error(self) -> float:
-        """The median standard error of a pose's mean, in units of the reference."""
+        """The median standard error of a pose's mean, in units of the
+        reference."""
         return float(np.median(self.error[: self.n]))
 
     @property
@@ -166,13 +176,14 @@ class Rows:
         return np.array([p.end_s - p.start_s for p in self.poses])
 
     def noise_variance_given(self, chi2: float) -> float:
-        """The mean variance of the noise over the one stated, where a model leaves this sum of squares."""
+        """The mean variance of the noise over the one stated, where a model
+        leaves this sum of squares."""
         known = self.noise.students_dof
         return (known + chi2) / (known + len(self.z))
 
     def log_likelihood(self, chi2: Floats) -> Floats:
-        """Of sums of squares in m degrees of freedom (any shape), but for a constant; the size of the noise is known as
-        far as the poses tell it."""
+        """Of sums of squares in m degrees of freedom (any shape), but for a
+        constant; the size of the noise is known as far as the poses tell it."""
         return np.interp(np.log(np.maximum(chi2, 1e-3)), CHI2_LOG, self.likelihood)
 
 

@@ -1,8 +1,10 @@
-"""How well a set of terms, beside an unmodelled part, accounts for the rows: the logarithm of its evidence.
+"""How well a set of terms, beside an unmodelled part, accounts for the rows:
+the logarithm of its evidence.
 
-All is conjugate: coefficients are normal of a size ρ, sizes lie on a grid with even shares, the nine parameters are
-flat and projected out, and the size of the noise is integrated over what the poses tell of it. All evidences are
-of the same rows, linearised at the same point, and so compare.
+All is conjugate: coefficients are normal of a size ρ, sizes lie on a grid with
+even shares, the nine parameters are flat and projected out, and the size of the
+noise is integrated over what the poses tell of it. All evidences are of the
+same rows, linearised at the same point, and so compare.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from triaxcal.evidence.unmodelled_kernels import UnmodelledCovariance, kinds_of
 
 @dataclass(frozen=True, eq=False)
 class UnmodelledPart:
-    """The assumption on what no term describes: nothing, or one ``kind`` of size ``tau`` standard errors."""
+    """The assumption on what no term describes: nothing, or one ``kind`` of
+    size ``tau`` standard errors."""
 
     kind: UnmodelledCovariance | None
     tau: float
@@ -34,7 +37,8 @@ class UnmodelledPart:
 
 @dataclass(frozen=True, eq=False)
 class _EigenBasis:
-    """The projected data in the axes of one kind: ``variance`` (m,) there, terms' columns (m,C), misfits (m,)."""
+    """The projected data in the axes of one kind: ``variance`` (m,) there,
+    terms' columns (m,C), misfits (m,)."""
 
     variance: Floats
     columns: Floats
@@ -43,8 +47,9 @@ class _EigenBasis:
 
 @dataclass(frozen=True, eq=False)
 class SetEvidence:
-    """Of one set, by the ``parts`` (P,) reckoned and sizes (S,k) of its k terms: ``log`` (P,S) joint with the priors of
-    part, sizes and members, ``mean`` (P,q) of the scaled coefficients of all members, over the sizes."""
+    """Of one set, by the ``parts`` (P,) reckoned and sizes (S,k) of its k
+    terms: ``log`` (P,S) joint with the priors of part, sizes and members,
+    ``mean`` (P,q) of the scaled coefficients of all members, over the sizes."""
 
     members: tuple[int, ...]
     parts: tuple[int, ...]
@@ -63,11 +68,13 @@ class SetEvidence:
 
 
 class Evidence:
-    """The rows, the ``terms`` a set may have with the ``columns`` (N,C) of them all, the ``parts`` (the first is none),
-    and the grid of ``sizes`` (R,) of effects in g."""
+    """The rows, the ``terms`` a set may have with the ``columns`` (N,C) of them
+    all, the ``parts`` (the first is none), and the grid of ``sizes`` (R,) of
+    effects in g."""
 
     def __init__(self, rows: Rows, terms: Sequence[Term], odds: Odds, smallest_g: float | None = None) -> None:
-        """Sizes begin at ``smallest_g``, by default at that share of the noise of a pose which the odds have."""
+        """Sizes begin at ``smallest_g``, by default at that share of the noise
+        of a pose which the odds have."""
         self.rows, self.terms, self.odds = rows, terms, odds
         self.parts = _parts(rows, odds)
         self._begin_sizes(odds.smallest * rows.median_standard_error if smallest_g is None else smallest_g)
@@ -105,15 +112,17 @@ class Evidence:
         return noise if assumed.kind is None else noise + assumed.tau**2 * assumed.kind.covariance
 
     def places(self, members: Sequence[int]) -> Ints:
-        """Where the scaled coefficients of these terms stand among those of all, and their ``columns``."""
+        """Where the scaled coefficients of these terms stand among those of
+        all, and their ``columns``."""
         ranges = [np.arange(self._ends[i], self._ends[i + 1]) for i in members]
         return np.concatenate([np.empty(0, dtype=int), *ranges])
 
     def log_evidence_with_each(
         self, part: int, members: Sequence[int] = (), sizes: Sequence[float] = ()
     ) -> tuple[Floats, float]:
-        """Logarithms (T,R) of the evidence of each term at each size beside ``members`` of given sizes, and that of
-        these alone; with the priors of the part and of the term's size, without those of names."""
+        """Logarithms (T,R) of the evidence of each term at each size beside
+        ``members`` of given sizes, and that of these alone; with the priors of
+        the part and of the term's size, without those of names."""
         diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
         score, chi2, shared, log_det = self._conditional_on(part, members, sizes)
         base = self.parts[part].log_prior + 0.5 * float(np.log(weight).sum()) - log_det
@@ -130,7 +139,8 @@ class Evidence:
     def _in_own_axes(
         self, diagonal: _EigenBasis, weight: Floats, shared: Floats, places: Ints, score: Floats
     ) -> tuple[Floats, Floats]:
-        """Eigenvalues (t,q) of the information of each term's coefficients, and the squared scores along its axes."""
+        """Eigenvalues (t,q) of the information of each term's coefficients, and
+        the squared scores along its axes."""
         columns = diagonal.columns[:, places]
         if places.shape[1] == 1:
             information = weight @ columns[:, :, 0] ** 2 - np.sum(shared[:, places[:, 0]] ** 2, axis=0)
@@ -144,8 +154,9 @@ class Evidence:
     def normal_equations(
         self, part: int, members: Sequence[int], sizes: Sequence[float], each: Sequence[int]
     ) -> tuple[dict[int, tuple[Floats, Floats]], float]:
-        """Of ``each`` term the information (q,q) and score (q,) of its scaled coefficients beside ``members`` of these
-        sizes, and the sum of squares that these leave."""
+        """Of ``each`` term the information (q,q) and score (q,) of its scaled
+        coefficients beside ``members`` of these sizes, and the sum of squares
+        that these leave."""
         diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
         score, chi2, shared, _ = self._conditional_on(part, members, sizes)
         out: dict[int, tuple[Floats, Floats]] = {}
@@ -158,8 +169,9 @@ class Evidence:
     def _conditional_on(
         self, part: int, members: Sequence[int], sizes: Sequence[float]
     ) -> tuple[Floats, float, Floats, float]:
-        """What ``members`` of these sizes leave: the score (C,) of all terms and the sum of squares; (k,C) whose square
-        is the information that they take; and half the logarithm of the determinant of their precision."""
+        """What ``members`` of these sizes leave: the score (C,) of all terms
+        and the sum of squares; (k,C) whose square is the information that they
+        take; and half the logarithm of the determinant of their precision."""
         diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
         index = self.places(members)
         scale = np.repeat(np.asarray(sizes, dtype=float), [self.terms[i].rank for i in members])
@@ -172,8 +184,9 @@ class Evidence:
         return score, chi2, shared, float(np.log(np.diag(lower)).sum())
 
     def with_each_further(self, found: SetEvidence, row: int, cells: int) -> Floats:
-        """(T,R) about the logarithm of the evidence of a set with each further term at each size, under the part in
-        this ``row`` of it: at those ``cells`` of the members' sizes that are best without the term."""
+        """(T,R) about the logarithm of the evidence of a set with each further
+        term at each size, under the part in this ``row`` of it: at those
+        ``cells`` of the members' sizes that are best without the term."""
         best = np.argsort(-found.log[row])[:cells]
         share = found.by_part[row] - log_sum_exp(found.log[row][best])
         each = []
@@ -213,11 +226,14 @@ def _squared(columns: Floats) -> Floats:
 def _marginalised(
     information: Floats, score: Floats, ranks: Sequence[int], grids: Sequence[Floats]
 ) -> tuple[Floats, Floats, Floats]:
-    """Of coefficients in blocks of these ``ranks``, with ``information`` (P,q,q) and ``score`` (P,q), for every choice
-    S of one size for each block from its grid: by how much they lower the sum of squares (P,S), the logarithm of the
-    determinant of their precision over that of the prior (P,S), and their mean (P,S,q).
+    """Of coefficients in blocks of these ``ranks``, with ``information``
+    (P,q,q) and ``score`` (P,q), for every choice S of one size for each block
+    from its grid: by how much they lower the sum of squares (P,S), the
+    logarithm of the determinant of their precision over that of the prior
+    (P,S), and their mean (P,S,q).
 
-    Block by block: in the axes of its own information every size is a division, and the rest is what it leaves.
+    Block by block: in the axes of its own information every size is a division,
+    and the rest is what it leaves.
     """
     if not ranks:
         nothing = np.zeros((len(score), 1))

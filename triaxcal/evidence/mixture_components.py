@@ -1,4 +1,5 @@
-"""The likeliest sets solved: coefficients and their covariance, for one part of the evidence and choice of sizes."""
+"""The likeliest sets solved: coefficients and their covariance, for one part of
+the evidence and choice of sizes."""
 
 from __future__ import annotations
 
@@ -16,16 +17,18 @@ from triaxcal.model.sensor import LINEAR
 NEGLIGIBLE = 1e-6
 """The probability of a set that moves no average."""
 CELLS = 400
-"""Sets, with one part and one choice of sizes each, whose covariances are mixed: the likeliest. The others are as these
-are."""
+"""Sets, with one part and one choice of sizes each, whose covariances are
+mixed: the likeliest. The others are as these are."""
 
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """A likely set, with one ``part`` of the evidence, under k choices of ``sizes`` (k,q) of its q scaled coefficients.
-    ``share`` (k,) is the probability of each. Of the linear parameters and the coefficients, d = 9 + q,
-    ``conditional_mean`` (k,d) are the means and ``conditional_covariance`` (k,d,d) the covariances but for the
-    ``noise`` (k,); ``residuals`` (k,N) the rows that are left, ``design`` (N,d) the derivatives of the rows and
+    """A likely set, with one ``part`` of the evidence, under k choices of
+    ``sizes`` (k,q) of its q scaled coefficients. ``share`` (k,) is the
+    probability of each. Of the linear parameters and the coefficients, d = 9 +
+    q, ``conditional_mean`` (k,d) are the means and ``conditional_covariance``
+    (k,d,d) the covariances but for the ``noise`` (k,); ``residuals`` (k,N) the
+    rows that are left, ``design`` (N,d) the derivatives of the rows and
     ``inverse`` (N,N) that of their covariance."""
 
     found: SetEvidence
@@ -43,7 +46,8 @@ class Components:
 
 
 def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
-    """Of the likeliest cells that hold this ``share`` of the probability, those of one set and part together."""
+    """Of the likeliest cells that hold this ``share`` of the probability, those
+    of one set and part together."""
     evidence = posterior.evidence
     rows = evidence.rows
     together: dict[tuple[int, int], list[tuple[float, int]]] = defaultdict(list)
@@ -75,7 +79,8 @@ def components(posterior: Posterior, share: float = 1.0) -> list[Components]:
 
 
 def _likely_cells(posterior: Posterior, share: float) -> list[tuple[float, SetEvidence, int, int]]:
-    """The logarithm of its probability, the set, and the places of part and sizes."""
+    """The logarithm of its probability, the set, and the places of part and
+    sizes."""
     total = float(log_sum_exp([found.total for found in posterior.sets]))
     log, of_set, where = [], [], []
     for k, found in enumerate(posterior.sets):

@@ -1,7 +1,9 @@
-"""What is corrected: the linear parameters and the effects' coefficients, averaged over all likely sets.
+"""What is corrected: the linear parameters and the effects' coefficients,
+averaged over all likely sets.
 
-A document has one form and one shape for each effect. So every shape of a name is carried over to the likeliest one:
-the coefficients are those that come nearest, in the poses and in the next recording, to what all shapes together do.
+A document has one form and one shape for each effect. So every shape of a name
+is carried over to the likeliest one: the coefficients are those that come
+nearest, in the poses and in the next recording, to what all shapes together do.
 """
 
 from __future__ import annotations
@@ -27,15 +29,18 @@ from triaxcal.model.sensor import LINEAR, Sensor
 from triaxcal.poses.covariates import at_moment
 
 NOTICEABLE = 0.1
-"""Of the standard error of a pose: a name that is unlikely and corrects less is not listed."""
+"""Of the standard error of a pose: a name that is unlikely and corrects less is
+not listed."""
 BIAS = slice(3, 6)
-"""Of the nine parameters as the fit has them: to one of these a bias adds as it is."""
+"""Of the nine parameters as the fit has them: to one of these a bias adds as it
+is."""
 THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
 SELECTED_LEAST = 0.03
-"""Of the mean square of what an unlikely name may do: a name that corrects less only adds coefficients that nobody
-knows."""
+"""Of the mean square of what an unlikely name may do: a name that corrects less
+only adds coefficients that nobody knows."""
 STEPS = 3
-"""Of Newton's method, for nine parameters a few parts in a thousand from where they go."""
+"""Of Newton's method, for nine parameters a few parts in a thousand from where
+they go."""
 
 
 _NextReadings = tuple[Floats, Floats, Floats, dict[str, Floats]]
@@ -46,21 +51,26 @@ class Refusal(StrEnum):
     """Why no effect is corrected."""
 
     UNMODELLED = "unmodelled"
-    """Something that no name describes probably acts: an average over names would go with it where it must not."""
+    """Something that no name describes probably acts: an average over names
+    would go with it where it must not."""
     CHANGE_POINT = "another"
-    """One calibration does not hold in all poses: a unit was exchanged on the way, or its channels."""
+    """One calibration does not hold in all poses: a unit was exchanged on the
+    way, or its channels."""
     ONE_POSE = "one_pose"
     """A name is certain, and without some single pose unlikelier than not."""
 
 
 @dataclass(frozen=True, eq=False)
 class Average:
-    """``sensor`` has one entry for each likely name, by the mean of its coefficients: sets without the effect count,
-    with zero. ``covariance`` (9+p,9+p) is that of its scale factors, misalignments, biases and coefficients, within the
-    sets and between them, of which ``thermal`` is the part of sets with a thermal effect that is not listed;
-    ``prior_sd`` (p,) are the coefficients' standard deviations before the poses were seen, as the probabilities and
-    sizes after have them. ``weights`` has the probability of each name. ``process_bias`` (3,) g, which the biases hold,
-    is what a process in time adds to them at the moment for which all this holds."""
+    """``sensor`` has one entry for each likely name, by the mean of its
+    coefficients: sets without the effect count, with zero. ``covariance``
+    (9+p,9+p) is that of its scale factors, misalignments, biases and
+    coefficients, within the sets and between them, of which ``thermal`` is the
+    part of sets with a thermal effect that is not listed; ``prior_sd`` (p,) are
+    the coefficients' standard deviations before the poses were seen, as the
+    probabilities and sizes after have them. ``weights`` has the probability of
+    each name. ``process_bias`` (3,) g, which the biases hold, is what a process
+    in time adds to them at the moment for which all this holds."""
 
     sensor: Sensor
     covariance: Floats
@@ -83,8 +93,9 @@ def refusal(posterior: Posterior) -> Refusal | None:
 
 
 def average(posterior: Posterior, at: HoldsAt, solved: Sequence[Components] | None = None) -> Average:
-    """Over all sets, sizes and parts; it holds for another recording as at a moment of this one. ``solved`` are the
-    likeliest sets (`components`), where they are known."""
+    """Over all sets, sizes and parts; it holds for another recording as at a
+    moment of this one. ``solved`` are the likeliest sets (`components`), where
+    they are known."""
     listed, solved = _likeliest(posterior), components(posterior) if solved is None else solved
     made = _of_listed(posterior, at, listed, solved)
     kept = [effect for effect in listed if _selected(posterior, made, effect)]
@@ -116,8 +127,8 @@ def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
 
 
 def linear_alone(posterior: Posterior, at: HoldsAt, linear: Sensor, solved: Sequence[Components]) -> Average:
-    """The ``linear`` sensor with the errors that all likely sets make of it: what is handed on where no effect is
-    corrected."""
+    """The ``linear`` sensor with the errors that all likely sets make of it:
+    what is handed on where no effect is corrected."""
     rows = posterior.evidence.rows
     state = State.of(rows.problem, linear)
     projection, mean = _Projection.of(posterior, at, []), state.theta - rows.state.theta
@@ -144,9 +155,11 @@ def _with_errors(
 
 @dataclass(frozen=True, eq=False)
 class _Projection:
-    """Maps the scaled coefficients of every term to deviations of the reported parameters: ``by_term`` (9+p,C), zero
-    for outliers. ``effects`` are those listed, each in the form and the shape that stands for its name, and ``columns``
-    (N,p) theirs. An effect that is not listed is projected onto the nine parameters."""
+    """Maps the scaled coefficients of every term to deviations of the reported
+    parameters: ``by_term`` (9+p,C), zero for outliers. ``effects`` are those
+    listed, each in the form and the shape that stands for its name, and
+    ``columns`` (N,p) theirs. An effect that is not listed is projected onto the
+    nine parameters."""
 
     effects: tuple[Effect, ...]
     columns: Floats
@@ -181,7 +194,8 @@ class _Projection:
 
 
 def _likeliest(posterior: Posterior) -> list[Effect]:
-    """Of each name that is listed the form and the shape of the greatest weight, the likeliest name first."""
+    """Of each name that is listed the form and the shape of the greatest
+    weight, the likeliest name first."""
     weight: dict[int, float] = defaultdict(float)
     effects: dict[int, Effect] = {}
     corrects: dict[str, float] = defaultdict(float)
@@ -206,7 +220,8 @@ def _likeliest(posterior: Posterior) -> list[Effect]:
 
 
 def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
-    """(9+p,q): the deviation of the linear parameters, and the coefficients, that come nearest to a unit of each."""
+    """(9+p,q): the deviation of the linear parameters, and the coefficients,
+    that come nearest to a unit of each."""
     size = np.maximum(np.linalg.norm(to, axis=0), 1e-300)
     found = np.linalg.lstsq(np.concatenate([linear, to / size], axis=1), of, rcond=1e-9)[0]
     found[linear.shape[1] :] /= size[:, None]
@@ -214,7 +229,8 @@ def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
 
 
 def _derivatives(posterior: Posterior, effect: Effect, next_readings: _NextReadings) -> Floats:
-    """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of |a| in the next recording."""
+    """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of
+    |a| in the next recording."""
     rows = posterior.evidence.rows
     _, along, by_v, covariates = next_readings
     try:
@@ -225,8 +241,9 @@ def _derivatives(posterior: Posterior, effect: Effect, next_readings: _NextReadi
 
 
 def _next_readings(posterior: Posterior, at: HoldsAt) -> _NextReadings:
-    """Of M readings all over the sphere, as of the next recording: derivatives by the linear parameters (M,9) over the
-    error of a pose, readings along the axes and derivatives by the biases (M,3), and the covariates."""
+    """Of M readings all over the sphere, as of the next recording: derivatives
+    by the linear parameters (M,9) over the error of a pose, readings along the
+    axes and derivatives by the biases (M,3), and the covariates."""
     rows = posterior.evidence.rows
     up = np.array([v for _, v in cube_directions()]) * rows.problem.reference
     found = reading_geometry(rows, rows.state.sensor(rows.problem).output(up, {}))
@@ -236,7 +253,8 @@ def _next_readings(posterior: Posterior, at: HoldsAt) -> _NextReadings:
 
 
 def _mean(posterior: Posterior, projection: _Projection) -> tuple[Floats, dict[int, Floats]]:
-    """(9+p,) deviations; and by part the rows that are left, weighted by the inverse of their covariance."""
+    """(9+p,) deviations; and by part the rows that are left, weighted by the
+    inverse of their covariance."""
     evidence = posterior.evidence
     rows = evidence.rows
     scaled = np.zeros(evidence.columns.shape[1])
@@ -262,8 +280,8 @@ def _mean(posterior: Posterior, projection: _Projection) -> tuple[Floats, dict[i
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """As `Average` has it, of the parameters as deviations: ``whole`` and ``thermal`` (9+p,9+p), ``prior`` (p,)
-    variances."""
+    """As `Average` has it, of the parameters as deviations: ``whole`` and
+    ``thermal`` (9+p,9+p), ``prior`` (p,) variances."""
 
     whole: Floats
     thermal: Floats
@@ -279,8 +297,8 @@ class _Spread:
         process_bias: Floats,
         t_s: float,
     ) -> _Spread:
-        """Within each set, part and choice of sizes, and between them. The biases are those of the moment, with what a
-        process in time adds."""
+        """Within each set, part and choice of sizes, and between them. The
+        biases are those of the moment, with what a process in time adds."""
         listed = {effect.name for effect in projection.effects}
         whole, thermal = np.zeros((2, len(mean), len(mean)))
         prior, total = np.zeros(len(mean) - LINEAR), 0.0
@@ -297,8 +315,9 @@ class _Spread:
 def _moments(
     cells: Components, posterior: Posterior, mean: Floats, projection: _Projection, process_bias: Floats, t_s: float
 ) -> tuple[Floats, Floats]:
-    """Sums over the choices, by their share: the variances (p,) that the sizes give the coefficients of an average,
-    and the second moments (9+p,9+p) about its mean."""
+    """Sums over the choices, by their share: the variances (p,) that the sizes
+    give the coefficients of an average, and the second moments (9+p,9+p) about
+    its mean."""
     rows, assumed = posterior.evidence.rows, posterior.evidence.parts[cells.part]
     to = np.concatenate([np.zeros((len(mean), LINEAR)), projection.by_term[:, cells.places]], axis=1)
     size = cells.share @ (cells.sizes**2 @ (to[LINEAR:, LINEAR:] ** 2).T)
@@ -318,8 +337,8 @@ def _moments(
 
 
 def _where_linearised(posterior: Posterior, deviation: Floats, projection: _Projection) -> State:
-    """Adjust the nine parameters until the exact residuals are those of the linear model. This absorbs the higher
-    orders of the effects."""
+    """Adjust the nine parameters until the exact residuals are those of the
+    linear model. This absorbs the higher orders of the effects."""
     rows = posterior.evidence.rows
     wanted = -rows.y + rows.linear @ (rows.lengths * deviation[:9]) + projection.columns @ deviation[9:]
     state = State(np.concatenate([rows.state.theta + deviation[:9], deviation[9:]]), projection.effects)

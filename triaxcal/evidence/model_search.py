@@ -1,4 +1,5 @@
-"""Which sets of terms are likely: single ones all, larger ones grown from the best (Occam's window)."""
+"""Which sets of terms are likely: single ones all, larger ones grown from the
+best (Occam's window)."""
 
 from __future__ import annotations
 
@@ -12,14 +13,16 @@ from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
 
 Scores = dict[tuple[int, ...], float]
 LEADERS = (12, 6)
-"""Sets of one term that are grown, and of more: two by each choice of names, then one."""
+"""Sets of one term that are grown, and of more: two by each choice of names,
+then one."""
 GROWN = 60
 """Terms that are put beside one leader, the best."""
 MOST = 260
-"""Sets that are reckoned in full. More than so many within the window share what a few leave."""
+"""Sets that are reckoned in full. More than so many within the window share
+what a few leave."""
 ROUGH = 4.0
-"""In the logarithm: by so much the score of a larger set may be off, as it is reckoned at the sizes and the parts that
-its smaller one likes best."""
+"""In the logarithm: by so much the score of a larger set may be off, as it is
+reckoned at the sizes and the parts that its smaller one likes best."""
 NO_PART = 1e-3
 """A part with a smaller share in every leading set is left out of the sums."""
 
@@ -69,8 +72,9 @@ def _leaders(evidence: Evidence, level: Mapping[tuple[int, ...], float], depth: 
 
 
 def _scores_with_each_term(evidence: Evidence, members: tuple[int, ...]) -> Floats:
-    """(T,) about the logarithm of the evidence of the members with each term, with all priors: at the sizes that are
-    best for the members, without an unmodelled part and with the three that are likeliest beside the members."""
+    """(T,) about the logarithm of the evidence of the members with each term,
+    with all priors: at the sizes that are best for the members, without an
+    unmodelled part and with the three that are likeliest beside the members."""
     alone = evidence.of_set(members, range(len(evidence.parts)))
     likely = np.argsort(-alone.by_part)[:3]
     rows = dict.fromkeys([0, *map(int, likely)])
@@ -84,7 +88,8 @@ def _go_together(evidence: Evidence, members: tuple[int, ...], other: int) -> bo
 
 
 def _nested(one: str, other: str) -> bool:
-    """Whether one of the names has the columns of the other: temperature, linear and quadratic."""
+    """Whether one of the names has the columns of the other: temperature,
+    linear and quadratic."""
     return {one, other} == {"temperature_bias", "temperature_bias_quadratic"}
 
 

@@ -1,7 +1,9 @@
-"""What several units, or recordings, show together: whether an effect acts in all, then whether its values are common.
+"""What several units, or recordings, show together: whether an effect acts in
+all, then whether its values are common.
 
-An effect that no unit shows for certain may be certain in all of them together. So existence is asked of the product
-of their evidences: one name, form, shape and size for all, and coefficients of its own for each unit, or the same. Its
+An effect that no unit shows for certain may be certain in all of them together.
+So existence is asked of the product of their evidences: one name, form, shape
+and size for all, and coefficients of its own for each unit, or the same. Its
 competitor is that each unit is for itself, with its own posterior.
 """
 
@@ -26,18 +28,22 @@ LIKELY = 3
 NEGLIGIBLE = 14.0
 """In the logarithm: parts that are less likely by more add nothing."""
 STEPS = 6
-"""Towards coefficients that units share: each weighs the units by the noise that is left in them."""
+"""Towards coefficients that units share: each weighs the units by the noise
+that is left in them."""
 Form = tuple[str, tuple[str, ...], tuple[int, ...]]
 """A name, the coefficients of a form, and those of them that are free."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pooled:
-    """Hypotheses are that one effect acts in every unit, of one form, shape and size, or that each unit is for itself.
+    """Hypotheses are that one effect acts in every unit, of one form, shape and
+    size, or that each unit is for itself.
 
-    ``shared`` is the probability of the first by name, ``independent_probability`` that of the second. ``probability``
-    is that each effect acts in every unit, whatever else does, the likeliest first; ``common`` that its values then are
-    one for all, and ``shapes`` has what its shape is. ``nothing`` is the probability that no effect acts in any unit.
+    ``shared`` is the probability of the first by name,
+    ``independent_probability`` that of the second. ``probability`` is that each
+    effect acts in every unit, whatever else does, the likeliest first;
+    ``common`` that its values then are one for all, and ``shapes`` has what its
+    shape is. ``nothing`` is the probability that no effect acts in any unit.
     """
 
     units: Sequence[Posterior]
@@ -49,8 +55,9 @@ class Pooled:
     nothing: float
 
     def one_of(self, names: Sequence[str]) -> float:
-        """The probability that one of these effects, the same, acts in every unit; at least, where units that share
-        nothing may have several of them."""
+        """The probability that one of these effects, the same, acts in every
+        unit; at least, where units that share nothing may have several of
+        them."""
         total = self.independent_probability * max(
             _product(unit.effect_probabilities.get(name, 0.0) for unit in self.units) for name in names
         )
@@ -62,9 +69,10 @@ class Pooled:
         return total
 
     def certain(self, level: float) -> tuple[tuple[str, ...], ...]:
-        """Groups of names, in each of which one acts in every unit with this probability: names alone, and the fewest
-        of the others, the likeliest first. Names that hold each other's columns, as temperature and its square, stand
-        together."""
+        """Groups of names, in each of which one acts in every unit with this
+        probability: names alone, and the fewest of the others, the likeliest
+        first. Names that hold each other's columns, as temperature and its
+        square, stand together."""
         alone = [name for name, p in self.probability.items() if p >= level]
         out = [(name,) for name in alone]
         rest = [name for name, p in self.probability.items() if 1 - level <= p < level]
@@ -75,8 +83,9 @@ class Pooled:
 
 
 def pool(units: Sequence[Posterior]) -> Pooled:
-    """Of units whose posteriors are of one catalogue and one grid of sizes (`Posterior.resized`). Names that some unit
-    cannot show are left out. Where an effect acts in all, another is asked about beside it."""
+    """Of units whose posteriors are of one catalogue and one grid of sizes
+    (`Posterior.resized`). Names that some unit cannot show are left out. Where
+    an effect acts in all, another is asked about beside it."""
     found, given = _pooled_conditional_on(units, frozenset()), units
     odds, acting = units[0].evidence.odds, list[str]()
     while len(acting) < odds.together - 1:
@@ -91,7 +100,8 @@ def pool(units: Sequence[Posterior]) -> Pooled:
 
 
 def _given(found: Pooled, more: Pooled, p: float) -> Pooled:
-    """With what was asked beside an effect that acts in all with probability ``p``."""
+    """With what was asked beside an effect that acts in all with probability
+    ``p``."""
     better = {n: p * q for n, q in more.probability.items() if p * q > found.probability[n]}
     of_names = dict(found.probability) | better
     return replace(
@@ -113,7 +123,8 @@ def _pooled_conditional_on(units: Sequence[Posterior], acting: frozenset[str]) -
     index: dict[str, list[int]] = defaultdict(list)
     for name in sorted({form[0] for form in forms}):
         ratios = [_ratio(unit, of_unit, name) for unit, of_unit in zip(units, bases, strict=True)]
-        # All without an unmodelled part, or each with its likeliest: the coefficients are one for all.
+        # All without an unmodelled part, or each with its likeliest: the
+        # coefficients are one for all.
         settings = [
             [_equations(unit, of_unit, name, none) for unit, of_unit in zip(units, bases, strict=True)]
             for none in (True, False)
@@ -170,8 +181,9 @@ def _terms(evidence: Evidence) -> dict[Form, list[int]]:
 def _alike(
     units: Sequence[Posterior], terms: Sequence[Mapping[Form, list[int]]], forms: Sequence[Form]
 ) -> Iterator[list[int]]:
-    """Of every form and shape of the first unit the term in each unit whose shape comes nearest: units that were held
-    still at other times have other grids of shapes."""
+    """Of every form and shape of the first unit the term in each unit whose
+    shape comes nearest: units that were held still at other times have other
+    grids of shapes."""
     for form in forms:
         shapes = [
             np.array([_shape_of(unit.evidence.terms[i]) for i in of_unit[form]])
@@ -190,8 +202,9 @@ def _shape_of(term: Term) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class _Base:
-    """A set that a further term may stand beside: ``found``, the ``names`` in it, and ``with_each`` (T,R), the
-    logarithm of its evidence with each term at each size, of the sizes one by one."""
+    """A set that a further term may stand beside: ``found``, the ``names`` in
+    it, and ``with_each`` (T,R), the logarithm of its evidence with each term at
+    each size, of the sizes one by one."""
 
     found: SetEvidence
     names: frozenset[str]
@@ -199,15 +212,17 @@ class _Base:
 
 
 def _bases(unit: Posterior, acting: frozenset[str]) -> list[_Base]:
-    """The likeliest sets, and what is left of the likeliest without some of its terms, but for effects that are
-    ``acting``; where none is, the empty set too."""
+    """The likeliest sets, and what is left of the likeliest without some of its
+    terms, but for effects that are ``acting``; where none is, the empty set
+    too."""
     evidence = unit.evidence
     best = unit.sets[0].members
     less = [kept for k in range(len(best) + 1) for kept in itertools.combinations(best, k)]
     some = [*less, *(found.members for found in unit.sets[:LIKELY])]
     sets = [m for m in dict.fromkeys(some) if acting <= {evidence.terms[i].name for i in m}]
     known = {found.members: found for found in unit.sets}
-    # Whatever part is likely beside some set: an effect may take the place of a part.
+    # Whatever part is likely beside some set: an effect may take the place of a
+    # part.
     likely = [row for row, part in enumerate(unit.sets[0].parts) if unit.part_probabilities[part] > np.exp(-NEGLIGIBLE)]
     out = []
     for members in sets:
@@ -220,7 +235,8 @@ def _bases(unit: Posterior, acting: frozenset[str]) -> list[_Base]:
 
 
 def _ratio(unit: Posterior, bases: Sequence[_Base], name: str) -> Floats:
-    """(T,R) the logarithm of the evidence of the unit with each term at each size, over that of the unit by itself."""
+    """(T,R) the logarithm of the evidence of the unit with each term at each
+    size, over that of the unit by itself."""
     others = [base for base in bases if name not in base.names]
     with_each = log_sum_exp([base.with_each for base in others], axis=0)
     without = log_sum_exp([base.found.total for base in others])
@@ -228,7 +244,8 @@ def _ratio(unit: Posterior, bases: Sequence[_Base], name: str) -> Floats:
 
 
 def _log_without(unit: Posterior, bases: Sequence[_Base], name: str) -> float:
-    """The logarithm of the evidence of the unit without that name, over that of the unit by itself."""
+    """The logarithm of the evidence of the unit without that name, over that of
+    the unit by itself."""
     every = {found.members: found for found in (*(base.found for base in bases), *unit.sets)}.values()
     others = [found.total for found in every if name not in unit.names_of(found)]
     return float(log_sum_exp(others) - log_sum_exp([found.total for found in every]))
@@ -236,9 +253,11 @@ def _log_without(unit: Posterior, bases: Sequence[_Base], name: str) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Of each term of a name the information (q,q) and score (q,) of its scaled coefficients, in standard errors,
-    beside one set with one part and one choice of sizes that leave ``chi2``. Its share of the unit by itself is
-    ``log_share``; ``variance`` is that of the noise where one more term explains what it can."""
+    """Of each term of a name the information (q,q) and score (q,) of its scaled
+    coefficients, in standard errors, beside one set with one part and one
+    choice of sizes that leave ``chi2``. Its share of the unit by itself is
+    ``log_share``; ``variance`` is that of the noise where one more term
+    explains what it can."""
 
     of_terms: Mapping[int, tuple[Floats, Floats]]
     chi2: float
@@ -247,7 +266,8 @@ class _Equations:
 
 
 def _equations(unit: Posterior, bases: Sequence[_Base], name: str, none: bool) -> _Equations:
-    """Beside what explains most with one more term of this name; without an unmodelled part, where ``none``."""
+    """Beside what explains most with one more term of this name; without an
+    unmodelled part, where ``none``."""
     evidence = unit.evidence
     mine = [i for i, term in enumerate(evidence.terms) if term.name == name]
     others = [base for base in bases if name not in base.names]
@@ -267,9 +287,10 @@ def _explained(information: Floats, score: Floats) -> float:
 
 
 def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations], index: Sequence[int]) -> Floats:
-    """(R,) the same ratio, where all have the coefficients of the first: by Laplace's method about the coefficients
-    that explain most, as the noise of no unit is known beforehand. Two such points are looked for, since a unit may as
-    well lack the effect and be noisy."""
+    """(R,) the same ratio, where all have the coefficients of the first: by
+    Laplace's method about the coefficients that explain most, as the noise of
+    no unit is known beforehand. Two such points are looked for, since a unit
+    may as well lack the effect and be noisy."""
     first = units[0].evidence.terms[index[0]]
     scaled = []
     for unit, of_unit, i in zip(units, equations, index, strict=True):
@@ -290,9 +311,10 @@ def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations
 def _laplace_log_evidence(
     units: Sequence[Posterior], information: Floats, score: Floats, chi2: Floats, start: Floats
 ) -> Floats:
-    """(R,) the logarithm of the evidence of coefficients that U units share over that of none, for each size. Of each
-    unit ``information`` (U,q,q), ``score`` (U,q) and ``chi2`` (U,) without them; ``start`` (U,) are variances of the
-    noise."""
+    """(R,) the logarithm of the evidence of coefficients that U units share
+    over that of none, for each size. Of each unit ``information`` (U,q,q),
+    ``score`` (U,q) and ``chi2`` (U,) without them; ``start`` (U,) are variances
+    of the noise."""
     size = units[0].evidence.sizes
     prior = np.eye(score.shape[1]) / size[:, None, None] ** 2
     variance = np.broadcast_to(start, (len(size), len(units)))

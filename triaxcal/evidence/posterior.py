@@ -1,4 +1,5 @@
-"""The posterior: how probable each name, each outlier and an unmodelled part are, over all likely sets of terms."""
+"""The posterior: how probable each name, each outlier and an unmodelled part
+are, over all likely sets of terms."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ from triaxcal.poses.pose import Pose
 ROUNDS = 4
 """Of linearising anew, each a step of Gauss and Newton, and of dividing shapes."""
 PARTS = 3
-"""Unmodelled parts beside which a name is asked about without a pose, the likeliest beside the name."""
+"""Unmodelled parts beside which a name is asked about without a pose, the
+likeliest beside the name."""
 ALTERNATIVES = 8
 """Names at most among which alternatives are looked for, the likeliest."""
 
@@ -60,7 +62,8 @@ class Posterior:
         return frozenset(pose for pose in poses if pose >= 0)
 
     def resized(self, smallest_g: float) -> Posterior:
-        """The same sets with sizes that begin elsewhere, as `posterior_of` has them."""
+        """The same sets with sizes that begin elsewhere, as `posterior_of` has
+        them."""
         evidence = self.evidence.resized(smallest_g)
         sets = [evidence.of_set(found.members, found.parts) for found in self.sets]
         return Posterior(evidence, sorted(sets, key=lambda found: -found.total))
@@ -71,7 +74,8 @@ class Posterior:
 
     @cached_property
     def effect_probabilities(self) -> Mapping[str, float]:
-        """The probability that each effect acts, whatever acts beside it, the likeliest first."""
+        """The probability that each effect acts, whatever acts beside it, the
+        likeliest first."""
         out: dict[str, float] = defaultdict(float)
         for w, found in zip(self.weight, self.sets, strict=True):
             for name in self.names_of(found):
@@ -80,7 +84,8 @@ class Posterior:
 
     @cached_property
     def effect_set_probabilities(self) -> Mapping[frozenset[str], float]:
-        """The probability that these effects act and no other, the likeliest first."""
+        """The probability that these effects act and no other, the likeliest
+        first."""
         out: dict[frozenset[str], float] = defaultdict(float)
         for w, found in zip(self.weight, self.sets, strict=True):
             out[self.names_of(found)] += float(w)
@@ -105,7 +110,8 @@ class Posterior:
 
     @cached_property
     def change_point_probabilities(self) -> Floats:
-        """(n,) the probability that from each pose on there is another unit, or another mounting."""
+        """(n,) the probability that from each pose on there is another unit, or
+        another mounting."""
         out = np.zeros(self.evidence.rows.n)
         for p, term in zip(self.of_terms, self.evidence.terms, strict=True):
             if term.change_point >= 0:
@@ -114,7 +120,8 @@ class Posterior:
 
     @cached_property
     def part_probabilities(self) -> Floats:
-        """(P,) the probability of each part of the evidence, the first that there is none."""
+        """(P,) the probability of each part of the evidence, the first that
+        there is none."""
         out = np.zeros(len(self.evidence.parts))
         for found in self.sets:
             out[list(found.parts)] += np.exp(found.by_part - self._total)
@@ -122,7 +129,8 @@ class Posterior:
 
     @property
     def unmodelled_probability(self) -> float:
-        """The probability that something acts on the means which no name describes."""
+        """The probability that something acts on the means which no name
+        describes."""
         parts = zip(self.part_probabilities, self.evidence.parts, strict=True)
         return float(
             sum(p for p, part in parts if part.kind is not None and part.kind.what != UnmodelledKind.WITHIN_POSE)
@@ -144,8 +152,9 @@ class Posterior:
 
     @cached_property
     def certain(self) -> tuple[tuple[str, ...], ...]:
-        """Groups of names, in each of which one acts for certain. A name alone is known, whichever pose were an
-        outlier; of several it is known that one of them acts."""
+        """Groups of names, in each of which one acts for certain. A name alone
+        is known, whichever pose were an outlier; of several it is known that
+        one of them acts."""
         level = self.evidence.odds.certain
         out: list[tuple[str, ...]] = []
         rest: list[str] = []
@@ -160,7 +169,8 @@ class Posterior:
         return tuple(out)
 
     def _alternatives(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The fewest of these of which one acts for certain, the likeliest first; none where nothing is certain."""
+        """The fewest of these of which one acts for certain, the likeliest
+        first; none where nothing is certain."""
         for size in range(2, min(len(names), ALTERNATIVES) + 1):
             groups = itertools.combinations(names[:ALTERNATIVES], size)
             best = max(groups, key=self.any_of)
@@ -169,12 +179,14 @@ class Posterior:
         return ()
 
     def least_leave_one_out(self, name: str) -> float:
-        """The probability of a name if that pose were an outlier which it takes most to explain."""
+        """The probability of a name if that pose were an outlier which it takes
+        most to explain."""
         return float(self.leave_one_out(name).min())
 
     def leave_one_out(self, name: str) -> Floats:
-        """(n,) the probability of a name if that pose were an outlier: beside the likeliest set with the name, less the
-        name. As it is, where the pose is one of that set's outliers."""
+        """(n,) the probability of a name if that pose were an outlier: beside
+        the likeliest set with the name, less the name. As it is, where the pose
+        is one of that set's outliers."""
         if name not in self._without:
             self._without[name] = self._leave_one_out_of(name)
         return self._without[name]
@@ -214,8 +226,9 @@ class Posterior:
 
 
 def considered(poses: Sequence[Pose], catalogue: Sequence[Effect] | None = None) -> tuple[Effect, ...]:
-    """The effects of a ``catalogue``, run by run where there are several; where it is None, of all that are known for
-    the channels that move in these poses."""
+    """The effects of a ``catalogue``, run by run where there are several; where
+    it is None, of all that are known for the channels that move in these
+    poses."""
     sound = [p for p in poses if not p.fault]
     if catalogue is None:
         catalogue = catalogue_for(set(channels_of(sound)) - static_covariates(sound))
@@ -231,8 +244,9 @@ def posterior_of(
     odds: Odds | None = None,
     smallest_g: float | None = None,
 ) -> Posterior:
-    """Of what acts beside the ``linear`` fit of these poses. ``smallest_g`` is the least size of an effect that is
-    asked about; several units that are compared have one."""
+    """Of what acts beside the ``linear`` fit of these poses. ``smallest_g`` is
+    the least size of an effect that is asked about; several units that are
+    compared have one."""
     odds = odds or Odds()
     effects = considered(poses, catalogue)
     rows, finer = Rows.of(poses, linear, signs, effects), list[Finer]()
@@ -247,8 +261,10 @@ def posterior_of(
 
 
 def finer_shapes(posterior: Posterior) -> Finer:
-    """Where two neighbouring values of a shape hold nearly all of the probability of a likely effect, what to divide
-    each into: where the effect is strong, the values of the grid are further apart than the poses tell them."""
+    """Where two neighbouring values of a shape hold nearly all of the
+    probability of a likely effect, what to divide each into: where the effect
+    is strong, the values of the grid are further apart than the poses tell
+    them."""
     out: dict[Variant, Sequence[Effect]] = {}
     terms, odds = posterior.evidence.terms, posterior.evidence.odds
     for name in (name for name, p in posterior.effect_probabilities.items() if p >= odds.reported):
@@ -265,7 +281,8 @@ def finer_shapes(posterior: Posterior) -> Finer:
 
 
 def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
-    """By the probability of each variant of one form of an effect, whose shape is one number."""
+    """By the probability of each variant of one form of an effect, whose shape
+    is one number."""
     if len(of_shapes) < 2:
         return {}
     (shape,) = of_shapes[0][0].shape
@@ -290,7 +307,8 @@ def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
 
 
 def _point_of(posterior: Posterior) -> State | None:
-    """Where the likeliest set says that the unit is; None where the linearisation holds there, or nothing does."""
+    """Where the likeliest set says that the unit is; None where the
+    linearisation holds there, or nothing does."""
     evidence, best = posterior.evidence, posterior.sets[0]
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
     if any(term.change_point >= 0 for term in terms) or not posterior.names_of(best):

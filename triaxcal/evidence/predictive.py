@@ -1,7 +1,9 @@
-"""What the likely sets say of poses that nobody has taken: of each a normal distribution, given all rows seen.
+"""What the likely sets say of poses that nobody has taken: of each a normal
+distribution, given all rows seen.
 
-Universal kriging: the nine parameters are flat, what no term describes is predicted through its covariance with the
-rows seen, and the coefficients of the terms have the distribution that these leave them.
+Universal kriging: the nine parameters are flat, what no term describes is
+predicted through its covariance with the rows seen, and the coefficients of the
+terms have the distribution that these leave them.
 """
 
 from __future__ import annotations
@@ -24,8 +26,9 @@ from triaxcal.evidence.unmodelled_kernels import PoseInputs, UnmodelledCovarianc
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What a reader wants to know: which effects act, which poses are outliers, from which pose on there is another
-    unit (−1: from none), and with what something goes that no name describes (None: with nothing)."""
+    """What a reader wants to know: which effects act, which poses are outliers,
+    from which pose on there is another unit (−1: from none), and with what
+    something goes that no name describes (None: with nothing)."""
 
     names: frozenset[str]
     outliers: frozenset[int]
@@ -35,9 +38,11 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Predictive:
-    """The likeliest sets, each with one part of the evidence and one choice of sizes: C of them, of H hypotheses.
-    ``weight`` (C,) adds up to one and gives each hypothesis its share of the probability of all that have a cell here;
-    ``of`` (C,) is the place of each cell's hypothesis among the ``hypotheses``."""
+    """The likeliest sets, each with one part of the evidence and one choice of
+    sizes: C of them, of H hypotheses. ``weight`` (C,) adds up to one and gives
+    each hypothesis its share of the probability of all that have a cell here;
+    ``of`` (C,) is the place of each cell's hypothesis among the
+    ``hypotheses``."""
 
     posterior: Posterior
     solved: Sequence[Components]
@@ -47,7 +52,8 @@ class Predictive:
 
     @classmethod
     def likeliest(cls, posterior: Posterior, share: float) -> Predictive:
-        """Those that hold this share of the probability, or as many as there are."""
+        """Those that hold this share of the probability, or as many as there
+        are."""
         solved = components(posterior, share)
         each = [_hypothesis(posterior, cells.found, cells.part) for cells in solved]
         hypotheses = list(dict.fromkeys(each))
@@ -63,7 +69,8 @@ class Predictive:
         return np.array([float(name in h.names) for h in self.hypotheses])[self.of]
 
     def predicted(self, rows: Rows) -> tuple[Floats, Floats]:
-        """Mean (C,M) and covariance (C,M,M) of M rows to come, over their errors."""
+        """Mean (C,M) and covariance (C,M,M) of M rows to come, over their
+        errors."""
         evidence = self.posterior.evidence
         columns = _columns(evidence, sorted({i for cells in self.solved for i in cells.found.members}), rows)
         here, there = PoseInputs.of(evidence.rows), PoseInputs.of(rows)
@@ -83,8 +90,9 @@ class Predictive:
 def _unmodelled(
     kind: UnmodelledCovariance | None, tau: float, here: PoseInputs, there: PoseInputs, inverse: Floats
 ) -> tuple[Floats, Floats]:
-    """Of the rows to come, noise and what no term describes: the best linear prediction (M,N) by the rows seen, of
-    whose covariance this is the ``inverse``, and the covariance (M,M) of its error."""
+    """Of the rows to come, noise and what no term describes: the best linear
+    prediction (M,N) by the rows seen, of whose covariance this is the
+    ``inverse``, and the covariance (M,M) of its error."""
     k, n = len(there.error), len(here.error)
     if kind is None:
         return np.zeros((k, n)), np.eye(k)
@@ -119,8 +127,9 @@ def _what(posterior: Posterior, part: int) -> UnmodelledKind | None:
 
 
 def _columns(evidence: Evidence, members: Sequence[int], rows: Rows) -> Floats:
-    """(M,C) of all terms in the rows to come; zero of those that are no ``members``, of outliers, and where an effect
-    of another package does not say what it adds."""
+    """(M,C) of all terms in the rows to come; zero of those that are no
+    ``members``, of outliers, and where an effect of another package does not
+    say what it adds."""
     out = np.zeros((len(rows.y), evidence.columns.shape[1]))
     known: dict[int, Floats] = {}
     for i in members:

@@ -7,52 +7,65 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Odds:
-    """Odds and sizes before the poses were seen. A factor of 3 in any of them changes little where the poses are many.
+    """Odds and sizes before the poses were seen. A factor of 3 in any of them
+    changes little where the poses are many.
 
-    Sizes are those of a whole effect: the rms of what it adds, over the sphere and over the recording's range of its
-    covariate. They mean the same for every recording.
+    Sizes are those of a whole effect: the rms of what it adds, over the sphere
+    and over the recording's range of its covariate. They mean the same for
+    every recording.
     """
 
     effect: float = 0.3
-    """That some effect of the catalogue acts, shared evenly among the names that can; a second one likewise."""
+    """That some effect of the catalogue acts, shared evenly among the names
+    that can; a second one likewise."""
     outlier: float = 0.005
     """That a pose is an outlier: one knock or slip in some two hundred."""
     unmodelled: float = 0.2
-    """That something acts that no name describes, shared evenly among its kinds."""
+    """That something acts that no name describes, shared evenly among its
+    kinds."""
     change_point: float = 0.005
-    """That one calibration does not hold in all poses: a unit exchanged, or its channels, in one of two hundred."""
+    """That one calibration does not hold in all poses: a unit exchanged, or its
+    channels, in one of two hundred."""
     largest_g: float = 30e-3
     """A sensor that departs by more from the linear model is broken."""
     largest_outlier: float = 1.0
-    """Of the reference, as of another unit or mounting: a pose that was moved, or turned over, is off by as much."""
+    """Of the reference, as of another unit or mounting: a pose that was moved,
+    or turned over, is off by as much."""
     smallest: float = 0.1
     """Of the noise of a pose: what is less shows in no data."""
     sizes: int = 9
-    """Steps between the two, even in the logarithm: a factor of 3 to 5, within which the evidence hardly changes."""
+    """Steps between the two, even in the logarithm: a factor of 3 to 5, within
+    which the evidence hardly changes."""
     unmodelled_smallest: float = 0.4
     unmodelled_largest: float = 200.0
     unmodelled_sizes: int = 7
-    """Of an unmodelled part in standard errors of a pose: from what hardly shows to what no effect exceeds."""
+    """Of an unmodelled part in standard errors of a pose: from what hardly
+    shows to what no effect exceeds."""
     on_one_axis: float = 0.25
     on_two_axes: float = 0.25
-    """Of an effect with a part for each axis: usually, in the half that is left, one mechanism acts on all of them."""
+    """Of an effect with a part for each axis: usually, in the half that is
+    left, one mechanism acts on all of them."""
     certain: float = 0.99
-    """A name of this probability is adopted, and has to keep it without any one pose."""
+    """A name of this probability is adopted, and has to keep it without any one
+    pose."""
     reported: float = 0.5
-    """Outliers, and names that are not certain, are reported from this probability on."""
+    """Outliers, and names that are not certain, are reported from this
+    probability on."""
     refused: float = 0.5
-    """Where an unmodelled part is likelier than not, or a name would be unlikelier than not without some one pose, no
-    effect is corrected."""
+    """Where an unmodelled part is likelier than not, or a name would be
+    unlikelier than not without some one pose, no effect is corrected."""
     together: int = 3
     """Effects and outliers at once, at most."""
     relinearise_chi2: float = 1.0
-    """Where the likeliest effects make more of chi-square by their curvature, all is linearised anew about them: so
-    much changes no evidence by more than a factor of 1.6."""
+    """Where the likeliest effects make more of chi-square by their curvature,
+    all is linearised anew about them: so much changes no evidence by more than
+    a factor of 1.6."""
     refine_share: float = 0.98
-    """Where two neighbouring values of a shape hold so much of an effect's probability, each is divided: a normal
-    distribution of more than a third of their distance has less there."""
+    """Where two neighbouring values of a shape hold so much of an effect's
+    probability, each is divided: a normal distribution of more than a third of
+    their distance has less there."""
     refine_count: int = 4
     """Values in the place of one."""
     window: float = 1e4
-    """Sets of less probability than the best by this factor are left out (Occam's window; Madigan and Raftery 1994,
-    J. Am. Stat. Assoc. 89:1535)."""
+    """Sets of less probability than the best by this factor are left out
+    (Occam's window; Madigan and Raftery 1994, J. Am. Stat. Assoc. 89:1535)."""

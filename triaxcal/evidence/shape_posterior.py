@@ -1,4 +1,5 @@
-"""The shape of an effect, a time constant or the moment of a step, as the posterior has it."""
+"""The shape of an effect, a time constant or the moment of a step, as the
+posterior has it."""
 
 from __future__ import annotations
 
@@ -12,14 +13,14 @@ from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.terms import Term
 
 AT_AN_END = 0.5
-"""If an end value of the grid holds more than this probability, the data do not bound the shape. No standard error is
-given then."""
+"""If an end value of the grid holds more than this probability, the data do not
+bound the shape. No standard error is given then."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Mean and standard deviation. ``standard_error`` is None where the poses do not tell it: it lies at an end of what
-    was asked about."""
+    """Mean and standard deviation. ``standard_error`` is None where the poses
+    do not tell it: it lies at an end of what was asked about."""
 
     value: float
     standard_error: float | None
@@ -27,7 +28,8 @@ class Shape:
 
 
 def shapes_of(posterior: Posterior, name: str) -> Mapping[str, Shape]:
-    """Of an effect, by the name of the shape, if that effect acts; none where it has none."""
+    """Of an effect, by the name of the shape, if that effect acts; none where
+    it has none."""
     terms, weights = posterior.evidence.terms, posterior.of_terms
     mine = [i for i, term in enumerate(terms) if term.effect is not None and term.name == name]
     return shapes_by([terms[i] for i in mine], weights[mine]) if weights[mine].any() else {}
@@ -45,7 +47,8 @@ def shapes_by(terms: Sequence[Term], weights: Floats) -> Mapping[str, Shape]:
 
 
 def _spread(values: Floats, weights: Floats) -> tuple[float, float | None]:
-    """Each value of the grid stands for all that are nearer to it than to any other."""
+    """Each value of the grid stands for all that are nearer to it than to any
+    other."""
     grid, which = np.unique(values, return_inverse=True)
     share = np.bincount(which, weights)
     share = share / share.sum()

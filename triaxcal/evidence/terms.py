@@ -1,4 +1,5 @@
-"""What a hypothesis is made of: effects, each in one form, on some axes, with one shape; poses that are outliers."""
+"""What a hypothesis is made of: effects, each in one form, on some axes, with
+one shape; poses that are outliers."""
 
 from __future__ import annotations
 
@@ -23,20 +24,23 @@ FEWEST = 4
 SPHERE = 48
 """Directions over which the size of an effect is reckoned."""
 NOTHING_G = 1e-12
-"""A coefficient that makes less than this makes nothing but rounding: no term is scaled
-by it."""
+"""A coefficient that makes less than this makes nothing but rounding: no term
+is scaled by it."""
 ABSORBED = 1e-6
-"""Of a term's columns: what the nine parameters leave no more of is theirs, to rounding."""
+"""Of a term's columns: what the nine parameters leave no more of is theirs, to
+rounding."""
 AXES = 3
 """The sensitive axes, and the components of a vector."""
 
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """``columns`` (N,q) are those of coefficients of size one, so that ρ times them has the rms ρ; ``combination`` (q,)
-    what they were multiplied by. ``kind`` is the same for terms that exclude each other; ``pose`` is the outlier's, or
-    −1; ``change_point`` is the pose from which on there is another unit or mounting, or −1; ``kept`` are those
-    coefficients of the ``effect`` that are free."""
+    """``columns`` (N,q) are those of coefficients of size one, so that ρ times
+    them has the rms ρ; ``combination`` (q,) what they were multiplied by.
+    ``kind`` is the same for terms that exclude each other; ``pose`` is the
+    outlier's, or −1; ``change_point`` is the pose from which on there is
+    another unit or mounting, or −1; ``kept`` are those coefficients of the
+    ``effect`` that are free."""
 
     name: str
     kind: str
@@ -54,9 +58,11 @@ class Term:
 
 
 Variant = tuple[str, tuple[str, ...], tuple[float, ...]]
-"""An effect's name, coefficients and shape: foreign effects need not be equal to themselves."""
+"""An effect's name, coefficients and shape: foreign effects need not be equal
+to themselves."""
 Finer = Mapping[Variant, Sequence[Effect]]
-"""Variants that share the prior of the one whose place they take, among which it stands itself."""
+"""Variants that share the prior of the one whose place they take, among which
+it stands itself."""
 
 
 def variant_of(effect: Effect) -> Variant:
@@ -64,8 +70,10 @@ def variant_of(effect: Effect) -> Variant:
 
 
 def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = ()) -> list[Term]:
-    """Every form, shape and choice of axes of every effect that can act in these poses, every pose as an outlier, and
-    every pose as the first of another unit or mounting. ``finer`` are divisions of shapes, one after the other."""
+    """Every form, shape and choice of axes of every effect that can act in
+    these poses, every pose as an outlier, and every pose as the first of
+    another unit or mounting. ``finer`` are divisions of shapes, one after the
+    other."""
     still = static_covariates(rows.poses)
     known = rows.problem.channel_reference
     if not np.ptp(rows.t_s) > 0:  # means whose times nobody knows
@@ -77,7 +85,8 @@ def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequenc
 
 
 def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
-    """Effects of other packages that cannot be used in these poses, though they could be loaded: name → reason."""
+    """Effects of other packages that cannot be used in these poses, though they
+    could be loaded: name → reason."""
     found = {}
     known, covariates = rows.problem.channel_reference, rows.problem.covariates
     s = rows.state.sensor(rows.problem).along_axes(rows.problem.u, covariates)
@@ -150,8 +159,9 @@ def _axes(parts: Sequence[str], odds: Odds) -> Iterator[tuple[tuple[int, ...], f
 
 
 def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
-    """Derivatives of the rows by the coefficients (N,p), and the size of each (p,): the rms of what a coefficient of
-    one adds over the sphere and over the poses' covariates, about its mean over these. None where it cannot be
+    """Derivatives of the rows by the coefficients (N,p), and the size of each
+    (p,): the rms of what a coefficient of one adds over the sphere and over the
+    poses' covariates, about its mean over these. None where it cannot be
     determined."""
     try:
         columns = rows.by_coefficients(effect)
@@ -181,7 +191,8 @@ def _outlier(rows: Rows, pose: int, odds: Odds) -> Term:
 
 
 def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
-    """From a pose on all nine parameters are others: another unit, channels that were exchanged."""
+    """From a pose on all nine parameters are others: another unit, channels
+    that were exchanged."""
     order = np.lexsort((rows.t_s, rows.run))
     cuts = range(FEWEST, rows.n - FEWEST + 1)
     size = np.sqrt(np.mean((rows.linear[: rows.n] * rows.error[: rows.n, None]) ** 2, axis=0))

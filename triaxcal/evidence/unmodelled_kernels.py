@@ -1,7 +1,9 @@
-"""What no name describes: a random function of one kind or another, whose covariance is all that is said of it.
+"""What no name describes: a random function of one kind or another, whose
+covariance is all that is said of it.
 
-Every function of direction is taken less what nine parameters absorb of it over the sphere, not at the poses: these
-would take half of it, and the linear part would come out two or three times worse.
+Every function of direction is taken less what nine parameters absorb of it over
+the sphere, not at the poses: these would take half of it, and the linear part
+would come out two or three times worse.
 """
 
 from __future__ import annotations
@@ -22,16 +24,19 @@ from triaxcal.model.directions import spiral
 SPHERE = 300
 """Directions over which the nine parameters absorb what they can."""
 SMOOTH = (0.4, 0.8)
-"""Correlation lengths on the sphere, of unit radius: bumps of a face's size, and of a hemisphere's."""
+"""Correlation lengths on the sphere, of unit radius: bumps of a face's size,
+and of a hemisphere's."""
 BY_AXIS = 0.3
-"""Of the reference vector, along the reading of an axis: a function of that reading alone, odd or even."""
+"""Of the reference vector, along the reading of an axis: a function of that
+reading alone, odd or even."""
 MEMORY = 0.8
 """Of the reference vector, by the pose before."""
 IN_TIME = (0.1, 0.3)
 """Of the recording's duration."""
 ABSORBED = 1e-9
-"""A kind is dropped if projection off the nine parameters leaves less than this share of its covariance. An example is
-time, where the times of the poses are unknown."""
+"""A kind is dropped if projection off the nine parameters leaves less than this
+share of its covariance. An example is time, where the times of the poses are
+unknown."""
 
 
 class UnmodelledKind(StrEnum):
@@ -49,8 +54,9 @@ class UnmodelledKind(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class ReadingGeometry:
-    """k readings: ``up`` (k,3) unit vectors, ``by_v`` (k,3) how |a| goes with the bias of each axis, ``along`` (k,3)
-    the readings along the sensitive axes in g, ``linear`` (k,9) derivatives by the nine parameters."""
+    """k readings: ``up`` (k,3) unit vectors, ``by_v`` (k,3) how |a| goes with
+    the bias of each axis, ``along`` (k,3) the readings along the sensitive axes
+    in g, ``linear`` (k,9) derivatives by the nine parameters."""
 
     up: Floats
     by_v: Floats
@@ -60,9 +66,10 @@ class ReadingGeometry:
 
 @dataclass(frozen=True, eq=False)
 class PoseInputs:
-    """k poses as a covariance sees them, taken or to come: ``reading_geometry``, the specific force in the pose
-    ``before`` (k,3) over the reference, ``t_s``, ``duration_s`` and ``run`` (k,); the standard ``error`` of their rows
-    (K,), K = 2 k where these have ``slopes``."""
+    """k poses as a covariance sees them, taken or to come:
+    ``reading_geometry``, the specific force in the pose ``before`` (k,3) over
+    the reference, ``t_s``, ``duration_s`` and ``run`` (k,); the standard
+    ``error`` of their rows (K,), K = 2 k where these have ``slopes``."""
 
     reading_geometry: ReadingGeometry
     before: Floats
@@ -86,17 +93,20 @@ class PoseInputs:
 
 
 class _Between(Protocol):
-    """(K,L) covariance of the rows of k poses and of l poses, in units of the reference squared, but for a factor."""
+    """(K,L) covariance of the rows of k poses and of l poses, in units of the
+    reference squared, but for a factor."""
 
     def __call__(self, p: PoseInputs, q: PoseInputs) -> Floats: ...
 
 
 @dataclass(frozen=True, eq=False)
 class UnmodelledCovariance:
-    """A covariance of the rows beside the nine parameters, in its own axes: ``variance`` (m,) along ``axes`` (m,m),
-    with mean 1, so that τ² is the mean variance in units of the noise. ``covariance`` (N,N) of the rows over their
-    errors, and ``between`` what makes it and that of any other poses; every covariance of this kind is to be multiplied
-    by ``scale``. ``length`` is that of its correlation."""
+    """A covariance of the rows beside the nine parameters, in its own axes:
+    ``variance`` (m,) along ``axes`` (m,m), with mean 1, so that τ² is the mean
+    variance in units of the noise. ``covariance`` (N,N) of the rows over their
+    errors, and ``between`` what makes it and that of any other poses; every
+    covariance of this kind is to be multiplied by ``scale``. ``length`` is that
+    of its correlation."""
 
     what: UnmodelledKind
     length: float
@@ -111,8 +121,10 @@ class UnmodelledCovariance:
         return np.asarray(self.scale * self.between(p, q) / p.error[:, None] / q.error)
 
     def bias_at(self, rows: Rows, t_s: float) -> Floats:
-        """(3,N) covariance of the bias at a moment of the last recording with the rows over their errors, of what goes
-        with time; a length is a share of the recording's duration. The bias itself has the variance ``scale``."""
+        """(3,N) covariance of the bias at a moment of the last recording with
+        the rows over their errors, of what goes with time; a length is a share
+        of the recording's duration. The bias itself has the variance
+        ``scale``."""
         length = self.length * duration_of(rows)
         apart = t_s - rows.t_s
         near = np.exp(-(apart**2) / 2 / length**2) * (rows.run == rows.run.max())
@@ -181,8 +193,8 @@ def _by_the_pose_before(p: PoseInputs, q: PoseInputs) -> Floats:
 
 
 def _in_time(p: PoseInputs, q: PoseInputs, length: float) -> Floats:
-    """A bias of each axis that wanders smoothly, in each recording anew: one process for means and slopes, or slow
-    drift is paid twice."""
+    """A bias of each axis that wanders smoothly, in each recording anew: one
+    process for means and slopes, or slow drift is paid twice."""
     apart = p.t_s[:, None] - q.t_s[None]
     together = (p.reading_geometry.by_v @ q.reading_geometry.by_v.T) * (p.run[:, None] == q.run)
     near = np.exp(-(apart**2) / 2 / length**2) * together
@@ -200,7 +212,8 @@ class _Covariance(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Sphere:
-    """Directions all over the sphere, with what takes the nine parameters' part off a function there."""
+    """Directions all over the sphere, with what takes the nine parameters' part
+    off a function there."""
 
     everywhere: ReadingGeometry
     fit: Floats

@@ -1,4 +1,5 @@
-"""The frame of the mounting faces: from faces in two orientations each to a rotation, with the fixture's own errors."""
+"""The frame of the mounting faces: from faces in two orientations each to a
+rotation, with the fixture's own errors."""
 
 from triaxcal.frames.frames import Frames, UnitFrame
 

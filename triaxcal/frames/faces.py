@@ -1,7 +1,8 @@
 """Which poses stand on which face of the fixture.
 
-A face pose has the label of the side that is up: ``+X`` stands on the face −X. Directions are unit vectors of up in
-the sensor's frame; a mounting is a rotation (3,3) that takes them to the body's frame.
+A face pose has the label of the side that is up: ``+X`` stands on the face −X.
+Directions are unit vectors of up in the sensor's frame; a mounting is a
+rotation (3,3) that takes them to the body's frame.
 """
 
 from __future__ import annotations
@@ -18,15 +19,17 @@ from triaxcal.estimate.caution import Caution
 
 LABELS = ("+X", "-X", "+Y", "-Y", "+Z", "-Z")
 NEAR_RAD = 0.05
-"""A pose stands on a face if up is as near as this to the face's own; tilts and errors of a fixture are far smaller."""
+"""A pose stands on a face if up is as near as this to the face's own; tilts and
+errors of a fixture are far smaller."""
 LABEL_RAD = 0.2
 """Beyond this a label that was given contradicts the others."""
 AS_GOOD = 0.75
-"""Share of the best score from which on a frame is as good; the one nearest to the
-sensor's axes is taken. Beside a whole cube with two poses a face it may lack one
-face, or the second poses of two."""
+"""Share of the best score from which on a frame is as good; the one nearest to
+the sensor's axes is taken. Beside a whole cube with two poses a face it may
+lack one face, or the second poses of two."""
 SEEDS_MOST = 300
-"""Poses of which pairs span frames: 45 thousand pairs at most, for the sake of time."""
+"""Poses of which pairs span frames: 45 thousand pairs at most, for the sake of
+time."""
 
 
 def axis_of(label: str) -> Floats:
@@ -64,19 +67,23 @@ class Miscounted(InvalidData):
 
 @dataclass(frozen=True)
 class AxesAssumed(Caution):
-    """No labels were given: the sensor's axes are taken to lie near the faces' axes of the same name."""
+    """No labels were given: the sensor's axes are taken to lie near the faces'
+    axes of the same name."""
 
 
 @dataclass(frozen=True)
 class SeveralCubes(Caution):
-    """The poses lie on the axes of more than one cube; taken is the one nearest to the sensor's own axes."""
+    """The poses lie on the axes of more than one cube; taken is the one nearest
+    to the sensor's own axes."""
 
 
 @dataclass(frozen=True)
 class Labelling:
-    """``labels`` and ``headings`` (rad, or None) of each pose, None where it stands on no face or is excluded.
+    """``labels`` and ``headings`` (rad, or None) of each pose, None where it
+    stands on no face or is excluded.
 
-    ``assumed``: the axes of the sensor were taken to lie near those of the body, which nothing in the data shows.
+    ``assumed``: the axes of the sensor were taken to lie near those of the
+    body, which nothing in the data shows.
     """
 
     labels: tuple[str | None, ...]
@@ -91,17 +98,20 @@ class Labelling:
 
 
 def nearest_rotation(up: Floats, axes: Floats) -> Floats:
-    """The rotation C (…,3,3) that minimises Σ|C upᵢ − axesᵢ|² (Wahba's problem; Markley 1988), for two (…,n,3)."""
+    """The rotation C (…,3,3) that minimises Σ|C upᵢ − axesᵢ|² (Wahba's problem;
+    Markley 1988), for two (…,n,3)."""
     u, _, vt = np.linalg.svd(np.swapaxes(axes, -1, -2) @ up)
     u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return np.asarray(u @ vt)
 
 
 def recognise(up: Floats, used: Bools) -> Labelling:
-    """Face poses by direction alone, the axes of the sensor taken near the body's. Raises Refused where there are none.
+    """Face poses by direction alone, the axes of the sensor taken near the
+    body's. Raises Refused where there are none.
 
-    Of the frames whose axes run through the poses, those are preferred that have most poses on their axes, twice
-    counted up to two a face, and of those as good the one nearest to the sensor's own.
+    Of the frames whose axes run through the poses, those are preferred that
+    have most poses on their axes, twice counted up to two a face, and of those
+    as good the one nearest to the sensor's own.
     """
     frames, scores = _frames(up[used])
     if not len(frames):
@@ -128,8 +138,9 @@ def labelled(
 ) -> Labelling:
     """Face poses by the labels given, whatever the mounting.
 
-    There are as many labels as poses (None, or a label that is no face's, for poses on no face), or as face poses, or
-    as faces stood on, in order of time. Raises Miscounted where there are not, InvalidData where they contradict the
+    There are as many labels as poses (None, or a label that is no face's, for
+    poses on no face), or as face poses, or as faces stood on, in order of time.
+    Raises Miscounted where there are not, InvalidData where they contradict the
     readings, Refused where the faces are too few.
     """
     given = [label if label in LABELS else None for label in labels]
@@ -146,7 +157,8 @@ def labelled(
 def _spread(
     up: Floats, used: Bools, given: Sequence[str | None], turns: Sequence[float | None]
 ) -> tuple[list[str | None], list[float | None]]:
-    """Labels for some poses as labels for all: of the face poses, or of the faces, each in order of first time."""
+    """Labels for some poses as labels for all: of the face poses, or of the
+    faces, each in order of first time."""
     found = recognise(up, used)
     on_face = [i for i, label in enumerate(found.labels) if label]
     order = list(dict.fromkeys(found.labels[i] for i in on_face))
@@ -215,7 +227,8 @@ def _on_faces(up: Floats, used: Bools, mounting: Floats) -> tuple[str | None, ..
 
 
 def _frames(up: Floats) -> tuple[Floats, Floats]:
-    """Rotations (f,3,3) with poses on at least two of their axes, and their scores (f,)."""
+    """Rotations (f,3,3) with poses on at least two of their axes, and their
+    scores (f,)."""
     seeds = up[:SEEDS_MOST]
     i, j = np.nonzero(np.triu(np.abs(seeds @ seeds.T) < np.sin(NEAR_RAD), 1))
     x = seeds[i]

@@ -1,4 +1,5 @@
-"""The errors of a fixture's own faces, and which of them do not depend on the frame they are expressed in."""
+"""The errors of a fixture's own faces, and which of them do not depend on the
+frame they are expressed in."""
 
 from __future__ import annotations
 
@@ -18,14 +19,18 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Fixture:
-    """Faces by the label of what is up on them. ``up`` (f,3) their inward normals in the body's frame.
+    """Faces by the label of what is up on them. ``up`` (f,3) their inward
+    normals in the body's frame.
 
-    ``error`` (f,3) how far these are from the axes, rad, along the body's axes; ``covariance`` (3f,3f) of all of them.
-    ``squareness`` by pair of axes (XY, YZ, ZX): how far the mean normals of their faces are from a right angle,
-    positive where the angle is smaller. ``parallelism`` by axis: half of what its two faces lack to be parallel, as the
-    mean of both inward normals, along the two other axes in cyclic order. Both do not depend on the datum.
-    ``offset`` (3,) rad: standard error, about the body's axes, of the datum against the frame that faces with
-    independent errors of this size were made to; None where nothing shows that size.
+    ``error`` (f,3) how far these are from the axes, rad, along the body's axes;
+    ``covariance`` (3f,3f) of all of them. ``squareness`` by pair of axes (XY,
+    YZ, ZX): how far the mean normals of their faces are from a right angle,
+    positive where the angle is smaller. ``parallelism`` by axis: half of what
+    its two faces lack to be parallel, as the mean of both inward normals, along
+    the two other axes in cyclic order. Both do not depend on the datum.
+    ``offset`` (3,) rad: standard error, about the body's axes, of the datum
+    against the frame that faces with independent errors of this size were made
+    to; None where nothing shows that size.
     """
 
     faces: tuple[str, ...]
@@ -43,12 +48,13 @@ class Fixture:
 
 
 def fixture_of(faces: tuple[str, ...], up: Floats, covariance: Floats, axes: Floats, datum: Floats) -> Fixture:
-    """``covariance`` (2f,2f) of the normals in ``axes`` (f,3,2); ``datum`` (3,2f): what of their errors there it makes
-    zero."""
+    """``covariance`` (2f,2f) of the normals in ``axes`` (f,3,2); ``datum``
+    (3,2f): what of their errors there it makes zero."""
     nominal = np.array([axis_of(label) for label in faces])
     spread = np.zeros((3 * len(faces), 2 * len(faces)))
     for k in range(len(faces)):
-        # What a normal loses along its own axis is of second order, and no error of the face.
+        # What a normal loses along its own axis is of second order, and no
+        # error of the face.
         spread[3 * k : 3 * k + 3, 2 * k : 2 * k + 2] = axes[k] - np.outer(nominal[k], nominal[k] @ axes[k])
     error = up - nominal * np.sum(nominal * up, axis=1, keepdims=True)
     V = spread @ covariance @ spread.T
@@ -68,7 +74,8 @@ def fixture_of(faces: tuple[str, ...], up: Floats, covariance: Floats, axes: Flo
         here = [label for label in faces if label[1] == "XYZ"[a]]
         for b in range(3):
             if here and a != b:
-                # The mean normal of an axis, the face of the minus side turned round.
+                # The mean normal of an axis, the face of the minus side turned
+                # round.
                 mean[a, b] = np.sum([component(x, b) * axis_of(x)[a] for x in here], axis=0) / len(here)
             if a in both and a != b:
                 half[a, b] = np.sum([component(x, b) for x in here], axis=0) / 2

@@ -1,9 +1,11 @@
-"""The frame of a unit's mounting faces: what an ellipsoid leaves open, from poses on the faces of a fixture.
+"""The frame of a unit's mounting faces: what an ellipsoid leaves open, from
+poses on the faces of a fixture.
 
-Each unit gives the inward normals of the faces it stood on, in its sensor's frame (`triaxcal.frames.standing`). The
-fixture's faces are the same for all units on it, so all their normals together give the faces, up to a rotation of the
-whole, and each unit's rotation against them. That last rotation is a convention, the datum: which three of the
-fixture's errors are zero.
+Each unit gives the inward normals of the faces it stood on, in its sensor's
+frame (`triaxcal.frames.standing`). The fixture's faces are the same for all
+units on it, so all their normals together give the faces, up to a rotation of
+the whole, and each unit's rotation against them. That last rotation is a
+convention, the datum: which three of the fixture's errors are zero.
 """
 
 from __future__ import annotations
@@ -25,19 +27,23 @@ from triaxcal.frames.standing import Standing, basis_of
 from triaxcal.poses.pure_error import LACK_OF_FIT
 
 ROUNDS = 8
-"""Steps of Gauss–Newton over small rotations, always all of them. Fewer may leave a
-rest of large angles; more cost time alone."""
+"""Steps of Gauss–Newton over small rotations, always all of them. Fewer may
+leave a rest of large angles; more cost time alone."""
 SINGULAR = 0.05
-"""Faces that connect units give singular values near 1; ones that do not, those of the faces' own errors."""
+"""Faces that connect units give singular values near 1; ones that do not, those
+of the faces' own errors."""
 
 
 @dataclass(frozen=True)
 class Datum:
-    """Which frame the body's is. ``faces``: none for the least-squares frame, else primary and secondary face.
+    """Which frame the body's is. ``faces``: none for the least-squares frame,
+    else primary and secondary face.
 
-    Faces are named by their outward normal: ``-Z`` is the one that the fixture stands on with +Z up. The least-squares
-    frame is the one in which the sum of the squared errors of the faces that there are is smallest, all weighing the
-    same. With faces, the primary's normal is the axis of its name, and the secondary's lies in the plane of the two.
+    Faces are named by their outward normal: ``-Z`` is the one that the fixture
+    stands on with +Z up. The least-squares frame is the one in which the sum of
+    the squared errors of the faces that there are is smallest, all weighing the
+    same. With faces, the primary's normal is the axis of its name, and the
+    secondary's lies in the plane of the two.
     """
 
     faces: tuple[str, str] | None = None
@@ -58,8 +64,9 @@ class Datum:
 class UnitFrame:
     """``rotation`` (3,3) takes vectors of the sensor's frame to the body's.
 
-    ``covariance`` (3,3) rad²: of the small rotation about the body's axes that would take it to the truth; ``dof``
-    (3,) the effective degrees of freedom behind its diagonal.
+    ``covariance`` (3,3) rad²: of the small rotation about the body's axes that
+    would take it to the truth; ``dof`` (3,) the effective degrees of freedom
+    behind its diagonal.
     """
 
     standing: Standing
@@ -84,7 +91,8 @@ class UnitFrame:
 
 @dataclass(frozen=True)
 class UnitsDisagree(Caution):
-    """On the fixture's faces, by ``ratio`` times what noise and seating explain (probability ``p``)."""
+    """On the fixture's faces, by ``ratio`` times what noise and seating explain
+    (probability ``p``)."""
 
     ratio: float
     p: float
@@ -92,7 +100,8 @@ class UnitsDisagree(Caution):
 
 @dataclass(frozen=True)
 class FacesMissing(Caution):
-    """Nothing stood with these ``faces`` up, and the least-squares frame is that of the others."""
+    """Nothing stood with these ``faces`` up, and the least-squares frame is
+    that of the others."""
 
     faces: tuple[str, ...]
 
@@ -106,10 +115,12 @@ class FaceFarOff(Caution):
 
 @dataclass(frozen=True)
 class Frames:
-    """``units`` in the order given, in one frame. ``covariance`` (3u,3u) of all their rotations.
+    """``units`` in the order given, in one frame. ``covariance`` (3u,3u) of all
+    their rotations.
 
-    ``chi2`` in ``left`` degrees of freedom: by how much the units disagree on the faces; ``birge_ratio`` ≥ 1 by how
-    much the standard errors were raised for it.
+    ``chi2`` in ``left`` degrees of freedom: by how much the units disagree on
+    the faces; ``birge_ratio`` ≥ 1 by how much the standard errors were raised
+    for it.
     """
 
     datum: Datum
@@ -127,11 +138,13 @@ class Frames:
 
     @property
     def agree(self) -> bool | None:
-        """Whether the units stood on one fixture; None where they have no faces to tell it by."""
+        """Whether the units stood on one fixture; None where they have no faces
+        to tell it by."""
         return self.birge_ratio == 1 if self.left else None
 
     def between(self, i: int, j: int) -> tuple[Floats, Floats]:
-        """Rotation vector (3,) rad from the sensor's frame of unit i to that of j, and its covariance (3,3).
+        """Rotation vector (3,) rad from the sensor's frame of unit i to that of
+        j, and its covariance (3,3).
 
         The covariance is of a small rotation about the body's axes.
         """
@@ -144,7 +157,8 @@ class Frames:
 def frames(standings: Sequence[Standing], *, datum: Datum | None = None) -> Frames:
     """One frame for units that stood on the faces of one fixture.
 
-    Raises Refused where the faces do not connect the units, or the datum's are not among those stood on.
+    Raises Refused where the faces do not connect the units, or the datum's are
+    not among those stood on.
     """
     if not standings:
         raise InvalidData("no unit")
@@ -177,10 +191,13 @@ def _datum_is_there(datum: Datum, faces: Sequence[str]) -> None:
 
 @dataclass
 class _Joint:
-    """Rotations of the units and normals of the faces that fit all observed normals best, under the datum.
+    """Rotations of the units and normals of the faces that fit all observed
+    normals best, under the datum.
 
-    Unknowns of a step: a small rotation about the body's axes for each unit (3u,), shifts of the normals in two axes
-    each (2f,). The three constraints of the datum take the place of the rotation of the whole, which nothing shows.
+    Unknowns of a step: a small rotation about the body's axes for each unit
+    (3u,), shifts of the normals in two axes each (2f,). The three constraints
+    of the datum take the place of the rotation of the whole, which nothing
+    shows.
     """
 
     standings: Sequence[Standing]
@@ -195,7 +212,8 @@ class _Joint:
         ]
 
     def connected(self) -> _Joint:
-        """Itself; raises Refused where the faces in common leave units free to turn against each other."""
+        """Itself; raises Refused where the faces in common leave units free to
+        turn against each other."""
         n = 3 * len(self.standings)
         self._prepare()
         G = np.concatenate([np.zeros((3, n)), self.constraints()[0]], axis=1)
@@ -247,7 +265,8 @@ class _Joint:
         return step
 
     def _observed(self, i: int, standing: Standing) -> tuple[Floats, Floats, Floats]:
-        """Derivatives (2k, 3u+2f), misses (2k,) and their covariance of one unit's normals, in the body's axes."""
+        """Derivatives (2k, 3u+2f), misses (2k,) and their covariance of one
+        unit's normals, in the body's axes."""
         n = 3 * len(self.standings)
         k = len(standing.faces)
         J, y, turn = np.zeros((2 * k, n + 2 * len(self.faces))), np.zeros(2 * k), np.zeros((2 * k, 2 * k))
@@ -262,7 +281,8 @@ class _Joint:
         return J, y, turn @ standing.covariance @ turn.T
 
     def constraints(self) -> tuple[Floats, Floats]:
-        """(3,2f) derivatives, and misses (3,), of what the datum wants to be zero."""
+        """(3,2f) derivatives, and misses (3,), of what the datum wants to be
+        zero."""
         G = np.zeros((3, 2 * len(self.faces)))
         if self.datum.faces is None:
             for k in range(len(self.faces)):
@@ -278,7 +298,8 @@ class _Joint:
 
 
 def _dof(joint: _Joint, standings: Sequence[Standing]) -> list[Floats]:
-    """(3,) for each unit by Welch and Satterthwaite's formula (JCGM 100, G.4.1)."""
+    """(3,) for each unit by Welch and Satterthwaite's formula (JCGM 100,
+    G.4.1)."""
     out: list[Floats] = []
     for i in range(len(standings)):
         whole = np.diag(joint.covariance)[3 * i : 3 * i + 3]

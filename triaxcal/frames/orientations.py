@@ -1,6 +1,8 @@
-"""In which orientations a fixture stood on each of its faces, and what these tell of the table's tilt.
+"""In which orientations a fixture stood on each of its faces, and what these
+tell of the table's tilt.
 
-Headings that nobody gave are found as far as they matter: the poses on a face are split in two, half a turn apart.
+Headings that nobody gave are found as far as they matter: the poses on a face
+are split in two, half a turn apart.
 """
 
 from __future__ import annotations
@@ -19,28 +21,31 @@ from triaxcal.frames.verticals import Verticals
 from triaxcal.poses.pose import PoseStart
 
 FLOOR_RAD = 1e-12
-"""Standard error of a direction that has no noise, as in a simulation: keeps the
-weights finite, and is far below what any pose tells."""
+"""Standard error of a direction that has no noise, as in a simulation: keeps
+the weights finite, and is far below what any pose tells."""
 SHOWS = 1e-4
-"""Probability below which a tilt, or a face that was not turned, is more than noise."""
+"""Probability below which a tilt, or a face that was not turned, is more than
+noise."""
 PAIRS_LEAST = 3
-"""So many faces that agree on the tilt are needed to conclude it for a face that stood one way only."""
+"""So many faces that agree on the tilt are needed to conclude it for a face
+that stood one way only."""
 SHORT = 0.95
 """The share of the tilt that a turn by 143° shows."""
 SPLIT_MOST = 12
-"""Poses on one face of which every split in two is tried, 2048 of twelve; with each
-more there are twice as many."""
+"""Poses on one face of which every split in two is tried, 2048 of twelve; with
+each more there are twice as many."""
 APART_RAD = 0.2
-"""Orientations that differ by less, 11°, are one: a fifth of a tilt shows between
-them."""
+"""Orientations that differ by less, 11°, are one: a fifth of a tilt shows
+between them."""
 LARGE_RAD = 0.01
-"""Tilts and errors of faces beyond this are asked about: a fixture's are far smaller,
-and poses of a unit in the hand lie on a cube by chance."""
+"""Tilts and errors of faces beyond this are asked about: a fixture's are far
+smaller, and poses of a unit in the hand lie on a cube by chance."""
 
 
 @dataclass(frozen=True)
 class NotTurned(Caution):
-    """The poses with a face up differ less than half a turn makes them on the others: taken as not turned by that."""
+    """The poses with a face up differ less than half a turn makes them on the
+    others: taken as not turned by that."""
 
     face: str
     began: PoseStart
@@ -48,7 +53,8 @@ class NotTurned(Caution):
 
 @dataclass(frozen=True)
 class NotFlush(Caution):
-    """The poses with a face up differ by ``angle_rad``, far more than on the other faces."""
+    """The poses with a face up differ by ``angle_rad``, far more than on the
+    other faces."""
 
     face: str
     began: PoseStart
@@ -57,9 +63,11 @@ class NotFlush(Caution):
 
 @dataclass(frozen=True)
 class Assumed:
-    """What the user knows: standard errors of one seating of the fixture and of a turn, and the table's tilt [rad].
+    """What the user knows: standard errors of one seating of the fixture and of
+    a turn, and the table's tilt [rad].
 
-    None where it is to be found from the poses. ``turn`` is that of a half turn, or of a heading that is given.
+    None where it is to be found from the poses. ``turn`` is that of a half
+    turn, or of a heading that is given.
     """
 
     seating: float | None = None
@@ -74,7 +82,8 @@ class Assumed:
 
 @dataclass(frozen=True)
 class Face:
-    """``rows`` of the poses on it, ``turn`` (n,) rad: headings where ``headed``, else counted from the first pose."""
+    """``rows`` of the poses on it, ``turn`` (n,) rad: headings where
+    ``headed``, else counted from the first pose."""
 
     label: str
     rows: tuple[int, ...]
@@ -97,15 +106,18 @@ class Face:
 
 
 def felt(turn: float) -> Floats:
-    """(2,2): the table's tilt in the axes of a face (`standing.basis_of`) that has turned by ``turn``."""
+    """(2,2): the table's tilt in the axes of a face (`standing.basis_of`) that
+    has turned by ``turn``."""
     c, s = np.cos(turn), np.sin(turn)
     return np.array([[c, s], [-s, c]])
 
 
 def _turns(found: Verticals, rows: Sequence[int]) -> Floats:
-    """(n,): half turns from the first pose, by the split in two whose means are farthest apart; or quarter turns.
+    """(n,): half turns from the first pose, by the split in two whose means are
+    farthest apart; or quarter turns.
 
-    Quarter turns where half turns leave far more than noise and quarter turns a small part of that.
+    Quarter turns where half turns leave far more than noise and quarter turns a
+    small part of that.
     """
     up = found.direction[list(rows)]
     second = _farthest_halves(up)
@@ -146,7 +158,8 @@ def _felt_by(turn: Floats) -> Floats:
 
 
 def _flat(found: Verticals, rows: Sequence[int]) -> tuple[Floats, Floats]:
-    """(2n,) up in the poses of one face, in axes square to its mean, x × y along it; and its covariance."""
+    """(2n,) up in the poses of one face, in axes square to its mean, x × y
+    along it; and its covariance."""
     up = found.direction[list(rows)]
     m = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
     x = np.linalg.svd(m[None])[2][1]
@@ -156,7 +169,8 @@ def _flat(found: Verticals, rows: Sequence[int]) -> tuple[Floats, Floats]:
 
 
 def _tilt_on(face: Face, found: Verticals) -> tuple[float, float]:
-    """Magnitude of the table's tilt as one face alone shows it, and its standard error."""
+    """Magnitude of the table's tilt as one face alone shows it, and its
+    standard error."""
     y, covariance = _flat(found, face.rows)
     gain = np.linalg.pinv(_felt_by(face.turn))[2:]
     d = gain @ y
@@ -166,12 +180,14 @@ def _tilt_on(face: Face, found: Verticals) -> tuple[float, float]:
 
 
 def pairs_of(faces: Sequence[Face], found: Verticals) -> list[tuple[Face, float, float]]:
-    """Faces in more than one orientation at unknown headings: the tilt's magnitude there and its standard error."""
+    """Faces in more than one orientation at unknown headings: the tilt's
+    magnitude there and its standard error."""
     return [(f, *_tilt_on(f, found)) for f in faces if not f.headed and f.resolved]
 
 
 def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[Caution]]:
-    """The faces, those that were seemingly not turned between their poses as in one orientation; and cautions."""
+    """The faces, those that were seemingly not turned between their poses as in
+    one orientation; and cautions."""
     cautions: list[Caution] = []
     pairs = pairs_of(faces, found)
     size = np.array([m for _, m, _ in pairs])
@@ -191,13 +207,15 @@ def turned(faces: list[Face], found: Verticals) -> tuple[list[Face], list[Cautio
             cautions.append(NotFlush(face.label, began, 2 * m))
     single = [f for f in faces if not f.headed and (not f.resolved or f.label in still)]
     if single and len(pairs) - len(still) < PAIRS_LEAST:
-        # One or two pairs among faces that stood one way may be poses repeated, without a turn.
+        # One or two pairs among faces that stood one way may be poses repeated,
+        # without a turn.
         still |= {f.label for f, m, error in pairs if m**2 < chi2_isf(SHOWS, 2) * error**2}
     return [replace(f, turn=np.zeros(len(f.rows))) if f.label in still else f for f in faces], cautions
 
 
 def tilt_of_others(faces: Sequence[Face], found: Verticals) -> float:
-    """rms tilt where it is resolved. Raises Refused where too few faces show one."""
+    """rms tilt where it is resolved. Raises Refused where too few faces show
+    one."""
     pairs = pairs_of(faces, found)
     chi2 = sum((m / error) ** 2 for _, m, error in pairs)
     if len(pairs) < PAIRS_LEAST or chi2_sf(chi2, 2 * len(pairs)) > SHOWS:

@@ -1,9 +1,12 @@
-"""A unit on the faces of its fixture, on a table that is not level: which way each face is, and how the table tilts.
+"""A unit on the faces of its fixture, on a table that is not level: which way
+each face is, and how the table tilts.
 
-A fixture that stands on face k at heading ψ has up at ``cos τ m + B d`` in its own frame: m the inward normal of that
-face, B (3,2) two axes at right angles to it, d (2,) the tilt of the table as the fixture feels it, |d| = sin τ. Half a
-turn about the normal turns d into −d and leaves m: the sum of two such poses is along m, however large the tilt. Of a
-face that stood one way only, d is not distinguished from m.
+A fixture that stands on face k at heading ψ has up at ``cos τ m + B d`` in its
+own frame: m the inward normal of that face, B (3,2) two axes at right angles to
+it, d (2,) the tilt of the table as the fixture feels it, |d| = sin τ. Half a
+turn about the normal turns d into −d and leaves m: the sum of two such poses is
+along m, however large the tilt. Of a face that stood one way only, d is not
+distinguished from m.
 """
 
 from __future__ import annotations
@@ -23,15 +26,17 @@ from triaxcal.frames.verticals import Verticals
 from triaxcal.poses.pure_error import SIGNIFICANT
 
 ROUNDS = 6
-"""How often the axes follow the normals, so that no angle is taken for small; two do
-from where a former solution ended. More cost time alone."""
+"""How often the axes follow the normals, so that no angle is taken for small;
+two do from where a former solution ended. More cost time alone."""
 
 
 @dataclass(frozen=True)
 class FaceTilt:
-    """The table's tilt as felt on one face. ``tilt`` (2,) in the face's axes, in the orientation recorded first.
+    """The table's tilt as felt on one face. ``tilt`` (2,) in the face's axes,
+    in the orientation recorded first.
 
-    ``poses`` are indices; ``resolved`` where the orientations on this face tell the tilt from the face's direction.
+    ``poses`` are indices; ``resolved`` where the orientations on this face tell
+    the tilt from the face's direction.
     """
 
     label: str
@@ -53,12 +58,14 @@ class FaceTilt:
 
 @dataclass(frozen=True)
 class Table:
-    """``tilt`` of the table from level, rad, and its standard error; None where nothing shows it.
+    """``tilt`` of the table from level, rad, and its standard error; None where
+    nothing shows it.
 
-    ``source``: ``measured``, or ``given`` by the user. ``shows`` where it is more than noise; ``p_value`` of the
-    differences between faces, and between repeated poses, if there were only the noise of the poses (and a seating
-    error that was given); ``vector`` (2,) and its ``vector_covariance`` where headings are known: up in the axes that
-    headings count from.
+    ``source``: ``measured``, or ``given`` by the user. ``shows`` where it is
+    more than noise; ``p_value`` of the differences between faces, and between
+    repeated poses, if there were only the noise of the poses (and a seating
+    error that was given); ``vector`` (2,) and its ``vector_covariance`` where
+    headings are known: up in the axes that headings count from.
     """
 
     tilt: float | None
@@ -72,7 +79,8 @@ class Table:
 
 @dataclass(frozen=True)
 class SeatingsDiffer(Caution):
-    """By more than the noise: ``seating_rad`` each, from ``dof`` degrees of freedom; the uncertainties contain that."""
+    """By more than the noise: ``seating_rad`` each, from ``dof`` degrees of
+    freedom; the uncertainties contain that."""
 
     seating_rad: float
     dof: int
@@ -80,13 +88,14 @@ class SeatingsDiffer(Caution):
 
 @dataclass(frozen=True)
 class NoSecondOrientation(Caution):
-    """The tilt of the table enters the rotation in full, with the size that was given."""
+    """The tilt of the table enters the rotation in full, with the size that was
+    given."""
 
 
 @dataclass(frozen=True)
 class SingleOrientation(Caution):
-    """On these ``faces`` the table's tilt enters with a size of ``tilt_rad``, as ``given`` or as on the other faces,
-    and an unknown direction."""
+    """On these ``faces`` the table's tilt enters with a size of ``tilt_rad``,
+    as ``given`` or as on the other faces, and an unknown direction."""
 
     faces: tuple[str, ...]
     tilt_rad: float
@@ -107,12 +116,14 @@ class TableTilts(Caution):
 
 @dataclass(frozen=True)
 class Standing:
-    """``up`` (f,3): the inward normal of the face stood on, sensor frame, for each of ``faces`` (labels of up).
+    """``up`` (f,3): the inward normal of the face stood on, sensor frame, for
+    each of ``faces`` (labels of up).
 
-    ``labelling`` says which poses stood there, and ``dof`` are those behind their covariance.
-    ``covariance`` (2f,2f) of the normals in ``basis`` (f,3,2), rad²; ``seating_part`` that part of it which seating
-    makes. ``seating`` is the standard error of one seating, from ``seating_dof`` degrees of freedom (0: not from the
-    poses).
+    ``labelling`` says which poses stood there, and ``dof`` are those behind
+    their covariance. ``covariance`` (2f,2f) of the normals in ``basis``
+    (f,3,2), rad²; ``seating_part`` that part of it which seating makes.
+    ``seating`` is the standard error of one seating, from ``seating_dof``
+    degrees of freedom (0: not from the poses).
     """
 
     labelling: Labelling
@@ -130,7 +141,8 @@ class Standing:
 
 
 def basis_of(label: str, up: Floats, mounting: Floats) -> Floats:
-    """(3,2): the next axis of the body (y for x, z for y, x for z) square to ``up``, and ``up`` × it. Sensor frame."""
+    """(3,2): the next axis of the body (y for x, z for y, x for z) square to
+    ``up``, and ``up`` × it. Sensor frame."""
     r = mounting[("XYZ".index(label[1]) + 1) % 3]
     r = r - (r @ up) * up
     r = r / np.linalg.norm(r)
@@ -138,8 +150,8 @@ def basis_of(label: str, up: Floats, mounting: Floats) -> Floats:
 
 
 def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None) -> Standing:
-    """Normals of the faces and the table's tilt. Raises Refused where the tilt is confounded
-    with the faces."""
+    """Normals of the faces and the table's tilt. Raises Refused where the tilt
+    is confounded with the faces."""
     assumed = assumed or Assumed()
     faces = [Face.of(found, labelling, label) for label in labelling.faces]
     faces, of_faces = turned(faces, found)
@@ -175,7 +187,8 @@ def stand(found: Verticals, labelling: Labelling, assumed: Assumed | None = None
 
 
 def _prior_tilt(faces: Sequence[Face], assumed: Assumed) -> float:
-    """The tilt to be reckoned with where the orientations do not resolve it; 0 where that is nowhere."""
+    """The tilt to be reckoned with where the orientations do not resolve it; 0
+    where that is nowhere."""
     headed = [f for f in faces if f.headed]
     single = [f for f in faces if not f.headed and not f.resolved]
     if not single and (not headed or any(f.resolved for f in headed)):
@@ -187,7 +200,8 @@ def _prior_tilt(faces: Sequence[Face], assumed: Assumed) -> float:
 
 @dataclass(frozen=True)
 class _Solved:
-    """``covariance`` of normals and tilts together, ``gain`` of them by the observations, residuals weighted."""
+    """``covariance`` of normals and tilts together, ``gain`` of them by the
+    observations, residuals weighted."""
 
     up: Floats
     basis: Floats
@@ -201,7 +215,8 @@ class _Solved:
 
 
 def _design(faces: Sequence[Face]) -> tuple[Floats, int]:
-    """(2n, 2f + 2t): observations by normals and tilts. A tilt for each face without headings, one for all others."""
+    """(2n, 2f + 2t): observations by normals and tilts. A tilt for each face
+    without headings, one for all others."""
     own = [f.label for f in faces if not f.headed]
     columns = 2 * (len(faces) + len(own) + any(f.headed for f in faces))
     blocks = []
@@ -216,10 +231,12 @@ def _design(faces: Sequence[Face]) -> tuple[Floats, int]:
 
 
 def _prior(faces: Sequence[Face], up: Floats, basis: Floats, variance: float, columns: int) -> Floats:
-    """(columns, columns) information on tilts that the orientations do not resolve, ``variance`` of a component.
+    """(columns, columns) information on tilts that the orientations do not
+    resolve, ``variance`` of a component.
 
-    That is τ²/2 where the heading is unknown. The headings of different faces are not independent of each other:
-    rolled over the table from face to face, a fixture feels the tilt as one rotation. So the tilts are taken as a
+    That is τ²/2 where the heading is unknown. The headings of different faces
+    are not independent of each other: rolled over the table from face to face,
+    a fixture feels the tilt as one rotation. So the tilts are taken as a
     rotation of that variance, and as much again independent of each other.
     """
     information = np.zeros((columns, columns))
@@ -297,7 +314,8 @@ def _tilts(faces: Sequence[Face], x: Floats, covariance: Floats) -> tuple[FaceTi
 
 
 def _misfit(solved: _Solved) -> tuple[int, float]:
-    """Degrees of freedom and chi-square of what repeated seatings and the table's one tilt leave over."""
+    """Degrees of freedom and chi-square of what repeated seatings and the
+    table's one tilt leave over."""
     left, chi2 = solved.left, solved.chi2
     pairs = _telling(solved)
     if len(pairs) > 1:
@@ -309,7 +327,8 @@ def _misfit(solved: _Solved) -> tuple[int, float]:
 
 
 def _telling(solved: _Solved) -> list[FaceTilt]:
-    """Tilts of single faces, where together they are so much more than noise that their magnitudes compare."""
+    """Tilts of single faces, where together they are so much more than noise
+    that their magnitudes compare."""
     if solved.vector is not None:
         return []
     pairs = [t for t in solved.tilts if t.resolved]
@@ -318,7 +337,8 @@ def _telling(solved: _Solved) -> list[FaceTilt]:
 
 
 def _seating(chi2_at: Callable[[float], float], left: int) -> float:
-    """The standard error of a seating at which the misfit is what noise makes it on average (Paule, Mandel 1982)."""
+    """The standard error of a seating at which the misfit is what noise makes
+    it on average (Paule, Mandel 1982)."""
     high = 1e-6
     while chi2_at(high) > left and high < 1:
         high *= 4
@@ -326,7 +346,8 @@ def _seating(chi2_at: Callable[[float], float], left: int) -> float:
 
 
 def _turning(solved: _Solved, turn: float) -> Floats:
-    """(2f,2f): a half turn that is off by δ leaves d δ/2 of the tilt, square to it."""
+    """(2f,2f): a half turn that is off by δ leaves d δ/2 of the tilt, square to
+    it."""
     n = 2 * len(solved.tilts)
     out = np.zeros((n, n))
     for k, t in enumerate(solved.tilts):

@@ -1,4 +1,5 @@
-"""A fixture whose truth is known: faces that are not square, on a table that is not level."""
+"""A fixture whose truth is known: faces that are not square, on a table that is
+not level."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from triaxcal.frames.faces import LABELS, axis_of
 
 @dataclass(frozen=True)
 class SyntheticFixture:
-    """``inward`` normals by label of the side that is up, unit vectors (3,) in the body's frame.
+    """``inward`` normals by label of the side that is up, unit vectors (3,) in
+    the body's frame.
 
     ``table`` (3,): the table's normal in the world, z up, a unit vector.
     """
@@ -24,7 +26,8 @@ class SyntheticFixture:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, face_error: float = 1e-3, tilt: float = 1e-3) -> SyntheticFixture:
-        """Normals off by Gaussian angles of ``face_error`` rad about each axis, a table tilted by exactly ``tilt``."""
+        """Normals off by Gaussian angles of ``face_error`` rad about each axis,
+        a table tilted by exactly ``tilt``."""
         inward = {}
         for label in LABELS:
             v = axis_of(label) + np.cross(rng.normal(0.0, face_error, 3), axis_of(label))
@@ -34,10 +37,12 @@ class SyntheticFixture:
         return cls(inward, table)
 
     def up(self, label: str, heading: float = 0.0) -> Floats:
-        """(3,) up in the body's frame where ``label`` is up and the fixture is turned by ``heading`` rad.
+        """(3,) up in the body's frame where ``label`` is up and the fixture is
+        turned by ``heading`` rad.
 
-        Heading counts about the table's normal, counter-clockwise from above, from the table's own x axis (the world's,
-        laid into the table) to the body's next axis (y for x up, z for y, x for z).
+        Heading counts about the table's normal, counter-clockwise from above,
+        from the table's own x axis (the world's, laid into the table) to the
+        body's next axis (y for x up, z for y, x for z).
         """
         if label not in self.inward:
             raise InvalidData(f"no face {label}")
@@ -53,7 +58,8 @@ class SyntheticFixture:
 
 
 def _axes(normal: Floats, along: Floats) -> Floats:
-    """(3,3): columns along ``along`` laid square to ``normal``, normal × that, and ``normal``."""
+    """(3,3): columns along ``along`` laid square to ``normal``, normal × that,
+    and ``normal``."""
     x = along - (along @ normal) * normal
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(normal, x), normal], axis=1)

@@ -1,4 +1,5 @@
-"""Which way is up in a unit's still poses, in the sensor's frame, and how uncertain that is."""
+"""Which way is up in a unit's still poses, in the sensor's frame, and how
+uncertain that is."""
 
 from __future__ import annotations
 
@@ -18,10 +19,12 @@ from triaxcal.poses.pure_error import SIGNIFICANT
 
 @dataclass(frozen=True)
 class Verticals:
-    """``direction`` (n,3) of up in each pose, unit vectors, sensor frame; ``covariance`` (3n,3n) of all, rad².
+    """``direction`` (n,3) of up in each pose, unit vectors, sensor frame;
+    ``covariance`` (3n,3n) of all, rad².
 
-    The covariance holds the noise of the poses and what the uncertainty of the calibration adds, which is common to
-    all poses. ``used`` (n,): poses that are no outliers. ``dof`` behind the covariance.
+    The covariance holds the noise of the poses and what the uncertainty of the
+    calibration adds, which is common to all poses. ``used`` (n,): poses that
+    are no outliers. ``dof`` behind the covariance.
     """
 
     poses: tuple[Pose, ...]
@@ -37,7 +40,8 @@ def verticals(calibration: Calibration) -> Verticals:
     poses = tuple(r.pose for r in results)
     used = np.array([r.used for r in results])
     p = calibration.residual.lack_of_fit_p
-    # Without a misfit the noise inside the poses is known better than the residuals tell it.
+    # Without a misfit the noise inside the poses is known better than the
+    # residuals tell it.
     scale = calibration.birge_ratio if p is None or p < SIGNIFICANT else 1.0
     direction, covariance = _directions(
         calibration.sensor,
@@ -60,10 +64,12 @@ def verticals_under(
     reference: float = 1.0,
     moment: tuple[float, float] | None = None,
 ) -> Verticals:
-    """Of poses of another recording than the calibration's; ``covariance`` (p,p) of `Calibration.parameters`.
+    """Of poses of another recording than the calibration's; ``covariance``
+    (p,p) of `Calibration.parameters`.
 
-    Effects of time count as at one ``moment`` (`triaxcal.poses.covariates.of_moment`), since its clock is its own.
-    Raises InvalidData where a channel that the calibration needs is missing.
+    Effects of time count as at one ``moment``
+    (`triaxcal.poses.covariates.of_moment`), since its clock is its own. Raises
+    InvalidData where a channel that the calibration needs is missing.
     """
     used = np.ones(len(poses), dtype=bool)
     covariates = covariates_elsewhere(poses, channel_reference, sensor.scale_factor, sensor.bias, moment)
@@ -80,12 +86,15 @@ def _directions(
     used: Bools,
     excess_g: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Up (n,3), and the covariance (3n,3n) of all, where that of the parameters is P (p,p).
+    """Up (n,3), and the covariance (3n,3n) of all, where that of the parameters
+    is P (p,p).
 
-    |a| is known, so the residual r = |a| − reference is noise along the measured vector, and with it goes that part of
-    the noise across which is correlated with it (noise that differs by axis): the estimate is a − N v r / (vᵀ N v), N
-    the noise of a. What noise is left is independent of the residuals, hence of the errors of a calibration that was
-    fitted to the same poses.
+    |a| is known, so the residual r = |a| − reference is noise along the
+    measured vector, and with it goes that part of the noise across which is
+    correlated with it (noise that differs by axis): the estimate is a − N v r /
+    (vᵀ N v), N the noise of a. What noise is left is independent of the
+    residuals, hence of the errors of a calibration that was fitted to the same
+    poses.
     """
     u = np.array([p.mean for p in poses])
     a, by_u, by_parameter = _derivatives(sensor, u, covariates)
@@ -112,7 +121,8 @@ def _directions(
 
 
 def _derivatives(sensor: Sensor, u: Floats, covariates: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """a (n,3), and its derivatives by the outputs (n,3,3) and by scale factor, misalignment, bias, effects (n,3,p)."""
+    """a (n,3), and its derivatives by the outputs (n,3,3) and by scale factor,
+    misalignment, bias, effects (n,3,p)."""
     s = sensor.along_axes(u, covariates)
     inverse = np.linalg.inv(sensor.axes)
     a = s @ inverse.T

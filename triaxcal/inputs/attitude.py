@@ -1,9 +1,12 @@
-"""Calibration from poses of known attitude: a turntable, or a cube on a levelled plate (the paper's traditional way).
+"""Calibration from poses of known attitude: a turntable, or a cube on a
+levelled plate (the paper's traditional way).
 
-``u = P g + c`` with ``g`` the reference vector in the table's frame, which the attitude gives, ``P = K R C`` (3,3) and
-``c = K b``: twelve parameters, the nine of the sensor and the rotation C from the table's frame to the sensor's, which
-magnitudes cannot show. Attitudes err too. Their error is a nuisance of two angles a pose with a variance of its own:
-where it is large against the noise the magnitude still counts in full, and the fit tends to that of the ellipsoid.
+``u = P g + c`` with ``g`` the reference vector in the table's frame, which the
+attitude gives, ``P = K R C`` (3,3) and ``c = K b``: twelve parameters, the nine
+of the sensor and the rotation C from the table's frame to the sensor's, which
+magnitudes cannot show. Attitudes err too. Their error is a nuisance of two
+angles a pose with a variance of its own: where it is large against the noise
+the magnitude still counts in full, and the fit tends to that of the ellipsoid.
 """
 
 from __future__ import annotations
@@ -36,22 +39,28 @@ from triaxcal.poses.pose_labels import the_poses
 from triaxcal.poses.pure_error import LACK_OF_FIT, pure_error_dof
 
 DILUTION_MOST = 100.0
-"""Largest standard error of a combination of the twelve parameters, in errors of one
-pose: the limit that a fit to still poses has."""
+"""Largest standard error of a combination of the twelve parameters, in errors
+of one pose: the limit that a fit to still poses has."""
 SECOND_ORDER = 0.2
-"""Share of a standard error from which on squares of the misalignments' errors are added to it."""
+"""Share of a standard error from which on squares of the misalignments' errors
+are added to it."""
 RAISED = 1.5
-"""By how much the error of the attitudes has to raise a standard error to be worth a word."""
+"""By how much the error of the attitudes has to raise a standard error to be
+worth a word."""
 PARAMETERS, LEFT_LEAST = 12, 6
-"""Degrees of freedom below which the residual proves little: half a degree for each of the parameters."""
+"""Degrees of freedom below which the residual proves little: half a degree for
+each of the parameters."""
 WRONG_MOST = 0.25
-"""Share of the rows that may be wrong; with more it is not known which ones are right."""
+"""Share of the rows that may be wrong; with more it is not known which ones are
+right."""
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """What one pose says of its attitude. ``up`` (3,) is the direction of the specific force in the table's frame, a
-    unit vector; ``off_rad`` the angle between it and what the fit finds, ``off`` in that angle's standard errors."""
+    """What one pose says of its attitude. ``up`` (3,) is the direction of the
+    specific force in the table's frame, a unit vector; ``off_rad`` the angle
+    between it and what the fit finds, ``off`` in that angle's standard
+    errors."""
 
     name: str
     up: Floats
@@ -61,7 +70,8 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Row:
-    """One of the attitudes that were given, by its name, and when its pose began."""
+    """One of the attitudes that were given, by its name, and when its pose
+    began."""
 
     name: str
     began: PoseStart
@@ -76,7 +86,8 @@ class AttitudesTied(Caution):
 
 @dataclass(frozen=True)
 class AttitudeExcluded(Caution):
-    """It is wrong by ``off_rad``; the pose was measured with ``up`` in the table's frame."""
+    """It is wrong by ``off_rad``; the pose was measured with ``up`` in the
+    table's frame."""
 
     row: Row
     off_rad: float
@@ -85,16 +96,19 @@ class AttitudeExcluded(Caution):
 
 @dataclass(frozen=True)
 class AttitudesContradict(Caution):
-    """Each other, by more than noise; ``error_rad`` by axis is estimated from that."""
+    """Each other, by more than noise; ``error_rad`` by axis is estimated from
+    that."""
 
     error_rad: float
 
 
 @dataclass(frozen=True)
 class DeclaredErrorContradicted(Caution):
-    """By the residuals, which say ``error_rad`` ± ``uncertainty_rad``; ``declared_rad`` stays in force.
+    """By the residuals, which say ``error_rad`` ± ``uncertainty_rad``;
+    ``declared_rad`` stays in force.
 
-    With it the standard errors are up to ``raised`` times what they are with the estimate.
+    With it the standard errors are up to ``raised`` times what they are with
+    the estimate.
     """
 
     declared_rad: float
@@ -105,7 +119,8 @@ class DeclaredErrorContradicted(Caution):
 
 @dataclass(frozen=True)
 class MagnitudeContradicts(Caution):
-    """Under the fit |a| is off by ``ratio`` times its noise, most in the ``worst`` row."""
+    """Under the fit |a| is off by ``ratio`` times its noise, most in the
+    ``worst`` row."""
 
     ratio: float
     worst: Row
@@ -113,13 +128,15 @@ class MagnitudeContradicts(Caution):
 
 @dataclass(frozen=True)
 class AttitudeFit:
-    """``rotation`` C (3,3): ``a_sensor = C a_table``; ``rotation_error_rad`` (3,) standard errors of turns of the
-    sensor's frame about its axes. ``attitude_error_rad`` by axis and pose, declared or ``estimated`` from the
-    residuals, then with its standard error, ``attitude_error_uncertainty_rad``. ``noise_error`` (9,) are the standard
-    errors that the same poses would give, were the attitudes exact; ``attitudes`` are those of all poses.
+    """``rotation`` C (3,3): ``a_sensor = C a_table``; ``rotation_error_rad``
+    (3,) standard errors of turns of the sensor's frame about its axes.
+    ``attitude_error_rad`` by axis and pose, declared or ``estimated`` from the
+    residuals, then with its standard error, ``attitude_error_uncertainty_rad``.
+    ``noise_error`` (9,) are the standard errors that the same poses would give,
+    were the attitudes exact; ``attitudes`` are those of all poses.
 
-    ``if_estimated`` is the fit with an estimate, where the residuals contradict the error that was declared and a
-    larger one explains them.
+    ``if_estimated`` is the fit with an estimate, where the residuals contradict
+    the error that was declared and a larger one explains them.
     """
 
     calibration: Calibration
@@ -144,11 +161,14 @@ def fit_attitudes(
 ) -> AttitudeFit:
     """Fit the linear model to still poses whose attitudes are known.
 
-    ``ups`` (n,3): the direction of the specific force at rest (up) in the table's frame, of any length. ``names`` tell
-    the rows in words. ``signs`` (3,) of the scale factors; attitudes show them but for a half turn of the sensor's
-    frame about one of its axes, and without them the frame nearest to the table's is taken. ``attitude_error_rad``,
-    standard error of either angle, is estimated from the residuals where it is None. Raises Refused where the poses
-    cannot carry twelve parameters, or rows and poses contradict each other; InvalidData.
+    ``ups`` (n,3): the direction of the specific force at rest (up) in the
+    table's frame, of any length. ``names`` tell the rows in words. ``signs``
+    (3,) of the scale factors; attitudes show them but for a half turn of the
+    sensor's frame about one of its axes, and without them the frame nearest to
+    the table's is taken. ``attitude_error_rad``, standard error of either
+    angle, is estimated from the residuals where it is None. Raises Refused
+    where the poses cannot carry twelve parameters, or rows and poses contradict
+    each other; InvalidData.
     """
     ups = _checked(poses, ups, signs, reference, attitude_error_rad)
     called = list(names) if names is not None else [f"row {i + 1}" for i in range(len(poses))]
@@ -170,7 +190,8 @@ def fit_attitudes(
     while True:
         kept = np.setdiff1d(rows, wrong)
         _require_spread(data.ups[kept], signs)
-        # As if nobody knew of an error of all: it would be made to explain a single wrong row.
+        # As if nobody knew of an error of all: it would be made to explain a
+        # single wrong row.
         worst = wrong_by_residual(iterated(data.only(kept), attitude_error_rad or 0.0))
         if len(worst) != 1 or len(wrong) + 1 > WRONG_MOST * len(poses):
             break
@@ -190,10 +211,11 @@ def fit_attitudes(
 def _if_estimated(
     poses: Sequence[Pose], ups: Floats, names: Sequence[str], signs: Sequence[float] | None, reference: float
 ) -> AttitudeFit | None:
-    """The fit with an error of the attitudes that the residuals say; None where they say none.
+    """The fit with an error of the attitudes that the residuals say; None where
+    they say none.
 
-    Nor where |a| disagrees with it: then more than the attitudes is wrong, and the estimate would
-    stand for all of it.
+    Nor where |a| disagrees with it: then more than the attitudes is wrong, and
+    the estimate would stand for all of it.
     """
     try:
         found = fit_attitudes(poses, ups, names=names, signs=signs, reference=reference)
@@ -321,7 +343,8 @@ def _concluded(
 
 
 def _signs(s: TurntableSolution, signs: Sequence[float] | None) -> Floats:
-    """(3,) as declared, else those with which the sensor's frame lies nearest to the table's."""
+    """(3,) as declared, else those with which the sensor's frame lies nearest
+    to the table's."""
     product = float(np.sign(np.linalg.det(s.P)))
     if signs is not None:
         flips = np.asarray(signs, dtype=float)
@@ -336,7 +359,8 @@ def _signs(s: TurntableSolution, signs: Sequence[float] | None) -> Floats:
 
 
 def _parts(P: Floats, c: Floats, flips: Floats) -> tuple[Sensor, Floats]:
-    """The sensor, its frame such that R is upper triangular and K has the signs ``flips``, and the rotation C."""
+    """The sensor, its frame such that R is upper triangular and K has the signs
+    ``flips``, and the rotation C."""
     KR, C = scipy.linalg.rq(P)
     turn = flips * np.sign(np.diag(KR))
     KR, C = KR * turn, turn[:, None] * C
@@ -346,7 +370,8 @@ def _parts(P: Floats, c: Floats, flips: Floats) -> tuple[Sensor, Floats]:
 
 
 def _by_differences(s: TurntableSolution, flips: Floats, C: Floats) -> Floats:
-    """(12,12) derivative of scale factor, misalignment, bias and turns of the sensor's frame by P row by row and c."""
+    """(12,12) derivative of scale factor, misalignment, bias and turns of the
+    sensor's frame by P row by row and c."""
 
     def of(p: Floats) -> Floats:
         sensor, turned = _parts(p[:9].reshape(3, 3), p[9:], flips)
@@ -361,9 +386,11 @@ def _by_differences(s: TurntableSolution, flips: Floats, C: Floats) -> Floats:
 
 
 def _of_second_order(covariance: Floats, sensor: Sensor, reference: float) -> Floats:
-    """(12,) what angles that are known so poorly do to scale factors and biases by their squares, where this counts.
+    """(12,) what angles that are known so poorly do to scale factors and biases
+    by their squares, where this counts.
 
-    On six faces only attitudes tell the misalignments; an axis that is off by an angle reads its cosine.
+    On six faces only attitudes tell the misalignments; an axis that is off by
+    an angle reads its cosine.
     """
     square = float(np.max(np.diag(covariance)[3:6]))
     scale = np.abs(sensor.scale_factor) * square
@@ -388,7 +415,8 @@ def _judged(
 
 
 def _left_out(s: TurntableSolution) -> float | None:
-    """rms of each pose's |a| − reference under a fit to all the others; None where others cannot carry one."""
+    """rms of each pose's |a| − reference under a fit to all the others; None
+    where others cannot carry one."""
     n = len(s.rest)
     squares = 0.0
     for i in range(n):
@@ -400,7 +428,8 @@ def _left_out(s: TurntableSolution) -> float | None:
 
 
 def _dilution(ups: Floats) -> float:
-    """The worst standard error of a combination of an axis's parameters, in standard errors of one pose."""
+    """The worst standard error of a combination of an axis's parameters, in
+    standard errors of one pose."""
     if len(ups) < 4:
         return float("inf")
     smallest = float(np.linalg.svd(np.concatenate([ups, np.ones((len(ups), 1))], axis=1), compute_uv=False)[-1])

@@ -1,9 +1,11 @@
-"""Refinement of datasheet values: a calibration that is known from before, brought up to date by a few still poses.
+"""Refinement of datasheet values: a calibration that is known from before,
+brought up to date by a few still poses.
 
-The paper's reference 3 adds increments to datasheet values until |a| is right in the poses. Here the datasheet's values
-are observations with standard errors of their own beside the poses (JCGM 102; Bayes with normal priors): fewer poses
-than parameters will do, each parameter is moved as far as the poses know better than the datasheet, and whether the two
-contradict each other can be tested.
+The paper's reference 3 adds increments to datasheet values until |a| is right
+in the poses. Here the datasheet's values are observations with standard errors
+of their own beside the poses (JCGM 102; Bayes with normal priors): fewer poses
+than parameters will do, each parameter is moved as far as the poses know better
+than the datasheet, and whether the two contradict each other can be tested.
 """
 
 from __future__ import annotations
@@ -25,20 +27,23 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof
 
 STEPS_MOST = 60
-"""Bounds the search, which ends sooner where it converges and refuses where it does
-not."""
+"""Bounds the search, which ends sooner where it converges and refuses where it
+does not."""
 CONVERGED = 1e-12
 """Relative step of the search at which rounding is all that is left."""
 CONFLICT = 0.01
-"""Probability below which poses contradict the datasheet: one sound unit in a hundred
-is called so. A higher level would blame more; a lower one let more changed units
-pass."""
+"""Probability below which poses contradict the datasheet: one sound unit in a
+hundred is called so. A higher level would blame more; a lower one let more
+changed units pass."""
 NAMED = 0.95
-"""Probability with which the value that has changed is among those named: the level of coverage."""
+"""Probability with which the value that has changed is among those named: the
+level of coverage."""
 SHARE_LEAST = 1e-6
-"""Share of the information on a parameter below which rounding is all that the poses say."""
+"""Share of the information on a parameter below which rounding is all that the
+poses say."""
 FROM_POSES, FROM_DATASHEET = 0.9, 0.1
-"""Share of the information on a parameter from which on it counts as the poses', or still as the datasheet's."""
+"""Share of the information on a parameter from which on it counts as the
+poses', or still as the datasheet's."""
 
 
 class FarFromPoses(Refused):
@@ -50,9 +55,10 @@ class FarFromPoses(Refused):
 
 @dataclass(frozen=True)
 class Datasheet:
-    """Values known from before. ``standard_error`` (9+p,) in the order of `Calibration.parameters`: scale factors,
-    misalignments, biases, effects' coefficients; a zero holds a value fast. ``correlation`` (9+p,9+p) of their errors,
-    none where it is None."""
+    """Values known from before. ``standard_error`` (9+p,) in the order of
+    `Calibration.parameters`: scale factors, misalignments, biases, effects'
+    coefficients; a zero holds a value fast. ``correlation`` (9+p,9+p) of their
+    errors, none where it is None."""
 
     sensor: Sensor
     standard_error: Floats
@@ -83,8 +89,8 @@ class Datasheet:
 
     @property
     def root(self) -> Floats:
-        """(9+p,q): what independent errors of variance one make of the values that are free; its square is their
-        covariance."""
+        """(9+p,q): what independent errors of variance one make of the values
+        that are free; its square is their covariance."""
         error = self.standard_error
         free = np.flatnonzero(error > 0)
         if self.correlation is None:
@@ -97,10 +103,11 @@ class Datasheet:
 
 @dataclass(frozen=True)
 class DatasheetContradicted(Caution):
-    """Poses and datasheet values contradict each other (probability ``p``). A change of any one of
-    ``parameters``, the likeliest first, would explain most of it; they moved by ``shifts`` standard
-    errors. ``alone``: whether the change of one explains all of it; standard errors are ``raised``
-    so many times."""
+    """Poses and datasheet values contradict each other (probability ``p``). A
+    change of any one of ``parameters``, the likeliest first, would explain most
+    of it; they moved by ``shifts`` standard errors. ``alone``: whether the
+    change of one explains all of it; standard errors are ``raised`` so many
+    times."""
 
     p: float
     parameters: tuple[str, ...]
@@ -118,13 +125,16 @@ class StillOfDatasheet(Caution):
 
 @dataclass(frozen=True)
 class Refinement:
-    """``share`` (9+p,) of the information on each parameter that came from the poses, 0…1: one less the ratio of its
-    variance after to that before. ``shift`` (9+p,) of the values in standard errors of a shift by chance, 0 where the
-    poses say nothing. ``conflict_p`` is the probability of residuals and shifts as large as these together.
+    """``share`` (9+p,) of the information on each parameter that came from the
+    poses, 0…1: one less the ratio of its variance after to that before.
+    ``shift`` (9+p,) of the values in standard errors of a shift by chance, 0
+    where the poses say nothing. ``conflict_p`` is the probability of residuals
+    and shifts as large as these together.
 
-    ``changed`` are the parameters (indices) of which one has changed, if one has, the likeliest
-    first, with the change in its standard errors by chance, given how the datasheet's errors go
-    together; none where there is no conflict. ``changed_alone``: whether that explains it.
+    ``changed`` are the parameters (indices) of which one has changed, if one
+    has, the likeliest first, with the change in its standard errors by chance,
+    given how the datasheet's errors go together; none where there is no
+    conflict. ``changed_alone``: whether that explains it.
     """
 
     calibration: Calibration
@@ -144,7 +154,8 @@ class Refinement:
 def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
     """Refine datasheet values by still poses, however few.
 
-    Raises Refused where there is none, InvalidData where a channel that the datasheet's effects need is missing.
+    Raises Refused where there is none, InvalidData where a channel that the
+    datasheet's effects need is missing.
     """
     if not poses:
         raise Refused("no still pose: there is nothing to refine the datasheet values by")
@@ -190,13 +201,15 @@ def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
 
 
 def _changed(datasheet: Datasheet, root: Floats, z: Floats, information: Floats) -> dict[int, float]:
-    """`Refinement.changed`: the parameters one of which has changed with the probability `NAMED`.
+    """`Refinement.changed`: the parameters one of which has changed with the
+    probability `NAMED`.
 
-    A change of unknown size in one value is ``effect / variance`` ± ``1/√variance``, and takes
-    ``effect²/variance`` off the sum of squares. Changes are taken to be as many times the datasheet's
-    standard error as a Cauchy variable is: they may be of any size, and of two that explain the
-    same, the smaller is the likelier. A single pose could be explained by any value, by most of them
-    with a change a thousand times as large.
+    A change of unknown size in one value is ``effect / variance`` ±
+    ``1/√variance``, and takes ``effect²/variance`` off the sum of squares.
+    Changes are taken to be as many times the datasheet's standard error as a
+    Cauchy variable is: they may be of any size, and of two that explain the
+    same, the smaller is the likelier. A single pose could be explained by any
+    value, by most of them with a change a thousand times as large.
     """
     free = np.flatnonzero(datasheet.standard_error > 0)
     back = np.linalg.pinv(root[free])
@@ -217,7 +230,8 @@ def _changed(datasheet: Datasheet, root: Floats, z: Floats, information: Floats)
 
 
 def _problem(poses: Sequence[Pose], datasheet: Datasheet) -> Problem:
-    """Scaled by what the datasheet expects, since few poses have no range of their own."""
+    """Scaled by what the datasheet expects, since few poses have no range of
+    their own."""
     sensor = datasheet.sensor
     held = covariates_elsewhere(poses, datasheet.channel_reference, sensor.scale_factor, sensor.bias, datasheet.moment)
     return Problem(
@@ -243,8 +257,8 @@ def _theta_by_parameters(problem: Problem, state: State) -> Floats:
 
 
 def _solved(problem: Problem, datasheet: Datasheet, root: Floats) -> tuple[Floats, Floats]:
-    """Shifts (q,) of the values along ``root`` (9+p,q) and the information (q,q) on them: Gauss–Newton with halved
-    steps."""
+    """Shifts (q,) of the values along ``root`` (9+p,q) and the information
+    (q,q) on them: Gauss–Newton with halved steps."""
     z = np.zeros(root.shape[1])
     free = datasheet.standard_error > 0
     size = max(float(np.linalg.norm(datasheet.values[free] / datasheet.standard_error[free])), 1.0)

@@ -1,4 +1,5 @@
-"""Weighted least squares of ``u = P g + c`` over poses of known attitude, whose errors are nuisances of the fit."""
+"""Weighted least squares of ``u = P g + c`` over poses of known attitude, whose
+errors are nuisances of the fit."""
 
 from __future__ import annotations
 
@@ -26,17 +27,19 @@ rounding."""
 ALARM = 0.005
 """Probability that one of a set of right rows is called wrong."""
 ESTIMATE_BELOW = 0.2
-"""Residuals of less probability are put down to the attitudes, where nobody declared their error."""
+"""Residuals of less probability are put down to the attitudes, where nobody
+declared their error."""
 ERROR_LEAST = 1e-8
 """Attitudes that are off by less, in rad (2 milliarcseconds), count as exact."""
 ERROR_MOST = 0.3
 """Attitudes that are off by more, in rad, carry nothing."""
 PAIRS_MOST = 400
-"""Pairs of rows of which each is tried for the rotation: one of two right rows is
-enough. All pairs of 28 rows; of more rows some, always the same, for the sake of
-time."""
+"""Pairs of rows of which each is tried for the rotation: one of two right rows
+is enough. All pairs of 28 rows; of more rows some, always the same, for the
+sake of time."""
 TIED = 0.02
-"""Rows that take out of the sum of squares within this share of each other cannot be distinguished."""
+"""Rows that take out of the sum of squares within this share of each other
+cannot be distinguished."""
 
 
 class AttitudesContradictReadings(Refused):
@@ -48,7 +51,8 @@ class AttitudesContradictReadings(Refused):
 
 @dataclass(frozen=True)
 class TurntableData:
-    """``u`` (n,3) outputs, ``covariance`` (n,3,3) of them with ``dof`` behind, ``ups`` (n,3) as stated."""
+    """``u`` (n,3) outputs, ``covariance`` (n,3,3) of them with ``dof`` behind,
+    ``ups`` (n,3) as stated."""
 
     u: Floats
     covariance: Floats
@@ -62,10 +66,11 @@ class TurntableData:
 
 @dataclass(frozen=True)
 class TurntableSolution:
-    """``P`` (3,3) and ``c`` (3,) with ``covariance`` (12,12) of P row by row and c; ``noise_only`` the same were the
-    attitudes exact. ``rest`` (n,3) residuals, ``weight`` (n,3,3) their inverse covariance, ``design`` (n,3,12).
-    ``found`` (n,3) the attitudes that the fit settled on, unit vectors; ``target`` (n,3) what ``design @ p`` is
-    fitted to.
+    """``P`` (3,3) and ``c`` (3,) with ``covariance`` (12,12) of P row by row
+    and c; ``noise_only`` the same were the attitudes exact. ``rest`` (n,3)
+    residuals, ``weight`` (n,3,3) their inverse covariance, ``design`` (n,3,12).
+    ``found`` (n,3) the attitudes that the fit settled on, unit vectors;
+    ``target`` (n,3) what ``design @ p`` is fitted to.
     """
 
     data: TurntableData
@@ -101,10 +106,11 @@ class TurntableSolution:
 
     @property
     def error_uncertainty_rad(self) -> float:
-        """Standard error of ``error_rad`` as it is estimated: where ``chi2`` is ``left``.
+        """Standard error of ``error_rad`` as it is estimated: where ``chi2`` is
+        ``left``.
 
-        The sum has variance 2 ``left``, and the part of it that is the attitudes' falls with the
-        square of their error.
+        The sum has variance 2 ``left``, and the part of it that is the
+        attitudes' falls with the square of their error.
         """
         of_noise = np.einsum("nij,njk,nkl,nli->", self.weight, self.free, self.weight, self.data.covariance)
         of_attitudes = float(self.left - of_noise)
@@ -120,7 +126,8 @@ class TurntableSolution:
 
 
 def solved(data: TurntableData, error_rad: float | None) -> TurntableSolution:
-    """With the declared error of the attitudes; else the smallest with which the residuals are as large as expected."""
+    """With the declared error of the attitudes; else the smallest with which
+    the residuals are as large as expected."""
     solution = iterated(data, error_rad or 0.0)
     if error_rad is not None or solution.p is None or solution.p > ESTIMATE_BELOW:
         return solution
@@ -142,8 +149,9 @@ def solved(data: TurntableData, error_rad: float | None) -> TurntableSolution:
 
 
 def iterated(data: TurntableData, error_rad: float) -> TurntableSolution:
-    """With attitudes that err by so much: Gauss–Newton over the twelve parameters, each attitude following within its
-    error. Raises Refused where it runs away."""
+    """With attitudes that err by so much: Gauss–Newton over the twelve
+    parameters, each attitude following within its error. Raises Refused where
+    it runs away."""
     n = len(data.u)
     g = data.ups
     design = np.zeros((n, 3, PARAMETERS))
@@ -182,7 +190,8 @@ def _plain(data: TurntableData) -> tuple[Floats, Floats]:
 
 
 def _weighted(design: Floats, weight: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """Least squares with weights by pose: parameters (12,) and covariance (12,12)."""
+    """Least squares with weights by pose: parameters (12,) and covariance
+    (12,12)."""
     root = np.linalg.cholesky(weight).transpose(0, 2, 1)
     X, y = (root @ design).reshape(-1, PARAMETERS), (root @ target[..., None]).ravel()
     norms = np.linalg.norm(X, axis=0)
@@ -199,8 +208,9 @@ def _across(g: Floats) -> Floats:
 
 
 def wrong_by_magnitude(poses: Sequence[Pose], ups: Floats, reference: float) -> Ints:
-    """Rows whose attitude does not go with those of most others, judged by the angles that |a| alone says are between
-    the poses. None where |a| cannot say."""
+    """Rows whose attitude does not go with those of most others, judged by the
+    angles that |a| alone says are between the poses. None where |a| cannot
+    say."""
     try:
         problem = problem_of(poses, reference=reference)
         sensor = start(problem, poses, (1, 1, 1)).sensor(problem)
@@ -215,7 +225,8 @@ def wrong_by_magnitude(poses: Sequence[Pose], ups: Floats, reference: float) -> 
 
 
 def _off_most(a: Floats, ups: Floats) -> Floats:
-    """(n,) angles between ``ups`` and ``a`` under the rotation that suits most of them best."""
+    """(n,) angles between ``ups`` and ``a`` under the rotation that suits most
+    of them best."""
     i, j = np.tril_indices(len(a), -1)
     apart = np.minimum(*(np.linalg.norm(np.cross(v[i], v[j]), axis=1) for v in (a, ups))) > 0.3
     i, j = i[apart], j[apart]
@@ -228,7 +239,8 @@ def _off_most(a: Floats, ups: Floats) -> Floats:
 
 
 def wrong_by_residual(s: TurntableSolution) -> Ints:
-    """The row whose residual stands out from the noise and from all others, as if it had not been in the fit.
+    """The row whose residual stands out from the noise and from all others, as
+    if it had not been in the fit.
 
     None where no row does, several where these cannot be distinguished.
     """

@@ -1,1 +1,2 @@
-"""How values look to others: JSON documents written and read, and samples as arrays or tables."""
+"""How values look to others: JSON documents written and read, and samples as
+arrays or tables."""

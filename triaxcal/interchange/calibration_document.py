@@ -1,4 +1,5 @@
-"""`triaxcal.poses/1` and `triaxcal.calibration/1`: the JSON documents that others script against."""
+"""`triaxcal.poses/1` and `triaxcal.calibration/1`: the JSON documents that
+others script against."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ from triaxcal.units import ErrorUnit, grouped, in_units_of
 Document = dict[str, Any]
 LINEAR = ("scale_factor", "misalignment", "bias")
 WEIGHT = "weight"
-"""Beside the coefficients of an effect, where predictions average models: by which share they count."""
+"""Beside the coefficients of an effect, where predictions average models: by
+which share they count."""
 _LEFT_OUT = {Exclusion.OUTLIER: "spoiled", Exclusion.CALLER: "caller", Exclusion.UNKNOWN_HISTORY: "unknown_history"}
 """As documents of 0.1 have it, beside ``excluded``; else the name of the fault."""
 
@@ -73,7 +75,8 @@ def coefficients_document(coefficients: Mapping[str, tuple[float, float | None, 
 
 
 def holds_of(c: Calibration) -> list[str]:
-    """In words, under which conditions scale factor, misalignment and bias are all of a reading; none where always."""
+    """In words, under which conditions scale factor, misalignment and bias are
+    all of a reading; none where always."""
     several = any(p.pose.run.of > 1 for p in c.poses)
     return list(text.holds([effect for effect, _ in c.sensor.effects], c.channel_reference, several=several))
 
@@ -86,8 +89,10 @@ def calibration_document(
     stated: Stated | None = None,
     budgeted: bool = True,
 ) -> Document:
-    """``reference_unit`` names the unit of the reference vector; keys keep their ``_g`` whatever it is. ``stated`` are
-    uncertainties that no recording can tell. ``budgeted``: with the budget, which is that of a fit to still poses."""
+    """``reference_unit`` names the unit of the reference vector; keys keep
+    their ``_g`` whatever it is. ``stated`` are uncertainties that no recording
+    can tell. ``budgeted``: with the budget, which is that of a fit to still
+    poses."""
     errors = dict(zip(c.parameters, c.standard_errors, strict=True))
     unit = output_unit or "output"
     evaluated = budget(c, stated) if budgeted else None
@@ -177,7 +182,8 @@ def next_recording_document(following: NextRecording) -> Document:
 
 
 def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
-    """Values in the order of `Calibration.parameters`, in groups as the coefficients stand in a document."""
+    """Values in the order of `Calibration.parameters`, in groups as the
+    coefficients stand in a document."""
     held = dict(zip(c.parameters, values, strict=True))
     groups: Document = {name: [held[f"{name}.{axis}"] for axis in "xyz"] for name in LINEAR}
     effects = {e.name: {k.name: held[f"{e.name}.{k.name}"] for k in e.coefficients} for e, _ in c.sensor.effects}
@@ -185,7 +191,8 @@ def by_parameter(c: Calibration, values: Sequence[Any]) -> Document:
 
 
 def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Document:
-    """Expanded uncertainties and where they come from. Standard uncertainties in the budget's lines."""
+    """Expanded uncertainties and where they come from. Standard uncertainties
+    in the budget's lines."""
 
     def by_name(values: Floats) -> Document:
         return by_parameter(c, [uncertainty(float(v)) for v in values])
@@ -221,5 +228,6 @@ def budget_document(c: Calibration, b: Budget, reference_unit: str = "g") -> Doc
 
 
 def assumed_in(basis: Basis) -> tuple[str, ...]:
-    """The effects whose size a line of the budget (`triaxcal.uncertainty.Component`) assumes."""
+    """The effects whose size a line of the budget
+    (`triaxcal.uncertainty.Component`) assumes."""
     return basis.effects if isinstance(basis, UnmodelledTemperature) and not basis.stated else ()

@@ -1,4 +1,5 @@
-"""The sensor that a document holds, of whoever wrote it: read with errors that name the file and the field."""
+"""The sensor that a document holds, of whoever wrote it: read with errors that
+name the file and the field."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ from triaxcal.units import reference_unit_of
 
 
 def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str, Any]:
-    """The `triaxcal.calibration/1` in a calibration, loop or certificate document. Raises InvalidData."""
+    """The `triaxcal.calibration/1` in a calibration, loop or certificate
+    document. Raises InvalidData."""
     inner: Any = document
     for key in ("result", "calibration"):
         if isinstance(inner, Mapping) and isinstance(inner.get(key), Mapping):
@@ -32,15 +34,16 @@ def calibration_part(document: Mapping[str, Any], *, where: str) -> Mapping[str,
 
 
 def reference_unit_in(document: Mapping[str, Any], *, where: str, magnitude: float) -> str:
-    """The unit of the reference that a calibration document says, or what it must be by its magnitude."""
+    """The unit of the reference that a calibration document says, or what it
+    must be by its magnitude."""
     units = calibration_part(document, where=where).get("units")
     said = units.get("reference") if isinstance(units, Mapping) else None
     return said if isinstance(said, str) and said else reference_unit_of(magnitude)
 
 
 def logged_in(document: Mapping[str, Any], *, where: str) -> dict[str, Floats]:
-    """The channels of the poses of a calibration document that were used, (n,) each, as covariates are named; none that
-    one of these lacks."""
+    """The channels of the poses of a calibration document that were used, (n,)
+    each, as covariates are named; none that one of these lacks."""
     poses = calibration_part(document, where=where).get("poses")
     used = [p for p in poses if isinstance(p, Mapping) and p.get("used", True)] if isinstance(poses, list) else []
     found = [p.get("channels") for p in used]
@@ -67,7 +70,8 @@ def _floats(value: Any) -> Floats:
 
 
 def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[str, float], float]:
-    """Sensor, channel references and reference magnitude of a calibration document. Raises InvalidData."""
+    """Sensor, channel references and reference magnitude of a calibration
+    document. Raises InvalidData."""
     part = calibration_part(document, where=where)
     try:
         k, m, b = (_floats(part[name]) for name in ("scale_factor", "misalignment", "bias"))
@@ -98,8 +102,9 @@ def sensor_of(document: Mapping[str, Any], *, where: str) -> tuple[Sensor, dict[
 
 
 def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
-    """The calibration in a calibration, loop or certificate document, as the model of other poses. What only its fit
-    could tell is not a number, and so is a covariance that the document does not hold. Raises InvalidData."""
+    """The calibration in a calibration, loop or certificate document, as the
+    model of other poses. What only its fit could tell is not a number, and so
+    is a covariance that the document does not hold. Raises InvalidData."""
     part = calibration_part(document, where=where)
     sensor, channel_reference, magnitude = sensor_of(document, where=where)
     unknown = math.nan
@@ -122,8 +127,9 @@ def calibration_of(document: Mapping[str, Any], *, where: str) -> Calibration:
 
 
 def covariance_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Floats:
-    """(p,p) of the parameters; not numbers where the document has no standard errors. Without a correlation they count
-    as independent. Raises InvalidData."""
+    """(p,p) of the parameters; not numbers where the document has no standard
+    errors. Without a correlation they count as independent. Raises
+    InvalidData."""
     n = 9 + sum(len(q) for _, q in sensor.effects)
     if not isinstance(part.get("standard_error"), Mapping):
         return np.full((n, n), math.nan)
@@ -138,7 +144,8 @@ def covariance_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Flo
 
 
 def holds_at_of(part: Mapping[str, Any], *, where: str) -> HoldsAt | None:
-    """None where the document, as those of 0.1, does not say. Raises InvalidData."""
+    """None where the document, as those of 0.1, does not say. Raises
+    InvalidData."""
     held = part.get("holds_at")
     if held is None:
         return None

@@ -1,4 +1,5 @@
-"""The errors of a calibration as its document holds them: standard errors, and how they go together."""
+"""The errors of a calibration as its document holds them: standard errors, and
+how they go together."""
 
 from __future__ import annotations
 
@@ -13,11 +14,13 @@ from triaxcal.interchange.calibration_document import LINEAR
 from triaxcal.model.sensor import Sensor
 
 ROUNDED = 1e-4
-"""Documents round correlations to a millionth, so that the smallest eigenvalue may come out below zero."""
+"""Documents round correlations to a millionth, so that the smallest eigenvalue
+may come out below zero."""
 
 
 def linear_errors_of(part: Mapping[str, Any], *, where: str) -> Floats:
-    """(9,) standard errors of scale factors, misalignments and biases. Raises InvalidData."""
+    """(9,) standard errors of scale factors, misalignments and biases. Raises
+    InvalidData."""
     held = part.get("standard_error")
     out = []
     for name in LINEAR:
@@ -42,7 +45,8 @@ def effect_errors_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> 
 
 
 def correlation_of(part: Mapping[str, Any], sensor: Sensor, *, where: str) -> Floats | None:
-    """(9+p,9+p) in the order of `Calibration.parameters`; None where the document has none. Raises InvalidData.
+    """(9+p,9+p) in the order of `Calibration.parameters`; None where the
+    document has none. Raises InvalidData.
 
     Values without a standard error go with nothing: zeros.
     """

@@ -1,4 +1,5 @@
-"""Samples as callers have them: arrays, or a DataFrame of pandas or polars, which neither is needed for."""
+"""Samples as callers have them: arrays, or a DataFrame of pandas or polars,
+which neither is needed for."""
 
 from __future__ import annotations
 
@@ -25,11 +26,13 @@ _UNIT_IN_NAME = re.compile(
     r"(?:^|[^a-z])(ms|msecs?|millis\w*|[uµ]s|usecs?|micros\w*|ns|nsecs?|nanos\w*)[^a-z]*$", re.IGNORECASE
 )
 SECONDS_MOST = 9.2e9
-"""Seconds that nanoseconds in 64 bits can count, from 1970 or from the first sample."""
+"""Seconds that nanoseconds in 64 bits can count, from 1970 or from the first
+sample."""
 
 
 def is_table(value: object) -> bool:
-    """Whether it has named columns, as a DataFrame has. Raises InvalidData for one that is not computed yet."""
+    """Whether it has named columns, as a DataFrame has. Raises InvalidData for
+    one that is not computed yet."""
     if hasattr(value, "collect") and not hasattr(value, "__len__"):
         raise InvalidData("a lazy table: collect it first")
     return hasattr(value, "columns") and hasattr(value, "__getitem__") and not isinstance(value, np.ndarray)
@@ -43,7 +46,8 @@ def names_of(table: Any) -> list[str]:
 
 
 def column(table: Any, name: str) -> Any:
-    """(n,) as numpy has it, of a column or of the index of that name. Raises InvalidData where there is none."""
+    """(n,) as numpy has it, of a column or of the index of that name. Raises
+    InvalidData where there is none."""
     if name not in names_of(table):
         if str(getattr(getattr(table, "index", None), "name", "")) == name:
             return np.asarray(table.index)
@@ -60,8 +64,9 @@ def _keys(table: Any) -> Iterable[Any]:
 
 
 def called(columns: Mapping[str, str] | None) -> dict[str, str]:
-    """The names that a table has for t_s, ux, uy, uz and the channels that ``columns`` names, by ours. Raises
-    InvalidData for names that are meant as one of these and are none."""
+    """The names that a table has for t_s, ux, uy, uz and the channels that
+    ``columns`` names, by ours. Raises InvalidData for names that are meant as
+    one of these and are none."""
     if unknown := next((ours for ours in columns or {} if ours in NO_ROLES), None):
         raise InvalidData(f"columns: {unknown} is no role; expected t, ux, uy, uz, or the name a channel is to have")
     return {name: name for name in (TIME_COLUMN, *OUTPUTS)} | {
@@ -70,12 +75,14 @@ def called(columns: Mapping[str, str] | None) -> dict[str, str]:
 
 
 SLOW_S = 1.0
-"""Nobody looks for still poses in so few samples: such times are milliseconds of a fast logger, if nothing says so."""
+"""Nobody looks for still poses in so few samples: such times are milliseconds
+of a fast logger, if nothing says so."""
 
 
 def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_unit: str | None = None) -> Samples:
-    """Of a table with the columns t_s, ux, uy, uz; ``columns`` says how they are called where that is otherwise. All
-    other columns of finite numbers are channels, by their own names, but for those that number the rows. Raises
+    """Of a table with the columns t_s, ux, uy, uz; ``columns`` says how they
+    are called where that is otherwise. All other columns of finite numbers are
+    channels, by their own names, but for those that number the rows. Raises
     InvalidData."""
     by_ours = called(columns)
     channels = {ours: column(table, theirs) for ours, theirs in by_ours.items() if ours not in (TIME_COLUMN, *OUTPUTS)}
@@ -101,15 +108,17 @@ def samples_of_table(table: Any, columns: Mapping[str, str] | None = None, time_
 
 
 def _counts(values: Any) -> bool:
-    """Whether each value is one more than that before: as a channel it would be the time again."""
+    """Whether each value is one more than that before: as a channel it would be
+    the time again."""
     return len(values) > 2 and bool((np.diff(values) == 1).all())
 
 
 def samples_of(
     t: Any, u: Any, channels: Mapping[str, Any] | None = None, time_unit: str | None = None, name: str = "t"
 ) -> Samples:
-    """``t`` (n,): floats are seconds, unless ``time_unit`` names another unit, datetimes are what they are, and of
-    integers the unit is asked for, as it is where seconds would be `SLOW_S` apart; ``u`` (n,3) output units;
+    """``t`` (n,): floats are seconds, unless ``time_unit`` names another unit,
+    datetimes are what they are, and of integers the unit is asked for, as it is
+    where seconds would be `SLOW_S` apart; ``u`` (n,3) output units;
     ``channels`` (n,) each. Raises InvalidData."""
     readings = readings_of(u)
     if readings.ndim != 2:
@@ -134,7 +143,8 @@ def samples_of(
 
 
 def readings_of(u: Any) -> Floats:
-    """(3,) or (n,3) as floats; of a table by the names ux, uy, uz, where it has these. Raises InvalidData."""
+    """(3,) or (n,3) as floats; of a table by the names ux, uy, uz, where it has
+    these. Raises InvalidData."""
     if is_table(u) and set(OUTPUTS) <= set(names_of(u)):
         u = np.stack([np.asarray(column(u, name)) for name in OUTPUTS], axis=1)
     readings = _numbers(u, "u")
@@ -153,7 +163,8 @@ def channel_of_samples(name: str, values: Any, n: int) -> Floats:
 
 
 def like(table: Any, columns: Mapping[str, Floats]) -> Any:
-    """A DataFrame of the same library with these columns, and the same index where it has one."""
+    """A DataFrame of the same library with these columns, and the same index
+    where it has one."""
     kind = type(table)
     found = kind.from_pydict(dict(columns)) if hasattr(kind, "from_pydict") else kind(dict(columns))
     if hasattr(table, "index") and hasattr(found, "index"):
@@ -162,7 +173,8 @@ def like(table: Any, columns: Mapping[str, Floats]) -> Any:
 
 
 def seconds(t: Any, time_unit: str | None = None) -> Floats:
-    """(n,) s of times as `samples_of` takes them, as they are counted. Raises InvalidData."""
+    """(n,) s of times as `samples_of` takes them, as they are counted. Raises
+    InvalidData."""
     return np.asarray(_time_ns(np.atleast_1d(np.asarray(t)), time_unit, "t") * 1e-9)
 
 
@@ -202,7 +214,8 @@ def _time_ns(t: Any, time_unit: str | None, name: str) -> Ints:
 
 
 def _datetimes(times: Any, name: str) -> Any:
-    """Datetimes of Python, of pandas with a zone, or as ISO text; those with a zone in UTC."""
+    """Datetimes of Python, of pandas with a zone, or as ISO text; those with a
+    zone in UTC."""
     utc = [t.replace(tzinfo=None) - t.utcoffset() if getattr(t, "tzinfo", None) else t for t in times.tolist()]
     try:
         return np.array(utc, dtype="datetime64[ns]")

@@ -1,1 +1,2 @@
-"""The unit: sensor, gravity, samples, and the moment for which effects of time hold."""
+"""The unit: sensor, gravity, samples, and the moment for which effects of time
+hold."""

@@ -14,8 +14,8 @@ from triaxcal.model.order import in_order
 from triaxcal.model.sensor import LINEAR
 
 PAPER, FULL = 14, 26
-"""Faces and vertices of a cube, as the paper has them; with its edges, which let
-effects of second and third order be seen together."""
+"""Faces and vertices of a cube, as the paper has them; with its edges, which
+let effects of second and third order be seen together."""
 LEAST = LINEAR
 """A pose tells one number, |a|: fewer cannot carry nine parameters."""
 Direction = tuple[str, Floats]
@@ -23,7 +23,8 @@ Direction = tuple[str, Floats]
 
 
 def cube_directions() -> list[Direction]:
-    """Six faces, eight vertices and twelve edges of a cube, in that order, as labels and unit vectors of up."""
+    """Six faces, eight vertices and twelve edges of a cube, in that order, as
+    labels and unit vectors of up."""
     out = []
     for corner in sorted(itertools.product((1, 0, -1), repeat=3), key=_faces_vertices_edges):
         if any(corner):
@@ -38,11 +39,14 @@ def _faces_vertices_edges(corner: tuple[int, ...]) -> int:
 
 
 def directions(count: int = FULL) -> list[Direction]:
-    """A plan of ``count`` distinct poses, in the order to take them; the first is then taken once more.
+    """A plan of ``count`` distinct poses, in the order to take them; the first
+    is then taken once more.
 
-    14 is the paper's (faces and vertices of a cube), 26 adds its edges; any other number of nine or more is spread
-    evenly over the sphere on a spiral (golden angle), labelled by number. The order keeps drift apart from the
-    rest (`triaxcal.model.order`). Raises InvalidData where there are fewer than nine.
+    14 is the paper's (faces and vertices of a cube), 26 adds its edges; any
+    other number of nine or more is spread evenly over the sphere on a spiral
+    (golden angle), labelled by number. The order keeps drift apart from the
+    rest (`triaxcal.model.order`). Raises InvalidData where there are fewer than
+    nine.
     """
     return list(_directions(count))
 
@@ -68,10 +72,11 @@ def spiral(count: int) -> Floats:
 
 
 def elsewhere(taken: Floats, count: int) -> list[Direction]:
-    """``count`` directions that lie far from those ``taken`` (n,3) and from each other, the farthest first.
+    """``count`` directions that lie far from those ``taken`` (n,3) and from
+    each other, the farthest first.
 
-    Labels are in parts of the axes: "+2X-Y" is two parts X to one of minus Y. Of 98 directions, so that a
-    ``count`` above that gives no more.
+    Labels are in parts of the axes: "+2X-Y" is two parts X to one of minus Y.
+    Of 98 directions, so that a ``count`` above that gives no more.
     """
     candidates = _lattice()
     ups = np.array([v for _, v in candidates])
@@ -97,33 +102,39 @@ def _lattice() -> tuple[Direction, ...]:
 
 
 def closed(plan: Sequence[Direction]) -> list[Direction]:
-    """The plan with its first pose repeated at the end: what differs between the two is time."""
+    """The plan with its first pose repeated at the end: what differs between
+    the two is time."""
     return [*plan, plan[0]]
 
 
 def linear_design(a: Floats, x: Floats) -> Floats:
-    """(n,9): derivative of |a| by the nine linear parameters ``a = T x − o``, T upper triangular.
+    """(n,9): derivative of |a| by the nine linear parameters ``a = T x − o``, T
+    upper triangular.
 
-    ``a`` (n,3) unit vectors, ``x`` (n,3) scaled outputs (or ``a`` itself, to judge a plan).
+    ``a`` (n,3) unit vectors, ``x`` (n,3) scaled outputs (or ``a`` itself, to
+    judge a plan).
     """
     rows, columns = np.triu_indices(3)
     return np.concatenate([a[:, rows] * x[:, columns], -a], axis=1)
 
 
 def in_range(u: Floats) -> Floats:
-    """Outputs (n,3), to any scale and offset of the axes, scaled so that each axis goes from −1 to 1."""
+    """Outputs (n,3), to any scale and offset of the axes, scaled so that each
+    axis goes from −1 to 1."""
     low, high = u.min(axis=0), u.max(axis=0)
     half = (high - low) / 2
     return np.asarray((u - (low + high) / 2) / np.where(half > 0, half, 1.0))
 
 
 def dilution(a: Floats, design: Floats | None = None) -> float:
-    """What the directions make of the noise: the largest standard error of any direction of the nine parameters, each
-    scaled by the range that its axis goes through (`in_range`), in standard errors of one pose.
+    """What the directions make of the noise: the largest standard error of any
+    direction of the nine parameters, each scaled by the range that its axis
+    goes through (`in_range`), in standard errors of one pose.
 
-    Noises of poses are taken as alike, as in a dilution of precision. ``design`` is `linear_design` of the outputs in
-    their range, where these are known; without it the triad counts as ideal. About 1 for the 14 poses; infinite where
-    the set is singular.
+    Noises of poses are taken as alike, as in a dilution of precision.
+    ``design`` is `linear_design` of the outputs in their range, where these are
+    known; without it the triad counts as ideal. About 1 for the 14 poses;
+    infinite where the set is singular.
     """
     if design is None and not len(a):
         return float("inf")
@@ -131,10 +142,12 @@ def dilution(a: Floats, design: Floats | None = None) -> float:
 
 
 def worst_error(design: Floats) -> float:
-    """The largest standard error of any direction of the nine parameters, in standard errors of the rows (n,9).
+    """The largest standard error of any direction of the nine parameters, in
+    standard errors of the rows (n,9).
 
-    With `linear_design` (a, a) the parameters are those at the whole reference, wherever the poses are, so that a
-    further pose never makes it larger. Infinite where the design is singular.
+    With `linear_design` (a, a) the parameters are those at the whole reference,
+    wherever the poses are, so that a further pose never makes it larger.
+    Infinite where the design is singular.
     """
     if len(design) < 9:
         return float("inf")
@@ -150,10 +163,12 @@ def most_wanted(
     unsure_rad: float = 0.0,
     weights: Floats | None = None,
 ) -> list[Direction]:
-    """The poses of the 26 that mend a set best, each once, until its dilution is below ``enough``; at most ``most``.
+    """The poses of the 26 that mend a set best, each once, until its dilution
+    is below ``enough``; at most ``most``.
 
-    ``a`` (n,3): the directions of up that the set has; where they are known to no better than ``unsure_rad``, the
-    dilution is that of the worst of some sets that are so far off. ``weights`` (n,) are 1/variance, of a pose to be
+    ``a`` (n,3): the directions of up that the set has; where they are known to
+    no better than ``unsure_rad``, the dilution is that of the worst of some
+    sets that are so far off. ``weights`` (n,) are 1/variance, of a pose to be
     added 1. Empty where nothing is wanted.
     """
     have = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300)
@@ -175,7 +190,8 @@ def _maybe(have: Floats, unsure_rad: float) -> list[Floats]:
     rng = np.random.default_rng(0)
     out = [have]
     for _ in range(8 if unsure_rad and len(have) else 0):
-        # Errors of scale and offset, which all directions have in common, and which matter most.
+        # Errors of scale and offset, which all directions have in common, and
+        # which matter most.
         matrix = np.eye(3) + unsure_rad * rng.standard_normal((3, 3))
         off = have @ matrix.T + unsure_rad * rng.standard_normal(3)
         out.append(off / np.linalg.norm(off, axis=1, keepdims=True))
@@ -189,7 +205,8 @@ def _worst(information: Floats, more: Floats) -> float:
 
 
 def _best_addition(information: Floats, rows: Floats, wanted: list[int]) -> int:
-    """The row not yet wanted that adds most to the determinant, over all sets; the first of those that add as much."""
+    """The row not yet wanted that adds most to the determinant, over all sets;
+    the first of those that add as much."""
     held = rows[wanted]
     inverse = np.linalg.inv(information + held.T @ held + 1e-9 * np.eye(9))
     gain = np.log1p(np.einsum("ci,kij,cj->kc", rows, inverse, rows)).sum(axis=0)
@@ -218,7 +235,8 @@ def _exchanged(information: Floats, rows: Floats, wanted: list[int], enough: flo
 
 
 def distinct(a: Floats, apart_deg: float = 5.0) -> int:
-    """How many directions differ from all before them by more than ``apart_deg``."""
+    """How many directions differ from all before them by more than
+    ``apart_deg``."""
     kept: list[Floats] = []
     for v in a / np.linalg.norm(a, axis=1, keepdims=True):
         if all(float(v @ k) < np.cos(np.radians(apart_deg)) for k in kept):

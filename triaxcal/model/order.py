@@ -1,9 +1,12 @@
-"""In which order to take poses, so that what happens in time does not pass for what happens with direction.
+"""In which order to take poses, so that what happens in time does not pass for
+what happens with direction.
 
-A unit drifts, warms up, and remembers the pose before. In an unlucky order such an effect looks like nonlinearity, or
-hides in the nine linear parameters, and nobody can tell them apart afterwards. The order is chosen by a Bayesian
-A-criterion (DuMouchel and Jones 1994, Technometrics 36:37): the smallest sum of the posterior variances of everything
-that may be there beside the nine parameters, each with a prior of its own size.
+A unit drifts, warms up, and remembers the pose before. In an unlucky order such
+an effect looks like nonlinearity, or hides in the nine linear parameters, and
+nobody can tell them apart afterwards. The order is chosen by a Bayesian
+A-criterion (DuMouchel and Jones 1994, Technometrics 36:37): the smallest sum of
+the posterior variances of everything that may be there beside the nine
+parameters, each with a prior of its own size.
 """
 
 from __future__ import annotations
@@ -13,20 +16,26 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 
 PRIOR = np.repeat([10.0, 1.0, 10.0, 0.3, 0.3, 0.3], 3)
-"""Prior standard deviations, in standard errors of one pose: of second order, third order, steady drift, drift that
-bends, scale factors that drift, and hysteresis. Second order and steady drift are to be distinguished whatever they
-are, since one fakes the other in real recordings; the rest where poses are left to do it with."""
+"""Prior standard deviations, in standard errors of one pose: of second order,
+third order, steady drift, drift that bends, scale factors that drift, and
+hysteresis. Second order and steady drift are to be distinguished whatever they
+are, since one fakes the other in real recordings; the rest where poses are left
+to do it with."""
 STARTS, ROWS_MOST, STEPS_MOST = 4, 12000, 80
-"""Searches from different orders (one for a large plan); rows of trial orders that one step of a search looks at."""
+"""Searches from different orders (one for a large plan); rows of trial orders
+that one step of a search looks at."""
 SURE = 1e-9
-"""Orders that differ by less than this are the same, whatever the processor makes of the last digits."""
+"""Orders that differ by less than this are the same, whatever the processor
+makes of the last digits."""
 
 
 def in_order(a: Floats, *, attached: Floats | None = None, kind: Ints | None = None) -> Ints:
-    """(n,) the rows of ``a`` (n,3) in the order to take them, the first row first; it is repeated at the end.
+    """(n,) the rows of ``a`` (n,3) in the order to take them, the first row
+    first; it is repeated at the end.
 
-    ``attached`` (n,q): columns of effects that are looked for in any case and go with their row. Rows change places
-    only with rows of the same ``kind`` (n,). Deterministic.
+    ``attached`` (n,q): columns of effects that are looked for in any case and
+    go with their row. Rows change places only with rows of the same ``kind``
+    (n,). Deterministic.
     """
     n = len(a)
     kind = np.zeros(n, dtype=int) if kind is None else kind
@@ -55,7 +64,8 @@ def _shuffled(kind: Ints, rng: np.random.Generator) -> Ints:
 def _descended(
     a: Floats, attached: Floats | None, order: Ints, pairs: Ints, rng: np.random.Generator
 ) -> tuple[float, Ints]:
-    """Swaps of two until none helps; of a large plan a sample of the swaps, for a limited number of steps."""
+    """Swaps of two until none helps; of a large plan a sample of the swaps, for
+    a limited number of steps."""
     n = len(order)
     some = max(ROWS_MOST // n, 8)
     least = float(_criterion(a, attached, order[None])[0])
@@ -74,7 +84,8 @@ def _descended(
 
 
 def _criterion(a: Floats, attached: Floats | None, orders: Ints) -> Floats:
-    """(m,) for orders (m,n): the sum of the variances, the first pose repeated at the end."""
+    """(m,) for orders (m,n): the sum of the variances, the first pose repeated
+    at the end."""
     closed = np.concatenate([orders, orders[:, :1]], axis=1)
     b = a[closed]
     time = np.linspace(-1, 1, closed.shape[1])[:, None]

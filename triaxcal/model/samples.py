@@ -13,7 +13,8 @@ from triaxcal.errors import InvalidData
 
 @dataclass(frozen=True)
 class Samples:
-    """``time_ns`` (n,) strictly increasing; ``readings`` (n,3) output units; ``channels`` name → (n,)."""
+    """``time_ns`` (n,) strictly increasing; ``readings`` (n,3) output units;
+    ``channels`` name → (n,)."""
 
     time_ns: Ints
     readings: Floats

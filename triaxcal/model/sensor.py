@@ -1,7 +1,9 @@
-"""The model of a triad and its inverse: ``u = K (R a + b + e(R a))`` (paper, eq. 1; METHOD notation).
+"""The model of a triad and its inverse: ``u = K (R a + b + e(R a))`` (paper,
+eq. 1; METHOD notation).
 
-``a`` (n,3) specific force in g, in the sensor's own orthogonal frame; ``u`` (n,3) output units;
-``R = [[1, az, ay], [0, 1, ax], [0, 0, 1]]`` (eq. 5) with ``misalignment = (ax, ay, az)`` in radians.
+``a`` (n,3) specific force in g, in the sensor's own orthogonal frame; ``u``
+(n,3) output units; ``R = [[1, az, ay], [0, 1, ax], [0, 0, 1]]`` (eq. 5) with
+``misalignment = (ax, ay, az)`` in radians.
 """
 
 from __future__ import annotations
@@ -17,16 +19,19 @@ from triaxcal.effects.contract import Effect
 from triaxcal.errors import Refused
 
 LINEAR = 9
-"""Parameters without effects: scale factor, misalignment and bias, three of each."""
+"""Parameters without effects: scale factor, misalignment and bias, three of
+each."""
 
 SOLVE_TOLERANCE = 1e-13
-"""Relative step, of the reference vector, at which the inverse of a nonlinear model counts as found."""
+"""Relative step, of the reference vector, at which the inverse of a nonlinear
+model counts as found."""
 
 
 class Radius(NamedTuple):
     """|a| (n,) and what it follows from: ``s`` = R a and ``a`` (n,3) in g.
 
-    ``by_s`` (n,3) is its gradient by s, ``by_v`` (n,3) by the reading in g less the bias, v = K⁻¹ u − b.
+    ``by_s`` (n,3) is its gradient by s, ``by_v`` (n,3) by the reading in g less
+    the bias, v = K⁻¹ u − b.
     """
 
     length: Floats
@@ -40,8 +45,9 @@ class Radius(NamedTuple):
 class Sensor:
     """Coefficients of one triad.
 
-    ``scale_factor`` (3,) output/g, signed; ``misalignment`` (3,) rad; ``bias`` (3,) g; ``effects`` pairs each effect
-    with its coefficients (p,), in the effect's own order.
+    ``scale_factor`` (3,) output/g, signed; ``misalignment`` (3,) rad; ``bias``
+    (3,) g; ``effects`` pairs each effect with its coefficients (p,), in the
+    effect's own order.
     """
 
     scale_factor: Floats
@@ -57,7 +63,8 @@ class Sensor:
 
     @property
     def matrix(self) -> Floats:
-        """A = (K R)⁻¹ (3,3), upper triangular: ``a = A (u − c)`` where there are no effects (eq. 4)."""
+        """A = (K R)⁻¹ (3,3), upper triangular: ``a = A (u − c)`` where there
+        are no effects (eq. 4)."""
         return np.linalg.inv(self.scale_factor[:, None] * self.axes)
 
     @property
@@ -66,7 +73,8 @@ class Sensor:
         return self.scale_factor * self.bias
 
     def moved(self, by: Floats) -> Sensor:
-        """With ``by`` (9+p,) added to scale factors, misalignments, biases and the effects' coefficients."""
+        """With ``by`` (9+p,) added to scale factors, misalignments, biases and
+        the effects' coefficients."""
         at, effects = 9, []
         for effect, q in self.effects:
             effects.append((effect, q + by[at : at + len(q)]))
@@ -74,7 +82,8 @@ class Sensor:
         return Sensor(self.scale_factor + by[:3], self.misalignment + by[3:6], self.bias + by[6:9], tuple(effects))
 
     def output(self, a: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        """u (n,3) for specific force (n,3); ``covariates`` are deviations from their references, each (n,)."""
+        """u (n,3) for specific force (n,3); ``covariates`` are deviations from
+        their references, each (n,)."""
         s = a @ self.axes.T
         return self.scale_factor * (s + self.bias + self.departure(s, covariates))
 
@@ -93,9 +102,11 @@ class Sensor:
         return slope
 
     def along_axes(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        """s = R a (n,3): the inverse up to the axes, by Newton's method where there are effects.
+        """s = R a (n,3): the inverse up to the axes, by Newton's method where
+        there are effects.
 
-        Raises Refused where the model has no inverse at a reading, as the methods that follow from this do.
+        Raises Refused where the model has no inverse at a reading, as the
+        methods that follow from this do.
         """
         v = u / self.scale_factor - self.bias
         if not self.effects:
@@ -132,7 +143,8 @@ class Sensor:
 
 
 _UNITY = np.eye(3)
-"""The derivative of a reading that has no effects in it: the unit matrix, made once."""
+"""The derivative of a reading that has no effects in it: the unit matrix, made
+once."""
 
 
 def _solved(slopes: Floats, right: Floats) -> Floats:

@@ -1,4 +1,5 @@
-"""Where to point the unit: directions, their order, designs for suspected effects, and what a set still lacks."""
+"""Where to point the unit: directions, their order, designs for suspected
+effects, and what a set still lacks."""
 
 from triaxcal.model.directions import dilution, directions, most_wanted
 from triaxcal.model.order import in_order

@@ -1,4 +1,5 @@
-"""The next best poses: what to add to poses that are there, and what each addition would do."""
+"""The next best poses: what to add to poses that are there, and what each
+addition would do."""
 
 from __future__ import annotations
 
@@ -26,16 +27,19 @@ from triaxcal.planning.design import Asked, channels_needed, profile_times
 from triaxcal.planning.optimal import profile
 
 ENOUGH = 1.25
-"""A set is good whose worst parameter is no more uncertain than this many poses' standard errors (the 14 have 1.06
-where all are alike), and whose effects come out no more than so many times worse than from the plan of 26."""
+"""A set is good whose worst parameter is no more uncertain than this many
+poses' standard errors (the 14 have 1.06 where all are alike), and whose effects
+come out no more than so many times worse than from the plan of 26."""
 MOST = FULL
-"""No more are added than a whole plan has: that would be the better one to take."""
+"""No more are added than a whole plan has: that would be the better one to
+take."""
 
 
 @dataclass(frozen=True)
 class Had:
-    """The poses that are there. ``up`` (n,3); ``weights`` (n,) 1/variance, of a typical pose 1; ``held`` by channel
-    and time (n,), each from −1 to 1 over what it went through, of which ``half`` is the half in the channel's unit;
+    """The poses that are there. ``up`` (n,3); ``weights`` (n,) 1/variance, of a
+    typical pose 1; ``held`` by channel and time (n,), each from −1 to 1 over
+    what it went through, of which ``half`` is the half in the channel's unit;
     ``axes`` (3,3) the sensitive axes, in rows."""
 
     up: Floats
@@ -46,15 +50,17 @@ class Had:
 
     @property
     def worst_error(self) -> float:
-        """Of the nine parameters, in standard errors of a typical pose (`worst_error`)."""
+        """Of the nine parameters, in standard errors of a typical pose
+        (`worst_error`)."""
         return worst_error(linear_design(self.up, self.up) * np.sqrt(self.weights)[:, None])
 
 
 @dataclass(frozen=True)
 class Addition:
-    """One pose more. ``levels`` of the channels, −1 lowest to 1 highest; ``dilution``, ``worst_error`` of the nine
-    parameters and ``errors`` (`Asked.errors`, per unit of the channels) are those of the poses there with this one and
-    all before it."""
+    """One pose more. ``levels`` of the channels, −1 lowest to 1 highest;
+    ``dilution``, ``worst_error`` of the nine parameters and ``errors``
+    (`Asked.errors`, per unit of the channels) are those of the poses there with
+    this one and all before it."""
 
     label: str
     up: Floats
@@ -65,8 +71,9 @@ class Addition:
 
 
 def additions(had: Had, asked: Asked, first: Sequence[Direction] = ()) -> list[Addition]:
-    """Poses of the 26 worth adding, best first: ``first`` those that the nine parameters want, then those that the
-    effects asked for want, until these come out nearly as well as from a whole plan, or ``MOST`` are added.
+    """Poses of the 26 worth adding, best first: ``first`` those that the nine
+    parameters want, then those that the effects asked for want, until these
+    come out nearly as well as from a whole plan, or ``MOST`` are added.
 
     Each is the one that adds most to the information on what is still wanting.
     """
@@ -123,7 +130,8 @@ class _Adding:
         return {name: v * self.had.half.get(name, 1.0) for name, v in held.items()}
 
     def _gain(self, rows: Floats) -> Floats:
-        """(C,) log of what each row multiplies the determinant of the effects' information by."""
+        """(C,) log of what each row multiplies the determinant of the effects'
+        information by."""
         M = (self.rows * self.weights[:, None]).T @ self.rows + 1e-9 * np.eye(rows.shape[1])
         whole = np.einsum("ci,ij,cj->c", rows, np.linalg.inv(M), rows)
         linear = rows[:, :LINEAR]
@@ -132,7 +140,8 @@ class _Adding:
 
 
 def _as_a_whole_plan(asked: Asked) -> float:
-    """The worst standard error that the combinations of the effects' coefficients may have."""
+    """The worst standard error that the combinations of the effects'
+    coefficients may have."""
     ups = np.array([v for _, v in directions(FULL)])
     ups = np.concatenate([ups, ups[:1]])
     held = {TIME: profile_times(len(ups))} | profile(channels_needed(asked.effects), len(ups), 3)

@@ -1,4 +1,5 @@
-"""Effects of the recording's clock as a plan sees them, whose time runs from −1, the first pose, to 1, the last."""
+"""Effects of the recording's clock as a plan sees them, whose time runs from
+−1, the first pose, to 1, the last."""
 
 from __future__ import annotations
 
@@ -16,15 +17,17 @@ from triaxcal.model.directions import FULL
 PLANS_CLOCK = "plans_clock"
 """`TIME` from −1 to 1, where that itself is in seconds."""
 POSES = FULL + 1
-"""Of the plan that shapes are chosen for: the one of 26, its first pose repeated."""
+"""Of the plan that shapes are chosen for: the one of 26, its first pose
+repeated."""
 HELD_SHARE = 0.01
-"""How long a pose is held, where the plan is two long: an eighth of the time from pose
-to pose, so that a step falls between poses as a rule."""
+"""How long a pose is held, where the plan is two long: an eighth of the time
+from pose to pose, so that a step falls between poses as a rule."""
 
 
 @dataclass(frozen=True)
 class OnPlansClock(Wrapped):
-    """``whole`` with a shape that suits a recording two units long, by `PLANS_CLOCK`, or `TIME` where that is one."""
+    """``whole`` with a shape that suits a recording two units long, by
+    `PLANS_CLOCK`, or `TIME` where that is one."""
 
     needs: tuple[str, ...] = (TIME,)
 
@@ -36,7 +39,8 @@ class OnPlansClock(Wrapped):
 
 
 def in_plan(effect: Effect) -> Effect:
-    """The effect as a plan can show it: of a time constant or a moment, the middle one that would be tried."""
+    """The effect as a plan can show it: of a time constant or a moment, the
+    middle one that would be tried."""
     if not of_clocks(effect) or effect.needs == (TIME,):
         return effect
     variants = effect.variants(_clocks(np.linspace(-1, 1, POSES)))

@@ -1,4 +1,5 @@
-"""What poses in given directions and covariates tell of effects: the columns of a plan's design, by |a| alone."""
+"""What poses in given directions and covariates tell of effects: the columns of
+a plan's design, by |a| alone."""
 
 from __future__ import annotations
 
@@ -13,10 +14,12 @@ from triaxcal.model.directions import linear_design
 from triaxcal.model.sensor import LINEAR
 
 SHOWS = 1e-6
-"""A combination of coefficients shows at all where this share of it is left beside the nine parameters."""
+"""A combination of coefficients shows at all where this share of it is left
+beside the nine parameters."""
 VISIBLE = 0.02
-"""What shows of an effect, or of a coefficient, can be used where at least this share of it is left beside all else.
-What is less comes of directions that are a degree off."""
+"""What shows of an effect, or of a coefficient, can be used where at least this
+share of it is left beside all else. What is less comes of directions that are a
+degree off."""
 
 
 def channels_needed(effects: Sequence[Effect]) -> tuple[str, ...]:
@@ -34,15 +37,17 @@ def profile_times(n: int) -> Floats:
 
 
 def radial(effects: Sequence[Effect], a: Floats, held: Mapping[str, Floats]) -> Floats:
-    """(n,p): what a unit of each coefficient adds to |a| of an ideal triad, ``a`` (n,3) unit vectors."""
+    """(n,p): what a unit of each coefficient adds to |a| of an ideal triad,
+    ``a`` (n,3) unit vectors."""
     columns = [np.einsum("ni,nip->np", a, e.basis(a, held)) for e in effects]
     return np.concatenate(columns, axis=1) if columns else np.empty((len(a), 0))
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Effects that a plan is for. ``seen`` (p,q): orthonormal combinations of their coefficients that |a| can show
-    beside the nine parameters, ``hidden`` (p,p−q) those that no plan can, since they look like others of them."""
+    """Effects that a plan is for. ``seen`` (p,q): orthonormal combinations of
+    their coefficients that |a| can show beside the nine parameters, ``hidden``
+    (p,p−q) those that no plan can, since they look like others of them."""
 
     effects: tuple[Effect, ...]
     seen: Floats
@@ -53,21 +58,25 @@ class Asked:
         return int(self.seen.shape[1])
 
     def rows(self, a: Floats, held: Mapping[str, Floats]) -> Floats:
-        """(n,9+q): derivatives of |a| by the nine parameters and by the combinations that show."""
+        """(n,9+q): derivatives of |a| by the nine parameters and by the
+        combinations that show."""
         return np.concatenate([linear_design(a, a), radial(self.effects, a, held) @ self.seen], axis=1)
 
     def errors(self, rows: Floats, weights: Floats | None = None) -> dict[str, dict[str, float | None]]:
-        """Standard error of each coefficient by effect, in standard errors of one pose, fitted all together.
+        """Standard error of each coefficient by effect, in standard errors of
+        one pose, fitted all together.
 
-        None where the poses (``rows`` (n,9+q), each with its weight) cannot show that coefficient by itself: less than
-        `VISIBLE` of what it makes is left beside the other parameters.
+        None where the poses (``rows`` (n,9+q), each with its weight) cannot
+        show that coefficient by itself: less than `VISIBLE` of what it makes is
+        left beside the other parameters.
         """
         loose, spread = self._spread(rows, weights)
         alone = np.linalg.norm(self.hidden, axis=1) < 1e-6
         known = alone & (np.abs(self.seen @ loose).max(axis=1, initial=0.0) < 1e-6)
         errors = np.linalg.norm(self.seen @ spread, axis=1)
         w = np.ones(len(rows)) if weights is None else weights
-        # Of a coefficient alone; the columns of what is hidden are those of others.
+        # Of a coefficient alone; the columns of what is hidden are those of
+        # others.
         whole = np.linalg.norm(rows[:, LINEAR:] @ self.seen.T * np.sqrt(w)[:, None], axis=0)
         known &= errors * whole * VISIBLE <= 1
         out: dict[str, dict[str, float | None]] = {}
@@ -80,14 +89,15 @@ class Asked:
         return out
 
     def worst(self, rows: Floats, weights: Floats | None = None) -> float:
-        """The largest standard error of the combinations that can show; infinite where the poses do not show one."""
+        """The largest standard error of the combinations that can show;
+        infinite where the poses do not show one."""
         loose, spread = self._spread(rows, weights)
         known = np.abs(loose).max(axis=1, initial=0.0) < 1e-6
         return float(np.linalg.norm(spread, axis=1).max(initial=0.0)) if known.all() else float("inf")
 
     def _spread(self, rows: Floats, weights: Floats | None) -> tuple[Floats, Floats]:
-        """Of the combinations that can show, (q,·) each: what of them the poses do not determine, and the spread of
-        what they do."""
+        """Of the combinations that can show, (q,·) each: what of them the poses
+        do not determine, and the spread of what they do."""
         w = np.ones(len(rows)) if weights is None else weights
         size = np.linalg.norm(rows, axis=0)
         size = np.where(size > 0, size, 1.0)
@@ -100,7 +110,8 @@ class Asked:
 
 
 def ask(effects: Sequence[Effect]) -> Asked:
-    """What of the effects, taken together, |a| can show, were directions and covariates free."""
+    """What of the effects, taken together, |a| can show, were directions and
+    covariates free."""
     rng = np.random.default_rng(0)
     a = rng.standard_normal((1500, 3))
     a /= np.linalg.norm(a, axis=1, keepdims=True)
@@ -110,9 +121,11 @@ def ask(effects: Sequence[Effect]) -> Asked:
 
 
 def combinations(nuisance: Floats, columns: Floats, least: float = SHOWS) -> tuple[Floats, Floats]:
-    """Orthonormal combinations (p,q) of columns (n,p) that show beside the nuisance (n,k), and (p,p−q) that do not.
+    """Orthonormal combinations (p,q) of columns (n,p) that show beside the
+    nuisance (n,k), and (p,p−q) that do not.
 
-    A combination shows where at least the share ``least`` of it is left after projection, the columns scaled alike.
+    A combination shows where at least the share ``least`` of it is left after
+    projection, the columns scaled alike.
     """
     size = np.linalg.norm(columns, axis=0)
     there = size > 1e-9
@@ -123,7 +136,8 @@ def combinations(nuisance: Floats, columns: Floats, least: float = SHOWS) -> tup
     _, singular, rows = np.linalg.svd(rest, full_matrices=True)
     kept = np.zeros(columns.shape[1], dtype=bool)
     kept[: len(singular)] = singular > least
-    # Coefficients of what does not show; what shows is whatever is at right angles to it.
+    # Coefficients of what does not show; what shows is whatever is at right
+    # angles to it.
     hidden = np.linalg.qr(rows[~kept].T / scale[:, None])[0] if not kept.all() else np.empty((len(size), 0))
     basis = np.linalg.svd(hidden, full_matrices=True)[0] if hidden.size else np.eye(len(size))
     return np.asarray(basis[:, hidden.shape[1] :]), np.asarray(hidden)

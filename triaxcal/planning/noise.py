@@ -1,4 +1,5 @@
-"""The noise that a recording foretells: what its poses leave beside the effects that a plan is for."""
+"""The noise that a recording foretells: what its poses leave beside the effects
+that a plan is for."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ from triaxcal.poses.pure_error import SIGNIFICANT, pure_error_dof
 
 @dataclass(frozen=True, eq=False)
 class Estimable(Effect):
-    """Those combinations ``seen`` (p,q) of the coefficients of ``effects``, all together, that poses can show."""
+    """Those combinations ``seen`` (p,q) of the coefficients of ``effects``, all
+    together, that poses can show."""
 
     effects: tuple[Effect, ...]
     seen: Floats = field(repr=False)
@@ -48,10 +50,12 @@ class Estimable(Effect):
 def fitted_beside(
     poses: Sequence[Pose], effects: Sequence[Effect], *, signs: Sequence[float], reference: float
 ) -> Calibration:
-    """The fit of the linear model with what the poses can show of ``effects`` beside it, so that this is no misfit.
+    """The fit of the linear model with what the poses can show of ``effects``
+    beside it, so that this is no misfit.
 
-    An effect of a plan's clock has the shape that the poses show best. Raises Refused as `fit` does; InvalidData where
-    a channel that an effect needs is not there.
+    An effect of a plan's clock has the shape that the poses show best. Raises
+    Refused as `fit` does; InvalidData where a channel that an effect needs is
+    not there.
     """
     sound = [p for p in poses if not p.fault]
     linear = fit(sound, signs=signs, reference=reference)
@@ -89,11 +93,12 @@ def _left(r: Floats, J: Floats) -> float:
 
 
 def noise_of(calibration: Calibration) -> Floats | None:
-    """(n,) standard errors of the poses used, as poses to come will have them, in the unit of the reference; None where
-    nothing tells them.
+    """(n,) standard errors of the poses used, as poses to come will have them,
+    in the unit of the reference; None where nothing tells them.
 
-    The noise inside the poses with the excess variance, and with a Birge ratio only where residuals are significantly
-    more than noise: to raise it for less would on average promise too much, as no factor ever lowers it.
+    The noise inside the poses with the excess variance, and with a Birge ratio
+    only where residuals are significantly more than noise: to raise it for less
+    would on average promise too much, as no factor ever lowers it.
     """
     used = [p for p in calibration.poses if p.used]
     error = np.array([p.error_g for p in used])

@@ -1,9 +1,13 @@
-"""Plans for suspected effects: the directions and covariates that tell their coefficients best.
+"""Plans for suspected effects: the directions and covariates that tell their
+coefficients best.
 
-D_s-optimality (Atkinson, Donev and Tobias 2007, Optimum Experimental Designs, ch. 10): the smallest determinant of the
-covariance of the effects' coefficients, the nine parameters being a nuisance, ``log|M| − log|M₁₁|`` to be maximised.
-Poses are exchanged one at a time for the best candidate (Fedorov 1972; Cook and Nachtsheim 1980, Technometrics
-22:315). How good the outcome is, the general equivalence theorem says, as an upper bound on what any plan can reach.
+D_s-optimality (Atkinson, Donev and Tobias 2007, Optimum Experimental Designs,
+ch. 10): the smallest determinant of the covariance of the effects'
+coefficients, the nine parameters being a nuisance, ``log|M| − log|M₁₁|`` to be
+maximised. Poses are exchanged one at a time for the best candidate (Fedorov
+1972; Cook and Nachtsheim 1980, Technometrics 22:315). How good the outcome is,
+the general equivalence theorem says, as an upper bound on what any plan can
+reach.
 """
 
 from __future__ import annotations
@@ -24,28 +28,35 @@ from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.design import Asked, ask, channels_needed, needs_time, profile_times
 
 WORSE_MOST = 1.5
-"""The nine parameters may come out so many times worse than by the plain plan of as many poses."""
+"""The nine parameters may come out so many times worse than by the plain plan
+of as many poses."""
 BEYOND_COSTS = 1e3
-"""What a plan beyond that limit loses of the criterion, so that it is taken only where there is no other."""
+"""What a plan beyond that limit loses of the criterion, so that it is taken
+only where there is no other."""
 CUBE_COSTS = 0.01
-"""So much efficiency may be lost for faces, edges and vertices of the cube, which fixtures have."""
+"""So much efficiency may be lost for faces, edges and vertices of the cube,
+which fixtures have."""
 APART_DEG = 10.0
-"""Directions are no nearer to each other than this, or a station would count them once."""
+"""Directions are no nearer to each other than this, or a station would count
+them once."""
 STARTS, PASSES_MOST, BOUND_STEPS = 4, 12, 150
-"""Exchange finds a local optimum: the best of so many is taken. Its passes end sooner
-where nothing changes. The bound holds after any number of steps; fewer leave it too
-high, and the efficiency that is told too low."""
+"""Exchange finds a local optimum: the best of so many is taken. Its passes end
+sooner where nothing changes. The bound holds after any number of steps; fewer
+leave it too high, and the efficiency that is told too low."""
 EVEN = 2e-3
 """Share of an even design in the one that the bound is taken at."""
 LEVELS = (2, 3, 4)
-"""Numbers of levels that a channel is tried with; the fewest that are within a hundredth of the best are taken."""
+"""Numbers of levels that a channel is tried with; the fewest that are within a
+hundredth of the best are taken."""
 
 
 @dataclass(frozen=True)
 class OptimalPlan:
-    """``plan`` in order, its first pose repeated at the end; ``levels`` (n,) of each channel from −1, the lowest that
-    it can be brought to, to 1. ``efficiency`` 0…1 against a bound on any plan; ``errors`` as of `Asked.errors`, a
-    channel counted in halves of its range and time in halves of the plan's."""
+    """``plan`` in order, its first pose repeated at the end; ``levels`` (n,) of
+    each channel from −1, the lowest that it can be brought to, to 1.
+    ``efficiency`` 0…1 against a bound on any plan; ``errors`` as of
+    `Asked.errors`, a channel counted in halves of its range and time in halves
+    of the plan's."""
 
     plan: tuple[Direction, ...]
     levels: Mapping[str, Floats]
@@ -59,9 +70,11 @@ class OptimalPlan:
 
 
 def optimal(count: int, effects: Sequence[Effect]) -> OptimalPlan:
-    """The plan of ``count`` distinct directions that tells the coefficients of ``effects`` best.
+    """The plan of ``count`` distinct directions that tells the coefficients of
+    ``effects`` best.
 
-    Raises Refused where |a| shows nothing of them, or where so few poses cannot.
+    Raises Refused where |a| shows nothing of them, or where so few poses
+    cannot.
     """
     asked = ask(effects)
     if asked.rank == 0:
@@ -82,15 +95,18 @@ def _names(effects: Sequence[Effect]) -> str:
 
 
 def _distinct_rank(asked: Asked) -> int:
-    """So many distinct directions at least, since effects of direction alone show in no other way."""
+    """So many distinct directions at least, since effects of direction alone
+    show in no other way."""
     still = ask([e for e in asked.effects if not e.needs])
     return LINEAR + still.rank
 
 
 def profile(channels: Sequence[str], n: int, levels: int) -> dict[str, Floats]:
-    """Levels (n,) of each channel, as many poses at each: up and down again, so that it does not go with time.
+    """Levels (n,) of each channel, as many poses at each: up and down again, so
+    that it does not go with time.
 
-    A second channel goes through it twice as often, and so on, so that no two go together.
+    A second channel goes through it twice as often, and so on, so that no two
+    go together.
     """
     out: dict[str, Floats] = {}
     for j, name in enumerate(channels):
@@ -110,7 +126,8 @@ class _Found:
 
 
 class _Search:
-    """The exchange over slots: pose k is taken at its time and its levels, whatever its direction."""
+    """The exchange over slots: pose k is taken at its time and its levels,
+    whatever its direction."""
 
     def __init__(self, count: int, asked: Asked) -> None:
         self.count, self.asked = count, asked
@@ -126,7 +143,8 @@ class _Search:
         return {TIME: np.full(n, self.times[k])} | {name: np.full(n, v[k]) for name, v in levels.items()}
 
     def levels_enough(self) -> int:
-        """The fewest levels of the channels that are within a hundredth of the best."""
+        """The fewest levels of the channels that are within a hundredth of the
+        best."""
         if not channels_needed(self.asked.effects):
             return LEVELS[0]
         values = []
@@ -146,7 +164,8 @@ class _Search:
         return best
 
     def _blocks(self, levels: Mapping[str, Floats]) -> list[Floats]:
-        """Candidates' rows (C,9+q) by slot; slots of the same covariates share them."""
+        """Candidates' rows (C,9+q) by slot; slots of the same covariates share
+        them."""
         timed = needs_time(self.asked.effects)
         known: dict[tuple[float, ...], Floats] = {}
         out = []
@@ -158,7 +177,8 @@ class _Search:
         return out
 
     def _start(self, seed: int) -> Ints:
-        """The candidates nearest to the plain plan, or some at random, none near to another."""
+        """The candidates nearest to the plain plan, or some at random, none
+        near to another."""
         rng = np.random.default_rng(seed)
         wanted = np.array([v for _, v in directions(self.count)]) if seed == 0 else _random(rng, 20 * self.count)
         chosen = [0]
@@ -207,7 +227,8 @@ def _random(rng: np.random.Generator, n: int) -> Floats:
 
 
 def _gain(M: Floats, candidates: Floats, out: Floats) -> Floats:
-    """(C,) log of the ratio of determinants where a row of ``M`` gives way to a candidate."""
+    """(C,) log of the ratio of determinants where a row of ``M`` gives way to a
+    candidate."""
     inverse = np.linalg.inv(M)
     against = candidates @ inverse @ out
     comes = np.einsum("ci,ij,cj->c", candidates, inverse, candidates)
@@ -220,7 +241,8 @@ def _worst_error(linear: Floats) -> float:
 
 
 def information(M: Floats) -> float:
-    """log|M| − log|M₁₁|: of the effects, the nine parameters being unknown; −inf where M is singular."""
+    """log|M| − log|M₁₁|: of the effects, the nine parameters being unknown;
+    −inf where M is singular."""
     norms = np.sqrt(np.maximum(np.diag(M), 1e-300))
     if np.linalg.eigvalsh(M / np.outer(norms, norms))[0] < 1e-9:
         return -np.inf
@@ -229,7 +251,8 @@ def information(M: Floats) -> float:
 
 @cache
 def candidates(least: int) -> tuple[Floats, Bools]:
-    """Unit vectors (C,3) of small whole numbers, +X first, and (C,) whether they are those; ``least`` or more."""
+    """Unit vectors (C,3) of small whole numbers, +X first, and (C,) whether
+    they are those; ``least`` or more."""
     seen: dict[tuple[int, ...], None] = {(1, 0, 0): None}
     for shell in range(1, 12):
         for v in itertools.product(range(shell, -shell - 1, -1), repeat=3):
@@ -266,10 +289,12 @@ def _concluded(search: _Search, found: _Found) -> OptimalPlan:
 
 
 def bound(asked: Asked, n: int) -> float:
-    """Upper bound of `information` a pose, over all plans of ``n`` poses in time at any directions and levels.
+    """Upper bound of `information` a pose, over all plans of ``n`` poses in
+    time at any directions and levels.
 
-    The criterion is concave, so at any design ξ no other exceeds it by more than the mean over time of the largest
-    variance function, less q (Kiefer and Wolfowitz 1960; Atkinson, Donev and Tobias 2007, ch. 9 and 10). ξ comes from
+    The criterion is concave, so at any design ξ no other exceeds it by more
+    than the mean over time of the largest variance function, less q (Kiefer and
+    Wolfowitz 1960; Atkinson, Donev and Tobias 2007, ch. 9 and 10). ξ comes from
     the multiplicative algorithm (Silvey, Titterington and Torsney 1978).
     """
     times = profile_times(min(n, 41)) if needs_time(asked.effects) else np.zeros(1)
@@ -289,7 +314,8 @@ def bound(asked: Asked, n: int) -> float:
 
     X = np.stack([rows(coarse, t) for t in times])
     weights = np.full(X.shape[:2], 1 / (X.shape[0] * X.shape[1]))
-    # The best design may be singular for the nine; a little of one that is not keeps the reckoning finite.
+    # The best design may be singular for the nine; a little of one that is not
+    # keeps the reckoning finite.
     even = EVEN * np.einsum("tci,tc,tcj->ij", X, weights, X, optimize=True)
 
     def information_of(weights: Floats) -> Floats:
@@ -306,7 +332,8 @@ def bound(asked: Asked, n: int) -> float:
 
 
 def _variance(M: Floats, X: Floats) -> Floats:
-    """The D_s variance function of rows (…,9+q): x' M⁻¹ x − x₁' M₁₁⁻¹ x₁; its mean over the design is q."""
+    """The D_s variance function of rows (…,9+q): x' M⁻¹ x − x₁' M₁₁⁻¹ x₁; its
+    mean over the design is q."""
     whole = np.einsum("...i,ij,...j->...", X, np.linalg.inv(M), X, optimize=True)
     linear = X[..., :LINEAR]
     part = np.einsum("...i,ij,...j->...", linear, np.linalg.inv(M[:LINEAR, :LINEAR]), linear, optimize=True)

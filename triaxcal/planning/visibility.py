@@ -1,4 +1,5 @@
-"""What a set of poses can show of an effect: the part of it that the model cannot absorb."""
+"""What a set of poses can show of an effect: the part of it that the model
+cannot absorb."""
 
 from __future__ import annotations
 
@@ -17,9 +18,11 @@ from triaxcal.planning.design import VISIBLE, combinations, profile_times, radia
 
 @dataclass(frozen=True)
 class Sight:
-    """What a plan shows of one effect: ``visible`` of its ``of`` independent coefficients.
+    """What a plan shows of one effect: ``visible`` of its ``of`` independent
+    coefficients.
 
-    ``hidden`` are the combinations of coefficients that do not show, name → weight, unit vectors.
+    ``hidden`` are the combinations of coefficients that do not show, name →
+    weight, unit vectors.
     """
 
     visible: int
@@ -28,7 +31,8 @@ class Sight:
 
 
 def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None = None) -> Sight:
-    """What poses in these directions (n,3), in this order and evenly in time, show of an effect by itself.
+    """What poses in these directions (n,3), in this order and evenly in time,
+    show of an effect by itself.
 
     Every channel is taken to move freely, but for those ``held`` (n,).
     """
@@ -45,7 +49,8 @@ def sight(directions: Floats, effect: Effect, held: Mapping[str, Floats] | None 
 
 
 def _plainly(hidden: Floats) -> Floats:
-    """The same space of combinations (k,p), with as many weights zero as the reduced echelon form has."""
+    """The same space of combinations (k,p), with as many weights zero as the
+    reduced echelon form has."""
     rows = hidden.copy()
     pivots = 0
     for column in range(rows.shape[1]):
@@ -62,7 +67,7 @@ def _plainly(hidden: Floats) -> Floats:
 
 
 def unseen_effects(directions: Floats, catalogue: Sequence[Effect] = CATALOGUE) -> list[str]:
-    """Names of the effects that poses in these directions (n,3) cannot show in full, were every channel moving
-    freely."""
+    """Names of the effects that poses in these directions (n,3) cannot show in
+    full, were every channel moving freely."""
     sights = [sight(directions, e) for e in catalogue]
     return [e.name for e, s in zip(catalogue, sights, strict=True) if s.visible < s.of]

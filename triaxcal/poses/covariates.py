@@ -1,7 +1,9 @@
-"""Covariates of the poses: the logged channels, the time, and what follows from the poses.
+"""Covariates of the poses: the logged channels, the time, and what follows from
+the poses.
 
-Time and rates come with any poses; the specific force in the pose before, and the scatter in g², need the scale of the
-outputs, and are added once a fit knows it (`with_scale`).
+Time and rates come with any poses; the specific force in the pose before, and
+the scatter in g², need the scale of the outputs, and are added once a fit knows
+it (`with_scale`).
 """
 
 from __future__ import annotations
@@ -33,19 +35,23 @@ from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose
 
 MOVES = 3.0
-"""A channel stands still unless its means, or its rates, differ by so many of their standard errors (rms)."""
+"""A channel stands still unless its means, or its rates, differ by so many of
+their standard errors (rms)."""
 SCATTER_MOVES = 0.1
-"""Scatter stands still unless it differs from pose to pose by this share, and by `MOVES` times what chance makes."""
+"""Scatter stands still unless it differs from pose to pose by this share, and
+by `MOVES` times what chance makes."""
 
 
 def covariates(channels: Mapping[str, Floats], reference: Mapping[str, float]) -> dict[str, Floats]:
-    """Deviations of the channels from their references; a channel with no reference is left out."""
+    """Deviations of the channels from their references; a channel with no
+    reference is left out."""
     return {name: np.asarray(channels[name]) - value for name, value in reference.items() if name in channels}
 
 
 def channels_of(poses: Sequence[Pose], wanted: Iterable[str] = ()) -> dict[str, Floats]:
-    """The channels' means by pose, (n,) each, their rates, and the time of each pose and for how long it was held; of
-    the channels' lags (`lag_of`) those that are among the covariates ``wanted``."""
+    """The channels' means by pose, (n,) each, their rates, and the time of each
+    pose and for how long it was held; of the channels' lags (`lag_of`) those
+    that are among the covariates ``wanted``."""
     out: dict[str, Floats] = {}
     for channel in sorted(set.intersection(*(set(p.channels) for p in poses)) if poses else set()):
         name = covariate_of(channel)
@@ -62,7 +68,8 @@ def channels_of(poses: Sequence[Pose], wanted: Iterable[str] = ()) -> dict[str, 
 
 
 def _lags(channels: Mapping[str, Floats], poses: Sequence[Pose], wanted: Iterable[str]) -> dict[str, Floats]:
-    """Each recording's by itself; the channel is taken to have stood still before its first pose."""
+    """Each recording's by itself; the channel is taken to have stood still
+    before its first pose."""
     out: dict[str, Floats] = {}
     runs = np.array([p.run.index for p in poses])
     t_s = np.array([p.t_s for p in poses])
@@ -82,8 +89,9 @@ def _lags(channels: Mapping[str, Floats], poses: Sequence[Pose], wanted: Iterabl
 
 
 def lag_deviation(t_s: Floats, values: Floats, constant_s: float) -> Floats:
-    """(n,) how far a first-order lag, τ y′ = c − y, is from the channel c that it follows: y − c at ascending times
-    (n,), where c has the values (n,). In between c goes straight, and before the first it had long stood still."""
+    """(n,) how far a first-order lag, τ y′ = c − y, is from the channel c that
+    it follows: y − c at ascending times (n,), where c has the values (n,). In
+    between c goes straight, and before the first it had long stood still."""
     out = np.zeros(len(values))
     for i, (step_s, change) in enumerate(zip(np.diff(t_s), np.diff(values), strict=True)):
         x = step_s / constant_s
@@ -93,12 +101,14 @@ def lag_deviation(t_s: Floats, values: Floats, constant_s: float) -> Floats:
 
 
 def rate_of_lag(behind_by: Floats, rate: Floats, constant_s: float) -> Floats:
-    """(n,) the rate of what `lag_deviation` gives, per second, where its channel has the ``rate``."""
+    """(n,) the rate of what `lag_deviation` gives, per second, where its
+    channel has the ``rate``."""
     return -behind_by / constant_s - rate
 
 
 def lags_for(effects: Iterable[Effect]) -> tuple[str, ...]:
-    """Every lag of the channels of whose lags the effects need any: their shapes may be moved."""
+    """Every lag of the channels of whose lags the effects need any: their
+    shapes may be moved."""
     found = {lag[0] for e in effects for n in e.needs if (lag := lag_in(n))}
     return tuple(lag_of(channel, constant_s) for channel in sorted(found) for constant_s in LAGS_S)
 
@@ -106,7 +116,8 @@ def lags_for(effects: Iterable[Effect]) -> tuple[str, ...]:
 def with_scale(
     channels: Mapping[str, Floats], poses: Sequence[Pose], scale_factor: Floats, bias: Floats
 ) -> dict[str, Floats]:
-    """With the covariates that need ``scale_factor`` (3,) output/g and ``bias`` (3,) g."""
+    """With the covariates that need ``scale_factor`` (3,) output/g and ``bias``
+    (3,) g."""
     now = np.array([p.mean for p in poses])
     before = np.array([p.mean if p.before is None else p.before for p in poses])
     change = (now - before) / scale_factor
@@ -117,17 +128,18 @@ def with_scale(
 
 
 def of_unknown_history(poses: Sequence[Pose], effects: Iterable[Effect]) -> tuple[int, ...]:
-    """Poses whose preceding pose is unknown although an effect needs it. Their covariates assume rest in the same
-    attitude."""
+    """Poses whose preceding pose is unknown although an effect needs it. Their
+    covariates assume rest in the same attitude."""
     needed = {n for e in effects for n in e.needs} & {*BEFORE, *CHANGE}
     return tuple(i for i, p in enumerate(poses) if p.before is None) if needed else ()
 
 
 def references(channels: Mapping[str, Floats]) -> dict[str, float]:
-    """Whence covariates are counted: channels and time from their means, what is itself a deviation from zero.
+    """Whence covariates are counted: channels and time from their means, what
+    is itself a deviation from zero.
 
-    Rounded, so that a reference temperature reads well and fits a float32 register: to a tenth, or to a tenth of the
-    range where that is finer.
+    Rounded, so that a reference temperature reads well and fits a float32
+    register: to a tenth, or to a tenth of the range where that is finer.
     """
     zero = {name for name in channels if is_derived(name)} - {TIME}
     return {
@@ -148,8 +160,9 @@ def covariates_elsewhere(
     bias: Floats,
     moment: tuple[float, float] | None = None,
 ) -> dict[str, Floats]:
-    """`covariates` of poses of another recording than that which ``reference`` is of, whose clock is its own: effects
-    of time count as at one ``moment`` (`of_moment`). Raises InvalidData where a channel is missing.
+    """`covariates` of poses of another recording than that which ``reference``
+    is of, whose clock is its own: effects of time count as at one ``moment``
+    (`of_moment`). Raises InvalidData where a channel is missing.
     """
     channels = with_scale(channels_of(poses, reference), poses, scale_factor, bias)
     channels[RUN] = np.full(len(poses), np.inf)
@@ -162,19 +175,22 @@ def covariates_elsewhere(
 
 
 def of_moment(reference: Mapping[str, float], moment: tuple[float, float] | None) -> dict[str, float]:
-    """The clocks at a moment, given as seconds from the first sample and as `TIME` counts them; long after the start,
-    and at the reference of `TIME`, where that is None."""
+    """The clocks at a moment, given as seconds from the first sample and as
+    `TIME` counts them; long after the start, and at the reference of `TIME`,
+    where that is None."""
     since_start_s, time_s = moment or (np.inf, reference.get(TIME, 0.0))
     return {SINCE_START: since_start_s, TIME: time_s}
 
 
 def at_reference(names: Iterable[str], n: int) -> dict[str, Floats]:
-    """n times the covariates at which every effect is at its reference: no deviation, and long after the start."""
+    """n times the covariates at which every effect is at its reference: no
+    deviation, and long after the start."""
     return {name: np.full(n, np.inf if name in (SINCE_START, RUN) else 0.0) for name in names}
 
 
 def at_moment(reference: Mapping[str, float], n: int, moment: tuple[float, float] | None) -> dict[str, Floats]:
-    """n times the covariates that a unit in use meets: no deviation, and the clocks at the ``moment`` (`of_moment`)."""
+    """n times the covariates that a unit in use meets: no deviation, and the
+    clocks at the ``moment`` (`of_moment`)."""
     clocks = of_moment(reference, moment)
     held = {name: np.full(n, t - reference[name]) for name, t in clocks.items() if name in reference}
     return at_reference(reference, n) | held
@@ -183,10 +199,12 @@ def at_moment(reference: Mapping[str, float], n: int, moment: tuple[float, float
 def of_readings(
     channels: Mapping[str, Floats], reference: Mapping[str, float], n: int, clocks: Mapping[str, Floats | float]
 ) -> tuple[dict[str, Floats], tuple[str, ...]]:
-    """`covariates` of n single readings, for whoever applies a calibration; and those that are needed and were not
-    given: a channel, its rate, scatter, the pose before. These count as at their reference.
+    """`covariates` of n single readings, for whoever applies a calibration; and
+    those that are needed and were not given: a channel, its rate, scatter, the
+    pose before. These count as at their reference.
 
-    A derived covariate may be among the ``channels``, unless the reference knows a logged channel of that name.
+    A derived covariate may be among the ``channels``, unless the reference
+    knows a logged channel of that name.
     """
     given = {covariate_of(name) if covariate_of(name) in reference else name: v for name, v in channels.items()}
     known: dict[str, Floats | float] = {**clocks, **given}
@@ -199,7 +217,8 @@ def of_readings(
 
 
 def static_covariates(poses: Sequence[Pose]) -> set[str]:
-    """Covariates that do not move from pose to pose by more than their own noise.
+    """Covariates that do not move from pose to pose by more than their own
+    noise.
 
     A coefficient of such a covariate would be one of chance.
     """

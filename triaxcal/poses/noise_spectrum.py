@@ -1,12 +1,16 @@
-"""The spectrum of a unit's noise, from all its poses together, and what it means for a pose's mean.
+"""The spectrum of a unit's noise, from all its poses together, and what it
+means for a pose's mean.
 
-A pose shows the noise at the frequencies 1/T, 2/T, … of its own length T; the variance of its mean depends on what
-lies below. All poses share one unit, hence one shape of spectrum, and a model of few parameters carries it down:
-white noise, one process of short memory (first-order, as AR(1), of any time constant; or a moving average of any
-length, as a sensor's filter makes), and 1/f noise, alone or together. The model is fitted by the likelihood of Whittle
-with the exact expectation of the periodogram (Sykulski et al. 2019, Biometrika 106:251), which is free of leakage and
-of what the subtracted mean takes away. How the models share the answer is decided by the Bayesian information
-criterion (Schwarz 1978).
+A pose shows the noise at the frequencies 1/T, 2/T, … of its own length T; the
+variance of its mean depends on what lies below. All poses share one unit, hence
+one shape of spectrum, and a model of few parameters carries it down: white
+noise, one process of short memory (first-order, as AR(1), of any time constant;
+or a moving average of any length, as a sensor's filter makes), and 1/f noise,
+alone or together. The model is fitted by the likelihood of Whittle with the
+exact expectation of the periodogram (Sykulski et al. 2019, Biometrika 106:251),
+which is free of leakage and of what the subtracted mean takes away. How the
+models share the answer is decided by the Bayesian information criterion
+(Schwarz 1978).
 """
 
 from __future__ import annotations
@@ -22,17 +26,19 @@ from triaxcal.distributions import chi2_isf
 from triaxcal.poses.noise_mixture import NoiseLevels
 
 BANDS = 1.25
-"""Ordinates of a periodogram are gathered in bands whose edges rise by this factor."""
+"""Ordinates of a periodogram are gathered in bands whose edges rise by this
+factor."""
 TIME_CONSTANTS = 12
-"""First-order processes tried, evenly in the logarithm. Together they have one prior,
-so that their number costs time alone; fewer leave gaps."""
+"""First-order processes tried, evenly in the logarithm. Together they have one
+prior, so that their number costs time alone; fewer leave gaps."""
 LENGTHS = 12
 """Moving averages tried, in the same way."""
 SLOWEST = 0.40
-"""exp(3/2 − γ) / 2π: ∫(1 − sinc²(πx)) dx/x from 0 to X tends to ln X + ln 2π + γ − 3/2."""
+"""exp(3/2 − γ) / 2π: ∫(1 − sinc²(πx)) dx/x from 0 to X tends to ln X + ln 2π +
+γ − 3/2."""
 STEPS = 12
-"""Of the search for amplitudes. Always all, so that the same bits come out everywhere;
-each step costs as much as the first."""
+"""Of the search for amplitudes. Always all, so that the same bits come out
+everywhere; each step costs as much as the first."""
 FLICKER = 0.3
 """Odds, before the data, of 1/f noise strong enough to matter (decision 0022)."""
 MISFIT = 1e-3
@@ -41,7 +47,8 @@ MISFIT = 1e-3
 
 @dataclass(frozen=True)
 class Track:
-    """Deviations (n,q) of q quantities from their mean over a pose, at whole places (n,) in units of a window."""
+    """Deviations (n,q) of q quantities from their mean over a pose, at whole
+    places (n,) in units of a window."""
 
     place: Ints
     deviation: Floats
@@ -55,7 +62,8 @@ class Track:
         return int(self.place[-1] - self.place[0]) + 1
 
     def pairs(self, weight: Floats | None = None) -> Floats:
-        """(length,) sums over all pairs of windows k apart of the products of their weights, 1 if not given."""
+        """(length,) sums over all pairs of windows k apart of the products of
+        their weights, 1 if not given."""
         there = np.zeros(self.length)
         there[self.place - self.place[0]] = 1.0 if weight is None else weight
         size = fft.next_fast_len(2 * self.length, real=True)
@@ -68,8 +76,9 @@ class Track:
 
 @dataclass(frozen=True)
 class Periodogram:
-    """Rows: one band of one pose each. ``power`` (r,q) and the expected power of every component (r,c); ``weight`` (r,)
-    is half the degrees of freedom, ``frequency`` in cycles a window, ``pose`` an index.
+    """Rows: one band of one pose each. ``power`` (r,q) and the expected power
+    of every component (r,c); ``weight`` (r,) is half the degrees of freedom,
+    ``frequency`` in cycles a window, ``pose`` an index.
     """
 
     power: Floats
@@ -86,18 +95,21 @@ class Periodogram:
 
 @dataclass(frozen=True)
 class Components:
-    """Autocovariances (c, lags) that a spectrum is made of: white, 1/f, first-order of a time constant each, moving
-    averages of a length each, none."""
+    """Autocovariances (c, lags) that a spectrum is made of: white, 1/f,
+    first-order of a time constant each, moving averages of a length each,
+    none."""
 
     autocovariance: Floats
 
     @classmethod
     def of(cls, lags: int, typical: float, recording: float) -> Components:
-        """For poses of ``typical`` length in a recording of a length, both in windows.
+        """For poses of ``typical`` length in a recording of a length, both in
+        windows.
 
-        1/f noise is a mixture of first-order processes with time constants spread evenly in the logarithm. What is
-        slower than the recording is the same for all poses, and counts as bias: the variance of 1/f noise about its
-        mean over a length L is that of its part above SLOWEST / L.
+        1/f noise is a mixture of first-order processes with time constants
+        spread evenly in the logarithm. What is slower than the recording is the
+        same for all poses, and counts as bias: the variance of 1/f noise about
+        its mean over a length L is that of its part above SLOWEST / L.
         """
         constants = np.geomspace(0.4, max(typical / 5, 0.8), TIME_CONSTANTS)
         lengths = np.geomspace(0.5, max(typical / 8, 1.0), LENGTHS)
@@ -109,7 +121,8 @@ class Components:
 
     @property
     def models(self) -> Ints:
-        """(m,3) which components go together; the last one is a row of zeros, for none."""
+        """(m,3) which components go together; the last one is a row of zeros,
+        for none."""
         none = len(self.autocovariance) - 1
         orders = range(2, none)
         rows = [(0, none, none), (0, 1, none), *((0, none, i) for i in orders), *((0, 1, i) for i in orders)]
@@ -122,7 +135,8 @@ class Components:
 
 
 def first_order_windows(constant: float, lags: int) -> Floats:
-    """Autocovariance of averages over windows of a first-order process of unit variance."""
+    """Autocovariance of averages over windows of a first-order process of unit
+    variance."""
     k = np.arange(lags, dtype=float)
     fall = -np.expm1(-1 / constant)
     out = constant**2 * fall**2 * np.exp(-np.maximum(k - 1, 0) / constant)
@@ -131,7 +145,8 @@ def first_order_windows(constant: float, lags: int) -> Floats:
 
 
 def moving_average_windows(length: float, lags: int) -> Floats:
-    """Autocovariance of averages over windows of white noise averaged over a length: a box twice on a box twice."""
+    """Autocovariance of averages over windows of white noise averaged over a
+    length: a box twice on a box twice."""
     steps = [(-1, 1.0), (0, -2.0), (1, 1.0)]
     k = np.arange(lags, dtype=float)
     out = np.sum([a * b * np.abs(k + i + j * length) ** 3 for i, a in steps for j, b in steps], axis=0)
@@ -163,8 +178,9 @@ def periodogram(tracks: Sequence[Track], components: Components, lowest: int = 1
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Autocovariance (q, lags) of window means, up to the scale of each pose; for each quantity the ``levels`` that the
-    variance of a mean of the usual length may have. ``highest`` is the frequency up to which it was fitted.
+    """Autocovariance (q, lags) of window means, up to the scale of each pose;
+    for each quantity the ``levels`` that the variance of a mean of the usual
+    length may have. ``highest`` is the frequency up to which it was fitted.
     """
 
     autocovariance: Floats
@@ -187,12 +203,14 @@ class Spectrum:
 
     def _sum(self, pairs: Floats) -> Floats:
         held = self.autocovariance[:, : len(pairs)] * pairs
-        # Never below what a thousandth of the same noise would give if it were white: rounding, and lines at Nyquist.
+        # Never below what a thousandth of the same noise would give if it were
+        # white: rounding, and lines at Nyquist.
         return np.asarray(np.maximum(2 * held.sum(axis=1) - held[:, 0], 1e-3 * held[:, 0]))
 
 
 def fitted(p: Periodogram, components: Components, typical: int) -> tuple[Spectrum, Floats]:
-    """The spectrum of every quantity, and the expected power (r,q) of every row of ``p``."""
+    """The spectrum of every quantity, and the expected power (r,q) of every row
+    of ``p``."""
     highest = 0.5
     while True:
         part = p.only(p.frequency <= highest)
@@ -204,7 +222,8 @@ def fitted(p: Periodogram, components: Components, typical: int) -> tuple[Spectr
 
 
 def _fits(p: Periodogram, expected: Floats) -> bool:
-    """Whether the bands of frequencies, over all poses, are off by no more than noise."""
+    """Whether the bands of frequencies, over all poses, are off by no more than
+    noise."""
     band = np.floor(np.log(np.maximum(p.frequency, 1e-9)) / np.log(1.3)).astype(int)
     _, group = np.unique(band, return_inverse=True)
     weight = np.bincount(group, p.weight)
@@ -217,10 +236,12 @@ def _fits(p: Periodogram, expected: Floats) -> bool:
 
 
 def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Floats, tuple[NoiseLevels, ...]]:
-    """Amplitudes (q,c) averaged over the models by their weights, and what the variance of a mean may be (q)."""
+    """Amplitudes (q,c) averaged over the models by their weights, and what the
+    variance of a mean may be (q)."""
     models, n = components.models, components.variance_of_mean(typical)
     fits = [_amplitudes(p.expected[:, models], column, p.weight) for column in p.power.T]
-    # The models of one kind with different time constants share one weight: a mean over a prior, not a sum.
+    # The models of one kind with different time constants share one weight: a
+    # mean over a prior, not a sum.
     none = len(n) - 1
     flicker, order = models[:, 1] != none, models[:, 2] != none
     free = len(fits) * (1 + flicker + order)
@@ -239,12 +260,14 @@ def _averaged(p: Periodogram, components: Components, typical: int) -> tuple[Flo
 
 
 SUBSETS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]], dtype=bool)
-"""Which of the three amplitudes are above zero: all seven are solved, the best is taken."""
+"""Which of the three amplitudes are above zero: all seven are solved, the best
+is taken."""
 
 
 def _amplitudes(basis: Floats, power: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]:
-    """For ``basis`` (r,m,3) of m models: amplitudes (m,3), none below zero, that maximise Whittle's likelihood; its
-    negative (m,), and Fisher's information (m,3,3) of those above zero.
+    """For ``basis`` (r,m,3) of m models: amplitudes (m,3), none below zero,
+    that maximise Whittle's likelihood; its negative (m,), and Fisher's
+    information (m,3,3) of those above zero.
     """
     size = float(np.average(power, weights=weight))
     power = power / (size or 1.0)
@@ -252,7 +275,8 @@ def _amplitudes(basis: Floats, power: Floats, weight: Floats) -> tuple[Floats, F
     basis = np.ascontiguousarray((basis / level).transpose(1, 0, 2))
     used = level > 1e-200
     amplitude = np.where(used, 1.0, 0.0) / used.sum(axis=1, keepdims=True)
-    # A fixed number of steps: where to stop must not hang on the last bits, which differ between processors.
+    # A fixed number of steps: where to stop must not hang on the last bits,
+    # which differ between processors.
     for step in range(STEPS):
         expected = np.maximum((basis @ amplitude[:, :, None])[:, :, 0], 1e-9)
         scaled = basis * (np.sqrt(weight) / expected)[:, :, None]
@@ -268,8 +292,9 @@ def _amplitudes(basis: Floats, power: Floats, weight: Floats) -> tuple[Floats, F
 
 
 def _nonnegative(information: Floats, target: Floats, used: Bools) -> Floats:
-    """(m,3) least-squares solutions of normal equations without a negative element: of the solutions in every subset of
-    the elements that has none, the best.
+    """(m,3) least-squares solutions of normal equations without a negative
+    element: of the solutions in every subset of the elements that has none, the
+    best.
     """
     scale = 1 / np.sqrt(np.maximum(np.einsum("mii->mi", information), 1e-300))
     matrix = information * scale[:, :, None] * scale[:, None, :] + 1e-10 * np.eye(3)

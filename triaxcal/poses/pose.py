@@ -1,4 +1,5 @@
-"""Still spans as poses: the mean of the outputs, and a covariance that minds autocorrelation, creep and rounding."""
+"""Still spans as poses: the mean of the outputs, and a covariance that minds
+autocorrelation, creep and rounding."""
 
 from __future__ import annotations
 
@@ -18,13 +19,15 @@ from triaxcal.poses.stillness.quantization import left_in_means, resolution
 from triaxcal.poses.stillness.windows import Windows
 
 SHAKEN, QUIET = 2.0, 0.1
-"""Poses are shaken in which the outputs scatter with so many times the variance of the quietest tenth of them."""
+"""Poses are shaken in which the outputs scatter with so many times the variance
+of the quietest tenth of them."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """Which of several recordings of a unit a pose is of: the ``index`` (0-based) of how many, and the middle of its
-    poses, from which time counts there. Alone, time counts as it was recorded.
+    """Which of several recordings of a unit a pose is of: the ``index``
+    (0-based) of how many, and the middle of its poses, from which time counts
+    there. Alone, time counts as it was recorded.
     """
 
     index: int = 0
@@ -34,7 +37,8 @@ class Run:
 
 @dataclass(frozen=True)
 class PoseStart:
-    """When a pose began: seconds from the first sample of its recording, and which of several (0-based)."""
+    """When a pose began: seconds from the first sample of its recording, and
+    which of several (0-based)."""
 
     start_s: float
     recording: int | None = None
@@ -42,21 +46,27 @@ class PoseStart:
 
 @dataclass(frozen=True)
 class Pose:
-    """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean, output units. ``dof`` are the
-    degrees of freedom behind the covariance (along the measured vector, where there are six poses or more), and
-    ``shared_dof`` those behind what the covariances of all poses have in common, infinite where that is nothing;
-    ``noise_levels`` say the same in full, where all poses of a recording have it in common.
+    """One still span. ``mean`` (3,) and ``covariance`` (3,3) of the mean,
+    output units. ``dof`` are the degrees of freedom behind the covariance
+    (along the measured vector, where there are six poses or more), and
+    ``shared_dof`` those behind what the covariances of all poses have in
+    common, infinite where that is nothing; ``noise_levels`` say the same in
+    full, where all poses of a recording have it in common.
 
-    ``channels`` are means over the span; ``t_s`` is the middle of the span, like ``start_s`` and ``end_s`` in seconds
-    from the first sample. ``creep`` (3,) is the change of the outputs along the span, output units, where it is more
-    than noise, else zero; ``slope`` (3,) the same whether it is noise or not, and ``slope_error`` the standard error of
-    its part along the measured vector, infinite where it is not known. ``rates`` are the channels' slopes in the middle
-    of the span, per second, and ``bends`` their second derivatives, per second², from the span and half its length on
-    either side; ``channel_errors``, ``rate_errors`` and ``bend_errors`` the standard errors of mean, slope and bend
-    from the scatter that these leave.
-    ``before`` (3,) is the mean of the pose before, None in the first; ``scatter`` (3,) the variance of a sample inside
-    the span, output units squared. ``fault`` is what its samples are to be blamed for (`triaxcal.poses.quality`), if at
-    all: no fit uses such a pose.
+    ``channels`` are means over the span; ``t_s`` is the middle of the span,
+    like ``start_s`` and ``end_s`` in seconds from the first sample. ``creep``
+    (3,) is the change of the outputs along the span, output units, where it is
+    more than noise, else zero; ``slope`` (3,) the same whether it is noise or
+    not, and ``slope_error`` the standard error of its part along the measured
+    vector, infinite where it is not known. ``rates`` are the channels' slopes
+    in the middle of the span, per second, and ``bends`` their second
+    derivatives, per second², from the span and half its length on either side;
+    ``channel_errors``, ``rate_errors`` and ``bend_errors`` the standard errors
+    of mean, slope and bend from the scatter that these leave. ``before`` (3,)
+    is the mean of the pose before, None in the first; ``scatter`` (3,) the
+    variance of a sample inside the span, output units squared. ``fault`` is
+    what its samples are to be blamed for (`triaxcal.poses.quality`), if at all:
+    no fit uses such a pose.
     """
 
     start_s: float
@@ -112,14 +122,16 @@ class Pose:
 
     @property
     def creep_covariance(self) -> Floats:
-        """(3,3) the part of ``covariance`` that is creep, output units squared: the variance of a value that is
-        anywhere on the way of a steady change, change²/12 (JCGM 100, 4.3.7). Zero where the pose does not creep.
+        """(3,3) the part of ``covariance`` that is creep, output units squared:
+        the variance of a value that is anywhere on the way of a steady change,
+        change²/12 (JCGM 100, 4.3.7). Zero where the pose does not creep.
         """
         return np.outer(self.creep, self.creep) / 12
 
 
 class StillSpan(Protocol):
-    """Where and when a unit was still: all of a pose but its noise. ``mean`` (3,) output units; times in seconds."""
+    """Where and when a unit was still: all of a pose but its noise. ``mean``
+    (3,) output units; times in seconds."""
 
     @property
     def start_s(self) -> float: ...
@@ -150,8 +162,9 @@ def still_spans_of(w: Windows, spans: Sequence[Span]) -> list[StillSpan]:
 
 
 def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None = None) -> list[Pose]:
-    """The poses of the still spans, in order of time. ``faults`` name those, by index, whose samples are not to be
-    trusted: they tell nothing of the noise of the others.
+    """The poses of the still spans, in order of time. ``faults`` name those, by
+    index, whose samples are not to be trusted: they tell nothing of the noise
+    of the others.
     """
     if faults:
         sound = iter(poses_of(w, [s for i, s in enumerate(spans) if i not in faults]))
@@ -179,7 +192,8 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
         along, predicted = _along(w, spans, tracks, out, recording, creeping)
         covariance = _mended(covariance, out, along.variance[:, 0] * predicted**2)
         dof, shared_dof, levels = along.dof[:, 0], along.common_dof, along.levels
-        # A unit that turns creeps across the measured vector; along it only where that shows by itself.
+        # A unit that turns creeps across the measured vector; along it only
+        # where that shows by itself.
         slope_error = along.slope_error[:, 0] * predicted * (length[:, 0] + 1)
         radial = np.einsum("ki,ki->k", creep, out) * ~along.creeping[:, 0]
         creep = creep - radial[:, None] * out
@@ -213,8 +227,8 @@ def poses_of(w: Windows, spans: Sequence[Span], faults: Mapping[int, str] | None
 
 
 class _Logged(NamedTuple):
-    """A channel about the middle of a pose: standard error of its mean; its rate per second and its bend per second²,
-    each with its standard error."""
+    """A channel about the middle of a pose: standard error of its mean; its
+    rate per second and its bend per second², each with its standard error."""
 
     error: float
     rate: float
@@ -224,8 +238,9 @@ class _Logged(NamedTuple):
 
 
 def _logged(w: Windows, s: Span, steps: Mapping[str, float]) -> dict[str, _Logged]:
-    """By a parabola through the span and half its length on either side: a thermometer's steps and noise are spread
-    over what is around the pose as well.
+    """By a parabola through the span and half its length on either side: a
+    thermometer's steps and noise are spread over what is around the pose as
+    well.
     """
     begin, end = int(w.start_ns[s.first]), int(w.end_ns[s.last])
     half = (end - begin) // 2
@@ -253,14 +268,16 @@ def _logged(w: Windows, s: Span, steps: Mapping[str, float]) -> dict[str, _Logge
 
 
 def _step(channel: Floats) -> float:
-    """By how much a channel moves where it stands still between its moves; zero where it is always on the move. A step
-    that falls inside a window makes two moves, so it is more than half a step."""
+    """By how much a channel moves where it stands still between its moves; zero
+    where it is always on the move. A step that falls inside a window makes two
+    moves, so it is more than half a step."""
     moves = np.abs(np.diff(channel))
     return float(np.median(moves[moves > 0])) if 0 < np.count_nonzero(moves) < len(moves) / 2 else 0.0
 
 
 def _track(w: Windows, s: Span) -> Track:
-    """Places by time, so that a silence inside a pose counts as the windows that it lacks."""
+    """Places by time, so that a silence inside a pose counts as the windows
+    that it lacks."""
     place = np.round((w.start_ns[s.used] - w.start_ns[s.first]) / w.period_ns).astype(np.int64)
     place = np.maximum.accumulate(place - np.arange(len(place))) + np.arange(len(place))
     return Track(place, w.mean[s.used] - w.mean[s.used].mean(axis=0))
@@ -275,8 +292,9 @@ def _correlation(w: Windows, s: Span) -> Floats:
 
 
 def outward(mean: Floats) -> Floats | None:
-    """(k,3) unit gradients of the length of the measured vector at pose means (k,3), in output units; known well enough
-    from the range of the means, for six poses or more.
+    """(k,3) unit gradients of the length of the measured vector at pose means
+    (k,3), in output units; known well enough from the range of the means, for
+    six poses or more.
     """
     half = (mean.max(axis=0) - mean.min(axis=0)) / 2
     if len(mean) < 6 or not np.all(half > 0):
@@ -288,15 +306,19 @@ def outward(mean: Floats) -> Floats | None:
 def _along(
     w: Windows, spans: Sequence[Span], tracks: Sequence[Track], out: Floats, recording: float, creeping: Bools
 ) -> tuple[PoseNoise, Floats]:
-    """Noise of the poses along the measured vector, in units (k,) of what the scatter inside the windows predicts.
+    """Noise of the poses along the measured vector, in units (k,) of what the
+    scatter inside the windows predicts.
 
-    A unit that is held by hand, or on a stand that settles, turns a little in every pose. That moves the outputs across
-    the measured vector, where |a| does not feel it, and raises the scatter of every axis; along the vector the noise is
-    the sensor's own.
+    A unit that is held by hand, or on a stand that settles, turns a little in
+    every pose. That moves the outputs across the measured vector, where |a|
+    does not feel it, and raises the scatter of every axis; along the vector the
+    noise is the sensor's own.
     """
-    # A scale for each pose, never zero, not even where a coarse output never changed in it.
+    # A scale for each pose, never zero, not even where a coarse output never
+    # changed in it.
     scatter = np.array([w.variance[s.used].mean(axis=0) for s in spans]) + resolution(w) ** 2 / 12
-    # Where a machine shakes the stand the scatter is the machine's, most of which a window averages out.
+    # Where a machine shakes the stand the scatter is the machine's, most of
+    # which a window averages out.
     scatter = np.minimum(scatter, SHAKEN * np.quantile(scatter, QUIET, axis=0))
     inside = np.array([_correlation(w, s) for s in spans]) * [np.outer(e, e) for e in np.sqrt(scatter / w.size)]
     predicted = np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", out, inside, out), 1e-300))

@@ -1,7 +1,9 @@
-"""Variances of pose means from the scatter of the windows in all poses together.
+"""Variances of pose means from the scatter of the windows in all poses
+together.
 
-The shape of the noise's spectrum is one unit's, so it is estimated from all poses; its size is each pose's own, shrunk
-towards the common one as far as the poses agree (empirical Bayes of variances; Smyth 2004, Stat. Appl. Genet. Mol.
+The shape of the noise's spectrum is one unit's, so it is estimated from all
+poses; its size is each pose's own, shrunk towards the common one as far as the
+poses agree (empirical Bayes of variances; Smyth 2004, Stat. Appl. Genet. Mol.
 Biol. 3:3).
 """
 
@@ -25,10 +27,12 @@ FALSE_CREEP = 0.01
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """For k poses and q quantities, (k,q) each: variance of the mean, degrees of freedom behind it, least-squares slope
-    a window, its standard error, and its significance in standard deviations. ``limit`` is where the latter is more
-    than chance. What the variances of all poses have in common is the shape of the spectrum: ``levels`` say what it may
-    make them, of the quantity that is known least, and ``common_dof`` the same as degrees of freedom.
+    """For k poses and q quantities, (k,q) each: variance of the mean, degrees
+    of freedom behind it, least-squares slope a window, its standard error, and
+    its significance in standard deviations. ``limit`` is where the latter is
+    more than chance. What the variances of all poses have in common is the
+    shape of the spectrum: ``levels`` say what it may make them, of the quantity
+    that is known least, and ``common_dof`` the same as degrees of freedom.
     """
 
     variance: Floats
@@ -47,14 +51,16 @@ class PoseNoise:
 
 
 def pose_noise(tracks: Sequence[Track], recording: float, creeping: Bools | None = None) -> PoseNoise:
-    """``recording`` is its length in windows. ``creeping`` (k,) are poses known to creep; without it they are found."""
+    """``recording`` is its length in windows. ``creeping`` (k,) are poses known
+    to creep; without it they are found."""
     cleaned = [without_tones(t) for t in tracks]
     tracks = [c.track for c in cleaned]
     slope = np.array([t.centred() @ t.deviation / (t.centred() @ t.centred()) for t in tracks])
     straight = [Track(t.place, t.deviation - t.centred()[:, None] * s) for t, s in zip(tracks, slope, strict=True)]
     limit = float(normal_isf(FALSE_CREEP / (2 * slope.size)))
     if creeping is None:
-        # What creeps must not pass for slow noise: the first look is at what a straight line leaves.
+        # What creeps must not pass for slow noise: the first look is at what a
+        # straight line leaves.
         model = _Model.of(straight, recording, lowest=2)
         for _ in range(2):
             before: Bools | None = creeping
@@ -111,7 +117,8 @@ class _Model:
         return np.asarray(self.scale * np.array([self.spectrum.variance_of_mean(t) for t in tracks]))
 
     def significance(self, tracks: Sequence[Track], slope: Floats) -> Floats:
-        """(k,q) of slopes, in standard deviations; of what exceeds the slope that a vibration makes."""
+        """(k,q) of slopes, in standard deviations; of what exceeds the slope
+        that a vibration makes."""
         excess = np.maximum(np.abs(slope) - self.vibration_slope(tracks), 0.0)
         return np.asarray(np.sign(slope) * excess / self.slope_error(tracks))
 
@@ -121,7 +128,8 @@ class _Model:
         return np.asarray(np.sqrt(np.maximum(variance, 1e-300)))
 
     def vibration_slope(self, tracks: Sequence[Track]) -> Floats:
-        """(k,q) the largest slope that a sine of the scatter's size makes by the part of a period at its ends.
+        """(k,q) the largest slope that a sine of the scatter's size makes by
+        the part of a period at its ends.
 
         Zero where the spectrum was fitted to the end: there is none then.
         """
@@ -144,8 +152,9 @@ class _Model:
 
 
 def shrunk(own: Floats, dof: Floats) -> tuple[Floats, Floats]:
-    """Variances (k,q) of ``dof`` degrees of freedom, (k,) or (k,q), shrunk towards their common value, and the degrees
-    of freedom (k,q) that they have then; infinite where the poses agree, as the common value is all there is.
+    """Variances (k,q) of ``dof`` degrees of freedom, (k,) or (k,q), shrunk
+    towards their common value, and the degrees of freedom (k,q) that they have
+    then; infinite where the poses agree, as the common value is all there is.
     """
     dof = np.broadcast_to(dof if dof.ndim == 2 else dof[:, None], own.shape)
     common = (own * dof).sum(axis=0) / dof.sum(axis=0)
@@ -166,7 +175,8 @@ def shrunk(own: Floats, dof: Floats) -> tuple[Floats, Floats]:
 
 
 def _inverse_trigamma(value: float) -> float:
-    """x with trigamma(x) = value, by Newton's method on 1/trigamma, which is nearly straight."""
+    """x with trigamma(x) = value, by Newton's method on 1/trigamma, which is
+    nearly straight."""
     x = 0.5 + 1 / value
     for _ in range(50):
         tri = float(special.polygamma(1, x))

@@ -1,7 +1,9 @@
-"""What the noise inside the poses counts beside the residuals: degrees of freedom, and which of the two to believe.
+"""What the noise inside the poses counts beside the residuals: degrees of
+freedom, and which of the two to believe.
 
-The scatter inside a pose gives its standard error without any model (pure error). Residuals beyond it come from what
-is not the same in every pose: an effect the model lacks, a stand that does not come back, a drift.
+The scatter inside a pose gives its standard error without any model (pure
+error). Residuals beyond it come from what is not the same in every pose: an
+effect the model lacks, a stand that does not come back, a drift.
 """
 
 from __future__ import annotations
@@ -18,22 +20,26 @@ from triaxcal.poses.pose import Pose
 LACK_OF_FIT = 0.01
 """Residuals of less probability (`Residual.lack_of_fit_p`) are more than noise."""
 SIGNIFICANT = 0.05
-"""The usual level of a test that excludes nothing: below it a misfit is worth a warning,
-or a variance of its own. Chance makes one in twenty."""
+"""The usual level of a test that excludes nothing: below it a misfit is worth a
+warning, or a variance of its own. Chance makes one in twenty."""
 BEYOND_DOUBT = 0.2
-"""Where residuals like these have less than this probability, the residuals alone say how large the noise is."""
+"""Where residuals like these have less than this probability, the residuals
+alone say how large the noise is."""
 
 
 def pose_dof(poses: Sequence[Pose]) -> Floats:
-    """(n,) degrees of freedom behind each pose's own noise; zero where it is not known."""
+    """(n,) degrees of freedom behind each pose's own noise; zero where it is
+    not known."""
     return np.array([min(p.dof, DOF_MOST) for p in poses])
 
 
 def pure_error_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
-    """Effective degrees of freedom of a variance of which pose i makes up ``part`` (n,), equal parts where None.
+    """Effective degrees of freedom of a variance of which pose i makes up
+    ``part`` (n,), equal parts where None.
 
-    Welch and Satterthwaite's formula (JCGM 100, G.4.1), where what the estimates of all poses have in common does not
-    average out. Zero where a pose does not know its noise.
+    Welch and Satterthwaite's formula (JCGM 100, G.4.1), where what the
+    estimates of all poses have in common does not average out. Zero where a
+    pose does not know its noise.
     """
     dof = pose_dof(poses)
     if not np.all(dof > 0):
@@ -45,15 +51,16 @@ def pure_error_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
 
 
 def combined_dof(share: Floats, left: int, dof: Floats | float) -> Floats:
-    """Degrees of freedom of variances of which a ``share`` is what residuals show beyond noise, in ``left`` degrees of
-    freedom, and the rest noise known by ``dof``, zero where it is not."""
+    """Degrees of freedom of variances of which a ``share`` is what residuals
+    show beyond noise, in ``left`` degrees of freedom, and the rest noise known
+    by ``dof``, zero where it is not."""
     with np.errstate(divide="ignore"):
         return np.asarray(1 / ((1 - share) ** 2 / dof + share**2 / left))
 
 
 def noise_levels(poses: Sequence[Pose]) -> NoiseLevels:
-    """How large the noise of all poses together may be: by the degrees of freedom alone where they are of several
-    recordings."""
+    """How large the noise of all poses together may be: by the degrees of
+    freedom alone where they are of several recordings."""
     first, dof = poses[0], max(pure_error_dof(poses), 1.0)
     common = first.noise_levels
     if common is None or any(p.noise_levels is not common for p in poses):
@@ -62,7 +69,8 @@ def noise_levels(poses: Sequence[Pose]) -> NoiseLevels:
 
 
 def lack_of_fit_p(chi2: float, left: float, pure_dof: float) -> float | None:
-    """Probability of a sum of squares this large in ``left`` degrees of freedom, from the poses' own noise.
+    """Probability of a sum of squares this large in ``left`` degrees of
+    freedom, from the poses' own noise.
 
     None where nothing is left, or where the noise is not known.
     """
@@ -70,11 +78,14 @@ def lack_of_fit_p(chi2: float, left: float, pure_dof: float) -> float | None:
 
 
 def raised_dof(chi2: float, left: int, pure_dof: float) -> float:
-    """Degrees of freedom of standard errors that residuals raise wherever they exceed the noise inside the poses.
+    """Degrees of freedom of standard errors that residuals raise wherever they
+    exceed the noise inside the poses.
 
-    ``chi2`` is the sum of squares in ``left`` degrees of freedom, ``pure_dof`` those of the noise. However little the
-    residuals exceed it they raise the errors, and step by step the degrees of freedom become those of the residuals: a
-    test that decides between the two would leave intervals too short where the excess is too small for it.
+    ``chi2`` is the sum of squares in ``left`` degrees of freedom, ``pure_dof``
+    those of the noise. However little the residuals exceed it they raise the
+    errors, and step by step the degrees of freedom become those of the
+    residuals: a test that decides between the two would leave intervals too
+    short where the excess is too small for it.
     """
     if left <= 0:
         return max(pure_dof, 1.0)

@@ -1,4 +1,5 @@
-"""Covariates that no single reading shows and a whole recording does: how fast its channels go, and their lags."""
+"""Covariates that no single reading shows and a whole recording does: how fast
+its channels go, and their lags."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ def followed(covariate: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class InStream:
-    """``covariates`` are those that a recording shows: times (m,) in s, and the values (m,) there."""
+    """``covariates`` are those that a recording shows: times (m,) in s, and the
+    values (m,) there."""
 
     covariates: Mapping[str, tuple[Floats, Floats]]
 
@@ -31,8 +33,10 @@ class InStream:
     def of(
         cls, pieces: Iterable[tuple[Floats, Mapping[str, Floats]]], wanted: Sequence[str], over_s: float
     ) -> InStream:
-        """Of the ``wanted`` covariates those that are rates or lags of a channel here. A recording comes in ``pieces``,
-        ascending times (n,) with the channels (n,) each; a rate is the slope of a straight line through ``over_s``."""
+        """Of the ``wanted`` covariates those that are rates or lags of a
+        channel here. A recording comes in ``pieces``, ascending times (n,) with
+        the channels (n,) each; a rate is the slope of a straight line through
+        ``over_s``."""
         held: dict[str, list[tuple[Floats, Floats]]] = {followed(name): [] for name in wanted}
         for t_s, channels in pieces if wanted else ():
             for name in held.keys() & channels.keys():
@@ -52,14 +56,16 @@ class InStream:
 
 
 def _averages(t_s: Floats, values: Floats, over_s: float) -> tuple[Floats, Floats]:
-    """Times and values (m,) averaged over `PARTS` to ``over_s``, of ascending times (n,)."""
+    """Times and values (m,) averaged over `PARTS` to ``over_s``, of ascending
+    times (n,)."""
     _, index, count = np.unique(np.floor(t_s * (PARTS / over_s)), return_inverse=True, return_counts=True)
     return np.bincount(index, t_s) / count, np.bincount(index, values) / count
 
 
 def _slopes(t_s: Floats, values: Floats, over_s: float) -> Floats:
-    """(m,) of the straight lines through all values within half of ``over_s``; zero where there is one alone. Sums are
-    about each moment: those from the start of a long recording lose their digits."""
+    """(m,) of the straight lines through all values within half of ``over_s``;
+    zero where there is one alone. Sums are about each moment: those from the
+    start of a long recording lose their digits."""
     count, t, v, tt, tv = np.zeros((5, len(t_s)))
     here = np.arange(len(t_s))
     for step in range(-PARTS, PARTS + 1):

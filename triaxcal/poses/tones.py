@@ -1,7 +1,8 @@
-"""Tones in a pose: a machine shakes the stand at frequencies of its own, or at those to which the windows fold them.
+"""Tones in a pose: a machine shakes the stand at frequencies of its own, or at
+those to which the windows fold them.
 
-A tone averages out as one over the length of the pose, and noise as its root. Taken for noise, it makes the standard
-error of a mean several times too large.
+A tone averages out as one over the length of the pose, and noise as its root.
+Taken for noise, it makes the standard error of a mean several times too large.
 """
 
 from __future__ import annotations
@@ -18,31 +19,34 @@ from triaxcal.poses.noise_spectrum import Track
 CYCLES_LEAST = 4.0
 """What is slower, in cycles a pose, is the noise that the mean has."""
 WINDOWS_LEAST = 24
-"""A pose of 2.4 s (decision 0025): shorter ones have too little noise beside a tone to
-tell it by."""
+"""A pose of 2.4 s (decision 0025): shorter ones have too little noise beside a
+tone to tell it by."""
 TONES_MOST = 6
 """Each takes three degrees of freedom: so many leave a quarter of the shortest
 pose's."""
 LOUD = 30.0
-"""A tone is so many times the median power about its frequency; noise makes one in one pose of two hundred."""
+"""A tone is so many times the median power about its frequency; noise makes one
+in one pose of two hundred."""
 ABOUT = 8
 """The median is taken over so many cycles a pose to either side."""
 PADDED = 2
-"""Times the length, by zeros appended: bins are half a cycle apart, so that a tone
-between two of them loses less."""
+"""Times the length, by zeros appended: bins are half a cycle apart, so that a
+tone between two of them loses less."""
 
 
 @dataclass(frozen=True)
 class Cleaned:
-    """A track without its tones, and the ``variance`` (q,) that they give its mean."""
+    """A track without its tones, and the ``variance`` (q,) that they give its
+    mean."""
 
     track: Track
     variance: Floats
 
 
 def without_tones(track: Track) -> Cleaned:
-    """A sine of amplitude A and j cycles adds about A/πj to a mean at most; half the square of that over the phases,
-    and half of this over the parts of a cycle that are left.
+    """A sine of amplitude A and j cycles adds about A/πj to a mean at most;
+    half the square of that over the phases, and half of this over the parts of
+    a cycle that are left.
     """
     q = track.deviation.shape[1]
     variance, left, tones = np.zeros(q), track.deviation, 0
@@ -63,7 +67,8 @@ def without_tones(track: Track) -> Cleaned:
 
 
 def _fitted(track: Track, deviation: Floats, frequency: float) -> tuple[Floats, Floats]:
-    """Cosine and sine (n,2) of a frequency, and their amplitudes (2,q) beside a straight line."""
+    """Cosine and sine (n,2) of a frequency, and their amplitudes (2,q) beside a
+    straight line."""
     x = track.centred()
     angle = 2 * np.pi * frequency * x
     columns = np.stack([np.cos(angle), np.sin(angle), np.ones_like(x), x], axis=1)
@@ -71,7 +76,8 @@ def _fitted(track: Track, deviation: Floats, frequency: float) -> tuple[Floats, 
 
 
 def _refined(track: Track, deviation: Floats, frequency: float) -> float:
-    """The frequency by one step of Gauss and Newton for deviations (n,), at most half a cycle a pose away."""
+    """The frequency by one step of Gauss and Newton for deviations (n,), at
+    most half a cycle a pose away."""
     sines, (a, b) = _fitted(track, deviation, frequency)
     rest = deviation - sines @ (a, b)
     by_frequency = 2 * np.pi * track.centred() * (b * sines[:, 0] - a * sines[:, 1])
@@ -81,7 +87,8 @@ def _refined(track: Track, deviation: Floats, frequency: float) -> float:
 
 
 def _loudest(track: Track, deviation: Floats) -> tuple[float, int] | None:
-    """Frequency, in cycles a window, and column of what stands out most in the spectrum; None where nothing does."""
+    """Frequency, in cycles a window, and column of what stands out most in the
+    spectrum; None where nothing does."""
     n = track.length
     taper = np.sin(np.pi * (track.place - track.place[0] + 0.5) / n) ** 2
     filled = np.zeros((n, deviation.shape[1]))

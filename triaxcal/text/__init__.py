@@ -1,7 +1,8 @@
-"""English for the values that the metrology returns: cautions, findings of data quality, lines of the budget.
+"""English for the values that the metrology returns: cautions, findings of data
+quality, lines of the budget.
 
-The one room that makes sentences; no other reads them back. An effect brings its own remedy, and an exception its own
-line.
+The one room that makes sentences; no other reads them back. An effect brings
+its own remedy, and an exception its own line.
 """
 
 from triaxcal.text.budget import basis, not_evaluated, remedy

@@ -1,4 +1,5 @@
-"""What to do after a diagnosis: what to record next, how to be rid of an effect, and what the poses cannot show."""
+"""What to do after a diagnosis: what to record next, how to be rid of an
+effect, and what the poses cannot show."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from triaxcal.poses.pose_labels import moment, the_poses
 from triaxcal.units import ErrorUnit
 
 ALMOST = 0.999
-"""Probabilities beyond are written as such: by which model they were reckoned matters more."""
+"""Probabilities beyond are written as such: by which model they were reckoned
+matters more."""
 GOES_WITH = {
     UnmodelledKind.EACH_POSE: "each pose by itself",
     UnmodelledKind.DIRECTION: "the direction",

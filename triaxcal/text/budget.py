@@ -1,4 +1,5 @@
-"""The lines of an uncertainty budget: what each rests on, what would halve it, what is not in it."""
+"""The lines of an uncertainty budget: what each rests on, what would halve it,
+what is not in it."""
 
 from __future__ import annotations
 
@@ -84,7 +85,8 @@ def _(b: of.ThermometerAt) -> str:
 
 
 def remedy(r: of.Remedy, small: Callable[[float], str] = micro_g) -> str:
-    """What would halve a component. ``small`` writes an error of the magnitude in the reference's unit."""
+    """What would halve a component. ``small`` writes an error of the magnitude
+    in the reference's unit."""
     match r:
         case of.LongerOrMorePoses(hold_s, poses) if hold_s <= 0:  # of poses of which only the means are known
             return f"record {poses} poses"

@@ -1,4 +1,5 @@
-"""What a closed loop found: whether the calibration can be used, what acts and how likely, and what is left."""
+"""What a closed loop found: whether the calibration can be used, what acts and
+how likely, and what is left."""
 
 from __future__ import annotations
 
@@ -28,8 +29,9 @@ CALLS = {
 
 
 def lines(loop: Loop, small: ErrorUnit, following: NextRecording | None = None) -> tuple[str, str, str, str]:
-    """The whole in four lines: the call, the cause, the error before and after, and what to do. ``following`` is the
-    next recording where a station knows more of the reference than the poses tell."""
+    """The whole in four lines: the call, the cause, the error before and after,
+    and what to do. ``following`` is the next recording where a station knows
+    more of the reference than the poses tell."""
     began = {i: p.pose.began for i, p in enumerate(loop.after.poses)}
     before, after = (c.residual.rms_g for c in (loop.before, loop.after))
     return (
@@ -52,8 +54,9 @@ def cause(
     small: ErrorUnit,
     probabilities: Mapping[str, float],
 ) -> str:
-    """What acts, each with its probability; ``began`` says when the poses began, by their place. ``probabilities`` are
-    those of all effects, the likeliest first."""
+    """What acts, each with its probability; ``began`` says when the poses
+    began, by their place. ``probabilities`` are those of all effects, the
+    likeliest first."""
     said = [*_causes(found, findings, candidates, began, small)]
     if said:
         return "; ".join(said)

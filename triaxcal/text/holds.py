@@ -23,8 +23,10 @@ from triaxcal.model.moment import Moment
 
 
 def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several: bool = False) -> tuple[str, ...]:
-    """The conditions under which a reading has nothing of these effects, so that scale factor, misalignment and bias
-    are all of it. ``reference`` is whence the conditions count; ``several``: recordings, each with its own clock."""
+    """The conditions under which a reading has nothing of these effects, so
+    that scale factor, misalignment and bias are all of it. ``reference`` is
+    whence the conditions count; ``several``: recordings, each with its own
+    clock."""
     out: list[str] = []
     for effect in effects:
         of_conditions = (_at(n, reference.get(n, 0.0), several) for n in effect.needs if n != RUN)
@@ -33,13 +35,15 @@ def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several:
 
 
 def as_at(moment: HoldsAt) -> str:
-    """The moment of a recording for which a correction holds that knows no time."""
+    """The moment of a recording for which a correction holds that knows no
+    time."""
     which = {Moment.END: "the end", Moment.MEAN: "the mean of the poses"}.get(moment.moment)
     return f"as at {plain(moment.t_s, 6)} s of the recording" + (f" ({which})" if which else "")
 
 
 def use(effects: Iterable[Effect], *, linear_only: bool) -> str:
-    """How readings u become specific force a. ``linear_only``: the best linear calibration is in the document too."""
+    """How readings u become specific force a. ``linear_only``: the best linear
+    calibration is in the document too."""
     if not tuple(effects):
         return "a = matrix (u - centre)"
     linear = "; linear_only is the best linear calibration" if linear_only else ""

@@ -17,7 +17,8 @@ def quality_line(finding: of.Finding, unit: str = "") -> str:
 
 @singledispatch
 def quality(finding: of.Finding, unit: str = "") -> str:
-    """Which axis, how much and where. Raises TypeError for a kind that has no words."""
+    """Which axis, how much and where. Raises TypeError for a kind that has no
+    words."""
     raise TypeError(f"no words for {type(finding).__name__}")
 
 

@@ -22,7 +22,8 @@ def short(c: Calibration, output_unit: str, reference_unit: str) -> str:
 
 
 def summary(c: Calibration, output_unit: str, reference_unit: str, warnings: Iterable[str]) -> str:
-    """The same with the effects' coefficients, all standard errors, and the warnings."""
+    """The same with the effects' coefficients, all standard errors, and the
+    warnings."""
     lines = [f"Calibration: {', '.join(c.terms)}"]
     lines += [
         f"  {name:<34}{value:>+16.9g} {error:<14} {unit}"
@@ -43,7 +44,8 @@ def poses(found: Sequence[Pose], data_quality: Iterable[str]) -> str:
 
 
 def verification(poses: str, rms: float, noise_floor: float, expected: float, reference: tuple[str, float]) -> str:
-    """The error in poses of another recording, beside what noise and the calibration's uncertainty make there."""
+    """The error in poses of another recording, beside what noise and the
+    calibration's uncertainty make there."""
     small = ErrorUnit.of(*reference)
     line = f"{poses}: rms {small.in_full(rms)}, noise floor {small.in_full(noise_floor)}"
     if math.isnan(expected):
@@ -72,7 +74,8 @@ def _linear(c: Calibration, output_unit: str, reference_unit: str) -> list[tuple
 
 
 def _all(c: Calibration, output_unit: str, reference_unit: str) -> list[tuple[str, float, str, str]]:
-    """Name, value, standard error and unit of every coefficient, and of the effects' shapes."""
+    """Name, value, standard error and unit of every coefficient, and of the
+    effects' shapes."""
     units = [unit for _, _, unit in _linear(c, output_unit, reference_unit) for _ in "xyz"]
     found = [
         (name, float(value), _error(float(error)), unit)

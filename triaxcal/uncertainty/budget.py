@@ -1,4 +1,5 @@
-"""The components combined: root sum of squares, degrees of freedom by Welch and Satterthwaite, and which dominates."""
+"""The components combined: root sum of squares, degrees of freedom by Welch and
+Satterthwaite, and which dominates."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Combined:
-    """``standard`` uncertainty, Welch–Satterthwaite ``dof``, Student's ``coverage`` factor; arrays of one shape."""
+    """``standard`` uncertainty, Welch–Satterthwaite ``dof``, Student's
+    ``coverage`` factor; arrays of one shape."""
 
     standard: Floats
     dof: Floats
@@ -48,7 +50,8 @@ class Combined:
 
 @dataclass(frozen=True)
 class Budget:
-    """Components, largest first; ``not_evaluated`` are sources that nothing is known of."""
+    """Components, largest first; ``not_evaluated`` are sources that nothing is
+    known of."""
 
     components: tuple[Component, ...]
     parameters: Combined
@@ -61,7 +64,8 @@ class Budget:
 
     @property
     def magnitude_if_halved(self) -> float:
-        """Standard uncertainty of the magnitude if the dominant component were half as large."""
+        """Standard uncertainty of the magnitude if the dominant component were
+        half as large."""
         least = float(self.magnitude.standard**2) - 0.75 * self.dominant.magnitude**2
         return float(np.sqrt(max(least, 0.0)))
 
@@ -72,7 +76,8 @@ class Budget:
 
 
 def budget(calibration: Calibration, stated: Stated | None = None, level: float = LEVEL) -> Budget:
-    """The budget of a calibration fitted to still poses (`triaxcal.estimate.pose_fit.fit`)."""
+    """The budget of a calibration fitted to still poses
+    (`triaxcal.estimate.pose_fit.fit`)."""
     stated = stated or Stated()
     linearised = ErrorPropagation(calibration)
     thermal, excess = temperature(calibration, linearised, stated)
@@ -90,9 +95,11 @@ def budget(calibration: Calibration, stated: Stated | None = None, level: float 
 
 
 def _combined(lines: list[tuple[Component, Floats]], dof: float, level: float, least: Floats) -> Combined:
-    """Root sum of squares, and degrees of freedom by annex G.4. Noise and what residuals add to it are one source, of
-    the ``dof`` that the fit gives them, since the one is judged by the other. Never below what the fit by itself states
-    (``least``), though thermal effects may be why its residuals are so large.
+    """Root sum of squares, and degrees of freedom by annex G.4. Noise and what
+    residuals add to it are one source, of the ``dof`` that the fit gives them,
+    since the one is judged by the other. Never below what the fit by itself
+    states (``least``), though thermal effects may be why its residuals are so
+    large.
     """
     variance = sum((u**2 for _, u in lines), start=np.zeros_like(lines[0][1]))
     variance = np.maximum(variance, least**2)

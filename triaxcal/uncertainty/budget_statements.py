@@ -1,4 +1,5 @@
-"""What the lines of a budget rest on, what would halve them, and what it leaves out: as values."""
+"""What the lines of a budget rest on, what would halve them, and what it leaves
+out: as values."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ class Basis:
 
 @dataclass(frozen=True)
 class WithinPoseScatter(Basis):
-    """With its autocorrelation; the poses were held for ``duration_s`` in the median."""
+    """With its autocorrelation; the poses were held for ``duration_s`` in the
+    median."""
 
     poses: int
     duration_s: float
@@ -34,15 +36,16 @@ class BirgeFactor(Basis):
 
 @dataclass(frozen=True)
 class Excess(Basis):
-    """Every pose has an ``excess`` standard deviation of |a|, in the reference, beside its noise."""
+    """Every pose has an ``excess`` standard deviation of |a|, in the reference,
+    beside its noise."""
 
     excess: float
 
 
 @dataclass(frozen=True)
 class StatedReference(Basis):
-    """The uncertainty of the reference; of normal gravity where there is a place. ``stated``, or that of gravity
-    anomalies over the Earth."""
+    """The uncertainty of the reference; of normal gravity where there is a
+    place. ``stated``, or that of gravity anomalies over the Earth."""
 
     latitude_deg: float | None = None
     height_m: float | None = None
@@ -58,20 +61,23 @@ class RegisterSteps(Basis):
 
 @dataclass(frozen=True)
 class NotHeld(Basis):
-    """What holds the result lacks effects, whose place the other coefficients take."""
+    """What holds the result lacks effects, whose place the other coefficients
+    take."""
 
 
 @dataclass(frozen=True)
 class AveragedModels(Basis):
-    """Over all that may act, each by its probability; ``names`` are those that are corrected and not certain."""
+    """Over all that may act, each by its probability; ``names`` are those that
+    are corrected and not certain."""
 
     names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class UnmodelledTemperature(Basis):
-    """The effects that the model lacks; the temperature moved by ``moved_k`` from pose to pose. ``identifiable``:
-    the poses can tell what that did. ``stated``: somebody said how sensitive such units are."""
+    """The effects that the model lacks; the temperature moved by ``moved_k``
+    from pose to pose. ``identifiable``: the poses can tell what that did.
+    ``stated``: somebody said how sensitive such units are."""
 
     effects: tuple[str, ...]
     moved_k: float
@@ -81,8 +87,8 @@ class UnmodelledTemperature(Basis):
 
 @dataclass(frozen=True)
 class ProbableTemperature(Basis):
-    """The effects that the model lacks, each as probable and as large as the poses leave it; the temperature moved by
-    ``moved_k`` from pose to pose."""
+    """The effects that the model lacks, each as probable and as large as the
+    poses leave it; the temperature moved by ``moved_k`` from pose to pose."""
 
     effects: tuple[str, ...]
     moved_k: float
@@ -120,7 +126,8 @@ class CompleteModel(Remedy):
 
 @dataclass(frozen=True)
 class ReferenceKnown(Remedy):
-    """To the standard uncertainty ``to_g``, in the unit of the reference vector."""
+    """To the standard uncertainty ``to_g``, in the unit of the reference
+    vector."""
 
     to_g: float
 
@@ -156,7 +163,8 @@ class PosesAtOtherTemperatures(Remedy):
 
 @dataclass(frozen=True)
 class SteadierTemperature(Remedy):
-    """Twice as steady; or one that swings until these ``effects`` can be fitted."""
+    """Twice as steady; or one that swings until these ``effects`` can be
+    fitted."""
 
     effects: tuple[str, ...]
 
@@ -192,7 +200,8 @@ class ThermometerNotStated(NotEvaluated):
 
 @dataclass(frozen=True)
 class SingleReading(NotEvaluated):
-    """The lack of fit of a single reading, ``cross_validated_g``: the budget holds what that does to the parameters."""
+    """The lack of fit of a single reading, ``cross_validated_g``: the budget
+    holds what that does to the parameters."""
 
     cross_validated_g: float
 

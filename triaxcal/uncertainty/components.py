@@ -1,4 +1,5 @@
-"""The sources of the budget, each evaluated from the linearised fit; those of the temperature have their own file."""
+"""The sources of the budget, each evaluated from the linearised fit; those of
+the temperature have their own file."""
 
 from __future__ import annotations
 
@@ -42,8 +43,9 @@ NOTHING = 1e-12
 class Component:
     """One line of the budget.
 
-    ``evaluation`` is A (from scatter) or B (otherwise); ``dof`` degrees of freedom behind it. ``parameters`` (p,)
-    standard uncertainties of `Calibration.parameters`; ``magnitude`` of |a|, rms over the sphere.
+    ``evaluation`` is A (from scatter) or B (otherwise); ``dof`` degrees of
+    freedom behind it. ``parameters`` (p,) standard uncertainties of
+    `Calibration.parameters`; ``magnitude`` of |a|, rms over the sphere.
     """
 
     source: str
@@ -65,21 +67,23 @@ class Component:
         basis: Basis,
         by: Remedy,
     ) -> Component:
-        """Of a source by the ``covariance`` (p,p) of the parameters that it makes; ``by`` what would halve it."""
+        """Of a source by the ``covariance`` (p,p) of the parameters that it
+        makes; ``by`` what would halve it."""
         parameters = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         return cls(source, evaluation, dof, parameters, linearised.magnitude(covariance), basis, by)
 
 
 def statistical(calibration: Calibration, linearised: ErrorPropagation, share: float) -> list[Component]:
-    """What the scatter inside the poses, their creep, and residuals beyond both say, of which thermal effects leave the
-    ``share``."""
+    """What the scatter inside the poses, their creep, and residuals beyond both
+    say, of which thermal effects leave the ``share``."""
     poses = [p.pose for p in calibration.poses if p.used]
     _, by_u = calibration.sensor.magnitude(linearised.problem.u, linearised.problem.covariates)
     creeping = np.array([p.creep_covariance for p in poses])
     S = linearised.by_residual
     creep = np.zeros(S.shape[1])
     creep[: len(poses)] = np.einsum("ni,nij,nj->n", by_u, creeping, by_u)
-    # Creep across the measured vector, of which a processor's rounding leaves something, is none.
+    # Creep across the measured vector, of which a processor's rounding leaves
+    # something, is none.
     creep = np.where(creep > NOTHING * linearised.noise**2, creep, 0.0)
     noise = np.maximum(linearised.noise**2 - creep, 0.0)
     out = [
@@ -108,8 +112,8 @@ def statistical(calibration: Calibration, linearised: ErrorPropagation, share: f
 
 
 def _between(calibration: Calibration, linearised: ErrorPropagation, noise: Floats) -> list[Component]:
-    """What the ``noise`` (p,p) of the poses leaves of a covariance that is one over all that may act; thermal effects
-    have a line of their own."""
+    """What the ``noise`` (p,p) of the poses leaves of a covariance that is one
+    over all that may act; thermal effects have a line of their own."""
     thermal = 0.0 if calibration.thermal is None else calibration.thermal
     rest = positive_semidefinite(calibration.covariance - noise - thermal)
     names = tuple(name for name, p in calibration.weights.items() if p < CERTAIN)

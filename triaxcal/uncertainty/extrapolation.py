@@ -1,4 +1,5 @@
-"""A calibration that is to hold for a moment after its recording: how well effects of time are known there."""
+"""A calibration that is to hold for a moment after its recording: how well
+effects of time are known there."""
 
 from __future__ import annotations
 
@@ -14,22 +15,25 @@ from triaxcal.estimate.caution import Caution
 from triaxcal.poses.covariates import at_moment
 
 STEP = 1e-4
-"""Relative step of the derivative by a shape, far above rounding and far below the curvature of any effect."""
+"""Relative step of the derivative by a shape, far above rounding and far below
+the curvature of any effect."""
 FACES = np.concatenate([np.eye(3), -np.eye(3)])
 """(6,3) up along each sensitive axis, both ways, where a bias shows whole."""
 
 
 @dataclass(frozen=True)
 class Extrapolated(Caution):
-    """It holds ``beyond_s`` after the last pose; what effects of time make of the readings there has this standard
-    uncertainty (of the axis and the face where it is largest), in the unit of the reference vector."""
+    """It holds ``beyond_s`` after the last pose; what effects of time make of
+    the readings there has this standard uncertainty (of the axis and the face
+    where it is largest), in the unit of the reference vector."""
 
     beyond_s: float
     uncertainty_g: float
 
 
 def extrapolated(c: Calibration) -> Extrapolated | None:
-    """None where the moment lies within the recording, or no effect goes with time."""
+    """None where the moment lies within the recording, or no effect goes with
+    time."""
     if c.holds_at is None or not c.poses:
         return None
     last = max(p.pose.run.index for p in c.poses)
@@ -49,7 +53,8 @@ def extrapolated(c: Calibration) -> Extrapolated | None:
 
 
 def _basis(effect: Effect, c: Calibration) -> Floats:
-    """(18,p) at the moment, on each face and axis, with everything else at its reference."""
+    """(18,p) at the moment, on each face and axis, with everything else at its
+    reference."""
     needed = {name: c.channel_reference[name] for name in effect.needs}
     basis = effect.basis(c.reference * FACES, at_moment(needed, len(FACES), c.moment))
     return np.asarray(basis.reshape(-1, basis.shape[-1]))

@@ -1,4 +1,5 @@
-"""How well a calibration predicts another recording of the same unit: beside its own error, how units start."""
+"""How well a calibration predicts another recording of the same unit: beside
+its own error, how units start."""
 
 from __future__ import annotations
 
@@ -15,9 +16,10 @@ from triaxcal.poses.covariates import at_moment
 from triaxcal.uncertainty import Budget
 
 START_TO_START = 2e-3
-"""In references, of |a| over the sphere, where one recording is all that is known: eight sensors of a mass-market board
-(MIMU4444, runs 1 to 4) came back by 1.5, 0.5 and 3.4 mg on their three axes. A unit of another class says otherwise by
-several recordings."""
+"""In references, of |a| over the sphere, where one recording is all that is
+known: eight sensors of a mass-market board (MIMU4444, runs 1 to 4) came back by
+1.5, 0.5 and 3.4 mg on their three axes. A unit of another class says otherwise
+by several recordings."""
 
 FEWEST = 3
 """Poses of a run that tell its bias."""
@@ -30,9 +32,10 @@ class Source(StrEnum):
 
 @dataclass(frozen=True)
 class NextRecording:
-    """``standard`` and ``expanded_uncertainty`` of |a|, rms over the sphere, at the reference conditions and the moment
-    for which the calibration holds; ``start_to_start`` the standard deviation of |a| from one recording to another. In
-    the unit of the reference."""
+    """``standard`` and ``expanded_uncertainty`` of |a|, rms over the sphere, at
+    the reference conditions and the moment for which the calibration holds;
+    ``start_to_start`` the standard deviation of |a| from one recording to
+    another. In the unit of the reference."""
 
     standard: float
     expanded_uncertainty: float
@@ -41,8 +44,8 @@ class NextRecording:
 
 
 def next_recording(c: Calibration, budget: Budget, start_to_start: float | None = None) -> NextRecording:
-    """``start_to_start`` is known of the unit's type, in the unit of the reference; from several recordings it is
-    measured."""
+    """``start_to_start`` is known of the unit's type, in the unit of the
+    reference; from several recordings it is measured."""
     measured = _between_runs(c)
     if measured is not None:
         start, dof, source = *measured, Source.MEASURED
@@ -58,8 +61,9 @@ def next_recording(c: Calibration, budget: Budget, start_to_start: float | None 
 
 
 def _between_runs(c: Calibration) -> tuple[float, float] | None:
-    """The standard deviation of |a| over the sphere that biases from run to run make, at the moment for which the
-    calibration holds, and its degrees of freedom; None of one recording."""
+    """The standard deviation of |a| over the sphere that biases from run to run
+    make, at the moment for which the calibration holds, and its degrees of
+    freedom; None of one recording."""
     poses = [p for p in c.poses if p.used]
     runs = sorted({p.pose.run.index for p in poses})
     if len(runs) < 2:
@@ -77,12 +81,14 @@ def _between_runs(c: Calibration) -> tuple[float, float] | None:
         return None
     by_noise = np.mean(variances, axis=0).sum()
     spread = np.var(biases, axis=0, ddof=1).sum() - by_noise
-    # Starts that agree within their noise may differ by as much as their mean is uncertain.
+    # Starts that agree within their noise may differ by as much as their mean
+    # is uncertain.
     return float(np.sqrt(max(spread, by_noise / len(biases)) / 3)), 3.0 * (len(biases) - 1)
 
 
 def _in_run(c: Calibration, run: int) -> Floats:
-    """(3,) what effects of the clocks, and of single runs, add to the bias in a run at the moment of its clock."""
+    """(3,) what effects of the clocks, and of single runs, add to the bias in a
+    run at the moment of its clock."""
     held = at_moment(c.channel_reference, 1, c.moment)
     if RUN in held:
         held[RUN] = np.array([run - c.channel_reference[RUN]])
@@ -90,7 +96,8 @@ def _in_run(c: Calibration, run: int) -> Floats:
 
 
 def _shift(by_v: Floats, off: Floats, error: Floats) -> tuple[Floats, Floats]:
-    """(3,) by how much the biases of a run are off, and the variances of that by noise."""
+    """(3,) by how much the biases of a run are off, and the variances of that
+    by noise."""
     weighted = by_v / error[:, None]
     inverse = np.linalg.pinv(weighted.T @ weighted)
     return inverse @ weighted.T @ (off / error), np.diag(inverse)

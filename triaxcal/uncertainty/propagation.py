@@ -1,4 +1,5 @@
-"""The fit linearised at its solution: from errors of the poses' residuals to parameters, and from these to |a|."""
+"""The fit linearised at its solution: from errors of the poses' residuals to
+parameters, and from these to |a|."""
 
 from __future__ import annotations
 
@@ -17,12 +18,13 @@ from triaxcal.model.directions import spiral
 from triaxcal.poses.covariates import at_moment
 
 SPHERE = 200
-"""Directions in a mean over the sphere. The variance of the magnitude is a polynomial
-of the fourth degree there, which so many average well."""
+"""Directions in a mean over the sphere. The variance of the magnitude is a
+polynomial of the fourth degree there, which so many average well."""
 
 
 class ErrorPropagation:
-    """The fit linearised at its solution, and the sphere that its parameters are judged on."""
+    """The fit linearised at its solution, and the sphere that its parameters
+    are judged on."""
 
     def __init__(self, calibration: Calibration) -> None:
         sensor = calibration.sensor
@@ -31,8 +33,10 @@ class ErrorPropagation:
         effects = [effect for effect, _ in sensor.effects]
         problem = problem_of(poses, signs=signs, reference=calibration.reference, effects=effects)
         problem = with_history(problem, poses, sensor)
-        # A model without a channel holds at its mean; the reference of one that has it is rounded to read well. To a
-        # millionth, since processors differ in the last digits, and a steady channel should not seem to move.
+        # A model without a channel holds at its mean; the reference of one that
+        # has it is rounded to read well. To a millionth, since processors
+        # differ in the last digits, and a steady channel should not seem to
+        # move.
         means = {n: round(float(np.mean(problem.channels[n])), 6) for n in problem.channel_reference}
         self.problem = replace(problem, channel_reference=means | dict(calibration.channel_reference))
         self.state = State.of(self.problem, sensor)
@@ -40,7 +44,8 @@ class ErrorPropagation:
         if calibration.slopes:
             self.problem = with_slopes(self.problem, poses, self.effects) or self.problem
         self.noise = linearise_all(self.problem, self.state)[2]
-        """(n,) standard errors of the residuals by the noise and creep of the poses."""
+        """(n,) standard errors of the residuals by the noise and creep of the
+        poses."""
         self.problem = Excess(excess_g=calibration.excess_g).added_to(self.problem, self.state)
         _, J, self.error = linearise_all(self.problem, self.state)
         # What the shapes of effects were chosen by blurs the parameters too.
@@ -48,7 +53,8 @@ class ErrorPropagation:
         self.gain = gain_given_prior(self.weighted, calibration.prior_sd)
         self.G = parameters_by_theta(self.problem, self.state)
         self.by_residual = -self.G @ self.gain[: len(self.G)] / self.error
-        """(p,n): shift of the parameters for an error of each residual (`likelihood.linearise_all`)."""
+        """(p,n): shift of the parameters for an error of each residual
+        (`likelihood.linearise_all`)."""
         self.up = spiral(SPHERE) * calibration.reference
         """(m,3) specific force all over the sphere."""
         self.sphere = self._sphere(calibration, {})
@@ -57,7 +63,8 @@ class ErrorPropagation:
         """(m,p): change of |a| over the sphere by the parameters."""
 
     def _sphere(self, calibration: Calibration, shift: Mapping[str, float]) -> Problem:
-        """Outputs of the unit all over the sphere, under the conditions of its use but for ``shift``."""
+        """Outputs of the unit all over the sphere, under the conditions of its
+        use but for ``shift``."""
         reference = self.problem.channel_reference
         covariates = at_moment(reference, len(self.up), calibration.moment)
         u = calibration.sensor.output(self.up, covariates)
@@ -66,13 +73,15 @@ class ErrorPropagation:
         return replace(self.problem, u=u, covariance=none, channels=channels, channel_reference=reference, slopes=None)
 
     def magnitude(self, covariance: Floats) -> float:
-        """rms over the sphere of the uncertainty of |a| that a covariance (p,p) of the parameters makes."""
+        """rms over the sphere of the uncertainty of |a| that a covariance (p,p)
+        of the parameters makes."""
         return float(
             np.sqrt(max(np.einsum("mi,ij,mj->", *[self.by_parameters, covariance, self.by_parameters]), 0.0) / SPHERE)
         )
 
     def when_shifted(self, calibration: Calibration, channel: str, by: float) -> Floats:
-        """(p,) what the parameters would have to be for |a| to stay right were a channel off by so much."""
+        """(p,) what the parameters would have to be for |a| to stay right were
+        a channel off by so much."""
         shifted = self._sphere(calibration, {channel: by})
         r, _, _ = linearise(shifted, self.state, jacobian=False)
         nine = self.by_parameters[:, :9]
@@ -80,8 +89,9 @@ class ErrorPropagation:
 
 
 def gain_given_prior(weighted: Floats, spread: Floats | None) -> Floats:
-    """(p,n) of parameters by weighted residuals, where coefficients are held by their ``prior_sd``. Columns are scaled
-    first: those of a temperature and of a cube are decades apart."""
+    """(p,n) of parameters by weighted residuals, where coefficients are held by
+    their ``prior_sd``. Columns are scaled first: those of a temperature and of
+    a cube are decades apart."""
     norms = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
     rows = weighted / norms
     if spread is not None and len(spread):

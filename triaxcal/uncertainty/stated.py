@@ -14,13 +14,16 @@ from triaxcal.uncertainty.budget_statements import StatedReference
 
 @dataclass(frozen=True)
 class Stated:
-    """What no recording can tell, as standard uncertainties; None where nobody stated it.
+    """What no recording can tell, as standard uncertainties; None where nobody
+    stated it.
 
-    ``reference`` in the reference's unit, with what it rests on; ``thermometer_k``; ``rounding`` the steps
-    of the registers that take the result, by parameter (`Calibration.parameters`), in its unit.
-    ``not_held`` is the rms over the sphere by which what holds the result is off the whole correction, in the
-    reference's unit. ``thermal_sensitivity`` is by how much a kelvin changes the bias of such units, in references, and
-    their scale factors, relatively.
+    ``reference`` in the reference's unit, with what it rests on;
+    ``thermometer_k``; ``rounding`` the steps of the registers that take the
+    result, by parameter (`Calibration.parameters`), in its unit. ``not_held``
+    is the rms over the sphere by which what holds the result is off the whole
+    correction, in the reference's unit. ``thermal_sensitivity`` is by how much
+    a kelvin changes the bias of such units, in references, and their scale
+    factors, relatively.
     """
 
     reference: float | None = None
@@ -40,8 +43,9 @@ class Stated:
         thermometer_k: float | None = None,
         thermal_sensitivity: float | None = None,
     ) -> Stated:
-        """Where the reference is gravity by `triaxcal.model.gravity`: a stated uncertainty, in g, comes before that of
-        the formula. Without a place, what is stated."""
+        """Where the reference is gravity by `triaxcal.model.gravity`: a stated
+        uncertainty, in g, comes before that of the formula. Without a place,
+        what is stated."""
         if latitude_deg is None or height_m is None:
             return cls(reference, thermometer_k=thermometer_k, thermal_sensitivity=thermal_sensitivity)
         basis = StatedReference(latitude_deg, height_m, stated=reference is not None)

@@ -1,4 +1,5 @@
-"""What temperature does to the parameters: by effects that the model lacks, and by the thermometer of those it has."""
+"""What temperature does to the parameters: by effects that the model lacks, and
+by the thermometer of those it has."""
 
 from __future__ import annotations
 
@@ -24,22 +25,25 @@ from triaxcal.uncertainty.propagation import ErrorPropagation
 from triaxcal.uncertainty.stated import Stated
 
 SENSITIVITY_PER_K = {"temperature_bias": 5e-4, "temperature_scale_factor": 3e-4}
-"""Standard deviation, before any data, of a coefficient that the fit has not taken up: in references per kelvin, and
-per kelvin. Typical of a mass-market MEMS accelerometer's data sheet; a navigation unit is ten times better."""
+"""Standard deviation, before any data, of a coefficient that the fit has not
+taken up: in references per kelvin, and per kelvin. Typical of a mass-market
+MEMS accelerometer's data sheet; a navigation unit is ten times better."""
 NO_SENSITIVITY = 1e-12
-"""In place of a sensitivity of zero, whose inverse is infinite: it makes nothing that
-shows."""
+"""In place of a sensitivity of zero, whose inverse is infinite: it makes
+nothing that shows."""
 
 
 def temperature(
     calibration: Calibration, linearised: ErrorPropagation, stated: Stated
 ) -> tuple[list[Component], float]:
-    """What thermal effects that the fit has not taken up may have done to its parameters; and the share of the
-    residuals' variance beyond noise that they do not explain, 0…1, lest it count twice.
+    """What thermal effects that the fit has not taken up may have done to its
+    parameters; and the share of the residuals' variance beyond noise that they
+    do not explain, 0…1, lest it count twice.
 
-    A coefficient that did not show is not zero: it is what the data leave of the sensitivity that was ``stated``, or of
-    `SENSITIVITY_PER_K`, a mean and a spread by Bayes' rule. The parameters of a fit without it are off by what it does
-    to them.
+    A coefficient that did not show is not zero: it is what the data leave of
+    the sensitivity that was ``stated``, or of `SENSITIVITY_PER_K`, a mean and a
+    spread by Bayes' rule. The parameters of a fit without it are off by what it
+    does to them.
     """
     if calibration.prior_sd is not None:
         return _as_probable(calibration, linearised), 1.0
@@ -55,8 +59,9 @@ def temperature(
     Z = J[:, p:] * spread / s[:, None]
     absorbed = linearised.gain @ (J[:, p:] * spread / linearised.error[:, None])
     rest = Z - linearised.weighted * (linearised.error / s)[:, None] @ absorbed
-    # With the prior's width as unit: what the poses do not show stays as wide as it was.
-    # By the means alone: slopes know nothing of an effect whose coefficients, and so its covariates' errors, are zero.
+    # With the prior's width as unit: what the poses do not show stays as wide
+    # as it was. By the means alone: slopes know nothing of an effect whose
+    # coefficients, and so its covariates' errors, are zero.
     n = len(linearised.problem.u)
     left = _posterior(rest[:n])
     mean = -left @ rest[:n].T @ (r / s)[:n]
@@ -79,7 +84,8 @@ def temperature(
 
 
 def _as_probable(calibration: Calibration, linearised: ErrorPropagation) -> list[Component]:
-    """By the probability of each thermal effect and of its sizes, as the poses and what happens inside them tell."""
+    """By the probability of each thermal effect and of its sizes, as the poses
+    and what happens inside them tell."""
     if calibration.thermal is None or not calibration.thermal.any():
         return []
     present = {e.name for e in linearised.effects}
@@ -90,9 +96,10 @@ def _as_probable(calibration: Calibration, linearised: ErrorPropagation) -> list
 
 
 def _posterior(Z: Floats) -> Floats:
-    """Covariance that the data leave of coefficients of which ``Z`` (n,q) is what each does to the residuals, in units
-    of the coefficients' prior widths and of the residuals' errors: (I + Zᵀ Z)⁻¹, also where Zᵀ Z has no inverse left
-    beside it in floating point."""
+    """Covariance that the data leave of coefficients of which ``Z`` (n,q) is
+    what each does to the residuals, in units of the coefficients' prior widths
+    and of the residuals' errors: (I + Zᵀ Z)⁻¹, also where Zᵀ Z has no inverse
+    left beside it in floating point."""
     _, size, axes = np.linalg.svd(Z)
     left = np.ones(Z.shape[1])
     left[: len(size)] = (1 / np.hypot(1.0, size)) ** 2  # s² itself might overflow
@@ -102,8 +109,9 @@ def _posterior(Z: Floats) -> Floats:
 def _halved_by(
     calibration: Calibration, names: tuple[str, ...], prior: float, left: float, apart: float, whole: float
 ) -> Remedy:
-    """As magnitudes: what the ``prior`` makes, what the data leave of it, what they would leave were the parameters
-    known (so that nothing takes an effect for them), and the ``whole`` component, which has the effects' means too."""
+    """As magnitudes: what the ``prior`` makes, what the data leave of it, what
+    they would leave were the parameters known (so that nothing takes an effect
+    for them), and the ``whole`` component, which has the effects' means too."""
     identifiable, p = 2 * left < prior, calibration.residual.lack_of_fit_p
     if identifiable and 2 * left < whole and p is not None and p < LACK_OF_FIT:
         return TemperatureModelled(names)
@@ -127,7 +135,8 @@ def _sensitivity(effect: Effect, reference: float, stated: Stated) -> float:
 
 
 def thermometer(calibration: Calibration, linearised: ErrorPropagation, stated: Stated) -> list[Component]:
-    """With thermal effects in the model its values hold at a temperature that somebody has to measure."""
+    """With thermal effects in the model its values hold at a temperature that
+    somebody has to measure."""
     if not stated.thermometer_k or not needs_temperature(linearised.effects):
         return []
     shift = linearised.when_shifted(calibration, TEMPERATURE, stated.thermometer_k)

@@ -1,6 +1,8 @@
-"""Computes a recording's result again from the recording alone, and finds where anything in it says otherwise.
+"""Computes a recording's result again from the recording alone, and finds where
+anything in it says otherwise.
 
-What is found are values; `triaxcald.audit.text` makes lines of them, which nothing reads back.
+What is found are values; `triaxcald.audit.text` makes lines of them, which
+nothing reads back.
 """
 
 from triaxcald.audit.conduct import Audit, audit

@@ -16,7 +16,8 @@ NAMES = (CERTIFICATE, REPORT, ATTACHMENT)
 
 
 def beside(path: Path, held: Mapping[str, bytes]) -> tuple[list[Difference], list[str]]:
-    """Files that are otherwise than in the recording, and names of those that are not there."""
+    """Files that are otherwise than in the recording, and names of those that
+    are not there."""
     differences, missing = [], []
     for name in NAMES:
         file = path.with_suffix(f".{name}")

@@ -46,14 +46,16 @@ Compute = Callable[[Recording, Digests], Again]
 
 @dataclass(frozen=True)
 class Notes:
-    """What an auditor should know and what is no difference. ``versions`` by name, then and now; ``not_beside`` are
-    files that are not beside the recording; ``report_as_listed`` where the report was not drawn again."""
+    """What an auditor should know and what is no difference. ``versions`` by
+    name, then and now; ``not_beside`` are files that are not beside the
+    recording; ``report_as_listed`` where the report was not drawn again."""
 
     older: bool = False
     versions: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     report_as_listed: bool = False
     earlier: bool = False
-    """What its search found was taken as it is. Sentences and keys of later versions were not compared."""
+    """What its search found was taken as it is. Sentences and keys of later
+    versions were not compared."""
     losses: tuple[str, ...] = ()
     mended: bool = False
     not_beside: tuple[str, ...] = ()
@@ -63,10 +65,12 @@ class Notes:
 
 @dataclass(frozen=True)
 class Audit:
-    """No difference means that everything comes out the same, byte for byte, and that no part is missing.
+    """No difference means that everything comes out the same, byte for byte,
+    and that no part is missing.
 
-    ``checked`` are the attachments that were computed again or compared with the register traffic. ``verdict`` is the
-    outcome's, None in a recording from before there were outcomes.
+    ``checked`` are the attachments that were computed again or compared with
+    the register traffic. ``verdict`` is the outcome's, None in a recording from
+    before there were outcomes.
     """
 
     recording: str
@@ -77,7 +81,8 @@ class Audit:
 
 
 def audit(path: Path, *, compute: Compute = compute) -> Audit:
-    """Raises RecordingError where the file cannot be read, or holds no result. ``compute`` makes the results again."""
+    """Raises RecordingError where the file cannot be read, or holds no result.
+    ``compute`` makes the results again."""
     with Recording.open(path) as recording:
         if recording.ends_with not in ("", FORMAT):
             raise RecordingError(f"{path}: ends with {recording.ends_with}, which this version does not know")
@@ -85,7 +90,8 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
 
 
 EARLIER = frozenset({"0.1.0"})
-"""Versions that named effects by a search, and whose documents have other sentences and lack keys that are made now."""
+"""Versions that named effects by a search, and whose documents have other
+sentences and lack keys that are made now."""
 
 
 class _Audit:
@@ -139,7 +145,8 @@ class _Audit:
 
     @property
     def _earlier(self) -> bool:
-        """Whether a version made it whose findings, sentences and keys are not those of this one."""
+        """Whether a version made it whose findings, sentences and keys are not
+        those of this one."""
         return self._recording.metadata.get("software", {}).get("triaxcal") in EARLIER
 
     @property
@@ -207,7 +214,8 @@ class _Audit:
         self._differences += told
 
     def _papers(self, again: Again) -> dict[str, str]:
-        """Digests of the papers that the line leaves: computed again where they can be."""
+        """Digests of the papers that the line leaves: computed again where they
+        can be."""
         found = {}
         ending = None if self._aborted else again.ending()
         if ending is not None and again.certified is not None:
@@ -379,7 +387,8 @@ def _object(data: bytes) -> Mapping[str, Any] | None:
 
 
 def _needs_journal(held: Held, registers: object) -> bool | None:
-    """Whether something is left to be cleared up; None where nothing was written, so that either may be."""
+    """Whether something is left to be cleared up; None where nothing was
+    written, so that either may be."""
     told = registers if isinstance(registers, Mapping) else {}
     if held.state is DeviceState.NEW_UNVERIFIED and not told.get("written"):
         return None
@@ -387,7 +396,8 @@ def _needs_journal(held: Held, registers: object) -> bool | None:
 
 
 def _owes_device(held: Held, outcome: Mapping[str, Any]) -> bool:
-    """Whether registers were written, and what the device holds is not settled, so that the exit code says so."""
+    """Whether registers were written, and what the device holds is not settled,
+    so that the exit code says so."""
     told = outcome.get("registers")
     return isinstance(told, Mapping) and held.state is not DeviceState.UNTOUCHED and bool(_needs_journal(held, told))
 

@@ -1,4 +1,5 @@
-"""The parts of the file against each other, and against the inventory that its outcome has."""
+"""The parts of the file against each other, and against the inventory that its
+outcome has."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ def faults(found: Survey) -> list[Difference]:
 
 
 def against_inventory(found: Survey, outcome: Mapping[str, Any]) -> list[Difference]:
-    """What was added, taken out, changed or put in another order since the outcome was written."""
+    """What was added, taken out, changed or put in another order since the
+    outcome was written."""
     listed = outcome.get("contents")
     if not isinstance(listed, Mapping):
         return [Difference(ATTACHMENT, Kind.VALUE, "contents", listed, "an inventory")]

@@ -16,7 +16,8 @@ SENTENCES = frozenset({
     "advice", "apart", "data_quality", "halved_by", "holds", "how", "lead", "not_evaluated", "reason", "remedy",
     "warnings",
 })  # fmt: skip
-"""Keys of documents under which English stands: words may be better in another version, numbers may not differ."""
+"""Keys of documents under which English stands: words may be better in another
+version, numbers may not differ."""
 
 
 class Nothing:
@@ -30,7 +31,8 @@ NOTHING = Nothing()
 
 
 class Kind(Enum):
-    """How a part differs. ``stored`` is what it says, ``again`` what it should say by all the rest."""
+    """How a part differs. ``stored`` is what it says, ``again`` what it should
+    say by all the rest."""
 
     VALUE = auto()
     BYTES = auto()
@@ -74,7 +76,8 @@ class Kind(Enum):
     NOT_SHOWN = auto()
     """The register traffic does not show ``stored``."""
     NOT_FORCED = auto()
-    """What the device held there is no calibration, and nobody is said to have overruled that."""
+    """What the device held there is no calibration, and nobody is said to have
+    overruled that."""
     BESIDE = auto()
     """The file beside the recording is not what is in the recording."""
     ALONE = auto()
@@ -83,7 +86,8 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Difference:
-    """``part`` is an attachment, a topic, a metadata record, or a file; ``place`` where in it."""
+    """``part`` is an attachment, a topic, a metadata record, or a file;
+    ``place`` where in it."""
 
     part: str
     kind: Kind
@@ -93,8 +97,9 @@ class Difference:
 
 
 def compare(part: str, stored: bytes, again: bytes, *, earlier: bool = False) -> list[Difference]:
-    """Two JSON documents, of which the second was computed again. ``earlier``: the first is of a version with other
-    sentences and fewer keys; these are not compared, nor the bytes."""
+    """Two JSON documents, of which the second was computed again. ``earlier``:
+    the first is of a version with other sentences and fewer keys; these are not
+    compared, nor the bytes."""
     if stored == again:
         return []
     try:

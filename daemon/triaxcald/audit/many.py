@@ -27,7 +27,8 @@ class Audited:
 
 
 def audit_each(asked: Sequence[Path]) -> Iterator[Audited]:
-    """Recordings, folders of recordings, and patterns, in the order in which they are given, each recording once."""
+    """Recordings, folders of recordings, and patterns, in the order in which
+    they are given, each recording once."""
     seen: set[Path] = set()
     for given in asked:
         try:

@@ -1,4 +1,5 @@
-"""Recordings from before there were outcomes, those made to look like them, and those whose effects a search named."""
+"""Recordings from before there were outcomes, those made to look like them, and
+those whose effects a search named."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ from triaxcald.station.config import Limits
 
 
 def turned_back(recording: Recording, raw: Digests) -> list[Difference]:
-    """Whether a recording that does not say in what it ends was made to end with an outcome: the digests in it are of
-    that too."""
+    """Whether a recording that does not say in what it ends was made to end
+    with an outcome: the digests in it are of that too."""
     stored = {
         raw.whole.were_it(FORMAT): recording.metadata.get(RAW_RECORD, {}).get("sha256"),
         raw.calibration.were_it(FORMAT): _digest_in(recording, CERTIFICATE, "recording", "raw_sha256"),
@@ -35,15 +36,18 @@ def turned_back(recording: Recording, raw: Digests) -> list[Difference]:
 
 
 SEARCHED = ("result", "registers")
-"""Of a certificate: what rests on the search for effects that there was before the posterior."""
+"""Of a certificate: what rests on the search for effects that there was before
+the posterior."""
 OF_A_POSE = ("start_s", "end_s", "mean")
 """What a pose is whatever acts."""
 
 
 def as_searched(certified: Certified, stored: Mapping[str, Any], profile: Profile, limits: Limits) -> Certified:
-    """With what the search of an earlier version made of the poses, which nobody can make again. Poses, the words of
-    the registers and the verdict are made again from that. Raises LookupError, TypeError or ValueError where the
-    ``stored`` certificate lacks a part, and DriverError for words that the profile does not have."""
+    """With what the search of an earlier version made of the poses, which
+    nobody can make again. Poses, the words of the registers and the verdict are
+    made again from that. Raises LookupError, TypeError or ValueError where the
+    ``stored`` certificate lacks a part, and DriverError for words that the
+    profile does not have."""
     document = {**certified.document, **{key: stored[key] for key in SEARCHED}}
     poses = certified.document["result"]["calibration"]["poses"]
     said = stored["result"]["calibration"]

@@ -1,4 +1,5 @@
-"""The thinned samples that a recording has for the eye, made again from its raw records."""
+"""The thinned samples that a recording has for the eye, made again from its raw
+records."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ class Thinned:
 
 
 class Previews:
-    """Takes the decoded samples of both streams in the order in which they came."""
+    """Takes the decoded samples of both streams in the order in which they
+    came."""
 
     def __init__(self, profile: Profile) -> None:
         self._encoder = PreviewEncoder(preview_channels(profile))
@@ -39,7 +41,8 @@ class Previews:
 
 
 def check(recording: Recording, again: Mapping[str, Thinned]) -> list[Difference]:
-    """All of them in their order, but for as many as are said to have been lost on the way to the disk."""
+    """All of them in their order, but for as many as are said to have been lost
+    on the way to the disk."""
     stored: dict[str, list[bytes]] = {topic: [] for topic in again}
     for topic, message in recording.messages():
         if topic in stored:

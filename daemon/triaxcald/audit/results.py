@@ -1,4 +1,5 @@
-"""What follows from a recording's raw records, profile, station file and metadata: computed as the station did it."""
+"""What follows from a recording's raw records, profile, station file and
+metadata: computed as the station did it."""
 
 from __future__ import annotations
 
@@ -40,8 +41,9 @@ class Digests:
 
 @dataclass(frozen=True)
 class Again:
-    """``certified`` is None where ``why_not`` says why the poses carry no certificate; ``verification`` is None where
-    there are no check poses, or no output to check."""
+    """``certified`` is None where ``why_not`` says why the poses carry no
+    certificate; ``verification`` is None where there are no check poses, or no
+    output to check."""
 
     bundle: Bundle
     station: StationFile
@@ -80,7 +82,8 @@ def digests(recording: Recording) -> Digests:
 
 
 def compute(recording: Recording, raw: Digests) -> Again:
-    """Raises RecordingError, ProfileError, InputError where the recording lacks what there is to compute with."""
+    """Raises RecordingError, ProfileError, InputError where the recording lacks
+    what there is to compute with."""
     bundle = bundle_of(recording)
     if STATION_FILE not in recording.attachments:
         raise RecordingError(f"attachment {STATION_FILE}: missing")
@@ -140,7 +143,8 @@ DRAWN_WITH = ("matplotlib", "jinja2")
 
 
 def held_in(outcome: Mapping[str, Any]) -> Held | None:
-    """What the device holds, as an outcome says it; None where it says no such thing."""
+    """What the device holds, as an outcome says it; None where it says no such
+    thing."""
     try:
         return Held(DeviceState(str(outcome.get("device_state"))), Evidence(str(outcome.get("evidence"))))
     except ValueError:
@@ -155,8 +159,9 @@ def report_of(again: Again, ending: Ending, held: Held) -> str:
 def outcome_again(
     stored: Mapping[str, Any], again: Again, recording: Recording, digests_of: Mapping[str, str], contents: Document
 ) -> Document:
-    """The outcome as it follows from all the rest. What a recording cannot know of itself is taken as ``stored``:
-    when it ended, which outcome it supersedes, why doubts were overruled, and why work was aborted."""
+    """The outcome as it follows from all the rest. What a recording cannot know
+    of itself is taken as ``stored``: when it ended, which outcome it
+    supersedes, why doubts were overruled, and why work was aborted."""
     aborted = stored.get("verdict") == Verdict.ABORTED.value
     ending = None if aborted else again.ending()
     if ending is None:

@@ -1,4 +1,5 @@
-"""The register traffic: what was read and written, against what the recording says was there, and is there now."""
+"""The register traffic: what was read and written, against what the recording
+says was there, and is there now."""
 
 from __future__ import annotations
 
@@ -22,14 +23,16 @@ Raw = Mapping[str, bytes]
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All calibration registers, read one after the other up to the access ``at``."""
+    """All calibration registers, read one after the other up to the access
+    ``at``."""
 
     at: int
     raw: Raw
 
 
 class Traffic:
-    """Register accesses in their order, read as what the line did. ``profile`` says which registers are which."""
+    """Register accesses in their order, read as what the line did. ``profile``
+    says which registers are which."""
 
     def __init__(self, accesses: Iterable[RegisterAccess], profile: Profile) -> None:
         self.accesses = list(accesses)
@@ -62,7 +65,8 @@ class Traffic:
 
     @cached_property
     def known(self) -> Raw:
-        """What was read last of each calibration register, without those that were written since."""
+        """What was read last of each calibration register, without those that
+        were written since."""
         found: dict[str, bytes] = {}
         for a in self.accesses:
             if a.operation == "write":
@@ -87,7 +91,8 @@ class Traffic:
         return [a.raw for a in self.accesses if a.register == name and a.operation == "read" and not a.error]
 
     def silent_since(self, at: int) -> bool:
-        """Whether the device went silent, as one does that loses its supply, and was read again."""
+        """Whether the device went silent, as one does that loses its supply,
+        and was read again."""
         missed = longest = 0
         for a in self.accesses[at + 1 :]:
             if a.operation == "read":
@@ -98,8 +103,10 @@ class Traffic:
 
 @dataclass(frozen=True)
 class Said:
-    """What a recording says of its registers. ``earlier`` is what an undoing brings back where it is not ``before``;
-    ``image`` what the certificate asks for; ``told`` and ``held`` are the outcome's, None in a recording without one.
+    """What a recording says of its registers. ``earlier`` is what an undoing
+    brings back where it is not ``before``; ``image`` what the certificate asks
+    for; ``told`` and ``held`` are the outcome's, None in a recording without
+    one.
     """
 
     before: Raw | None
@@ -111,7 +118,8 @@ class Said:
     forced: bool
     aborted: bool
     provisioned: Sequence[str] | None
-    """The registers that were written, by the event; None where there is no such event."""
+    """The registers that were written, by the event; None where there is no
+    such event."""
 
     @property
     def old(self) -> Raw | None:
@@ -151,7 +159,8 @@ def _identity(traffic: Traffic, serial: str | None) -> list[Difference]:
 
 
 def _asked_for(traffic: Traffic, said: Said) -> list[Difference]:
-    """Every write is of the certificate's image, of what the device held before, or of a sequence of the profile."""
+    """Every write is of the certificate's image, of what the device held
+    before, or of a sequence of the profile."""
     steps = {step for label in ("unlock", "store", "lock", "reset") for step in traffic.sequence(label)}
     asked = {(name, raw) for some in (said.new, said.before, said.earlier) for name, raw in (some or {}).items()}
     written = dict.fromkeys((a.register, a.raw) for a in traffic.accesses if a.operation == "write")
@@ -211,7 +220,8 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
     seen = list(dict.fromkeys(a.register for _, a in traffic.writes if a.raw == image.get(a.register)))
     if written is None:
         return [Difference(REGISTERS, Kind.NOT_ASKED_FOR, n) for n in seen]
-    # A stop may come between a request and its record; an undoing may write what is old and new alike.
+    # A stop may come between a request and its record; an undoing may write
+    # what is old and new alike.
     cut = said.aborted and seen == list(written[:-1])
     if seen[: len(written)] != list(written) and not cut:
         found.append(Difference(REGISTERS, Kind.NOT_SHOWN, "written", list(written), seen))
@@ -284,8 +294,9 @@ _GOES_WITH: dict[DeviceState, tuple[Evidence, ...]] = {
 
 
 def _restarted(traffic: Traffic, said: Said) -> bool:
-    """A restart after the last write, then all registers read. One that nobody acknowledged counts where an old value
-    was put into a register in use before it, and did not come back."""
+    """A restart after the last write, then all registers read. One that nobody
+    acknowledged counts where an old value was put into a register in use before
+    it, and did not come back."""
     lasting = said.held is not None and said.held.state is DeviceState.OLD
     if not traffic.profile.sequences.reset:  # it may have lost its supply, and started from what is stored
         return lasting
@@ -304,7 +315,8 @@ def _power_cycled(traffic: Traffic, said: Said) -> bool:
 
 
 def _not_restarted(traffic: Traffic, said: Said) -> bool:
-    """Nothing was read after a restart that was acknowledged: else it would have proven the registers."""
+    """Nothing was read after a restart that was acknowledged: else it would
+    have proven the registers."""
     return said.held is None or said.held.state is not DeviceState.NEW_UNVERIFIED or not _acknowledged(traffic)
 
 

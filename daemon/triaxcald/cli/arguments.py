@@ -1,4 +1,5 @@
-"""Arguments that several commands share, and a parser whose errors are one line."""
+"""Arguments that several commands share, and a parser whose errors are one
+line."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ RECORDING = ".mcap, a table (.csv, .csv.gz, .txt, .parquet) or - for text on sta
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong in one line and ends with 2. Options may stand anywhere between files."""
+    """Says what is wrong in one line and ends with 2. Options may stand
+    anywhere between files."""
 
     _mixing = False
 
@@ -193,7 +195,8 @@ def add_uncertainty(parser: argparse.ArgumentParser) -> None:
 
 
 def writable(path: Path | None) -> None:
-    """Fail before the work, not after it, where a result could not be written. Raises InputError."""
+    """Fail before the work, not after it, where a result could not be written.
+    Raises InputError."""
     if path is None:
         return
     if not path.parent.is_dir():
@@ -202,8 +205,8 @@ def writable(path: Path | None) -> None:
 
 
 def keep_apart(chosen: argparse.Namespace) -> None:
-    """Raises InputError, before anything is read or written, where a file is to be written over one that is read, or
-    two files over each other."""
+    """Raises InputError, before anything is read or written, where a file is to
+    be written over one that is read, or two files over each other."""
     written = {
         f"--{name}": path for name in ("output", "report") if isinstance(path := getattr(chosen, name, None), Path)
     }

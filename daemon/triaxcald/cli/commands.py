@@ -36,7 +36,8 @@ def say_version() -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs one command; gives its exit code. Errors are one line on standard error."""
+    """Runs one command; gives its exit code. Errors are one line on standard
+    error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal that knows no µ shall not end the work

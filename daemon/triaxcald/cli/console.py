@@ -1,4 +1,5 @@
-"""What a person sees: results on standard output, progress and warnings on standard error."""
+"""What a person sees: results on standard output, progress and warnings on
+standard error."""
 
 from __future__ import annotations
 
@@ -30,9 +31,11 @@ def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
 
 
 def say(text: str) -> None:
-    """A line to standard error; nowhere, where that has been closed: no work may fail for it.
+    """A line to standard error; nowhere, where that has been closed: no work
+    may fail for it.
 
-    What a file holds may be quoted in it: that can neither begin a second line nor steer the terminal.
+    What a file holds may be quoted in it: that can neither begin a second line
+    nor steer the terminal.
     """
     line = _CONTROL.sub(lambda c: c[0].encode("unicode_escape").decode(), text)
     if len(line) > LINE_MOST:
@@ -55,7 +58,8 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> 
 
 class _Output(Console):
     def on_broken_pipe(self) -> None:
-        """rich would end the program, with a code that means something else here."""
+        """rich would end the program, with a code that means something else
+        here."""
         raise BrokenPipeError
 
 
@@ -66,7 +70,8 @@ def micro(value: float | None) -> str:
 
 class _Shown(Console):
     def on_broken_pipe(self) -> None:
-        """Nobody looks any more; rich would take standard output away too, and end the program."""
+        """Nobody looks any more; rich would take standard output away too, and
+        end the program."""
         self.quiet = True
 
 
@@ -74,7 +79,8 @@ SHOW_CURSOR = "\x1b[?25h"
 
 
 class Bars:
-    """Progress bars, one a unit; plain lines where standard error is no terminal."""
+    """Progress bars, one a unit; plain lines where standard error is no
+    terminal."""
 
     def __init__(self) -> None:
         self._console = _Shown(stderr=True)
@@ -101,7 +107,8 @@ class Bars:
         discard_action(self)
 
     def _show_cursor_at_abort(self, _: float) -> None:
-        """The bars hide it. Anything else of theirs could wait for a lock that the main thread holds."""
+        """The bars hide it. Anything else of theirs could wait for a lock that
+        the main thread holds."""
         if self._console.is_terminal:
             tell(SHOW_CURSOR)
 
@@ -117,7 +124,8 @@ class Bars:
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         what = "check poses" if phase == "verification" else "poses"
         self._show(unit, completed=guide.found, total=guide.wanted, description=f"{what}: {guide.hint}")
-        # Seconds that go by are for a terminal; a log gets a line for each pose, and where to turn next.
+        # Seconds that go by are for a terminal; a log gets a line for each
+        # pose, and where to turn next.
         if not guide.hint.startswith("hold still"):
             hint = f"; {guide.hint}" if guide.hint.startswith("next") else ""
             self._plain(unit, f"{what}: {guide.found} of {guide.wanted}{hint}")

@@ -125,8 +125,9 @@ def _placed(
     given: Labels | None,
     assumed: Assumed,
 ) -> tuple[Source, Standing]:
-    """On a level table a turn and a knock look the same but for their length. Labels, where they count the poses, say
-    how many of the longest were turns."""
+    """On a level table a turn and a knock look the same but for their length.
+    Labels, where they count the poses, say how many of the longest were
+    turns."""
     measured = read_recording(a, name, turn_s=TURN_S)
     source = _source(a, measured, name, calibration, taken)
     try:
@@ -141,7 +142,8 @@ def _placed(
 
 
 def _lengths(measured: Measured) -> list[float]:
-    """How long disturbances lasted that left the readings as they were, the longest first."""
+    """How long disturbances lasted that left the readings as they were, the
+    longest first."""
     if measured.windows is None:
         return []
     found = {span.since_s for span in find_spans(measured.windows, turn_s=0.0)}

@@ -16,8 +16,8 @@ T = TypeVar("T")
 
 
 class Interrupted(Exception):
-    """The work was cancelled by a signal, ``number`` the first; ``notes`` are what it left to say, such as the state
-    of a device."""
+    """The work was cancelled by a signal, ``number`` the first; ``notes`` are
+    what it left to say, such as the state of a device."""
 
     def __init__(self, number: int, notes: tuple[str, ...]) -> None:
         super().__init__("; ".join(("interrupted", *notes)))
@@ -25,7 +25,8 @@ class Interrupted(Exception):
 
 
 def run_interruptible(work: Coroutine[Any, Any, T]) -> T:
-    """Runs ``work`` in an event loop. Raises Interrupted where it was cancelled and did not make a result of that.
+    """Runs ``work`` in an event loop. Raises Interrupted where it was cancelled
+    and did not make a result of that.
 
     What it still has running in threads goes on, and is not waited for.
     """
@@ -54,7 +55,8 @@ async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals) -> T:
 
 
 class _Unawaited(ThreadPoolExecutor):
-    """A computation or a bus driver that has been given up may take long; the loop's end does not wait for it."""
+    """A computation or a bus driver that has been given up may take long; the
+    loop's end does not wait for it."""
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         super().shutdown(wait=False, cancel_futures=cancel_futures)
@@ -62,7 +64,8 @@ class _Unawaited(ThreadPoolExecutor):
 
 @contextmanager
 def _woken(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
-    """Signals wake the loop. Their handlers alone do not, where one strikes as the loop is about to fall asleep."""
+    """Signals wake the loop. Their handlers alone do not, where one strikes as
+    the loop is about to fall asleep."""
     near, far = socket.socketpair()
     with near, far:
         near.setblocking(False)
@@ -77,7 +80,8 @@ def _woken(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
 
 
 def _notes(e: BaseException | None) -> tuple[str, ...]:
-    """Of the exception and of those that it took the place of: a second cancellation replaces the first."""
+    """Of the exception and of those that it took the place of: a second
+    cancellation replaces the first."""
     notes: dict[str, None] = {}
     while e is not None:
         notes |= dict.fromkeys(getattr(e, "__notes__", ()))

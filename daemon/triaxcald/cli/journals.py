@@ -9,6 +9,7 @@ from triaxcald.station.config import Station
 
 
 def warn_of_a_journal(station: Station, unit: str, serial: str | None) -> None:
-    """To standard error, where an earlier provisioning of the unit is not settled."""
+    """To standard error, where an earlier provisioning of the unit is not
+    settled."""
     if journal := open_journal(station.folder, unit, serial):
         say(f"warning: unit {unit}: {text.unfinished(journal, unit, station.path)}")

@@ -24,10 +24,12 @@ from triaxcal.poses.pose import Pose
 
 @dataclass(frozen=True)
 class Lacking:
-    """``had`` are the poses that carry a fit, None where they do not, and ``dilution`` that of the linear fit to them;
-    ``wanted`` the poses to add; ``noise`` the standard error of a typical pose beside the effects, in parts of the
-    reference; ``now`` the effects' standard errors without the poses to add, in that unit; ``absent`` the channels that
-    the recording has not; ``moves`` in words how the channels have to move."""
+    """``had`` are the poses that carry a fit, None where they do not, and
+    ``dilution`` that of the linear fit to them; ``wanted`` the poses to add;
+    ``noise`` the standard error of a typical pose beside the effects, in parts
+    of the reference; ``now`` the effects' standard errors without the poses to
+    add, in that unit; ``absent`` the channels that the recording has not;
+    ``moves`` in words how the channels have to move."""
 
     had: Had | None
     dilution: float | None

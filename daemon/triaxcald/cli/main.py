@@ -1,4 +1,5 @@
-"""The command line ``triaxcal``: which commands there are, and what exit code each failure owes."""
+"""The command line ``triaxcal``: which commands there are, and what exit code
+each failure owes."""
 
 from __future__ import annotations
 
@@ -31,8 +32,9 @@ def entry() -> NoReturn:
 
 
 def _end(code: int) -> NoReturn:
-    """The interpreter's own end gives signals back to the system, which would spoil the exit code, and waits for every
-    thread, one that hangs in a bus driver or reckons what nobody wants any more too."""
+    """The interpreter's own end gives signals back to the system, which would
+    spoil the exit code, and waits for every thread, one that hangs in a bus
+    driver or reckons what nobody wants any more too."""
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     others = [t for t in threading.enumerate() if t is not threading.current_thread() and not t.daemon]
@@ -45,7 +47,8 @@ def _end(code: int) -> NoReturn:
 
 
 def _leave_nothing_unsaid() -> None:
-    """Flushes what was said to standard error; where that has been closed, the interpreter shall not stumble over it.
+    """Flushes what was said to standard error; where that has been closed, the
+    interpreter shall not stumble over it.
 
     It would end with 120, whatever the command had to say by its exit code.
     """

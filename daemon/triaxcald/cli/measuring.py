@@ -100,7 +100,8 @@ def verify_command(a: argparse.Namespace) -> int:
 
 
 def _of_its_recording(model: Calibration, name: str) -> list[str]:
-    """A line each for effects of time, and of the recording, which say little of another recording."""
+    """A line each for effects of time, and of the recording, which say little
+    of another recording."""
     of_time = [e.name for e, _ in model.sensor.effects if {TIME, SINCE_START} & set(e.needs)]
     of_run = [e.name for e, _ in model.sensor.effects if RUN in e.needs and e.name not in of_time]
     out = []
@@ -122,7 +123,8 @@ def _require_trusted(measured: Measured) -> None:
 
 
 def _verified(measured: Measured, model: Calibration, *, where: str) -> Verification:
-    """Under a calibration of another recording. Raises InputError where what ``where`` holds gives no finite errors."""
+    """Under a calibration of another recording. Raises InputError where what
+    ``where`` holds gives no finite errors."""
     with np.errstate(all="ignore"):  # numbers out of a file may be any; what comes of them is judged
         errors, noise = magnitude_errors(
             model.sensor,

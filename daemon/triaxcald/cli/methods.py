@@ -1,4 +1,5 @@
-"""fit by other ways: a turning unit, poses of known attitude, refinement of datasheet values."""
+"""fit by other ways: a turning unit, poses of known attitude, refinement of
+datasheet values."""
 
 from __future__ import annotations
 
@@ -27,11 +28,13 @@ from triaxcald.inputs import Measured, read_document, require_unit
 
 POSES_ENOUGH = 9
 Way = tuple[Measured, Document, Calibration, Callable[[], None]]
-"""What was measured, the document, the calibration, and how it is shown at the console."""
+"""What was measured, the document, the calibration, and how it is shown at the
+console."""
 
 
 def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | None:
-    """The way that the options ask for; None for still poses alone. Raises InputError for options without their way."""
+    """The way that the options ask for; None for still poses alone. Raises
+    InputError for options without their way."""
     if a.attitude_error is not None and not a.attitudes:
         raise InputError("--attitude-error: there are no --attitudes")
     if a.datasheet_error is not None and not a.datasheet:
@@ -45,7 +48,8 @@ def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | N
 
 @contextmanager
 def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator[None]:
-    """A refusal names poses, and which way is up depends on signs that nobody may have given."""
+    """A refusal names poses, and which way is up depends on signs that nobody
+    may have given."""
     try:
         yield
     except Refused as e:

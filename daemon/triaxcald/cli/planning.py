@@ -124,7 +124,8 @@ def _plan_for(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
 
 
 def _enough_for(effects: Sequence[Effect]) -> int:
-    """The smaller of the plain plans that shows the effects; more where they have more coefficients than it poses."""
+    """The smaller of the plain plans that shows the effects; more where they
+    have more coefficients than it poses."""
     names = {e.name for e in effects}
     plain = (n for n in (PAPER, FULL) if not names & set(unseen_effects(_ups(closed(directions(n))), effects)))
     return max(next(plain, FULL), LEAST + ask(effects).rank)
@@ -287,7 +288,8 @@ def _of_all(
 
 
 def _not_shown(found: Lacking, effects: Sequence[Effect]) -> dict[str, str]:
-    """In words, by effect: what of it the poses there cannot show, and whether the poses to add do."""
+    """In words, by effect: what of it the poses there cannot show, and whether
+    the poses to add do."""
     out = {}
     for effect in effects:
         lost = [n for n in effect.needs if n in found.absent]

@@ -103,10 +103,12 @@ def _show(done: Provisioned, place: Place, station: Path) -> None:
 
 
 def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
-    """The registers that a calibration file asks for, and the serial number of the unit that it is meant for.
+    """The registers that a calibration file asks for, and the serial number of
+    the unit that it is meant for.
 
-    The serial is the station's where the file names none. Raises Refused where file, station and device do not go
-    together: another unit, another unit of the reference vector, other signs, effects that the device cannot hold.
+    The serial is the station's where the file names none. Raises Refused where
+    file, station and device do not go together: another unit, another unit of
+    the reference vector, other signs, effects that the device cannot hold.
     """
     document = read_document(path)
     full = calibration_of(document, where=path)
@@ -135,8 +137,9 @@ def _require_little_lost(
     profile: Profile,
     logged: Mapping[str, Floats],
 ) -> None:
-    """Raises Refused where the registers would be off by more than the calibration itself may be, or where nobody knows
-    by how much: ``logged`` are the channels that are known as they were in the poses."""
+    """Raises Refused where the registers would be off by more than the
+    calibration itself may be, or where nobody knows by how much: ``logged`` are
+    the channels that are known as they were in the poses."""
     lost = [effect.name for effect, _ in full.sensor.effects if effect.name not in registers.calibration.terms]
     known = expanded_uncertainty_in(document, where=path)
     passing = {effect.name for effect, _ in full.sensor.effects if is_passing(effect)}

@@ -46,7 +46,8 @@ def cross_validated(r: Residual, small: ErrorUnit) -> str:
 
 
 def temperature_of(c: Calibration) -> str:
-    """Where the values of a model without temperature are known to hold; empty for any other."""
+    """Where the values of a model without temperature are known to hold; empty
+    for any other."""
     of_poses = [p.pose.channels.get(TEMPERATURE, math.nan) for p in c.poses if p.used]
     modelled = any(TEMPERATURE in effect.needs for effect, _ in c.sensor.effects)
     if modelled or not of_poses or not all(map(math.isfinite, of_poses)):
@@ -55,14 +56,16 @@ def temperature_of(c: Calibration) -> str:
 
 
 def held_at(mean: float, lowest: float, highest: float, of: str) -> str:
-    """At which temperature the values hold, the mean over the poses or samples ``of`` the fit."""
+    """At which temperature the values hold, the mean over the poses or samples
+    ``of`` the fit."""
     low, middle, high = (f"{v:.4g}" for v in (lowest, mean, highest))
     spread = "" if low == high else f", the mean of the {of} ({low} to {high} °C)"
     return f"scale factor, misalignment and bias are those at {TEMPERATURE} = {middle} °C{spread}"
 
 
 def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = None) -> None:
-    """``whole`` is their uncertainty with all that the budget has, where there is one."""
+    """``whole`` is their uncertainty with all that the budget has, where there
+    is one."""
     rows = []
     unit = choice.reference_unit
     of_scale = f"{choice.output_unit or 'output'}/{grouped(unit)}"

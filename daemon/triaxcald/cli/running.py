@@ -54,5 +54,6 @@ def run(check: Callable[[], None], work: Callable[[], int]) -> int:
 
 
 def _drop_output() -> None:
-    """What is still in the buffer, so that the interpreter does not stumble over it at its end."""
+    """What is still in the buffer, so that the interpreter does not stumble
+    over it at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,5 @@
-"""Several recordings for one command: whether they go together, and what came of each at the console."""
+"""Several recordings for one command: whether they go together, and what came
+of each at the console."""
 
 from __future__ import annotations
 
@@ -32,8 +33,8 @@ COLUMNS = {
 
 
 def measured_each(a: argparse.Namespace) -> list[Measured]:
-    """The recordings that the arguments name. Raises InputError where one is named twice, Refused for one without a
-    pose among several."""
+    """The recordings that the arguments name. Raises InputError where one is
+    named twice, Refused for one without a pose among several."""
     names: list[str] = a.recording
     places = [_place(name) for name in names]
     twice = next((n for i, n in enumerate(names) if places[i] in places[:i]), None)
@@ -50,7 +51,8 @@ def measured_each(a: argparse.Namespace) -> list[Measured]:
 
 
 def measured_check(measured: Measured, a: argparse.Namespace) -> Measured | None:
-    """The recording of the held-out poses, where the arguments name one. Raises InputError where it is not alike."""
+    """The recording of the held-out poses, where the arguments name one. Raises
+    InputError where it is not alike."""
     if not a.check:
         return None
     check = read_recording(a, a.check)
@@ -59,12 +61,14 @@ def measured_check(measured: Measured, a: argparse.Namespace) -> Measured | None
 
 
 def _place(name: str) -> Path | None:
-    """Where a recording lies, however its path is written; None for standard input."""
+    """Where a recording lies, however its path is written; None for standard
+    input."""
     return None if name == "-" else Path(name).resolve()
 
 
 def as_one_unit(recordings: Sequence[Measured], a: argparse.Namespace) -> Measured:
-    """All poses together, the rest as in the first. Raises InputError where they are not alike."""
+    """All poses together, the rest as in the first. Raises InputError where
+    they are not alike."""
     first = recordings[0]
     if len(recordings) == 1:
         return first
@@ -95,7 +99,8 @@ def _require_alike(first: Measured, other: Measured, a: argparse.Namespace, *, h
 
 
 def channels_of_some(recordings: Sequence[Measured]) -> list[str]:
-    """A line for each channel that not all of several recordings have: no effect of it can be put to all poses."""
+    """A line for each channel that not all of several recordings have: no
+    effect of it can be put to all poses."""
     logged = {m.name: set.intersection(*(set(p.channels) for p in m.poses)) for m in recordings if m.poses}
     out = []
     for channel in sorted(set().union(*logged.values())):
@@ -107,7 +112,8 @@ def channels_of_some(recordings: Sequence[Measured]) -> list[str]:
 
 
 def doubts_of_one_unit(recordings: Sequence[Measured], loop: Loop, choice: Choice) -> list[str]:
-    """Lines where several recordings can hardly be of one unit; ``loop`` is that of all of them."""
+    """Lines where several recordings can hardly be of one unit; ``loop`` is
+    that of all of them."""
     if len(recordings) == 1:
         return []
     names = " and ".join(m.name for m in recordings)
@@ -119,7 +125,8 @@ def doubts_of_one_unit(recordings: Sequence[Measured], loop: Loop, choice: Choic
 
 
 def doubts_of_check(measured: Measured, check: Measured, loop: Loop, choice: Choice) -> list[str]:
-    """A line where the held-out poses can hardly be of the unit of those diagnosed in ``loop``."""
+    """A line where the held-out poses can hardly be of the unit of those
+    diagnosed in ``loop``."""
     assert loop.held_out is not None
     if said := unlike(check.name, loop.held_out.before_rms_g, choice.reference):
         return said

@@ -24,7 +24,8 @@ from triaxcald.tables.samples import Reading
 
 @dataclass(frozen=True)
 class Choice:
-    """How a recording is to be read: the user's word, else the recording's own, else the default."""
+    """How a recording is to be read: the user's word, else the recording's own,
+    else the default."""
 
     signs: tuple[int, int, int]
     reference: float
@@ -44,8 +45,9 @@ def read_recording(
     of: Calibration | None = None,
     turn_s: float | None = None,
 ) -> Measured:
-    """The still poses of the recording ``name``, read as the arguments say; how a table was read is told. ``of`` is the
-    calibration that is to be applied to them; ``turn_s`` as for `measure`. Raises InputError where that is of other
+    """The still poses of the recording ``name``, read as the arguments say; how
+    a table was read is told. ``of`` is the calibration that is to be applied to
+    them; ``turn_s`` as for `measure`. Raises InputError where that is of other
     units."""
     found = measure(name, moments=moments, reading=reading_of(a, name, of), turn_s=turn_s)
     if of is not None:
@@ -58,8 +60,8 @@ def read_recording(
 
 
 def reading_of(a: argparse.Namespace, name: str, of: Calibration | None = None) -> Reading:
-    """How a table is to be read, where ``of`` is the calibration that needs its channels. Raises InputError where the
-    recording is none."""
+    """How a table is to be read, where ``of`` is the calibration that needs its
+    channels. Raises InputError where the recording is none."""
     said = Reading(a.columns or {}, a.time_unit, a.rate, a.skip_bad, dict(a.where or ()), a.pose_means)
     if name.endswith(".mcap") and said != Reading():
         raise InputError(f"{name}: --columns, --time-unit, --rate, --skip-bad, --where and --pose-means are for tables")
@@ -67,7 +69,8 @@ def reading_of(a: argparse.Namespace, name: str, of: Calibration | None = None) 
 
 
 def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
-    """Raises InputError where what was said of the reference does not go together."""
+    """Raises InputError where what was said of the reference does not go
+    together."""
     latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
     if (latitude is None) != (height is None):
         raise InputError("--latitude, --height: give both, or neither")
@@ -87,7 +90,8 @@ def chosen(a: argparse.Namespace, measured: Measured) -> Choice:
 
 
 def _stated(a: argparse.Namespace, measured: Measured) -> Stated:
-    """What the recording's station says holds where the user says nothing, but for another reference."""
+    """What the recording's station says holds where the user says nothing, but
+    for another reference."""
     latitude, height = getattr(a, "latitude", None), getattr(a, "height", None)
     own = measured.stated or Stated()
     thermometer = getattr(a, "thermometer_uncertainty", None)
@@ -111,7 +115,8 @@ def counted(poses: int, left_out: int, what: str = "poses") -> str:
 
 
 def show_poses(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], poses: Sequence[Pose]) -> None:
-    """A table with a row for each pose, and, where some are at fault, with a column that says which and why."""
+    """A table with a row for each pose, and, where some are at fault, with a
+    column that says which and why."""
     if any(p.fault for p in poses):
         columns = [*columns, "left out"]
         rows = [[*row, p.fault] for row, p in zip(rows, poses, strict=True)]

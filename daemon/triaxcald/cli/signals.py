@@ -1,8 +1,10 @@
 """SIGINT, SIGTERM and SIGHUP from the first line of the program to its last.
 
-Work that runs in an event loop is cancelled by the first signal, which has it put things in order, and again by the
-second; the third ends the process at once. Before and without such work the first one does, as there is nothing to put
-in order. No signal raises an exception: at a random place that would come out as a trace back, or not at all.
+Work that runs in an event loop is cancelled by the first signal, which has it
+put things in order, and again by the second; the third ends the process at
+once. Before and without such work the first one does, as there is nothing to
+put in order. No signal raises an exception: at a random place that would come
+out as a trace back, or not at all.
 """
 
 from __future__ import annotations
@@ -23,13 +25,14 @@ class StopSignals:
         self._cancel: Callable[[], bool] | None = None
 
     def heed(self) -> dict[int, Any]:
-        """From now on; gives the handlers that were there. SIGTERM and SIGHUP stay ignored where they are (`nohup`)."""
+        """From now on; gives the handlers that were there. SIGTERM and SIGHUP
+        stay ignored where they are (`nohup`)."""
         heeded = [n for n in STOP_SIGNALS if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
         return {number: signal.signal(number, self._strike) for number in heeded}
 
     def cancel_by(self, cancel: Callable[[], bool]) -> None:
-        """From now on the first signal calls ``cancel``, which says if there still is work, and the second again; also
-        once the work has ended."""
+        """From now on the first signal calls ``cancel``, which says if there
+        still is work, and the second again; also once the work has ended."""
         self._cancel = cancel
 
     def _strike(self, number: int, _: object) -> None:
@@ -55,7 +58,8 @@ def heed_stop_signals() -> None:
 
 @contextmanager
 def stop_signals() -> Iterator[StopSignals]:
-    """The process's own; where another program runs the work, such as a test, some for as long as it takes."""
+    """The process's own; where another program runs the work, such as a test,
+    some for as long as it takes."""
     if _process is not None:
         yield _process
         return

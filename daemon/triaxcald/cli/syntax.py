@@ -1,4 +1,5 @@
-"""All commands with their arguments and help. Imports nothing that works: a command's own module is imported to run it.
+"""All commands with their arguments and help. Imports nothing that works: a
+command's own module is imported to run it.
 
 ``run`` of what is parsed names module and function ("fitting:fit_command").
 """
@@ -42,7 +43,8 @@ def register(commands: Any) -> None:
 
 
 def _command(commands: Any, name: str, run: str, help_line: str, more: str = "", example: str = "") -> Any:
-    """``more`` follows the line in the command's own help, and the ``example`` stands below the options."""
+    """``more`` follows the line in the command's own help, and the ``example``
+    stands below the options."""
     p = commands.add_parser(
         name,
         help=help_line,

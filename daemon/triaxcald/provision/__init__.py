@@ -1,1 +1,2 @@
-"""Provisioning: a calibration into a device's registers, verified, or the old one put back."""
+"""Provisioning: a calibration into a device's registers, verified, or the old
+one put back."""

@@ -1,4 +1,5 @@
-"""Register access with patience: requests that may be repeated are, a busy device is waited for, all is recorded."""
+"""Register access with patience: requests that may be repeated are, a busy
+device is waited for, all is recorded."""
 
 from __future__ import annotations
 
@@ -19,17 +20,20 @@ Kind = Literal["read", "write"]
 RETRIES = 2
 """A lost request in a hundred then fails one request in a million."""
 BUSY_S = 6.0
-"""So long a busy device is waited for: longer than any EEPROM takes, and short enough that a provisioning and its
-undoing, with a reconnection each, end within 30 s."""
+"""So long a busy device is waited for: longer than any EEPROM takes, and short
+enough that a provisioning and its undoing, with a reconnection each, end within
+30 s."""
 BUSY_PAUSE_S = 0.02
 NO_CONTACT = (BusError, DeviceAbsent, DeviceSilent)
-"""Nothing came back; unlike a refusal, that says nothing about what the device did."""
+"""Nothing came back; unlike a refusal, that says nothing about what the device
+did."""
 
 
 @dataclass(frozen=True)
 class RegisterAccess:
-    """``raw`` as on the wire, written or read (empty where a read failed); ``error`` the driver's message.
-    ``unanswered``: nothing came back, not even a refusal."""
+    """``raw`` as on the wire, written or read (empty where a read failed);
+    ``error`` the driver's message. ``unanswered``: nothing came back, not even
+    a refusal."""
 
     kind: Kind
     register: str
@@ -41,10 +45,12 @@ class RegisterAccess:
 class RegisterLink:
     """A Device whose register requests are repeated where that is safe.
 
-    Reads, and writes of calibration registers and keys, are repeated up to `RETRIES` times where no answer came,
-    over a new connection where the old one was lost, and for `BUSY_S` where the device is busy. What a store or
-    reset sequence writes is sent once. Once a kind of request has failed for good, no more patience is spent on
-    that kind until one succeeds, or until `refresh`. ``record`` is told of every request that has ended.
+    Reads, and writes of calibration registers and keys, are repeated up to
+    `RETRIES` times where no answer came, over a new connection where the old
+    one was lost, and for `BUSY_S` where the device is busy. What a store or
+    reset sequence writes is sent once. Once a kind of request has failed for
+    good, no more patience is spent on that kind until one succeeds, or until
+    `refresh`. ``record`` is told of every request that has ended.
     """
 
     def __init__(
@@ -78,7 +84,8 @@ class RegisterLink:
         self._tired.clear()
 
     def go_on_unrecorded(self) -> None:
-        """From now on no failure to record a request stops the work: putting a device in order weighs more."""
+        """From now on no failure to record a request stops the work: putting a
+        device in order weighs more."""
         record = self._record
 
         def lenient(access: RegisterAccess) -> None:

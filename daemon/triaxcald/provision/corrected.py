@@ -1,4 +1,5 @@
-"""Does a device's corrected output follow its own registers? Values alone, no I/O."""
+"""Does a device's corrected output follow its own registers? Values alone, no
+I/O."""
 
 from __future__ import annotations
 
@@ -16,14 +17,16 @@ from triaxcald.provision.plausible import Doubt
 from triaxcald.provision.snapshot import Snapshot
 
 TOLERANCE_G = 0.01
-"""Wrong word order, axes, signs or conventions make errors of the size of the bias at least; rounding, and an order of
-correction other than ours, make ones of the size of a product of two small coefficients."""
+"""Wrong word order, axes, signs or conventions make errors of the size of the
+bias at least; rounding, and an order of correction other than ours, make ones
+of the size of a product of two small coefficients."""
 LEAST = 3
 """So few samples or poses say nothing."""
 
 
 def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[Sensor, float] | None:
-    """The sensor that the registers describe, and its reference temperature in °C; None where they describe none."""
+    """The sensor that the registers describe, and its reference temperature in
+    °C; None where they describe none."""
     held = {r.role: profile.decode(n, snapshot.raw[n]) for n, r in profile.registers.items() if n in snapshot.raw}
     linear = [[held.get(f"{name}.{axis}") for axis in "xyz"] for name in ("scale_factor", "misalignment", "bias")]
     if any(value is None or not np.isfinite(value) for values in linear for value in values):
@@ -43,8 +46,9 @@ def sensor_in(profile: Profile, snapshot: Snapshot) -> tuple[Sensor, float] | No
 def departure_g(
     profile: Profile, snapshot: Snapshot, readings: Floats, corrected: Floats, channels: Mapping[str, Floats]
 ) -> float | None:
-    """Median distance in g of the ``corrected`` output (n,3) from what the registers make of the ``readings`` (n,3) of
-    the same moments; ``channels`` (n,) each. None where that cannot be told."""
+    """Median distance in g of the ``corrected`` output (n,3) from what the
+    registers make of the ``readings`` (n,3) of the same moments; ``channels``
+    (n,) each. None where that cannot be told."""
     if len(readings) < LEAST or (described := sensor_in(profile, snapshot)) is None:
         return None
     sensor, reference_c = described

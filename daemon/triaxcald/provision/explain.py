@@ -13,7 +13,8 @@ from triaxcald.provision.snapshot import Snapshot
 
 @dataclass(frozen=True)
 class Row:
-    """One register. ``raw_hex`` as on the wire; ``crc_ok`` is None for registers other than the checksum."""
+    """One register. ``raw_hex`` as on the wire; ``crc_ok`` is None for
+    registers other than the checksum."""
 
     register: str
     role: str
@@ -26,7 +27,8 @@ class Row:
 
 
 def explain(bundle: Bundle, snapshot: Snapshot) -> list[Row]:
-    """A row for each register of the snapshot. Raises RegisterValueError on bytes of a wrong length."""
+    """A row for each register of the snapshot. Raises RegisterValueError on
+    bytes of a wrong length."""
     return [_row(bundle.profile, snapshot, name) for name in snapshot.raw]
 
 

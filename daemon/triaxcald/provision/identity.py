@@ -16,9 +16,11 @@ class WrongUnit(ProvisionError):
 
 @dataclass(frozen=True)
 class IdentityRead:
-    """``serial``: the serial register as text of at least four digits, None where the profile has none.
+    """``serial``: the serial register as text of at least four digits, None
+    where the profile has none.
 
-    ``values``: the raw numbers of the registers that the profile's identity expects, by name.
+    ``values``: the raw numbers of the registers that the profile's identity
+    expects, by name.
     """
 
     serial: str | None
@@ -28,7 +30,8 @@ class IdentityRead:
 async def check_identity(
     device: Device, bundle: Bundle, expected_serial: str | None, *, where: str | None = None
 ) -> IdentityRead:
-    """Read who answers and compare. ``where`` names the place in messages; by default the profile.
+    """Read who answers and compare. ``where`` names the place in messages; by
+    default the profile.
 
     Raises WrongUnit; RegisterRefused, DeviceSilent of the driver.
     """
@@ -48,7 +51,8 @@ async def check_identity(
 
 
 async def read_serial(device: Device, bundle: Bundle) -> str | None:
-    """The serial number as `IdentityRead` has it. Raises RegisterRefused, DeviceSilent."""
+    """The serial number as `IdentityRead` has it. Raises RegisterRefused,
+    DeviceSilent."""
     name = bundle.profile.identity.serial_register
     return f"{await _read_raw_number(device, bundle, name):04d}" if name else None
 

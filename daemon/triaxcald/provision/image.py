@@ -1,4 +1,5 @@
-"""What is to be written: a calibration's coefficients as raw register words. No I/O."""
+"""What is to be written: a calibration's coefficients as raw register words. No
+I/O."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ NOT_CALIBRATION = ("serial_number", "write_counter")
 
 @dataclass(frozen=True)
 class Word:
-    """One register of an image. ``value`` is wanted and ``held`` is what ``raw`` (bytes as on the wire) says,
-    both in the register's ``unit``."""
+    """One register of an image. ``value`` is wanted and ``held`` is what
+    ``raw`` (bytes as on the wire) says, both in the register's ``unit``."""
 
     register: str
     role: str
@@ -36,8 +37,8 @@ class Word:
 
 @dataclass(frozen=True)
 class RegisterImage:
-    """The words in the profile's order, the checksum last; ``not_held`` are roles with no register to take
-    them."""
+    """The words in the profile's order, the checksum last; ``not_held`` are
+    roles with no register to take them."""
 
     words: tuple[Word, ...]
     not_held: tuple[str, ...]
@@ -48,7 +49,8 @@ class RegisterImage:
 
 
 def calibration_registers(profile: Profile) -> tuple[str, ...]:
-    """Writable registers with a role in a calibration, in the profile's order, the checksum last."""
+    """Writable registers with a role in a calibration, in the profile's order,
+    the checksum last."""
     names = [
         name for name, r in profile.registers.items() if r.access == "rw" and r.role and r.role not in NOT_CALIBRATION
     ]
@@ -57,12 +59,13 @@ def calibration_registers(profile: Profile) -> tuple[str, ...]:
 
 
 def build_image(profile: Profile, coefficients: Mapping[str, float], *, date_days: int) -> RegisterImage:
-    """``coefficients`` by role, each in its register's unit, with ``reference_temperature`` among them;
-    ``date_days`` since 1970-01-01.
+    """``coefficients`` by role, each in its register's unit, with
+    ``reference_temperature`` among them; ``date_days`` since 1970-01-01.
 
-    A register whose role has no coefficient gets 0: the calibration does not have that effect. Raises
-    RegisterValueError for a value that does not fit, InputError where a scale factor (or the reference
-    temperature of temperature effects) is missing, ProfileError where the checksum covers other registers.
+    A register whose role has no coefficient gets 0: the calibration does not
+    have that effect. Raises RegisterValueError for a value that does not fit,
+    InputError where a scale factor (or the reference temperature of temperature
+    effects) is missing, ProfileError where the checksum covers other registers.
     """
     names = calibration_registers(profile)
     wanted = {**coefficients, DATE_ROLE: float(date_days)}
@@ -77,7 +80,8 @@ def build_image(profile: Profile, coefficients: Mapping[str, float], *, date_day
 
 
 def image_of(profile: Profile, raw: Mapping[str, bytes]) -> RegisterImage:
-    """The image whose raw bytes are known. Raises ProfileError for a register that the profile has not."""
+    """The image whose raw bytes are known. Raises ProfileError for a register
+    that the profile has not."""
     words = []
     for name, data in raw.items():
         if name not in profile.registers:
@@ -104,7 +108,8 @@ def _word(profile: Profile, name: str, value: float) -> Word:
 
 
 def checksum_of(profile: Profile, raw: Mapping[str, bytes]) -> int:
-    """The profile's checksum over registers' raw bytes (as on the wire), by name.
+    """The profile's checksum over registers' raw bytes (as on the wire), by
+    name.
 
     Raises ProfileError where it covers a register that is not given.
     """

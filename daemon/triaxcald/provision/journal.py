@@ -1,4 +1,5 @@
-"""What a provisioning sets out to do, on disk before the first register is written, until the device is settled."""
+"""What a provisioning sets out to do, on disk before the first register is
+written, until the device is settled."""
 
 from __future__ import annotations
 
@@ -13,12 +14,14 @@ from triaxcald.files import synchronise, write_durably
 
 FORMAT, FOLDER = "triaxcal.journal/1", "journal"
 Step = Literal["writing", "storing", "stored", "unverified"]
-"""``unverified``: it came to its end, on a device that no restart has shown to hold it."""
+"""``unverified``: it came to its end, on a device that no restart has shown to
+hold it."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """``before`` and ``wanted`` are raw register bytes as on the wire, in the order in which they are written."""
+    """``before`` and ``wanted`` are raw register bytes as on the wire, in the
+    order in which they are written."""
 
     unit: str
     serial: str | None
@@ -37,11 +40,13 @@ class Journal:
 
     @staticmethod
     def of(folder: Path, unit: str, serial: str | None) -> Journal:
-        """By serial number; by the unit's name in the station file where the device has none."""
+        """By serial number; by the unit's name in the station file where the
+        device has none."""
         return Journal(folder / FOLDER / f"{serial or f'unit-{unit}'}.json")
 
     def read(self) -> Entry | None:
-        """None where nothing was cut short. Raises InputError on a file that is no journal."""
+        """None where nothing was cut short. Raises InputError on a file that is
+        no journal."""
         try:
             text = self.path.read_bytes()
         except FileNotFoundError:
@@ -114,5 +119,6 @@ def parse(text: bytes, *, where: str) -> Entry:
 
 
 def registers_of(held: Mapping[str, str]) -> dict[str, bytes]:
-    """Raw bytes by register from a document. Raises ValueError, TypeError, AttributeError."""
+    """Raw bytes by register from a document. Raises ValueError, TypeError,
+    AttributeError."""
     return {str(name): bytes.fromhex(raw) for name, raw in held.items()}

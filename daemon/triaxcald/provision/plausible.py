@@ -1,7 +1,7 @@
 """Is what the device holds a calibration at all? Values alone, no I/O.
 
-Registers read with the wrong word order, scaling or address hold absurd numbers, and what is written the same way
-leaves absurd numbers behind.
+Registers read with the wrong word order, scaling or address hold absurd
+numbers, and what is written the same way leaves absurd numbers behind.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from triaxcald.provision.snapshot import Snapshot
 Kind = Literal["not_a_number", "outside_limits", "implausible", "unstable", "checksum", "corrected_output"]
 
 SCALE_FACTOR_RATIO = 4.0
-"""A scale factor this many times off its nominal value is no scale factor of this device: data sheets allow 0.1."""
+"""A scale factor this many times off its nominal value is no scale factor of
+this device: data sheets allow 0.1."""
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "misalignment": (-0.5, 0.5),  # rad: half a right angle's worth; housings are square to a hundredth of that
     "bias": (-20.0, 20.0),  # g: the full scale of the triads in question
@@ -27,12 +28,14 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     DATE_ROLE: (0.0, 100_000.0),  # days: until the year 2243
 }
 EFFECT_BOUND = 10.0
-"""g per g², per K and so on: an effect as large as this would leave nothing of the measurement."""
+"""g per g², per K and so on: an effect as large as this would leave nothing of
+the measurement."""
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Why a snapshot is hardly a calibration. ``low`` and ``high`` bound what was expected of ``value``."""
+    """Why a snapshot is hardly a calibration. ``low`` and ``high`` bound what
+    was expected of ``value``."""
 
     kind: Kind
     register: str
@@ -83,7 +86,8 @@ def _of(profile: Profile, name: str, raw: bytes, wanted: Mapping[str, float]) ->
 
 
 def fits_its_checksum(profile: Profile, snapshot: Snapshot) -> bool:
-    """Whether the device has a checksum, and holds the one that belongs to its registers."""
+    """Whether the device has a checksum, and holds the one that belongs to its
+    registers."""
     return profile.crc is not None and not _checksum(profile, snapshot)
 
 

@@ -10,9 +10,11 @@ from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.sequence import probe, reconnect
 
 LOOK_S = 0.2
-"""So often the device is asked; a supply is off for longer when a person switches it."""
+"""So often the device is asked; a supply is off for longer when a person
+switches it."""
 MISSED = 3
-"""So many requests in a row go unanswered by chance once in a million times where a link loses one in a hundred."""
+"""So many requests in a row go unanswered by chance once in a million times
+where a link loses one in a hundred."""
 
 
 def least_off_s(profile: Profile) -> float:
@@ -21,7 +23,8 @@ def least_off_s(profile: Profile) -> float:
 
 
 async def power_cycled(link: RegisterLink, profile: Profile, patience_s: float) -> bool:
-    """Waits until the device, which answered, has gone silent and answers again; whether it has within ``patience_s``.
+    """Waits until the device, which answered, has gone silent and answers
+    again; whether it has within ``patience_s``.
 
     One that is busy, or refuses, has its supply.
     """

@@ -1,4 +1,5 @@
-"""Writes a calibration to a device so that it ends with the new one or with the old one, and says with which."""
+"""Writes a calibration to a device so that it ends with the new one or with the
+old one, and says with which."""
 
 from __future__ import annotations
 
@@ -29,13 +30,16 @@ T = TypeVar("T")
 
 @dataclass
 class Provisioning:
-    """One device on its way to a new calibration: `examine`, then `write`, and `undo` where it must not stay.
+    """One device on its way to a new calibration: `examine`, then `write`, and
+    `undo` where it must not stay.
 
-    ``folder`` is the station's, where the journal lies; ``started`` a time in words for it. ``held`` says at any
-    moment what the device holds, whatever has been raised. ``found`` is what the device held at first; ``before`` is
-    what an undoing brings back: the same, or, where an earlier provisioning was cut short, what the device held
-    before that one. ``after`` was read last. ``differing`` are the registers in which the device differed from the
-    image, ``written`` those that were written, ``steps`` what was done, in order.
+    ``folder`` is the station's, where the journal lies; ``started`` a time in
+    words for it. ``held`` says at any moment what the device holds, whatever
+    has been raised. ``found`` is what the device held at first; ``before`` is
+    what an undoing brings back: the same, or, where an earlier provisioning was
+    cut short, what the device held before that one. ``after`` was read last.
+    ``differing`` are the registers in which the device differed from the image,
+    ``written`` those that were written, ``steps`` what was done, in order.
     """
 
     link: RegisterLink
@@ -47,7 +51,8 @@ class Provisioning:
     where: str
     started: str = ""
     power_cycle: Callable[[], Awaitable[bool]] | None = None
-    """Has the supply switched off and on, where nothing else shows what is stored; whether that was seen."""
+    """Has the supply switched off and on, where nothing else shows what is
+    stored; whether that was seen."""
     held: Held = field(default_factory=Held)
     doubts: list[Doubt] = field(default_factory=list)
     differing: tuple[str, ...] = ()
@@ -58,7 +63,8 @@ class Provisioning:
     """Whether an earlier provisioning was cut short."""
     undoing_failed: str | None = None
     _store_owed: bool = False
-    """What is in use is the image, and the provisioning that was cut short may not have stored it."""
+    """What is in use is the image, and the provisioning that was cut short may
+    not have stored it."""
     _restarted: bool = False
     _journal_lies: bool = False
     _journaled: bool = False
@@ -89,7 +95,8 @@ class Provisioning:
 
     @property
     def stores(self) -> bool:
-        """Whether what is written takes a store to last; else every write lasts."""
+        """Whether what is written takes a store to last; else every write
+        lasts."""
         return bool(self.bundle.profile.sequences.store)
 
     @property
@@ -100,8 +107,10 @@ class Provisioning:
     async def examine(self, *, restart: bool = True) -> None:
         """Who is there, and what it holds. Nothing is written.
 
-        A device that holds the image already, or that has a journal, is restarted, where ``restart`` allows: what is in
-        use may not be what is stored. Raises WrongUnit, InputError (the journal), DriverError, SequenceStalled.
+        A device that holds the image already, or that has a journal, is
+        restarted, where ``restart`` allows: what is in use may not be what is
+        stored. Raises WrongUnit, InputError (the journal), DriverError,
+        SequenceStalled.
         """
         await self.identify()
         entry = self.journal.read()
@@ -137,8 +146,9 @@ class Provisioning:
     async def write(self) -> None:
         """Write what differs, store it, restart the device, and read it back.
 
-        Raises ProvisionError that says what failed at which step, WrongUnit, DiskError. A cancellation, like any other
-        exception, goes on only once the old calibration is back. ``held`` then says whether it is.
+        Raises ProvisionError that says what failed at which step, WrongUnit,
+        DiskError. A cancellation, like any other exception, goes on only once
+        the old calibration is back. ``held`` then says whether it is.
         """
         try:
             if self.differing or self._store_owed:
@@ -161,10 +171,12 @@ class Provisioning:
             raise
 
     async def put_back(self, snapshot: Snapshot) -> None:
-        """Instead of `examine` and `write`: the registers of ``snapshot``, whose image this is, back into the device.
+        """Instead of `examine` and `write`: the registers of ``snapshot``,
+        whose image this is, back into the device.
 
-        An earlier journal stays as it is, so that a cut leaves no more to choose from than there was. Raises
-        ProvisionError that says why they are not back, WrongUnit, DriverError, DiskError.
+        An earlier journal stays as it is, so that a cut leaves no more to
+        choose from than there was. Raises ProvisionError that says why they are
+        not back, WrongUnit, DriverError, DiskError.
         """
         self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         await self.identify()
@@ -185,11 +197,13 @@ class Provisioning:
             raise ProvisionError(self.undoing_failed or "the old calibration is not back")
 
     async def undo(self) -> None:
-        """The old calibration back in the device, by whatever it takes; ``held`` says whether it is."""
+        """The old calibration back in the device, by whatever it takes;
+        ``held`` says whether it is."""
         await to_its_end(self._undo())
 
     async def prove_old(self) -> None:
-        """After an undoing that no restart has proven, by a power cycle, where one can be asked for."""
+        """After an undoing that no restart has proven, by a power cycle, where
+        one can be asked for."""
         if self.power_cycle is None or self.held.settled:
             return
         self.steps.append("power cycle")
@@ -206,8 +220,8 @@ class Provisioning:
 
     @contextmanager
     def finishing(self) -> Iterator[None]:
-        """At its end the journal goes, where nothing is left to be cleared up. Raises DiskError, unless something else
-        has been raised."""
+        """At its end the journal goes, where nothing is left to be cleared up.
+        Raises DiskError, unless something else has been raised."""
         try:
             yield
         except BaseException:
@@ -301,7 +315,8 @@ class Provisioning:
                 await self._decide(Evidence.RESTART)
 
     async def _decide(self, evidence: Evidence) -> None:
-        """What the device holds, by reading it. Raises ProvisionError where that is not the image."""
+        """What the device holds, by reading it. Raises ProvisionError where
+        that is not the image."""
         try:
             self.after = await self._look()
         except NO_CONTACT:
@@ -312,7 +327,8 @@ class Provisioning:
                 self.held.now(DeviceState.NEW_VERIFIED, evidence)
             return
         if not self.after.differing(self.before.raw):
-            # Read from what is stored: what was in use before the restart was the image.
+            # Read from what is stored: what was in use before the restart was
+            # the image.
             self.held.now(DeviceState.OLD, Evidence.RESTART if evidence is Evidence.READ_BACK else evidence)
             raise ProvisionError("after the restart the registers hold the old calibration: nothing was stored")
         self._decided = False
@@ -348,7 +364,8 @@ class Provisioning:
                 await self._judge(lasting)
 
     async def _judge(self, lasting: bool) -> None:
-        """What an undoing that failed has left. Raises DriverError, StationError."""
+        """What an undoing that failed has left. Raises DriverError,
+        StationError."""
         await self._require_same_unit()
         restarted = self.resets and await run_sequence(self.link, self.bundle, "reset")
         held = self.after = await self._look()
@@ -395,7 +412,8 @@ class Provisioning:
         return None if name is None else await self.link.read(name)
 
     def _by_counter(self, before: bytes | None, after: bytes | None) -> None:
-        """What came of a store that went unanswered, where the device counts its stores."""
+        """What came of a store that went unanswered, where the device counts
+        its stores."""
         if before is not None and before != after:
             self.stored = True
             self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.WRITE_COUNTER)
@@ -426,7 +444,8 @@ class Provisioning:
 async def to_its_end(work: Coroutine[object, object, T]) -> T:
     """The result of ``work``, which no cancellation stops half-way or hides.
 
-    A caller that has more to do afterwards looks whether it was cancelled meanwhile (`asyncio.Task.cancelling`).
+    A caller that has more to do afterwards looks whether it was cancelled
+    meanwhile (`asyncio.Task.cancelling`).
     """
     task = asyncio.ensure_future(work)
     while not task.done():

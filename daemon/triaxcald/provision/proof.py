@@ -18,10 +18,12 @@ async def show_restart(
     old: Mapping[str, bytes],
     differing: Sequence[str],
 ) -> bool:
-    """Restart once more with an old value in one register in use: only a restart brings the stored one back.
+    """Restart once more with an old value in one register in use: only a
+    restart brings the stored one back.
 
-    For devices whose writes do not last without a store. The value is put back where the restart did not. Raises
-    ProvisionError where that fails; DriverError, SequenceStalled where the device does not come back.
+    For devices whose writes do not last without a store. The value is put back
+    where the restart did not. Raises ProvisionError where that fails;
+    DriverError, SequenceStalled where the device does not come back.
     """
     checksum = bundle.profile.crc.register_name if bundle.profile.crc else None
     name = next((n for n in differing if n != checksum), None)

@@ -1,4 +1,5 @@
-"""Puts an old calibration back and shows that it is back, whatever state the device is in."""
+"""Puts an old calibration back and shows that it is back, whatever state the
+device is in."""
 
 from __future__ import annotations
 
@@ -15,12 +16,15 @@ from triaxcald.provision.state import Evidence
 
 
 async def restore(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, *, stored: bool = True) -> Evidence:
-    """Make the device hold ``snapshot``, also permanently where ``stored`` says that it may have been overwritten.
+    """Make the device hold ``snapshot``, also permanently where ``stored`` says
+    that it may have been overwritten.
 
-    First a restart, since that brings back whatever is stored without writing; then, only where it is not the
-    snapshot, the registers that differ. Returns once every register reads back as the snapshot's raw bytes, and what
-    shows it: with ``stored`` a restart, where the device has one. Raises ProvisionError that says why not; WrongUnit,
-    with nothing written, where another unit answers.
+    First a restart, since that brings back whatever is stored without writing;
+    then, only where it is not the snapshot, the registers that differ. Returns
+    once every register reads back as the snapshot's raw bytes, and what shows
+    it: with ``stored`` a restart, where the device has one. Raises
+    ProvisionError that says why not; WrongUnit, with nothing written, where
+    another unit answers.
     """
     try:
         await _contact(link, bundle, snapshot)
@@ -37,20 +41,23 @@ async def restore(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, *, sto
 
 
 async def let_a_store_end(link: RegisterLink, bundle: Bundle) -> None:
-    """A restart in the middle of a store could spoil the stored copy. What came of it shows after the restart."""
+    """A restart in the middle of a store could spoil the stored copy. What came
+    of it shows after the restart."""
     waits = [step for step in bundle.profile.sequences.store if isinstance(step, (WaitStep, PollStep))]
     with suppress(DriverError, StationError):
         await run_steps(link, bundle, "store", waits)
 
 
 async def differing(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> tuple[str, ...]:
-    """The registers in which the snapshot's own unit differs from it. Raises WrongUnit, DriverError."""
+    """The registers in which the snapshot's own unit differs from it. Raises
+    WrongUnit, DriverError."""
     await check_identity(link, bundle, snapshot.serial)
     return snapshot.differing((await take_snapshot(link, bundle, snapshot.raw)).raw)
 
 
 async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> None:
-    """A device that had its power cut is back after a moment, on a new connection."""
+    """A device that had its power cut is back after a moment, on a new
+    connection."""
     try:
         await check_identity(link, bundle, snapshot.serial)
     except NO_CONTACT:

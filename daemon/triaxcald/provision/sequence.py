@@ -14,7 +14,8 @@ from triaxcald.provision.access import NO_CONTACT, RegisterLink
 Label = Literal["unlock", "store", "lock", "reset"]
 POLL_S, RETRY_S = 0.02, 0.1
 RECONNECT_S = 5.0
-"""A device that lost its power is back after so long, or somebody has to look after it."""
+"""A device that lost its power is back after so long, or somebody has to look
+after it."""
 
 
 class SequenceStalled(StationError):
@@ -22,11 +23,14 @@ class SequenceStalled(StationError):
 
 
 async def run_sequence(link: RegisterLink, bundle: Bundle, label: Label) -> bool:
-    """Carry out ``label``'s steps in order; none where the profile gives none. Whether every write was acknowledged.
+    """Carry out ``label``'s steps in order; none where the profile gives none.
+    Whether every write was acknowledged.
 
-    A store may go unanswered or be answered by "busy", and so may a write by which the device restarts (a wait or a
-    reconnect follows): nothing is sent twice, and what came of it is for a read to decide. Any other write raises.
-    Raises RegisterRefused, DeviceSilent, DeviceAbsent, BusError, SequenceStalled.
+    A store may go unanswered or be answered by "busy", and so may a write by
+    which the device restarts (a wait or a reconnect follows): nothing is sent
+    twice, and what came of it is for a read to decide. Any other write raises.
+    Raises RegisterRefused, DeviceSilent, DeviceAbsent, BusError,
+    SequenceStalled.
     """
     return await run_steps(link, bundle, label, getattr(bundle.profile.sequences, label))
 
@@ -48,13 +52,15 @@ async def run_steps(link: RegisterLink, bundle: Bundle, label: Label, steps: Seq
 
 
 async def lock_quietly(link: RegisterLink, bundle: Bundle) -> None:
-    """Lock if the device will. A restart locks it too; what it holds does not depend on it."""
+    """Lock if the device will. A restart locks it too; what it holds does not
+    depend on it."""
     with suppress(DriverError, StationError):
         await run_sequence(link, bundle, "lock")
 
 
 async def _written(link: RegisterLink, bundle: Bundle, step: WriteStep, *, open_ended: bool) -> bool:
-    """Whether the write was acknowledged; ``open_ended`` where that need not be known."""
+    """Whether the write was acknowledged; ``open_ended`` where that need not be
+    known."""
     raw = bundle.profile.encode(step.write, step.value)
     try:
         await link.write(step.write, raw, timeout_s=step.timeout_s)
@@ -86,10 +92,11 @@ async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollSt
 
 
 async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | None = None) -> None:
-    """Close and open until the device answers, for `RECONNECT_S` where nothing else is said.
+    """Close and open until the device answers, for `RECONNECT_S` where nothing
+    else is said.
 
-    One that starts may refuse for a while. At the deadline raises DeviceAbsent, DeviceSilent, BusError,
-    RegisterRefused.
+    One that starts may refuse for a while. At the deadline raises DeviceAbsent,
+    DeviceSilent, BusError, RegisterRefused.
     """
     deadline_s = link.pace.clock_s() + (RECONNECT_S if timeout_s is None else timeout_s)
     while True:
@@ -106,5 +113,6 @@ async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | Non
 
 
 def probe(profile: Profile) -> str | None:
-    """A register by which a device shows that it is there: opening may succeed on the bus alone."""
+    """A register by which a device shows that it is there: opening may succeed
+    on the bus alone."""
     return profile.identity.serial_register or next(iter(profile.identity.expect), None)

@@ -13,8 +13,9 @@ from triaxcald.provision.image import calibration_registers
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Raw bytes as on the wire by register, in the order in which they are to be written, and whose they are
-    (None where the profile has no serial number)."""
+    """Raw bytes as on the wire by register, in the order in which they are to
+    be written, and whose they are (None where the profile has no serial
+    number)."""
 
     raw: Mapping[str, bytes]
     serial: str | None = None
@@ -25,7 +26,8 @@ class Snapshot:
 
 
 async def take_snapshot(device: Device, bundle: Bundle, names: Iterable[str] | None = None) -> Snapshot:
-    """Read ``names``, by default every calibration register. Raises RegisterRefused, DeviceSilent."""
+    """Read ``names``, by default every calibration register. Raises
+    RegisterRefused, DeviceSilent."""
     serial = await read_serial(device, bundle)
     names = calibration_registers(bundle.profile) if names is None else names
     return Snapshot({name: await device.read(name) for name in names}, serial)

@@ -1,4 +1,5 @@
-"""What a device holds, and what shows it. Values alone: `triaxcald.text` puts them into words."""
+"""What a device holds, and what shows it. Values alone: `triaxcald.text` puts
+them into words."""
 
 from __future__ import annotations
 
@@ -7,7 +8,8 @@ from enum import StrEnum
 
 
 class DeviceState(StrEnum):
-    """Which calibration the device starts with, as far as anybody can vouch for it."""
+    """Which calibration the device starts with, as far as anybody can vouch for
+    it."""
 
     UNTOUCHED = "untouched"
     """No calibration register was written."""
@@ -16,7 +18,8 @@ class DeviceState(StrEnum):
     NEW_VERIFIED = "new_verified"
     """Read back equal after a restart."""
     NEW_UNVERIFIED = "new_unverified"
-    """The store was acknowledged and the registers read back equal; no restart has proven it."""
+    """The store was acknowledged and the registers read back equal; no restart
+    has proven it."""
     MIXED = "mixed"
     """The registers are known to be neither the old ones nor the new ones."""
     UNKNOWN = "unknown"
@@ -34,13 +37,15 @@ class Evidence(StrEnum):
     RESTART = "read_after_restart"
     POWER_CYCLE = "read_after_power_cycle"
     WRITE_COUNTER = "write_counter"
-    """The store went unanswered; the device's counter of stores shows that it took place, or did not."""
+    """The store went unanswered; the device's counter of stores shows that it
+    took place, or did not."""
     NO_ANSWER = "no_answer"
 
 
 @dataclass
 class Held:
-    """What the device holds, at any moment: true also when nobody gets to change it any more."""
+    """What the device holds, at any moment: true also when nobody gets to
+    change it any more."""
 
     state: DeviceState = DeviceState.UNTOUCHED
     evidence: Evidence = Evidence.NOTHING_WRITTEN

@@ -17,9 +17,11 @@ from triaxcald.provision.snapshot import Snapshot
 async def journaled_image(
     link: RegisterLink, bundle: Bundle, *, folder: Path, unit: str, expected_serial: str | None, where: str
 ) -> tuple[RegisterImage, str | None]:
-    """What the provisioning of this device that was cut short was to write, and the device's serial number.
+    """What the provisioning of this device that was cut short was to write, and
+    the device's serial number.
 
-    Raises InputError where there is none, or where it was begun with another profile; WrongUnit, DriverError.
+    Raises InputError where there is none, or where it was begun with another
+    profile; WrongUnit, DriverError.
     """
     identity = await check_identity(link, bundle, expected_serial, where=where)
     journal = Journal.of(folder, unit, identity.serial)
@@ -32,9 +34,11 @@ async def journaled_image(
 
 
 def was_cut_short(entry: Entry, profile: Profile, found: Snapshot, image: RegisterImage, restarted: bool) -> bool:
-    """Whether a device with a journal still is as that provisioning left it, and not as somebody has made it since.
+    """Whether a device with a journal still is as that provisioning left it,
+    and not as somebody has made it since.
 
-    ``found`` was read after a restart, where ``restarted`` says so; ``image`` is what is to be written now.
+    ``found`` was read after a restart, where ``restarted`` says so; ``image``
+    is what is to be written now.
     """
     if not found.differing(entry.before):  # which is in use, and may not be what is stored
         return bool(profile.sequences.store) and not restarted
@@ -43,6 +47,7 @@ def was_cut_short(entry: Entry, profile: Profile, found: Snapshot, image: Regist
     torn = [n for n, raw in found.raw.items() if raw not in (entry.before[n], entry.wanted.get(n))]
     if profile.crc is None:
         return len(torn) <= 1  # a supply that fails in a write leaves one register half written
-    # Without a serial number, a blank unit at the same place is not to be taken for one that was cut short.
+    # Without a serial number, a blank unit at the same place is not to be taken
+    # for one that was cut short.
     known = profile.identity.serial_register is not None or len(torn) <= 1
     return known and not fits_its_checksum(profile, found)

@@ -1,4 +1,5 @@
-"""What can still be found in a damaged file: its readable records in order and the stretches between them."""
+"""What can still be found in a damaged file: its readable records in order and
+the stretches between them."""
 
 from __future__ import annotations
 
@@ -31,15 +32,18 @@ from triaxcald.recording.frames import (
 
 _SEARCH_BLOCK = 2**20
 _TRIED_MOST, _TRIED_LEAST, _TRY = 8, 16 * 2**20, 256
-"""What looks like a record may be tried for so many times the file, and for so many bytes in any case, each try
-counting for its length and so many bytes more. In a file of ours, hardly any of its bytes look like one."""
-# Chunk, attachment, metadata or end of data, shorter than 4 GiB: its type and the upper half of its length.
+"""What looks like a record may be tried for so many times the file, and for so
+many bytes in any case, each try counting for its length and so many bytes more.
+In a file of ours, hardly any of its bytes look like one."""
+# Chunk, attachment, metadata or end of data, shorter than 4 GiB: its type and
+# the upper half of its length.
 _RECORD_START = re.compile(rb"[\x06\x09\x0c\x0f](?=[\s\S]{4}\x00\x00\x00\x00)")
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Bytes that are no whole record; ``at_end`` where nothing readable follows."""
+    """Bytes that are no whole record; ``at_end`` where nothing readable
+    follows."""
 
     offset: int
     length: int
@@ -64,7 +68,8 @@ class DamagedFile:
         self._look_ahead()
 
     def pieces(self) -> Iterator[Frame | Stretch]:
-        """Up to the end of the data and with it, or to the end of the file where that is missing.
+        """Up to the end of the data and with it, or to the end of the file
+        where that is missing.
 
         A chunk or attachment among them may still fail its CRC.
         """
@@ -102,7 +107,8 @@ class DamagedFile:
             parse(frame, self.name)
 
     def _search(self, offset: int) -> int:
-        """Where the next record begins that proves itself, from ``offset`` on; the file's size if none."""
+        """Where the next record begins that proves itself, from ``offset`` on;
+        the file's size if none."""
         while offset < self.size:
             block = self.read(offset, _SEARCH_BLOCK + HEAD.size)
             for found in _RECORD_START.finditer(block):
@@ -127,7 +133,8 @@ class DamagedFile:
         return True
 
     def _look_ahead(self) -> None:
-        """Looks for what says whose file it is, and in the summary for what the first chunk declared."""
+        """Looks for what says whose file it is, and in the summary for what the
+        first chunk declared."""
         profile: str | None = None
         ours = False
         for piece in self.pieces():
@@ -149,7 +156,8 @@ class DamagedFile:
             )
 
     def _read_summary(self, offset: int) -> None:
-        """Takes what it declares, if its CRC vouches for it; it only repeats what the chunks say."""
+        """Takes what it declares, if its CRC vouches for it; it only repeats
+        what the chunks say."""
         records, crc = [], 0
         try:
             frame = frame_at(self._source, self.name, offset, self.size)

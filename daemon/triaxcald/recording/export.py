@@ -17,8 +17,9 @@ from triaxcald.errors import RecordingError
 
 @dataclass(frozen=True)
 class Rows:
-    """Some lines of a table: their times (n,), and what else is in them by name, (n,) each: arrays of floats, or cells
-    as they stood in the table that was read."""
+    """Some lines of a table: their times (n,), and what else is in them by
+    name, (n,) each: arrays of floats, or cells as they stood in the table that
+    was read."""
 
     time_ns: Ints
     columns: Mapping[str, Any]
@@ -33,10 +34,12 @@ class Rows:
 
 
 def write_csv(out: TextIO, blocks: Iterable[Rows], start_ns: int | None = None) -> int:
-    """Header ``t_s,ux,uy,uz`` and the other columns', one line a sample; the number of samples.
+    """Header ``t_s,ux,uy,uz`` and the other columns', one line a sample; the
+    number of samples.
 
-    Times count from ``start_ns``, the first sample where that is None, to the nanosecond; values are the shortest text
-    that reads back as the same number. Raises RecordingError where a block has other columns than the first.
+    Times count from ``start_ns``, the first sample where that is None, to the
+    nanosecond; values are the shortest text that reads back as the same number.
+    Raises RecordingError where a block has other columns than the first.
     """
     samples = 0
     names: Sequence[str] | None = None
@@ -55,7 +58,8 @@ def write_csv(out: TextIO, blocks: Iterable[Rows], start_ns: int | None = None) 
 
 
 def require_alike(block: Rows, names: Sequence[str] | None, samples: int) -> Sequence[str]:
-    """The names of its columns, which are those of the blocks before. Raises RecordingError."""
+    """The names of its columns, which are those of the blocks before. Raises
+    RecordingError."""
     if names is not None and list(block.columns) != names:
         raise RecordingError(f"channels {list(block.columns)[3:]} after sample {samples}, expected {list(names)[3:]}")
     return list(block.columns)

@@ -1,6 +1,8 @@
-"""The MCAP file as a row of records, each with its offset, checked so strictly that damage cannot pass.
+"""The MCAP file as a row of records, each with its offset, checked so strictly
+that damage cannot pass.
 
-The library's own readers give no offsets, do not check attachments, and trust the lengths they read.
+The library's own readers give no offsets, do not check attachments, and trust
+the lengths they read.
 """
 
 from __future__ import annotations
@@ -41,15 +43,18 @@ from triaxcald.errors import RecordingError
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length
 CHUNK_LIMIT = 16 * 2**20
-"""Bytes, before and after compression. Ours are about 1 MiB, those of other tools 4; 8192 of the longest records, the
-most that one message of ours has, are 2."""
+"""Bytes, before and after compression. Ours are about 1 MiB, those of other
+tools 4; 8192 of the longest records, the most that one message of ours has, are
+2."""
 ATTACHMENT_LIMIT = 32 * 2**20  # a report is some MiB, the DBC of a whole vehicle ten
 INDEX_LIMIT = 8 * 2**20  # of the messages in one chunk
 RECORD_LIMIT = 2**20  # of all others; the longest of ours is the index of a chunk
 EXPANSION_MOST = 64
-"""So many times the file may unpack to, and one chunk: raw records come to a fifth or a tenth."""
+"""So many times the file may unpack to, and one chunk: raw records come to a
+fifth or a tenth."""
 INDEX_ENTRY, UNINDEXED_MOST = 16, 4096
-"""Bytes of the file that each message has in an index, uncompressed. Those of a last chunk may have none."""
+"""Bytes of the file that each message has in an index, uncompressed. Those of a
+last chunk may have none."""
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _KNOWN = frozenset(int(code) for code in Opcode)
@@ -70,7 +75,8 @@ class Damage(RecordingError):
 
 
 class CutShort(Damage):
-    """The file ends before the record that begins at ``offset``, or in its middle."""
+    """The file ends before the record that begins at ``offset``, or in its
+    middle."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,8 @@ class Frame:
 
 
 def check_magic(stream: BinaryIO, name: str) -> None:
-    """Raises CutShort where the file ends inside the magic, RecordingError where it is something else."""
+    """Raises CutShort where the file ends inside the magic, RecordingError
+    where it is something else."""
     stream.seek(0)
     magic = stream.read(len(MAGIC))
     if magic == MAGIC:
@@ -106,7 +113,8 @@ def size_of(stream: BinaryIO) -> int:
 
 
 def frame_at(stream: BinaryIO, name: str, offset: int, size: int) -> Frame:
-    """The record at ``offset`` of a file of ``size`` bytes. Raises CutShort, Damage."""
+    """The record at ``offset`` of a file of ``size`` bytes. Raises CutShort,
+    Damage."""
     stream.seek(offset)
     head = stream.read(HEAD.size)
     if len(head) < HEAD.size:
@@ -127,7 +135,8 @@ def _kind(opcode: int) -> str:
 
 
 def walk(stream: BinaryIO, name: str, size: int) -> Iterator[Frame]:
-    """All records in order, from the header to the footer. Raises CutShort, Damage."""
+    """All records in order, from the header to the footer. Raises CutShort,
+    Damage."""
     offset = len(MAGIC)
     while True:
         frame = frame_at(stream, name, offset, size)
@@ -138,7 +147,8 @@ def walk(stream: BinaryIO, name: str, size: int) -> Iterator[Frame]:
 
 
 def _index(stream: ReadDataStream) -> MessageIndex:
-    """Its entries, of which nothing here makes use, stay bytes: as numbers they would take ten times the memory."""
+    """Its entries, of which nothing here makes use, stay bytes: as numbers they
+    would take ten times the memory."""
     channel_id = stream.read2()
     stream.read(stream.read4())
     return MessageIndex(channel_id, [])
@@ -162,7 +172,8 @@ _READERS: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
 
 
 def parse(frame: Frame, name: str) -> McapRecord:
-    """The record in ``frame``, which must be as long as it says; chunks are for `chunk_data`. Raises Damage."""
+    """The record in ``frame``, which must be as long as it says; chunks are for
+    `chunk_data`. Raises Damage."""
     kind = _kind(frame.opcode)
     read = _READERS.get(frame.opcode)
     if read is None:
@@ -182,13 +193,15 @@ def parse(frame: Frame, name: str) -> McapRecord:
 
 
 def footer_fits(frame: Frame, crc: int) -> bool:
-    """Whether the footer's CRC is that of the summary before it, whose running CRC is ``crc``."""
+    """Whether the footer's CRC is that of the summary before it, whose running
+    CRC is ``crc``."""
     (expected,) = struct.unpack("<I", frame.body[-4:])
     return expected in (0, zlib.crc32(frame.body[:-4], zlib.crc32(frame.head, crc)))
 
 
 def chunk_head(body: bytes) -> tuple[Chunk, int] | None:
-    """A chunk with what there is of its data, and the length these should have; None where it cannot be."""
+    """A chunk with what there is of its data, and the length these should have;
+    None where it cannot be."""
     try:
         start, end, uncompressed_size, crc = _CHUNK_HEAD.unpack_from(body)
         (name_length,) = struct.unpack_from("<I", body, _CHUNK_HEAD.size)
@@ -204,7 +217,8 @@ def chunk_head(body: bytes) -> tuple[Chunk, int] | None:
 
 
 def whole_chunk_head(frame: Frame, name: str) -> Chunk:
-    """The chunk in ``frame``, still compressed. Raises Damage where its lengths do not agree."""
+    """The chunk in ``frame``, still compressed. Raises Damage where its lengths
+    do not agree."""
     found = chunk_head(frame.body)
     if found is None:
         raise Damage(name, frame.offset, "unreadable chunk (expected zstd or no compression)")
@@ -216,7 +230,8 @@ def whole_chunk_head(frame: Frame, name: str) -> Chunk:
 
 
 def chunk_data(frame: Frame, name: str) -> bytes:
-    """The records inside the chunk, decompressed, their CRC checked. Raises Damage."""
+    """The records inside the chunk, decompressed, their CRC checked. Raises
+    Damage."""
     data = unpack(whole_chunk_head(frame, name))
     if data is None:
         raise Damage(name, frame.offset, "a chunk fails its CRC")
@@ -228,7 +243,8 @@ def unpack(chunk: Chunk) -> bytes | None:
     data = chunk.data
     if chunk.compression == "zstd":
         try:
-            # The frame's own size decides how much memory is taken: check it first.
+            # The frame's own size decides how much memory is taken: check it
+            # first.
             if zstandard.frame_content_size(data) != chunk.uncompressed_size:
                 return None
             data = zstandard.decompress(data)
@@ -240,7 +256,8 @@ def unpack(chunk: Chunk) -> bytes | None:
 
 
 def unpack_part(chunk: Chunk) -> bytes:
-    """The records of a chunk that was cut off, as far as its bytes go; no CRC can vouch for them."""
+    """The records of a chunk that was cut off, as far as its bytes go; no CRC
+    can vouch for them."""
     if chunk.compression != "zstd":
         return chunk.data
     source = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT).stream_reader(io.BytesIO(chunk.data))
@@ -251,8 +268,9 @@ def unpack_part(chunk: Chunk) -> bytes:
 
 
 class Unpacked:
-    """Counts what a file's chunks unpack to, which has to stay in proportion to the file: a few bytes of compressed
-    nothing keep a reader busy for as long as they like. Raises RecordingError where it does not."""
+    """Counts what a file's chunks unpack to, which has to stay in proportion to
+    the file: a few bytes of compressed nothing keep a reader busy for as long
+    as they like. Raises RecordingError where it does not."""
 
     def __init__(self, name: str, size: int) -> None:
         self._name = name
@@ -272,7 +290,8 @@ class Unpacked:
 
 
 def chunk_records(data: bytes) -> Iterator[Schema | Channel | Message]:
-    """The whole records in ``data``; a last one that is cut off is left out. Raises Damage, by its place in ``data``.
+    """The whole records in ``data``; a last one that is cut off is left out.
+    Raises Damage, by its place in ``data``.
 
     A chunk holds nothing but schemas, channels and messages.
     """

@@ -11,7 +11,8 @@ from triaxcald.recording.reader import Recording
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The recording's contents as a JSON document; also of one not finished, up to its last whole record.
+    """The recording's contents as a JSON document; also of one not finished, up
+    to its last whole record.
 
     Raises RecordingError.
     """
@@ -53,7 +54,8 @@ def _topics(recording: Recording) -> dict[str, dict[str, int]]:
 
 
 def _phases(recording: Recording) -> dict[str, dict[str, Any]]:
-    """Of each phase: records, their bytes, and the time from the first to the last."""
+    """Of each phase: records, their bytes, and the time from the first to the
+    last."""
     phases: dict[str, dict[str, Any]] = {}
     for phase, batch in recording.raw_batches():
         if not len(batch):

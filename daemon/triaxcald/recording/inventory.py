@@ -1,4 +1,5 @@
-"""What a recording holds, as digests: so that an outcome can name it, and an audit can miss nothing. No I/O."""
+"""What a recording holds, as digests: so that an outcome can name it, and an
+audit can miss nothing. No I/O."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ class Inventory:
         self._declared: dict[str, set[str]] = {}
 
     def channel(self, topic: str, encoding: str, metadata: Mapping[str, str], kind: tuple[str, str, bytes]) -> None:
-        """A topic as it is declared; ``kind`` is its schema's name, encoding and data. Each way counts once."""
+        """A topic as it is declared; ``kind`` is its schema's name, encoding
+        and data. Each way counts once."""
         said = [topic, encoding, *(f"{key}\0{value}" for key, value in sorted(metadata.items())), *kind[:2]]
         text = "\0".join(said).encode() + b"\0" + kind[2]
         self._declared.setdefault(topic, set()).add(hashlib.sha256(text).hexdigest())
@@ -41,7 +43,8 @@ class Inventory:
         self._topics[topic] = count + 1, digest
 
     def document(self) -> Document:
-        """Attachments in the order of the file, metadata by name, messages by topic."""
+        """Attachments in the order of the file, metadata by name, messages by
+        topic."""
         topics = sorted(self._topics.items())
         return {
             "attachments": list(self._attachments),

@@ -1,4 +1,5 @@
-"""Reads a recording in bounded memory, one chunk at a time, and believes nothing that fails its CRC."""
+"""Reads a recording in bounded memory, one chunk at a time, and believes
+nothing that fails its CRC."""
 
 from __future__ import annotations
 
@@ -70,9 +71,10 @@ class Attachments(Mapping[str, bytes]):
 class Recording:
     """One unit's recording, opened; a context manager.
 
-    Opening reads the whole file once and checks it: every byte of a finished recording is under a CRC.
-    ``unfinished`` also takes one that is still being written or was cut short, up to its last whole record.
-    Raises RecordingError, from opening and from every iterator.
+    Opening reads the whole file once and checks it: every byte of a finished
+    recording is under a CRC. ``unfinished`` also takes one that is still being
+    written or was cut short, up to its last whole record. Raises
+    RecordingError, from opening and from every iterator.
     """
 
     def __init__(self, stream: BinaryIO, name: str, *, unfinished: bool = False) -> None:
@@ -139,11 +141,13 @@ class Recording:
 
     @property
     def ends_with(self) -> str:
-        """The format of the document that the whole recording ends with; empty where it ends with none."""
+        """The format of the document that the whole recording ends with; empty
+        where it ends with none."""
         return self.metadata[schema.FORMAT_RECORD].get(schema.ENDS_WITH, "")
 
     def raw_digest(self) -> schema.RawDigest:
-        """Of all raw records; the metadata record ``raw`` says what it was when they were written."""
+        """Of all raw records; the metadata record ``raw`` says what it was when
+        they were written."""
         digest = schema.RawDigest(self.ends_with)
         for phase, batch in self.raw_batches():
             digest.update(phase, batch)
@@ -199,7 +203,8 @@ class Recording:
                     raise RecordingError(f"{self.name}: {topic} at {message.log_time} ns: {e}") from e
 
     def _survey(self) -> None:
-        """Notes where everything is and checks the two CRCs that together cover every byte."""
+        """Notes where everything is and checks the two CRCs that together cover
+        every byte."""
         crc = zlib.crc32(MAGIC)
         unpacked = Unpacked(self.name, self.size)
         for frame in walk(self._stream, self.name, self.size):

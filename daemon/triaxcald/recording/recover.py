@@ -1,4 +1,5 @@
-"""Mends a recording that was cut short or damaged: keeps every whole record and counts what is lost."""
+"""Mends a recording that was cut short or damaged: keeps every whole record and
+counts what is lost."""
 
 from __future__ import annotations
 
@@ -37,14 +38,16 @@ from triaxcald.recording.frames import (
 class Recovery:
     """What was kept and what was lost.
 
-    ``raw_records`` kept; ``raw_missing`` lost from the file by their running index (at least: what was to
-    come after the last one is unknown where ``cut_short``); ``raw_dropped`` never reached it, by its own
-    loss records.
-    ``chunks_failed`` and ``attachments_failed`` fail their CRC and are given up. ``unverified_messages`` kept
-    from a chunk that was cut off, where no CRC can vouch for them. ``undeclared_messages`` given up because
-    the chunk that declares their type is lost. ``bytes_dropped`` of the file in no whole record kept.
-    ``unlocated_damage``: the CRC of the whole is wrong though no chunk's or attachment's is, so that header
-    or metadata may hold a wrong byte.
+    ``raw_records`` kept; ``raw_missing`` lost from the file by their running
+    index (at least: what was to come after the last one is unknown where
+    ``cut_short``); ``raw_dropped`` never reached it, by its own loss records.
+    ``chunks_failed`` and ``attachments_failed`` fail their CRC and are given
+    up. ``unverified_messages`` kept from a chunk that was cut off, where no CRC
+    can vouch for them. ``undeclared_messages`` given up because the chunk that
+    declares their type is lost. ``bytes_dropped`` of the file in no whole
+    record kept. ``unlocated_damage``: the CRC of the whole is wrong though no
+    chunk's or attachment's is, so that header or metadata may hold a wrong
+    byte.
     """
 
     raw_records: int = 0
@@ -67,10 +70,12 @@ class Recovery:
 
 
 def recover(path: Path, out: Path) -> Recovery:
-    """Writes what can be had of ``path`` to ``out``, a finished recording; ``path`` is only read.
+    """Writes what can be had of ``path`` to ``out``, a finished recording;
+    ``path`` is only read.
 
-    Raises RecordingError: ``path`` is no recording of ours or cannot be read, ``out`` exists or cannot be
-    written; Refused: ``path`` holds neither a whole message nor an attachment. Nothing of ``out`` is left behind.
+    Raises RecordingError: ``path`` is no recording of ours or cannot be read,
+    ``out`` exists or cannot be written; Refused: ``path`` holds neither a whole
+    message nor an attachment. Nothing of ``out`` is left behind.
     """
     try:
         with open_file(path) as source:
@@ -91,7 +96,8 @@ def _write(damaged: DamagedFile, name: str, out: Path) -> Recovery:
 
 
 class _Mending:
-    """Carries record after record from the damaged file to the new one, counting."""
+    """Carries record after record from the damaged file to the new one,
+    counting."""
 
     def __init__(self, damaged: DamagedFile, mcap: McapWriter) -> None:
         self._damaged = damaged
@@ -149,7 +155,8 @@ class _Mending:
             self._digest.ends_with = record.metadata[schema.ENDS_WITH]
 
     def _stretch(self, stretch: Stretch) -> None:
-        """Keeps what a chunk of the wrong length or one that was cut off still holds."""
+        """Keeps what a chunk of the wrong length or one that was cut off still
+        holds."""
         self._located = True
         body = self._damaged.read(stretch.offset, min(stretch.length, CHUNK_LIMIT))
         found = chunk_head(body[HEAD.size :]) if body[:1] == bytes([Opcode.CHUNK]) else None
@@ -167,7 +174,8 @@ class _Mending:
             self._recovery.unverified_messages += self._records(unpack_part(chunk))
 
     def _records(self, data: bytes) -> int:
-        """Carries over a chunk's records; the number of messages among them that were kept."""
+        """Carries over a chunk's records; the number of messages among them
+        that were kept."""
         kept = 0
         try:
             for record in chunk_records(data):

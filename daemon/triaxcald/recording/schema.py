@@ -1,7 +1,9 @@
-"""What a recording holds: topics, protobuf messages built at run time, and the digest of the raw records.
+"""What a recording holds: topics, protobuf messages built at run time, and the
+digest of the raw records.
 
-Reader and writer meet only here. Ids of schemas and channels are fixed, so that a recording whose first chunk
-(the one that declares them) is lost can still be read by `recover`.
+Reader and writer meet only here. Ids of schemas and channels are fixed, so that
+a recording whose first chunk (the one that declares them) is lost can still be
+read by `recover`.
 """
 
 from __future__ import annotations
@@ -78,8 +80,9 @@ _MESSAGES: Mapping[str, Sequence[_Field]] = {
 
 @dataclass(frozen=True)
 class RegisterAccess:
-    """``raw`` is what went over the wire, most significant byte first; ``error`` is empty where it worked.
-    ``unanswered``: nothing came back, not even a refusal."""
+    """``raw`` is what went over the wire, most significant byte first;
+    ``error`` is empty where it worked. ``unanswered``: nothing came back, not
+    even a refusal."""
 
     time_ns: int
     register: str
@@ -104,9 +107,11 @@ class Event:
 
 @dataclass(frozen=True)
 class Loss:
-    """``records`` dropped before they reached the file; ``where`` is the topic they were meant for.
+    """``records`` dropped before they reached the file; ``where`` is the topic
+    they were meant for.
 
-    ``first`` is the running index of the first of them, for the raw topic alone.
+    ``first`` is the running index of the first of them, for the raw topic
+    alone.
     """
 
     time_ns: int
@@ -140,7 +145,8 @@ def _schema(name: str, fields: Sequence[_Field]) -> Schema:
 
 SCHEMAS: Mapping[str, Schema] = {name: _schema(name, fields) for name, fields in _MESSAGES.items()}
 
-# (topic, message) in the order of their ids, which start at 1; the preview's schema differs per recording.
+# (topic, message) in the order of their ids, which start at 1; the preview's
+# schema differs per recording.
 CHANNELS: Sequence[tuple[str, str]] = (
     (RAW, "RawBatch"),
     (REGISTERS, "RegisterAccess"),
@@ -150,14 +156,16 @@ CHANNELS: Sequence[tuple[str, str]] = (
 
 
 def preview_schema(channels: Sequence[str]) -> Schema:
-    """The preview message with one plain double field for each auxiliary channel, for Foxglove to plot."""
+    """The preview message with one plain double field for each auxiliary
+    channel, for Foxglove to plot."""
     vector = [("time_ns", _F.TYPE_FIXED64, False)] + [(axis, _F.TYPE_DOUBLE, False) for axis in "xyz"]
     named = [(field, _F.TYPE_DOUBLE, False) for field in preview_fields(channels)]
     return _schema("Preview", vector + named)
 
 
 def preview_fields(channels: Sequence[str]) -> list[str]:
-    """The channels' field names: letters, digits and underscores, none twice, none hiding time or an axis."""
+    """The channels' field names: letters, digits and underscores, none twice,
+    none hiding time or an axis."""
     taken = {"time_ns", "x", "y", "z"}
     fields = []
     for channel in channels:
@@ -172,7 +180,8 @@ def preview_fields(channels: Sequence[str]) -> list[str]:
 
 
 def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
-    """``first`` is the running index of the batch's first record among all that were offered."""
+    """``first`` is the running index of the batch's first record among all that
+    were offered."""
     message = SCHEMAS["RawBatch"].message(
         first=first,
         phase=phase,
@@ -186,7 +195,8 @@ def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
 
 
 def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
-    """(running index of the first record, phase, batch). Raises ValueError where ``data`` is none."""
+    """(running index of the first record, phase, batch). Raises ValueError
+    where ``data`` is none."""
     message = _parse("RawBatch", data)
     if len(message.time_ns) > MAX_RECORDS:
         raise ValueError(f"{len(message.time_ns)} records in one message, expected at most {MAX_RECORDS}")
@@ -255,11 +265,13 @@ def cut(batch: RawBatch, records: int = MAX_RECORDS) -> Iterator[RawBatch]:
 
 
 class RawDigest:
-    """SHA-256 over raw records, the same however they are cut into batches and the phases interleaved.
+    """SHA-256 over raw records, the same however they are cut into batches and
+    the phases interleaved.
 
-    Each phase has two running hashes, over the records' fixed-width columns and over their payloads. ``ends_with`` is
-    what the recording says that it ends with: the digest is of it too, so that nobody can take the end away and leave
-    a recording that looks like an older one.
+    Each phase has two running hashes, over the records' fixed-width columns and
+    over their payloads. ``ends_with`` is what the recording says that it ends
+    with: the digest is of it too, so that nobody can take the end away and
+    leave a recording that looks like an older one.
     """
 
     _RECORD = np.dtype([("time_ns", "<i8"), ("source", "<u4"), ("flags", "u1"), ("length", "<u2")])
@@ -284,7 +296,8 @@ class RawDigest:
         return self.were_it(self.ends_with)
 
     def were_it(self, ends_with: str) -> str:
-        """The digest of the same records in a recording that says it ends with ``ends_with``."""
+        """The digest of the same records in a recording that says it ends with
+        ``ends_with``."""
         whole = hashlib.sha256(ends_with.encode())
         for phase in sorted(self._phases):
             columns, payloads = self._phases[phase]
@@ -306,7 +319,8 @@ class PreviewEncoder:
 
 
 class Decimator:
-    """Picks at most one sample of each period of the samples' own time, however they are cut into blocks."""
+    """Picks at most one sample of each period of the samples' own time, however
+    they are cut into blocks."""
 
     def __init__(self, rate_hz: float = PREVIEW_HZ) -> None:
         self._period_ns = max(1, round(1e9 / rate_hz))

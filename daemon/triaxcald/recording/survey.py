@@ -1,4 +1,5 @@
-"""What a finished recording's file consists of, record by record, and where its parts contradict each other."""
+"""What a finished recording's file consists of, record by record, and where its
+parts contradict each other."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ from triaxcald.recording.reader import Recording
 
 Kind = Literal["twice", "times", "sequence", "running_index", "topic", "undecodable", "index"]
 AFTER_THE_END = (schema.RAW_RECORD, schema.END_RECORD, schema.RECOVERY_RECORD)
-"""Metadata records that are written after the document that the recording ends with, and are in no inventory."""
+"""Metadata records that are written after the document that the recording ends
+with, and are in no inventory."""
 _TOPICS = frozenset([*(topic for topic, _ in schema.CHANNELS), *schema.PREVIEWS])
 _INDEX_HEAD, _INDEX_ENTRY = struct.Struct("<HI"), struct.Struct("<QQ")
 _CHANNEL_AND_TIME = struct.Struct("<HIQ")
@@ -38,7 +40,8 @@ _CHANNEL_AND_TIME = struct.Struct("<HIQ")
 
 @dataclass(frozen=True)
 class Fault:
-    """Of what is in the file: ``kind`` of contradiction, ``part`` a topic, a name or an index, how many records."""
+    """Of what is in the file: ``kind`` of contradiction, ``part`` a topic, a
+    name or an index, how many records."""
 
     kind: Kind
     part: str
@@ -47,8 +50,9 @@ class Fault:
 
 @dataclass
 class Survey:
-    """``inventory`` of all that is before the document that the recording ends with, which is ``last`` among the
-    attachments where all is well; ``faults`` of the file itself."""
+    """``inventory`` of all that is before the document that the recording ends
+    with, which is ``last`` among the attachments where all is well; ``faults``
+    of the file itself."""
 
     inventory: Inventory = field(default_factory=Inventory)
     attachments: list[str] = field(default_factory=list)
@@ -60,7 +64,8 @@ class Survey:
 
 
 def survey(recording: Recording, end: str) -> Survey:
-    """``end`` names the attachment that the recording ends with. Raises RecordingError."""
+    """``end`` names the attachment that the recording ends with. Raises
+    RecordingError."""
     return _Surveying(recording, end).run()
 
 
@@ -239,7 +244,8 @@ class _Surveying:
         self._counts["running_index", schema.RAW] += sum(not self._is_noted(*gap) for gap in self._gaps)
 
     def _is_noted(self, first: int, end: int) -> bool:
-        """Whether the raw records between two running indices are noted as lost."""
+        """Whether the raw records between two running indices are noted as
+        lost."""
         if end < first:
             return False
         for begin, until in sorted(self._lost):
@@ -269,7 +275,8 @@ _NAMES: dict[type, str] = {
 
 
 def _messages_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Of each message in a chunk: where it begins, its channel and its log time."""
+    """Of each message in a chunk: where it begins, its channel and its log
+    time."""
     at = 0
     while at + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, at)

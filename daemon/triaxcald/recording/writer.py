@@ -1,4 +1,5 @@
-"""Writes one unit's recording, on a thread of its own so that no disk ever holds up a bus."""
+"""Writes one unit's recording, on a thread of its own so that no disk ever
+holds up a bus."""
 
 from __future__ import annotations
 
@@ -28,15 +29,18 @@ CHUNK_NS = 1_000_000_000  # no record waits longer than this for the operating s
 
 
 class RecordingWriter:
-    """An MCAP recording being written; every method but `drain` and `close` returns at once.
+    """An MCAP recording being written; every method but `drain` and `close`
+    returns at once.
 
-    ``metadata`` are named records of strings (run, station, unit, software). ``clock_ns`` is the host's time
-    since the epoch; chunks close by it. At most ``queue_batches`` raw batches and preview blocks wait for the
-    disk; what comes when the queue is full is dropped, counted in `losses` and noted in the file. Registers,
-    events and attachments are few and never dropped. ``ends_with`` is the format of the document that `seal` will be
-    given.
+    ``metadata`` are named records of strings (run, station, unit, software).
+    ``clock_ns`` is the host's time since the epoch; chunks close by it. At most
+    ``queue_batches`` raw batches and preview blocks wait for the disk; what
+    comes when the queue is full is dropped, counted in `losses` and noted in
+    the file. Registers, events and attachments are few and never dropped.
+    ``ends_with`` is the format of the document that `seal` will be given.
 
-    Raises RecordingError, here and from every method: the file exists already or the disk has failed.
+    Raises RecordingError, here and from every method: the file exists already
+    or the disk has failed.
     """
 
     def __init__(
@@ -78,7 +82,8 @@ class RecordingWriter:
             raise RecordingError(f"{path}: exists already; a recording is never overwritten") from None
         except OSError as e:
             raise RecordingError(f"{path}: cannot be created: {e.strerror}") from e
-        # A caller that dies without closing must not be kept alive by it; `log recover` finishes the file.
+        # A caller that dies without closing must not be kept alive by it; `log
+        # recover` finishes the file.
         self._thread = threading.Thread(target=self._run, name=f"recording {path.name}", daemon=True)
         self._thread.start()
         add_action(self, self._finish_at_abort)
@@ -92,7 +97,8 @@ class RecordingWriter:
             return self._offer(schema.RAW, first, len(batch), partial(self._write_raw, phase, first, batch))
 
     def preview(self, topic: schema.PreviewTopic, block: SampleBlock) -> bool:
-        """Keeps the block's samples at the preview rate; whether there was room for them."""
+        """Keeps the block's samples at the preview rate; whether there was room
+        for them."""
         self._check()
         with self._order:
             picked = self._decimators[topic].pick(block)
@@ -121,7 +127,8 @@ class RecordingWriter:
         self._jobs.put(partial(self._write_attachment, self._clock_ns(), name, media_type, data))
 
     def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
-        """The last attachment, made from the inventory of all that is in the file before it; closes the recording."""
+        """The last attachment, made from the inventory of all that is in the
+        file before it; closes the recording."""
         self._check()
         time_ns = self._clock_ns()
 
@@ -145,7 +152,8 @@ class RecordingWriter:
 
     @property
     def raw_sha256(self) -> str:
-        """Digest of the raw records in the file; complete after `drain` or `close`."""
+        """Digest of the raw records in the file; complete after `drain` or
+        `close`."""
         return self._digest.hexdigest()
 
     def close(self) -> None:
@@ -297,7 +305,8 @@ def _create(path: Path) -> BinaryIO:
 
 
 def _declare(mcap: McapWriter, inventory: Inventory, preview: schema.Schema, unit: str) -> dict[str, int]:
-    """Registers schemas and channels in the order that fixes their ids; the channels' ids by topic."""
+    """Registers schemas and channels in the order that fixes their ids; the
+    channels' ids by topic."""
     ids = {}
 
     def channel(topic: str, kind: schema.Schema, schema_id: int, said: dict[str, str]) -> None:

@@ -1,4 +1,5 @@
-"""The uncertainty budget of a calibration document, read without trust like the rest of it."""
+"""The uncertainty budget of a calibration document, read without trust like the
+rest of it."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from triaxcald.report.untrusted import mapping, numbers, texts, vector
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """``magnitude_g`` is a standard uncertainty of |a|; ``share`` of its variance, 0…1."""
+    """``magnitude_g`` is a standard uncertainty of |a|; ``share`` of its
+    variance, 0…1."""
 
     source: str
     evaluation: str

@@ -21,7 +21,8 @@ _LONGEST_LABEL = 34
 
 
 def bars_picture(stages: Sequence[Stage], held_out: HoldOut | None, unit: ErrorUnit = MICRO_G) -> Markup | None:
-    """Errors of every stage against the noise floor, or None when none is known."""
+    """Errors of every stage against the noise floor, or None when none is
+    known."""
     groups = _bar_groups(stages, held_out)
     if not groups:
         return None
@@ -52,7 +53,8 @@ def bars_picture(stages: Sequence[Stage], held_out: HoldOut | None, unit: ErrorU
 
 
 def stream_picture(stream: StreamOverview) -> Markup | None:
-    """The three raw outputs with the still spans shaded, or None for an empty stream."""
+    """The three raw outputs with the still spans shaded, or None for an empty
+    stream."""
     if stream.time_s.size == 0:
         return None
     alt = f"Raw outputs x, y and z over time with {len(stream.spans)} still spans shaded"

@@ -1,4 +1,5 @@
-"""Who corrects what, in words, and the error that each choice leaves in the poses of the fit."""
+"""Who corrects what, in words, and the error that each choice leaves in the
+poses of the fit."""
 
 from __future__ import annotations
 
@@ -23,8 +24,9 @@ class Choice:
 
 
 def choices_in(document: Mapping[str, object], papers: Mapping[str, object], outcome: Outcome) -> tuple[Choice, ...]:
-    """From the least to the most; empty where there is nothing to choose. Documents from before they had `choices`
-    tell the same by their steps and their registers."""
+    """From the least to the most; empty where there is nothing to choose.
+    Documents from before they had `choices` tell the same by their steps and
+    their registers."""
     stated = document.get("choices")
     told = [_read(mapping(entry)) for entry in stated] if isinstance(stated, list) else _reckoned(papers, outcome)
     passing = tuple(name for name, _ in outcome.effects if passes(name))

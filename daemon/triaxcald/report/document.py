@@ -1,7 +1,8 @@
-"""What the page needs of a `triaxcal.calibration/1` or `triaxcal.loop/1`, read without trust.
+"""What the page needs of a `triaxcal.calibration/1` or `triaxcal.loop/1`, read
+without trust.
 
-Nothing in a document is required: a report on a refused or damaged result must still come out, with a dash
-where a value is missing.
+Nothing in a document is required: a report on a refused or damaged result must
+still come out, with a dash where a value is missing.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ _OF_A_POSE = (
 
 
 CANDIDATE = "candidate"
-"""The verdict on an effect that probably acts; documents have it under ``candidates``."""
+"""The verdict on an effect that probably acts; documents have it under
+``candidates``."""
 _NOT_AGAIN = (Exclusion.UNKNOWN_HISTORY, Exclusion.CALLER)
 """Poses that are not to be taken again, though the fit excludes them."""
 
@@ -41,8 +43,9 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Pose:
-    """`direction` is the unit vector of up in the sensor's frame; `mean` in output units; `recording` that of several
-    whose clock its times are on. `again`: left out of the fit, and to be taken again.
+    """`direction` is the unit vector of up in the sensor's frame; `mean` in
+    output units; `recording` that of several whose clock its times are on.
+    `again`: left out of the fit, and to be taken again.
     """
 
     number: int
@@ -85,7 +88,8 @@ class Finding:
 
     @property
     def hangs_on_a_pose(self) -> bool:
-        """Whether it is likely enough to be known, and is not since some one pose may be an outlier."""
+        """Whether it is likely enough to be known, and is not since some one
+        pose may be an outlier."""
         likely = self.probability is not None and self.probability >= Odds().certain
         return self.verdict == CANDIDATE and likely and not self.alternatives
 
@@ -104,8 +108,9 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Everything the page shows of a document. `stages` are the plain model and the final one; `findings` end with the
-    candidates; `searched` tells a loop, which looked for effects, from a fit, which did not. `recordings` are their
+    """Everything the page shows of a document. `stages` are the plain model and
+    the final one; `findings` end with the candidates; `searched` tells a loop,
+    which looked for effects, from a fit, which did not. `recordings` are their
     names where there are several.
     """
 
@@ -148,7 +153,8 @@ class Outcome:
 
     @property
     def mean_decimals(self) -> int:
-        """Of the poses' means, so that the largest has eight digits: a few hundredths of a millionth of 1 g."""
+        """Of the poses' means, so that the largest has eight digits: a few
+        hundredths of a millionth of 1 g."""
         largest = max((abs(v) for pose in self.poses if pose.mean for v in pose.mean), default=0.0)
         return int(np.clip(7 - np.floor(np.log10(largest)), 0, 12)) if largest else 0
 
@@ -158,7 +164,8 @@ class Outcome:
 
 
 def read_document(document: Mapping[str, object]) -> Outcome:
-    """The outcome that `document` describes; whatever is missing or of the wrong kind counts as missing."""
+    """The outcome that `document` describes; whatever is missing or of the
+    wrong kind counts as missing."""
     looped = str(document.get("format", "")).startswith("triaxcal.loop/")
     calibration = mapping(document.get("calibration")) if looped else document
     matrix, centre = _matrix(calibration.get("matrix")), vector(calibration.get("centre"))

@@ -1,4 +1,5 @@
-"""What spoils poses, told apart from what is merely worth knowing about a recording."""
+"""What spoils poses, told apart from what is merely worth knowing about a
+recording."""
 
 from __future__ import annotations
 
@@ -36,8 +37,8 @@ def faults_of(lines: Iterable[str]) -> tuple[Fault, ...]:
 
 
 def left_out(poses: Sequence[Pose], unit: ErrorUnit) -> tuple[str, ...]:
-    """The poses that the fit did not use and that are to be taken again, with where they are and by how much they are
-    off."""
+    """The poses that the fit did not use and that are to be taken again, with
+    where they are and by how much they are off."""
     return tuple(
         f"Pose {pose.number}"
         + ("" if pose.start_s is None else f", at {pose.start_s:.1f} s")

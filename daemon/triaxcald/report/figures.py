@@ -1,4 +1,5 @@
-"""How a number is written for a person: units, digits, uncertainty. What is missing is an em dash."""
+"""How a number is written for a person: units, digits, uncertainty. What is
+missing is an em dash."""
 
 from __future__ import annotations
 
@@ -16,14 +17,16 @@ _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def number(value: object) -> float | None:
-    """`value` as a float when it is a finite number of a size that can be drawn, None for anything else."""
+    """`value` as a float when it is a finite number of a size that can be
+    drawn, None for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return None
     return float(value) if -_LARGEST < value < _LARGEST else None
 
 
 def clean(value: object) -> str:
-    """Text from data without characters that print as nothing or reorder their neighbours."""
+    """Text from data without characters that print as nothing or reorder their
+    neighbours."""
     text = "".join(c if c.isprintable() else " " if c.isspace() else "\ufffd" for c in str(value))
     return " ".join(text.split())
 
@@ -45,7 +48,8 @@ def fixed(value: float | None, decimals: int) -> str:
 
 
 def digits(value: float | None, significant: int = 3) -> str:
-    """`value` to so many significant digits, without an exponent where one can do without."""
+    """`value` to so many significant digits, without an exponent where one can
+    do without."""
     if value is None:
         return MISSING
     if value == 0.0:
@@ -57,7 +61,8 @@ def digits(value: float | None, significant: int = 3) -> str:
 
 
 def micro(value_g: float | None, unit: ErrorUnit = MICRO_G) -> str:
-    """An error in the unit of the reference as a bare number of the small ``unit``, three digits."""
+    """An error in the unit of the reference as a bare number of the small
+    ``unit``, three digits."""
     if value_g is None:
         return MISSING
     count = unit.count(value_g)
@@ -105,7 +110,8 @@ def chance(p: float | None) -> str:
 
 
 def plus_minus(value: float | None, standard_error: float | None, unit: str) -> str:
-    """`(6.254 ± 0.016) × 10⁻³ rad`: the error to two digits, the value to the same place."""
+    """`(6.254 ± 0.016) × 10⁻³ rad`: the error to two digits, the value to the
+    same place."""
     if value is None:
         return MISSING
     unit = unit_text(unit)

@@ -1,4 +1,5 @@
-"""From a matplotlib figure to inline SVG that takes its colours from the page, light or dark."""
+"""From a matplotlib figure to inline SVG that takes its colours from the page,
+light or dark."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-# Stand-ins that occur nowhere else in a drawing; the page's style sheet gives them their colours.
+# Stand-ins that occur nowhere else in a drawing; the page's style sheet gives
+# them their colours.
 INK, MUTED, GRID, PAPER = "#010101", "#010102", "#010103", "#010104"
 BEFORE, STEP, AFTER, FLOOR = "#010105", "#010106", "#010107", "#010108"
 AXES = ("#010109", "#01010a", "#01010b")
@@ -58,7 +60,8 @@ _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 def draw(name: str, alt: str, size_in: tuple[float, float], paint: Callable[[Figure], None]) -> Markup:
     """Inline SVG of what `paint` draws, `alt` read aloud in its place.
 
-    The same drawing gives the same bytes; `name` keeps the ids of several drawings on a page apart.
+    The same drawing gives the same bytes; `name` keeps the ids of several
+    drawings on a page apart.
     """
     with matplotlib.style.context(["default", {**_STYLE, "svg.hashsalt": name}]):
         figure = Figure(figsize=size_in, layout="constrained")

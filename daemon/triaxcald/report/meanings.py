@@ -1,6 +1,8 @@
-"""What an effect says that it is (`triaxcal.effects.contract.Meaning`), by the names that stand in the documents.
+"""What an effect says that it is (`triaxcal.effects.contract.Meaning`), by the
+names that stand in the documents.
 
-One that says nothing, or is not installed, is shown by its name and its coefficients alone.
+One that says nothing, or is not installed, is shown by its name and its
+coefficients alone.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from triaxcald.report.figures import clean, digits, effect_title, power
 
 @dataclass(frozen=True)
 class Told:
-    """A meaning of one effect of a document, with its channel and its references put in."""
+    """A meaning of one effect of a document, with its channel and its
+    references put in."""
 
     title: str
     clause: str
@@ -51,7 +54,8 @@ _EXPONENT = re.compile(r"(?<![\w.])(?<!\d )(\d(?:\.\d{1,8})?)e[+-]\d{1,2}(?![\w.
 
 
 def told(effect: str, references: Mapping[str, float | None]) -> Told:
-    """``references`` are the values from which the conditions count, by channel."""
+    """``references`` are the values from which the conditions count, by
+    channel."""
     meaning, channel = _meaning(effect)
     title = effect_title(effect)
     if meaning is None:
@@ -70,7 +74,8 @@ def told(effect: str, references: Mapping[str, float | None]) -> Told:
 
 
 def factor(effect: str, coefficient: str) -> tuple[str, str]:
-    """The axis that a coefficient acts on, and what it is multiplied by; empty where that is not known."""
+    """The axis that a coefficient acts on, and what it is multiplied by; empty
+    where that is not known."""
     meaning, _ = _meaning(effect)
     coefficient, run, alone = run_of(coefficient)
     axis, by = _factor(meaning.factors if meaning else {}, coefficient)
@@ -80,8 +85,9 @@ def factor(effect: str, coefficient: str) -> tuple[str, str]:
 
 
 def run_of(coefficient: str) -> tuple[str, int | None, bool]:
-    """A coefficient's name without the recording that it names (the first is 1, None where it names none), and whether
-    that differs from all others, which are alike."""
+    """A coefficient's name without the recording that it names (the first is 1,
+    None where it names none), and whether that differs from all others, which
+    are alike."""
     found = _RUN.fullmatch(coefficient)
     return (found[1], int(found[2]), bool(found[3])) if found else (coefficient, None, False)
 
@@ -97,7 +103,8 @@ def _factor(factors: Mapping[str, str], coefficient: str) -> tuple[str, str]:
 
 
 def in_plain(text: str, *, begins: bool = True) -> str:
-    """A sentence of a document with names and powers of ten as people write them; ``begins``: with a capital."""
+    """A sentence of a document with names and powers of ten as people write
+    them; ``begins``: with a capital."""
     said = _EXPONENT.sub(lambda found: _written_out(found[0], found[1]), text)
     said = _TIMES.sub(lambda found: f"{found[1]} × {power(int(found[2]))}", said)
     said = _NAME.sub(lambda found: _plain(found[0]), said)

@@ -1,4 +1,5 @@
-"""The moments that effects of the model name, each by the clock of one recording, and the poses about them."""
+"""The moments that effects of the model name, each by the clock of one
+recording, and the poses about them."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from triaxcald.report.meanings import run_of
 
 
 def moments_in(outcome: Outcome, recording: str) -> Mapping[str, float]:
-    """By name, in s by the clock of the recording; an empty name is the only one's."""
+    """By name, in s by the clock of the recording; an empty name is the only
+    one's."""
     return {
         clean(effect_title(finding.effect)): at_s
         for finding in outcome.findings
@@ -20,7 +22,8 @@ def moments_in(outcome: Outcome, recording: str) -> Mapping[str, float]:
 
 
 def bracket(finding: Finding, outcome: Outcome) -> str:
-    """In which pose or between which a moment lies, and how far it may be from there; empty where there is none."""
+    """In which pose or between which a moment lies, and how far it may be from
+    there; empty where there is none."""
     at_s, recording = finding.shape("at"), _recording(finding, outcome)
     timed = [
         (pose, pose.start_s, pose.end_s)
@@ -47,7 +50,8 @@ def bracket(finding: Finding, outcome: Outcome) -> str:
     if not (before and after):
         return ""
     (end_s, first), (start_s, last) = max(before), min(after)
-    # Anywhere between the two is a rectangle; a tenth more, and it may have been inside them.
+    # Anywhere between the two is a rectangle; a tenth more, and it may have
+    # been inside them.
     sure = error_s is None or error_s <= 1.1 * (start_s - end_s) / math.sqrt(12)
     return (
         f"The moment lies {'' if sure else 'most likely '}between pose {first} and pose {last}{where}, that is between "
@@ -56,7 +60,8 @@ def bracket(finding: Finding, outcome: Outcome) -> str:
 
 
 def _recording(finding: Finding, outcome: Outcome) -> str:
-    """The one that its coefficients name; empty where they name none, or several."""
+    """The one that its coefficients name; empty where they name none, or
+    several."""
     runs = {run for c in finding.coefficients if (run := run_of(c.name)[1]) is not None}
     run = runs.pop() if len(runs) == 1 else 0
     return outcome.recordings[run - 1] if 0 < run <= len(outcome.recordings) else ""

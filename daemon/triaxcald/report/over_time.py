@@ -1,4 +1,5 @@
-"""The residuals along the time of each recording, before and after, above the channels that moved meanwhile."""
+"""The residuals along the time of each recording, before and after, above the
+channels that moved meanwhile."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def time_pictures(
     moments_in: Callable[[str], Mapping[str, float]],
     unit: ErrorUnit,
 ) -> list[tuple[str, Markup]]:
-    """One a recording, each by its own clock, with the recording's name; ``moments_in`` it are marked."""
+    """One a recording, each by its own clock, with the recording's name;
+    ``moments_in`` it are marked."""
     pictures: list[tuple[str, Markup]] = []
     for recording in dict.fromkeys(pose.recording for pose in poses):
         rows = np.array([pose.recording == recording for pose in poses])
@@ -67,8 +69,8 @@ def time_picture(
     unit: ErrorUnit = MICRO_G,
     name: str = "time",
 ) -> Markup | None:
-    """A panel a stage, each on its own scale, and one for each logged channel that moved; ``moments`` are marked. All
-    poses are of one recording."""
+    """A panel a stage, each on its own scale, and one for each logged channel
+    that moved; ``moments`` are marked. All poses are of one recording."""
     shown = [stage for stage in stages if stage.pose_residual_g is not None]
     if not shown:
         return None
@@ -115,7 +117,8 @@ def stage_colours(stages: Sequence[Stage]) -> dict[str, str]:
 
 
 def _places(poses: Sequence[Pose]) -> tuple[NDArray[np.float64], str]:
-    """Where each pose stands on the axis of time, or its number where a time is missing."""
+    """Where each pose stands on the axis of time, or its number where a time is
+    missing."""
     middles = [pose.middle_s for pose in poses]
     times_s = np.array([middle for middle in middles if middle is not None])
     if times_s.size < len(poses):
@@ -161,7 +164,8 @@ def _residuals(
 
 
 def _keep_used_in_sight(axes: Axes, residual: NDArray[np.float64], used: NDArray[np.bool_]) -> None:
-    """Poses left out may be off by a hundred times what the others are: those are drawn at the edge, as arrows."""
+    """Poses left out may be off by a hundred times what the others are: those
+    are drawn at the edge, as arrows."""
     reach = 3.0 * float(np.nanmax(np.abs(residual[used])))
     if not float(np.nanmax(np.abs(residual))) > 2 * reach > 0:
         return
@@ -184,7 +188,8 @@ def _mark_moments(axes: Axes, moments: Mapping[str, float] | None, *, named: boo
 def _mark_conspicuous(
     axes: Axes, place: NDArray[np.float64], poses: Sequence[Pose], stage: Stage, unit: ErrorUnit
 ) -> None:
-    """Numbers beside the poses a metrologist looks up first: not used, or far out for their noise."""
+    """Numbers beside the poses a metrologist looks up first: not used, or far
+    out for their noise."""
     assert stage.pose_residual_g is not None
     conspicuous = [
         (abs(pose.studentized or 0.0), pose, at, residual_g)

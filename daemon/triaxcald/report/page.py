@@ -24,7 +24,8 @@ from triaxcald.report.stream import StreamOverview
 from triaxcald.report.untrusted import mapping
 from triaxcald.report.verdict import final_word, judge
 
-# Parts of a certificate that the page shows elsewhere, or that are too long to read.
+# Parts of a certificate that the page shows elsewhere, or that are too long to
+# read.
 _SHOWN_ELSEWHERE = {
     "format", "calibration", "loop", "before", "after", "held_out", "findings", "unexplained", "poses",
     "limits", "data_quality", "advice", "residual", "result", "registers", "verification", "not_written", "device",
@@ -40,10 +41,12 @@ def render_report(
     stream: StreamOverview | None = None,
     certificate: Mapping[str, object] | None = None,
 ) -> str:
-    """HTML of a `triaxcal.calibration/1` or `triaxcal.loop/1`: no script, no outside resource.
+    """HTML of a `triaxcal.calibration/1` or `triaxcal.loop/1`: no script, no
+    outside resource.
 
-    Limits (`limits`, named like the fields of a residual, in g) come from the document or the certificate; a
-    document with `refused` gives the reason in place of a result. The same input gives the same bytes.
+    Limits (`limits`, named like the fields of a residual, in g) come from the
+    document or the certificate; a document with `refused` gives the reason in
+    place of a result. The same input gives the same bytes.
     """
     outcome, papers = read_document(document), certificate or {}
     unit, device = outcome.small, read_device(papers)
@@ -77,7 +80,8 @@ def render_report(
 
 
 def _entries(papers: Mapping[str, object], above: str = "") -> Iterator[tuple[str, str]]:
-    """The certificate's own facts as (label, text), nested ones with their path."""
+    """The certificate's own facts as (label, text), nested ones with their
+    path."""
     judged = {"verdict", "outside"} if "outcome" in papers else set()  # of the fit alone
     for key, value in papers.items():
         if not above and key in _SHOWN_ELSEWHERE | judged:

@@ -13,7 +13,8 @@ from triaxcald.report.untrusted import mapping
 
 @dataclass(frozen=True)
 class OfRecording:
-    """How well the magnitude comes out in the poses of one recording, rms in the unit of the reference."""
+    """How well the magnitude comes out in the poses of one recording, rms in
+    the unit of the reference."""
 
     name: str
     poses: float | None
@@ -23,7 +24,8 @@ class OfRecording:
 
 
 def file_names(paths: Sequence[str]) -> dict[str, str]:
-    """What to call recordings, by path: by their files' names where these tell them apart."""
+    """What to call recordings, by path: by their files' names where these tell
+    them apart."""
     names = [PurePath(path).name or path for path in paths]
     counts = Counter(names)
     return {path: clean(name if counts[name] == 1 else path) for path, name in zip(paths, names, strict=True)}

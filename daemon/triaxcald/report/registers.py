@@ -1,4 +1,5 @@
-"""What a station put into the device: the registers, and what the device itself then measured."""
+"""What a station put into the device: the registers, and what the device itself
+then measured."""
 
 from __future__ import annotations
 
@@ -24,8 +25,9 @@ class Word:
 
 @dataclass(frozen=True)
 class Device:
-    """Effects: ``held`` are in its registers, for ``host`` it has none, ``passing`` depend on how the poses were taken.
-    ``checked`` are errors in g of the device's own output; ``state`` says in words what it holds now.
+    """Effects: ``held`` are in its registers, for ``host`` it has none,
+    ``passing`` depend on how the poses were taken. ``checked`` are errors in g
+    of the device's own output; ``state`` says in words what it holds now.
     """
 
     state: str

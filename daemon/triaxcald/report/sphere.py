@@ -1,4 +1,5 @@
-"""The residual of every pose over the sphere of directions, one pair of hemispheres a stage."""
+"""The residual of every pose over the sphere of directions, one pair of
+hemispheres a stage."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from triaxcald.report.figures import MICRO_G, micro, unit_label
 from triaxcald.report.ink import GRID, INK, MUTED, draw
 from triaxcald.report.stages import Stage
 
-# Readable on white and on near-black alike: saturated ends, a middle grey for "no more than noise".
+# Readable on white and on near-black alike: saturated ends, a middle grey for
+# "no more than noise".
 _COLOURS = LinearSegmentedColormap.from_list(
     "residual", ["#0a4fd0", "#3f86f0", "#8db4e8", "#a3a3a3", "#eab27e", "#f07f1e", "#c04a00"]
 )
@@ -33,7 +35,8 @@ _LABEL_SIZE = (0.25, 0.14)
 def sphere_picture(
     poses: Sequence[Pose], stages: Sequence[Stage], noise_floor_g: float | None, unit: ErrorUnit = MICRO_G
 ) -> Markup | None:
-    """Poses on two equal-area hemispheres coloured by residual, or None without directions or residuals."""
+    """Poses on two equal-area hemispheres coloured by residual, or None without
+    directions or residuals."""
     shown = [stage for stage in stages if stage.pose_residual_g is not None]
     if not shown or all(pose.direction is None for pose in poses):
         return None
@@ -60,7 +63,8 @@ def sphere_picture(
 
 
 def equal_area(direction: NDArray[np.float64], side: int) -> NDArray[np.float64]:
-    """Lambert's projection of unit vectors (n, 3) onto the unit disc (n, 2) about +Z or −Z.
+    """Lambert's projection of unit vectors (n, 3) onto the unit disc (n, 2)
+    about +Z or −Z.
 
     Both halves are seen from +Z, so +X lies right and +Y up in each.
     """
@@ -70,7 +74,8 @@ def equal_area(direction: NDArray[np.float64], side: int) -> NDArray[np.float64]
 
 
 def _doubling_classes(stages: Sequence[Stage], noise_floor_g: float | None) -> BoundaryNorm:
-    """Classes of ±1, ±2, ±4 … noise floors, so that errors before and after both show on one scale."""
+    """Classes of ±1, ±2, ±4 … noise floors, so that errors before and after
+    both show on one scale."""
     largest = max(float(np.nanmax(np.abs(r))) for stage in stages if (r := stage.pose_residual_g) is not None)
     unit = noise_floor_g if noise_floor_g is not None and noise_floor_g > 0 else (largest / 8 or 1e-6)
     doublings = int(np.clip(np.ceil(np.log2(max(largest / unit, 1.0))), 2, _MOST_DOUBLINGS))
@@ -109,13 +114,15 @@ def _markers(axes: Axes, side: int, here: Sequence[tuple[Pose, float]], norm: Bo
         )  # fmt: skip
     if numbered:
         for (x, y), numbers in _labels([pose.number for pose, _ in here], places):
-            # Clear of the axes' names, which stand above the rim and to the right of it.
+            # Clear of the axes' names, which stand above the rim and to the
+            # right of it.
             up = -9.0 if y > 0.85 and abs(x) < 0.3 else 7.5 if x > 0.85 and abs(y) < 0.2 else 4.5
             axes.annotate(numbers, (x, y), (4.5, up), textcoords="offset points", fontsize=6.5)
 
 
 def _labels(numbers: Sequence[int], places: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], str]]:
-    """One for all poses whose own would lie on each other, as of a pose that is taken twice."""
+    """One for all poses whose own would lie on each other, as of a pose that is
+    taken twice."""
     groups: list[tuple[NDArray[np.float64], list[int]]] = []
     for number, place in zip(numbers, places, strict=True):
         near = next((g for at, g in groups if np.all(np.abs(place - at) < _LABEL_SIZE)), None)

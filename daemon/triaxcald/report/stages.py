@@ -14,7 +14,8 @@ from triaxcald.report.untrusted import mapping
 
 @dataclass(frozen=True)
 class Residual:
-    """Errors of the magnitude in g, and the probability that pure noise leaves as much."""
+    """Errors of the magnitude in g, and the probability that pure noise leaves
+    as much."""
 
     rms_g: float | None = None
     max_abs_g: float | None = None
@@ -65,7 +66,8 @@ def stages_of(
     by_pose_g: tuple[Sequence[float | None], Sequence[float | None]],
     held_out: HoldOut | None,
 ) -> tuple[Stage, ...]:
-    """Before and after; one where they are the same. ``by_pose_g`` has the residuals of both."""
+    """Before and after; one where they are the same. ``by_pose_g`` has the
+    residuals of both."""
     before_g, after_g = by_pose_g
     after = residual_of(document.get("after")) or residual_of(calibration.get("residual"))
     before = residual_of(document.get("before"))
@@ -79,6 +81,7 @@ def stages_of(
 
 
 def _series(values: Sequence[float | None]) -> NDArray[np.float64] | None:
-    """Residuals as an array with NaN for a missing one; None when all are missing."""
+    """Residuals as an array with NaN for a missing one; None when all are
+    missing."""
     array = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
     return None if array.size == 0 or bool(np.isnan(array).all()) else array

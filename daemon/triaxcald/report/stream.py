@@ -1,4 +1,5 @@
-"""The raw readings as the page shows them: few enough points to draw, no extreme lost."""
+"""The raw readings as the page shows them: few enough points to draw, no
+extreme lost."""
 
 from __future__ import annotations
 
@@ -17,8 +18,8 @@ from triaxcal.poses.stillness.detector import Windows
 class StreamOverview:
     """Raw readings thinned for a picture.
 
-    time_s (n,), readings (n, 3) in `unit`, spans the still spans as (start_s, end_s) on the same clock.
-    Raises ValueError when the shapes disagree.
+    time_s (n,), readings (n, 3) in `unit`, spans the still spans as (start_s,
+    end_s) on the same clock. Raises ValueError when the shapes disagree.
     """
 
     time_s: NDArray[np.float64]
@@ -38,7 +39,8 @@ class StreamOverview:
 
 
 def thin(time_s: ArrayLike, readings: ArrayLike, points: int = 2000) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """At most `points` rows of (n,) and (n, 3), in order, among them every stretch's extremes of each axis.
+    """At most `points` rows of (n,) and (n, 3), in order, among them every
+    stretch's extremes of each axis.
 
     Raises ValueError below 8 points: the ends and one stretch's six extremes.
     """
@@ -58,7 +60,8 @@ def thin(time_s: ArrayLike, readings: ArrayLike, points: int = 2000) -> tuple[ND
 
 
 def overview_of(windows: Windows | None, poses: Sequence[Pose], unit: str) -> StreamOverview | None:
-    """The stream from its windows' means; None where there is not one whole window."""
+    """The stream from its windows' means; None where there is not one whole
+    window."""
     if windows is None:
         return None
     time_s, readings = thin((windows.start_ns - int(windows.start_ns[0])) * 1e-9, windows.mean)

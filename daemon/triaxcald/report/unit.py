@@ -1,4 +1,5 @@
-"""The report on one unit of a station, from values that its recording holds: line and audit draw it alike."""
+"""The report on one unit of a station, from values that its recording holds:
+line and audit draw it alike."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ def drawn_with() -> dict[str, str]:
 def unit_report(
     certified: Certified, pipeline: Pipeline, ending: Ending, verification: Mapping[str, Any] | None, held: Held
 ) -> str:
-    """``pipeline`` is that of the readings, finished. The same values give the same bytes."""
+    """``pipeline`` is that of the readings, finished. The same values give the
+    same bytes."""
     papers: dict[str, object] = dict(certified.document)
     papers["outcome"] = {"verdict": ending.verdict.value, "reason": ending.reason}
     if verification:

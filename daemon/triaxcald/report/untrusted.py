@@ -1,4 +1,5 @@
-"""Values of a document, read without trust: what is missing or of the wrong kind counts as missing."""
+"""Values of a document, read without trust: what is missing or of the wrong
+kind counts as missing."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ def mapping(value: object) -> Mapping[str, object]:
 
 
 def texts(value: object) -> tuple[str, ...]:
-    """A list of sentences or names; an entry with keys becomes `key: value; key: value`."""
+    """A list of sentences or names; an entry with keys becomes `key: value;
+    key: value`."""
     entries = value if isinstance(value, (list, tuple)) else [] if value is None else [value]
     return tuple(words(entry) for entry in entries if entry is not None)
 

@@ -1,4 +1,5 @@
-"""The first line of the page: what came out, in one word and one sentence, and what speaks against it."""
+"""The first line of the page: what came out, in one word and one sentence, and
+what speaks against it."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ EVEN = 0.5
 
 @dataclass(frozen=True)
 class LimitCheck:
-    """One declared limit in g against what was measured; `passed` is None where nothing was measured."""
+    """One declared limit in g against what was measured; `passed` is None where
+    nothing was measured."""
 
     name: str
     measured_g: float | None
@@ -73,10 +75,12 @@ def judge(
     expanded_g: float | None = None,
     final: FinalWord | None = None,
 ) -> Verdict:
-    """The verdict on an outcome, or the ``final`` one of a station, with what the fit says for it and against it.
+    """The verdict on an outcome, or the ``final`` one of a station, with what
+    the fit says for it and against it.
 
-    Limits are named like the fields of a residual, or `held_out_rms_g`, and hold inclusively. A limit that
-    nothing was measured against is never taken as kept, and nothing is well whose times or unit are in doubt.
+    Limits are named like the fields of a residual, or `held_out_rms_g`, and
+    hold inclusively. A limit that nothing was measured against is never taken
+    as kept, and nothing is well whose times or unit are in doubt.
     """
     failed = final is not None and final.verdict == "fail"
     found = _concluded(_judged(outcome, certificate_limits, expanded_g, failed), final)
@@ -231,7 +235,8 @@ def _lacks_fit(outcome: Outcome) -> bool:
 
 
 def _errors(outcome: Outcome) -> str:
-    """The error before and after where both are known, the most honest one available, against the floor."""
+    """The error before and after where both are known, the most honest one
+    available, against the floor."""
     name, pairs = "cross-validated", [s.residual.cross_validated_rms_g for s in outcome.stages]
     if outcome.held_out is not None and outcome.held_out.after_rms_g is not None:
         name, pairs = "held-out", [outcome.held_out.before_rms_g, outcome.held_out.after_rms_g]
@@ -249,7 +254,8 @@ def _errors(outcome: Outcome) -> str:
 
 
 def _beyond_limits(checks: tuple[LimitCheck, ...], expanded_g: float | None, unit: ErrorUnit) -> list[str]:
-    """What no residual can show: an error of the reference is the same in every pose, and fitted away."""
+    """What no residual can show: an error of the reference is the same in every
+    pose, and fitted away."""
     least = min((c.limit_g for c in checks if c.limit_g is not None), default=None)
     if least is None or expanded_g is None or expanded_g <= least:
         return []

@@ -1,4 +1,5 @@
-"""How work ends: the verdict, the exit code it owes, and the reason in one line."""
+"""How work ends: the verdict, the exit code it owes, and the reason in one
+line."""
 
 from __future__ import annotations
 
@@ -23,8 +24,9 @@ from triaxcald.verification import WORSE
 
 
 def judged(outside: Sequence[str], verification: Mapping[str, Any] | None, limits: Limits) -> Ending:
-    """The verdict on the figures: on those of the fit, ``outside`` where they are outside a limit, and on the device's
-    own output where it was written. Nothing else enters, so that an audit comes to the same."""
+    """The verdict on the figures: on those of the fit, ``outside`` where they
+    are outside a limit, and on the device's own output where it was written.
+    Nothing else enters, so that an audit comes to the same."""
     if outside:
         return Ending(Verdict.FAIL, "; ".join(outside), OUTSIDE)
     if verification is not None and verification["verdict"] in (VERIFIED_OUTSIDE, WORSE):
@@ -36,8 +38,8 @@ def judged(outside: Sequence[str], verification: Mapping[str, Any] | None, limit
 
 
 def aborted(e: BaseException, p: Provisioning | None) -> Ending:
-    """Once registers were written any error is one of the device, unless it is settled and only the disk failed or
-    somebody interrupted."""
+    """Once registers were written any error is one of the device, unless it is
+    settled and only the disk failed or somebody interrupted."""
     code, reason = exit_code_of(e), str(e) or type(e).__name__
     if isinstance(e, asyncio.CancelledError):
         reason = "interrupted"

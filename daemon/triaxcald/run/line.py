@@ -1,4 +1,5 @@
-"""One unit's way down the line: record, certify, provision, verify. Everything goes into its recording."""
+"""One unit's way down the line: record, certify, provision, verify. Everything
+goes into its recording."""
 
 from __future__ import annotations
 
@@ -56,11 +57,13 @@ CERTIFICATE, REPORT = "certificate.json", "report.html"
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one unit's run ended. ``exit_code`` as the command line owes it; ``error`` one line where it failed.
+    """How one unit's run ended. ``exit_code`` as the command line owes it;
+    ``error`` one line where it failed.
 
-    ``document`` is the `triaxcal.outcome/1`. ``device_state`` says in words what the device holds, None where nothing
-    was to be written; ``settling`` the command that clears it up, None where nothing is left to be cleared up. ``lost``
-    counts records that did not get to the disk.
+    ``document`` is the `triaxcal.outcome/1`. ``device_state`` says in words
+    what the device holds, None where nothing was to be written; ``settling``
+    the command that clears it up, None where nothing is left to be cleared up.
+    ``lost`` counts records that did not get to the disk.
     """
 
     unit: str
@@ -82,7 +85,8 @@ class Outcome:
 
 
 class UnitRun:
-    """The whole line for one unit of a station. ``force`` is the reason to write in spite of doubts."""
+    """The whole line for one unit of a station. ``force`` is the reason to
+    write in spite of doubts."""
 
     def __init__(
         self,
@@ -109,7 +113,8 @@ class UnitRun:
         self._lost = 0
 
     async def run(self) -> Outcome:
-        """Raises nothing, not even when it is cancelled: it says everything in the outcome."""
+        """Raises nothing, not even when it is cancelled: it says everything in
+        the outcome."""
         ending: Ending | None = None
         try:
             async with self.place.opened() as device:
@@ -163,7 +168,8 @@ class UnitRun:
         return Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER) if self._open_journal else Held()
 
     def _seal(self, writer: RecordingWriter, ending: Ending) -> None:
-        """The outcome as the last attachment, with the inventory of all that is before it; closes the recording."""
+        """The outcome as the last attachment, with the inventory of all that is
+        before it; closes the recording."""
         made: list[Document] = []
 
         def make(contents: Document) -> bytes:
@@ -212,7 +218,8 @@ class UnitRun:
         return text.unfinished(self._open_journal, self.name, self.station.path) if self._open_journal else None
 
     def _write_papers(self) -> None:
-        """The files beside the recording, once it is closed: certificate and report, the outcome last."""
+        """The files beside the recording, once it is closed: certificate and
+        report, the outcome last."""
         if self._recording is None:
             return
         papers = dict(self._papers)
@@ -372,7 +379,8 @@ class UnitRun:
         )
 
     async def check(self) -> Verification:
-        """Records nothing and writes nothing: only asks the device, in check poses, for its own corrected output."""
+        """Records nothing and writes nothing: only asks the device, in check
+        poses, for its own corrected output."""
         async with self.place.opened() as device:
             await self.identify(device)
             self.progress.stage(self.name, "check poses")
@@ -389,7 +397,8 @@ class UnitRun:
 async def run_station(station: Station, progress: Progress, *, force: str | None = None) -> list[Outcome]:
     """All units of a station at once; one that fails does not stop the others.
 
-    When it is cancelled, every unit is, again each time, and put in order first; the outcomes then say 130.
+    When it is cancelled, every unit is, again each time, and put in order
+    first; the outcomes then say 130.
     """
     serials = SerialsSeen()
     runs = [UnitRun(station, place, progress, serials=serials, force=force) for place in station.places]

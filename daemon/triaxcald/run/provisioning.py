@@ -1,4 +1,5 @@
-"""Provisioning by hand: a calibration that was made before, one that was cut short, or an old one put back."""
+"""Provisioning by hand: a calibration that was made before, one that was cut
+short, or an old one put back."""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ from triaxcald.station.power import power_cycle_asked
 
 @dataclass(frozen=True)
 class Provisioned:
-    """``error`` is one line where it failed; ``path`` is where the outcome was written, if it was."""
+    """``error`` is one line where it failed; ``path`` is where the outcome was
+    written, if it was."""
 
     exit_code: int
     document: Document
@@ -59,8 +61,9 @@ class Provisioned:
 
 @dataclass
 class ProvisionRun:
-    """Writes ``image``, meant for the unit ``serial``, to the device at ``place``; without an image, the one of a
-    provisioning that was cut short. ``force`` is the reason to write in spite of doubts."""
+    """Writes ``image``, meant for the unit ``serial``, to the device at
+    ``place``; without an image, the one of a provisioning that was cut short.
+    ``force`` is the reason to write in spite of doubts."""
 
     station: Station
     place: Place
@@ -69,15 +72,16 @@ class ProvisionRun:
     dry_run: bool = False
     force: str | None = None
     ask: Callable[[str], None] | None = None
-    """Shows the operator what to do; given, the supply is to be switched off and on where nothing else shows what is
-    stored."""
+    """Shows the operator what to do; given, the supply is to be switched off
+    and on where nothing else shows what is stored."""
     clock_ns: Callable[[], int] = time.time_ns
     provisioning: Provisioning | None = field(default=None, init=False)
     doubts: Sequence[Doubt] = field(default=(), init=False)
     _begun: Provisioning | None = field(default=None, init=False)
 
     async def run(self) -> Provisioned:
-        """Raises nothing, not even when it is cancelled: it says everything in the outcome."""
+        """Raises nothing, not even when it is cancelled: it says everything in
+        the outcome."""
         ending: Ending | None = None
         try:
             with at_abort(self.left):
@@ -153,7 +157,8 @@ class ProvisionRun:
 
     @property
     def _open_journal(self) -> Path | None:
-        """The journal of an earlier provisioning, or of this one, where it is still needed."""
+        """The journal of an earlier provisioning, or of this one, where it is
+        still needed."""
         if self._begun is not None and self._begun.identified:
             return self._begun.open_journal
         return open_journal(self.station.folder, self.place.unit.name, self.serial or self.place.unit.serial)
@@ -223,7 +228,8 @@ class RestoreRun(ProvisionRun):
 
 
 def snapshot_in(path: Path, profile: Profile) -> tuple[Snapshot, str | None]:
-    """The registers that a recording or a journal has kept, and the name of the unit. Raises InputError."""
+    """The registers that a recording or a journal has kept, and the name of the
+    unit. Raises InputError."""
     held, serial, unit = _kept(path)
     for name, raw in held.items():
         if name not in profile.registers:

@@ -1,4 +1,5 @@
-"""Writing back and verifying by physics: no way out leaves the device with a calibration that nobody vouches for."""
+"""Writing back and verifying by physics: no way out leaves the device with a
+calibration that nobody vouches for."""
 
 from __future__ import annotations
 
@@ -44,15 +45,18 @@ from triaxcald.verification import (
 VERIFICATION_FILE = "verification.json"
 REGISTERS_BEFORE, REGISTERS_AFTER = "registers-before.json", "registers-after.json"
 FIRST_POSES = 4
-"""Of so many poses at the start of either stream at least one is in the other stream too."""
+"""Of so many poses at the start of either stream at least one is in the other
+stream too."""
 REGISTERS_EARLIER = "registers-earlier.json"
-"""What the device held before an earlier provisioning that was cut short: what an undoing brings back."""
+"""What the device held before an earlier provisioning that was cut short: what
+an undoing brings back."""
 
 
 @dataclass
 class WriteBack:
-    """``collect`` fetches check poses, ``ask`` shows the operator what to do; ``force`` is the reason to go on in spite
-    of `doubts`. ``verdict`` is the one on the device's own output, None before it is judged."""
+    """``collect`` fetches check poses, ``ask`` shows the operator what to do;
+    ``force`` is the reason to go on in spite of `doubts`. ``verdict`` is the
+    one on the device's own output, None before it is judged."""
 
     place: Place
     station: Station
@@ -67,9 +71,11 @@ class WriteBack:
     provisioning: Provisioning | None = field(default=None, init=False)
 
     async def run(self, device: Device, image: RegisterImage, serial: str | None, tumble: Collection) -> None:
-        """Whatever is raised on the way, the old calibration has been put back before, or `held` says what is not.
+        """Whatever is raised on the way, the old calibration has been put back
+        before, or `held` says what is not.
 
-        Raises Implausible, with nothing written, ProvisionError, StationError, DiskError.
+        Raises Implausible, with nothing written, ProvisionError, StationError,
+        DiskError.
         """
         link = RegisterLink(device, self.place.bundle.profile, _recorder(self.writer))
         asked = power_cycle_asked(self.ask, link, self.place, self.station)
@@ -164,9 +170,11 @@ def corrected(collection: Collection, reference: float) -> Verification:
 
 
 def _alignments(readings: Sequence[Pose], outputs: Sequence[Pose]) -> Iterator[list[tuple[Pose, Pose]]]:
-    """Poses of the two streams that lie over each other, for each way to lay one over the other.
+    """Poses of the two streams that lie over each other, for each way to lay
+    one over the other.
 
-    Each stream counts its seconds from its own first sample, and either may have begun some poses later.
+    Each stream counts its seconds from its own first sample, and either may
+    have begun some poses later.
     """
     (r0, r1), (c0, c1) = (np.array([(p.start_s, p.end_s) for p in s]).reshape(-1, 2).T for s in (readings, outputs))
     apart_s = np.subtract.outer(r0, c0)

@@ -1,4 +1,5 @@
-"""A simulated unit on a simulated tumble fixture: the file that describes it, its physics, its place on a bus."""
+"""A simulated unit on a simulated tumble fixture: the file that describes it,
+its physics, its place on a bus."""
 
 from __future__ import annotations
 
@@ -51,13 +52,14 @@ class Surroundings(Strict):
 
 
 CHECK_POSES, CHECK_TOURS = 14, 3
-"""More poses than a station asks for by default, so that one that comes late still finds enough; and after so many
-restarts the first ones come again."""
+"""More poses than a station asks for by default, so that one that comes late
+still finds enough; and after so many restarts the first ones come again."""
 
 
 class Fixture(Strict):
-    """The tumble fixture: it goes through the poses of the plan, in its order, the first once more, again and again;
-    and after a restart of the unit once through others, to check by."""
+    """The tumble fixture: it goes through the poses of the plan, in its order,
+    the first once more, again and again; and after a restart of the unit once
+    through others, to check by."""
 
     poses: Annotated[int, Field(ge=9, le=1000)] = 26
     hold_s: Annotated[float, Field(gt=0)] = 4.0
@@ -84,7 +86,8 @@ class DeviceFile(Strict):
 
 @dataclass(frozen=True)
 class CheckedTumble(Tumble):
-    """Goes through ``tours`` (t,k,3), one after each restart, and then on with its own directions."""
+    """Goes through ``tours`` (t,k,3), one after each restart, and then on with
+    its own directions."""
 
     tours: Floats = field(kw_only=True)
     _begun: list[int] = field(default_factory=list, init=False)
@@ -126,7 +129,8 @@ def load_device(path: Path) -> DeviceFile:
 
 
 def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics:
-    """Raises InputError where an effect is not known or not simulated; ``where`` names the file in it."""
+    """Raises InputError where an effect is not known or not simulated;
+    ``where`` names the file in it."""
     effects = [_effect(name, held, where) for name, held in device.sensor.effects.items()]
     truth = device.sensor
     sensor = Sensor(np.array(truth.scale_factor), np.array(truth.misalignment), np.array(truth.bias), tuple(effects))
@@ -139,7 +143,8 @@ def physics_of(device: DeviceFile, *, where: str = "device") -> SyntheticPhysics
 
 
 def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[Effect, Floats]:
-    """An effect and its coefficients, as a device file has them. Raises InputError."""
+    """An effect and its coefficients, as a device file has them. Raises
+    InputError."""
     here = f"{where}: sensor.effects.{name}"
     try:
         forms = effect_named(name).forms
@@ -161,8 +166,8 @@ def _effect(name: str, held: Mapping[str, float], where: str) -> tuple[Effect, F
 
 
 def tumble_of(device: DeviceFile) -> CheckedTumble:
-    """The plan's directions in its order, the first once more, and others to check by; each off by the fixture's
-    attitude error."""
+    """The plan's directions in its order, the first once more, and others to
+    check by; each off by the fixture's attitude error."""
     fixture = device.fixture
     try:
         plan = np.array([v for _, v in directions(fixture.poses)])
@@ -185,7 +190,8 @@ def tumble_of(device: DeviceFile) -> CheckedTumble:
 
 @dataclass
 class SimulatedUnit:
-    """A described unit, ready to be served. ``unit`` is the electronics, for whoever wants to look inside."""
+    """A described unit, ready to be served. ``unit`` is the electronics, for
+    whoever wants to look inside."""
 
     device: DeviceFile
     bundle: Bundle

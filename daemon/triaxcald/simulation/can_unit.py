@@ -1,4 +1,5 @@
-"""The reference unit on a CAN bus: a CANopen node (CiA 301) that streams by TPDO and answers by SDO."""
+"""The reference unit on a CAN bus: a CANopen node (CiA 301) that streams by
+TPDO and answers by SDO."""
 
 from __future__ import annotations
 
@@ -93,11 +94,12 @@ class _Requests(can.Listener):
 class CanUnit:
     """Serves ``unit`` as node ``bus.node_id`` while the context is entered.
 
-    Everything runs in the event loop; python-can's thread only receives. SDO is served here and not by
-    canopen's LocalNode, which stumbles over malformed requests, invents members of arrays and cannot keep
-    silent; NMT, heartbeat and TPDOs run in the unit's time. Expedited SDO transfers only: no object is
-    longer than four bytes.
-    Raises BusError on entering where the bus cannot be opened, on leaving where it has failed meanwhile.
+    Everything runs in the event loop; python-can's thread only receives. SDO is
+    served here and not by canopen's LocalNode, which stumbles over malformed
+    requests, invents members of arrays and cannot keep silent; NMT, heartbeat
+    and TPDOs run in the unit's time. Expedited SDO transfers only: no object is
+    longer than four bytes. Raises BusError on entering where the bus cannot be
+    opened, on leaving where it has failed meanwhile.
     """
 
     def __init__(self, unit: ReferenceUnit, time_base: TimeBase, bus: CanBus) -> None:
@@ -151,7 +153,8 @@ class CanUnit:
             await self._time.wait_until(self._time.later_s(now_s, 1 / self._unit.rate_hz))
 
     def _work(self, now_s: float) -> None:
-        """Everything due by ``now_s``: boot-up after a start, heartbeat, samples."""
+        """Everything due by ``now_s``: boot-up after a start, heartbeat,
+        samples."""
         if not self._unit.alive(now_s):
             return
         if self._started_s != self._unit.started_s:
@@ -198,7 +201,8 @@ class CanUnit:
             self._state = _COMMANDS.get(command, self._state)
 
     def _answer(self, request: bytes) -> bytes | None:
-        """The SDO server (CiA 301): one request, its answer or an abort; None for silence."""
+        """The SDO server (CiA 301): one request, its answer or an abort; None
+        for silence."""
         command, index, subindex = struct.unpack_from("<BHB", request)
         try:
             if command >> 5 == _UPLOAD:

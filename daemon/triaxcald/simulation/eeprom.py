@@ -15,11 +15,13 @@ from triaxcald.simulation.unit import ReferenceUnit
 
 LOOK_S = 0.05
 EEPROM_MOST = 4096
-"""Bytes; the unit's has 90. What is longer is somebody's file, and not to be written over."""
+"""Bytes; the unit's has 90. What is longer is somebody's file, and not to be
+written over."""
 
 
 def read_eeprom(path: Path) -> bytes | None:
-    """None where there is no such file yet; it must be one that can be written. Raises InputError."""
+    """None where there is no such file yet; it must be one that can be written.
+    Raises InputError."""
     require_writable(path)
     try:
         return read_whole(path, EEPROM_MOST)
@@ -36,7 +38,8 @@ def write_eeprom(path: Path, image: bytes) -> None:
 
 @asynccontextmanager
 async def keep_eeprom(unit: ReferenceUnit, path: Path | None) -> AsyncIterator[None]:
-    """Writes the unit's EEPROM to ``path`` whenever it changes, until the context ends."""
+    """Writes the unit's EEPROM to ``path`` whenever it changes, until the
+    context ends."""
     if path is None:
         yield
         return

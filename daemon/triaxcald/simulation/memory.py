@@ -1,4 +1,5 @@
-"""The reference unit's registers as data, and its memory: the RAM copy in use and the stored copy."""
+"""The reference unit's registers as data, and its memory: the RAM copy in use
+and the stored copy."""
 
 from __future__ import annotations
 
@@ -63,16 +64,19 @@ TABLE: Mapping[str, Entry] = {
     **{name: Entry(_INTEGERS.get(name, "float32"), "rw") for name in CALIBRATION},
     **{"stored_" + name: Entry(_INTEGERS.get(name, "float32"), "ro") for name in CALIBRATION},
 }
-"""Every register of the unit by name; ``stored_`` + name mirrors the stored copy."""
+"""Every register of the unit by name; ``stored_`` + name mirrors the stored
+copy."""
 
 
 def checksum(copy: Mapping[str, bytes]) -> bytes:
-    """The calibration_crc that belongs to a copy of the calibration registers, as raw bytes."""
+    """The calibration_crc that belongs to a copy of the calibration registers,
+    as raw bytes."""
     return crc("crc-16/modbus", b"".join(copy[name] for name in COVERED)).to_bytes(2, "big")
 
 
 def factory_calibration() -> dict[str, bytes]:
-    """The nominal scale factor and the reference temperature; nothing else, dated 1970-01-01."""
+    """The nominal scale factor and the reference temperature; nothing else,
+    dated 1970-01-01."""
     values = {f"scale_factor_{axis}": -2.4 for axis in "xyz"} | {"reference_temperature": 25.0}
     copy = {name: TABLE[name].encode(values.get(name, 0.0)) for name in COVERED}
     return copy | {CRC: checksum(copy)}
@@ -80,7 +84,8 @@ def factory_calibration() -> dict[str, bytes]:
 
 @dataclass(frozen=True)
 class Stored:
-    """The stored copy: calibration registers as raw bytes, times stored, and whether it was read whole."""
+    """The stored copy: calibration registers as raw bytes, times stored, and
+    whether it was read whole."""
 
     calibration: Mapping[str, bytes]
     write_counter: int = 0
@@ -91,13 +96,15 @@ class Stored:
         return self.intact and checksum(self.calibration) == self.calibration[CRC]
 
     def image(self) -> bytes:
-        """The bytes of the EEPROM: calibration registers in order, write counter, CRC-32 over both."""
+        """The bytes of the EEPROM: calibration registers in order, write
+        counter, CRC-32 over both."""
         body = b"".join(self.calibration[name] for name in CALIBRATION) + self.write_counter.to_bytes(4, "big")
         return body + zlib.crc32(body).to_bytes(4, "big")
 
     @staticmethod
     def from_image(image: bytes) -> Stored:
-        """What the unit finds at start-up. An image that is damaged, or of another length, is not intact."""
+        """What the unit finds at start-up. An image that is damaged, or of
+        another length, is not intact."""
         sizes = [TABLE[name].size for name in CALIBRATION]
         expected = sum(sizes) + 8
         whole = image[:expected].ljust(expected, b"\xff")  # an erased cell reads as ones

@@ -1,4 +1,5 @@
-"""The reference unit on Modbus, over TCP or RTU on a serial line: register map and FIFO windows."""
+"""The reference unit on Modbus, over TCP or RTU on a serial line: register map
+and FIFO windows."""
 
 from __future__ import annotations
 
@@ -70,7 +71,8 @@ _WORDS = {address + word: (name, word) for address, name in HOLDING.items() for 
 
 
 class Fifo:
-    """Records of ten words; when it is full the oldest one goes, and is counted."""
+    """Records of ten words; when it is full the oldest one goes, and is
+    counted."""
 
     def __init__(self) -> None:
         self._records = bytearray()
@@ -92,7 +94,8 @@ class Fifo:
         self.lost += excess
 
     def window(self, words: int) -> bytes:
-        """The first ``words`` words of the window; takes out the records that lie in them whole."""
+        """The first ``words`` words of the window; takes out the records that
+        lie in them whole."""
         self._read = True
         number = min(len(self), WINDOW_RECORDS, max(0, words - HEADER_WORDS) // RECORD_WORDS)
         taken = bytes(self._records[: number * 2 * RECORD_WORDS])
@@ -107,7 +110,8 @@ class Fifo:
 
 
 class ModbusMap:
-    """The unit's registers and FIFO windows as Modbus sees them; implements `protocol.Handler`."""
+    """The unit's registers and FIFO windows as Modbus sees them; implements
+    `protocol.Handler`."""
 
     def __init__(self, unit: ReferenceUnit, time_base: TimeBase) -> None:
         self._unit = unit
@@ -117,7 +121,8 @@ class ModbusMap:
         time_base.wait_for_reader(lambda: any(fifo.behind for fifo in self._windows.values()))
 
     def fill(self) -> None:
-        """Moves the samples that have come due into the FIFOs; empties these where the unit has restarted."""
+        """Moves the samples that have come due into the FIFOs; empties these
+        where the unit has restarted."""
         run = self._unit.advance(self._time_base.now_s())
         if self._unit.started_s != self._started_s:
             self._started_s = self._unit.started_s
@@ -145,7 +150,8 @@ class ModbusMap:
         return b"".join(words)
 
     def write(self, address: int, data: bytes) -> None:
-        """Whole registers, in order of address; the first that is refused ends it."""
+        """Whole registers, in order of address; the first that is refused ends
+        it."""
         names, at, end = [], address, address + len(data) // 2
         while at < end:
             if at not in _WORDS:
@@ -188,10 +194,12 @@ def _records(run: SampleRun, stamp_us: NDArray[np.int64], xyz: NDArray[np.int32]
 
 
 class ModbusUnit:
-    """Serves the unit while the context is open; ``bus`` then says how to reach it.
+    """Serves the unit while the context is open; ``bus`` then says how to reach
+    it.
 
-    A serial port ``pty:/tmp/link`` is a pseudo-terminal made for the purpose, with a symbolic link to the end
-    that a driver opens. Raises BusError where the port or the address is not to be had.
+    A serial port ``pty:/tmp/link`` is a pseudo-terminal made for the purpose,
+    with a symbolic link to the end that a driver opens. Raises BusError where
+    the port or the address is not to be had.
     """
 
     def __init__(
@@ -242,7 +250,8 @@ class ModbusUnit:
         )
 
     async def _fill(self) -> None:
-        """So that a unit that nobody reads overflows as it goes, and not in one long run later."""
+        """So that a unit that nobody reads overflows as it goes, and not in one
+        long run later."""
         while True:
             await self._time_base.wait_until(self._time_base.now_s() + _FILL_PERIOD_S)
             self._map.fill()

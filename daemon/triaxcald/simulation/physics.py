@@ -1,4 +1,5 @@
-"""What the simulated unit's sensor sees: voltages and a temperature as functions of time."""
+"""What the simulated unit's sensor sees: voltages and a temperature as
+functions of time."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 class Physics(Protocol):
     def sample(self, unit_time_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The sensor's output (n, 3) in V before the converter, and its temperature (n,) in °C.
+        """The sensor's output (n, 3) in V before the converter, and its
+        temperature (n,) in °C.
 
         Times are in the unit's time base, ascending, each asked for once.
         """

@@ -1,4 +1,5 @@
-"""A serial line without hardware: two pseudo-terminals, each the other's far end."""
+"""A serial line without hardware: two pseudo-terminals, each the other's far
+end."""
 
 from __future__ import annotations
 
@@ -13,11 +14,12 @@ from triaxcal_drivers.errors import BusError
 
 @asynccontextmanager
 async def pty_pair(link: Path | None = None) -> AsyncIterator[tuple[str, str]]:
-    """Paths of the two ends. Both open as serial ports, in this process or another; parity and baud rate are
-    taken and mean nothing. ``link`` becomes a symbolic link to the second end while the pair is open.
+    """Paths of the two ends. Both open as serial ports, in this process or
+    another; parity and baud rate are taken and mean nothing. ``link`` becomes a
+    symbolic link to the second end while the pair is open.
 
-    What an end does not read in time is lost, as on a line. Raises BusError where ``link`` is in the way or
-    cannot be made.
+    What an end does not read in time is lost, as on a line. Raises BusError
+    where ``link`` is in the way or cannot be made.
     """
     import tty  # which Windows has not
 
@@ -26,7 +28,8 @@ async def pty_pair(link: Path | None = None) -> AsyncIterator[tuple[str, str]]:
         masters, paths = [], []
         for _ in range(2):
             master, slave = os.openpty()
-            # The slave stays open here: a master whose slave nobody holds reads as an error.
+            # The slave stays open here: a master whose slave nobody holds reads
+            # as an error.
             stack.callback(os.close, master)
             stack.callback(os.close, slave)
             tty.setraw(slave)

@@ -1,4 +1,5 @@
-"""The simulated unit's time: the wall clock times a speed, or a clock that a test moves by hand."""
+"""The simulated unit's time: the wall clock times a speed, or a clock that a
+test moves by hand."""
 
 from __future__ import annotations
 
@@ -12,25 +13,29 @@ from typing import Protocol
 
 class TimeBase(Protocol):
     def wait_for_reader(self, behind: Callable[[], bool]) -> None:
-        """``behind`` says from now on whether much of what the unit has sent is not fetched yet."""
+        """``behind`` says from now on whether much of what the unit has sent is
+        not fetched yet."""
 
     def now_s(self) -> float:
         """Unit time in seconds; never goes back."""
 
     def later_s(self, unit_s: float, period_s: float) -> float:
-        """A period later; where the unit is so fast that the machine would do little but wake up, some periods."""
+        """A period later; where the unit is so fast that the machine would do
+        little but wake up, some periods."""
 
     async def wait_until(self, unit_s: float) -> None:
-        """Returns once ``now_s()`` has reached ``unit_s``; at once where it has already."""
+        """Returns once ``now_s()`` has reached ``unit_s``; at once where it has
+        already."""
 
 
 WAKE_S = 0.004
-"""By the wall clock. A unit twenty times as fast as life then sends eight samples at a time, and still as often as an
-adapter delivers its frames."""
+"""By the wall clock. A unit twenty times as fast as life then sends eight
+samples at a time, and still as often as an adapter delivers its frames."""
 
 
 class RealTimeBase:
-    """Starts at 0 when made and runs ``speed`` times as fast as the wall clock, whatever a reader does."""
+    """Starts at 0 when made and runs ``speed`` times as fast as the wall clock,
+    whatever a reader does."""
 
     def __init__(self, speed: float = 1.0) -> None:
         if not speed > 0:
@@ -53,11 +58,14 @@ class RealTimeBase:
 
 
 class ElasticTimeBase:
-    """At most ``speed`` times as fast as the wall clock, and stretched where machine or reader do not keep up.
+    """At most ``speed`` times as fast as the wall clock, and stretched where
+    machine or reader do not keep up.
 
-    It goes on by no more than ``step_s`` from one look to the next, so that a process that was kept from looking has
-    nothing to make up for; and while the reader is behind no faster than the wall clock, so that nothing overflows that
-    would not in real time. It does not stand still then: a unit that nobody reads still stores and restarts.
+    It goes on by no more than ``step_s`` from one look to the next, so that a
+    process that was kept from looking has nothing to make up for; and while the
+    reader is behind no faster than the wall clock, so that nothing overflows
+    that would not in real time. It does not stand still then: a unit that
+    nobody reads still stores and restarts.
     """
 
     def __init__(self, speed: float = 1.0, step_s: float = 0.05) -> None:
@@ -89,7 +97,8 @@ class ElasticTimeBase:
 
 
 class SteppedTimeBase:
-    """Stands still until a test moves it; whoever waits is woken in the order of the times waited for."""
+    """Stands still until a test moves it; whoever waits is woken in the order
+    of the times waited for."""
 
     def __init__(self, start_s: float = 0.0) -> None:
         self._now_s = start_s
@@ -113,7 +122,8 @@ class SteppedTimeBase:
         await woken
 
     async def advance_to(self, unit_s: float) -> None:
-        """Move to ``unit_s``, stopping at every time somebody waits for, so that loops keep their period."""
+        """Move to ``unit_s``, stopping at every time somebody waits for, so
+        that loops keep their period."""
         await self._let_others_run()
         while self._waiting and self._waiting[0][0] <= unit_s:
             due_s, _, woken = heapq.heappop(self._waiting)

@@ -1,4 +1,5 @@
-"""The reference unit TRIAX-REF, simulated: converter, registers, correction. Pure; time is an argument."""
+"""The reference unit TRIAX-REF, simulated: converter, registers, correction.
+Pure; time is an argument."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ from triaxcald.simulation.physics import Physics
 
 FULL_SCALE_V, FULL_SCALE_COUNTS = 10.0, 2**23
 INVALID_CORRECTED = -(2**31)
-"""The corrected output of a unit whose stored calibration is damaged; on CAN it is sent as 0x800000."""
+"""The corrected output of a unit whose stored calibration is damaged; on CAN it
+is sent as 0x800000."""
 STORE_S, RESTART_S = 0.05, 0.1
 _DUE_S = 1e-9  # a sample is due this early, so that rounding of k/rate does not put it off
 
@@ -46,7 +48,8 @@ class Status(IntFlag):
 
 
 class RegisterFault(Exception):
-    """The unit refuses a read or a write; ``kind`` says why, the transport says it in its own code."""
+    """The unit refuses a read or a write; ``kind`` says why, the transport says
+    it in its own code."""
 
     def __init__(self, kind: FaultKind, register: str) -> None:
         super().__init__(f"{register}: {kind}")
@@ -55,17 +58,19 @@ class RegisterFault(Exception):
 
 
 class UnitSilent(Exception):
-    """The unit does not answer: it restarts or is dead. The transport sends no reply."""
+    """The unit does not answer: it restarts or is dead. The transport sends no
+    reply."""
 
 
 @dataclass(frozen=True)
 class Faults:
     """Faults that a real unit can have.
 
-    ``refuse_registers``: writes to them are refused. ``forget_store``: a store is acknowledged and the stored
-    copy stays as it was. ``corrupt_write``: the low byte of that register is xor-ed when it is written.
-    ``die_at_s``: from that unit time on it is silent for ever. ``die_on_write``: likewise on a write to that
-    register, which is not carried out.
+    ``refuse_registers``: writes to them are refused. ``forget_store``: a store
+    is acknowledged and the stored copy stays as it was. ``corrupt_write``: the
+    low byte of that register is xor-ed when it is written. ``die_at_s``: from
+    that unit time on it is silent for ever. ``die_on_write``: likewise on a
+    write to that register, which is not carried out.
     """
 
     refuse_registers: frozenset[str] = frozenset()
@@ -77,9 +82,10 @@ class Faults:
 
 @dataclass(frozen=True)
 class SampleRun:
-    """Samples in order. ``counter`` (n,) wraps at 2^16; ``unit_time_s`` (n,); ``counts`` (n, 3) of the
-    converter, 24 bit; ``temperature_raw`` (n,) in 0.01 °C; ``corrected`` (n, 3) in 1e-6 g, INVALID_CORRECTED
-    where the calibration is damaged, else within ±(2^31 − 1); ``status`` (n,) of `Status`."""
+    """Samples in order. ``counter`` (n,) wraps at 2^16; ``unit_time_s`` (n,);
+    ``counts`` (n, 3) of the converter, 24 bit; ``temperature_raw`` (n,) in 0.01
+    °C; ``corrected`` (n, 3) in 1e-6 g, INVALID_CORRECTED where the calibration
+    is damaged, else within ±(2^31 − 1); ``status`` (n,) of `Status`."""
 
     counter: NDArray[np.uint16]
     unit_time_s: NDArray[np.float64]
@@ -93,11 +99,13 @@ class SampleRun:
 
 
 class ReferenceUnit:
-    """Powered up and running since ``lower_time_s``, where sample 0 is taken; ``stored`` is an `eeprom`.
+    """Powered up and running since ``lower_time_s``, where sample 0 is taken;
+    ``stored`` is an `eeprom`.
 
-    Every time given is in the unit's time base and not before an earlier one. A write acts on the samples
-    of the next `advance`: call it first where those before the write are wanted with the old registers.
-    Samples not fetched before a restart are lost.
+    Every time given is in the unit's time base and not before an earlier one. A
+    write acts on the samples of the next `advance`: call it first where those
+    before the write are wanted with the old registers. Samples not fetched
+    before a restart are lost.
     """
 
     def __init__(
@@ -131,7 +139,8 @@ class ReferenceUnit:
 
     @property
     def started_s(self) -> float:
-        """Unit time of sample 0 since the last start; changes with every restart."""
+        """Unit time of sample 0 since the last start; changes with every
+        restart."""
         return self._started_s
 
     @property
@@ -150,7 +159,8 @@ class ReferenceUnit:
         self._start(unit_time_s + RESTART_S)
 
     def read(self, name: str, unit_time_s: float) -> bytes:
-        """A register's raw bytes, most significant first. Raises RegisterFault, UnitSilent."""
+        """A register's raw bytes, most significant first. Raises RegisterFault,
+        UnitSilent."""
         if not self.alive(unit_time_s):
             raise UnitSilent
         if name not in TABLE:
@@ -173,7 +183,8 @@ class ReferenceUnit:
         return entry.encode(values[name])
 
     def write(self, name: str, raw: bytes, unit_time_s: float) -> None:
-        """Write raw bytes, most significant first. Raises RegisterFault, UnitSilent."""
+        """Write raw bytes, most significant first. Raises RegisterFault,
+        UnitSilent."""
         if not self.alive(unit_time_s):
             raise UnitSilent
         if name not in TABLE:
@@ -214,7 +225,8 @@ class ReferenceUnit:
             raise RegisterFault("bad_value", name)
 
     def _settle(self, unit_time_s: float) -> None:
-        """Carry out what has come due: the end of a store, if the unit lived to see it."""
+        """Carry out what has come due: the end of a store, if the unit lived to
+        see it."""
         if self._storing and self._storing[0] <= min(unit_time_s, self._died_s) + _DUE_S:
             if not self.faults.forget_store:
                 self._stored = self._storing[1]
@@ -229,7 +241,8 @@ class ReferenceUnit:
         )
 
     def advance(self, unit_time_s: float) -> SampleRun:
-        """All samples due since the last call; none while the unit restarts or once it is dead."""
+        """All samples due since the last call; none while the unit restarts or
+        once it is dead."""
         self._settle(unit_time_s)
         last_s = min(unit_time_s + _DUE_S, math.nextafter(self._died_s, -math.inf))
         due = max(self._next, math.floor((last_s - self._started_s) * self.rate_hz) + 1)
@@ -257,7 +270,8 @@ class ReferenceUnit:
         )
 
     def _corrected(self, counts: NDArray[np.int32], temperature_raw: NDArray[np.int16]) -> NDArray[np.int32]:
-        """What the unit's firmware makes of its own readings, from the RAM registers; (n, 3) in 1e-6 g."""
+        """What the unit's firmware makes of its own readings, from the RAM
+        registers; (n, 3) in 1e-6 g."""
         if self._damaged:
             return np.full(counts.shape, INVALID_CORRECTED, dtype=np.int32)
         with np.errstate(all="ignore"):  # registers may hold nonsense, a scale factor of 0 included

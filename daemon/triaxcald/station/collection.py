@@ -1,4 +1,5 @@
-"""The raw records of one phase, on their way to disk and down the pipelines, until there are poses enough."""
+"""The raw records of one phase, on their way to disk and down the pipelines,
+until there are poses enough."""
 
 from __future__ import annotations
 
@@ -22,11 +23,14 @@ from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
-"""The poses so far are looked at so often, by the samples' time and by the host's, whichever is longer."""
+"""The poses so far are looked at so often, by the samples' time and by the
+host's, whichever is longer."""
 LOOK_SHARE = 5.0
-"""A look is followed by a pause of so many times what it took, or samples would be lost meanwhile."""
+"""A look is followed by a pause of so many times what it took, or samples would
+be lost meanwhile."""
 SILENCE_SHARE = 0.25
-"""Of a silence, what one batch without a sample may add. A device that sends brings several in that time."""
+"""Of a silence, what one batch without a sample may add. A device that sends
+brings several in that time."""
 
 
 class Progress(Protocol):
@@ -38,9 +42,11 @@ class Progress(Protocol):
 
 @dataclass
 class Collection:
-    """``pipelines`` by stream: the readings, and the corrected output where the device has one.
+    """``pipelines`` by stream: the readings, and the corrected output where the
+    device has one.
 
-    ``where`` says where the unit is, for messages; ``ends_with`` is what the recording ends with.
+    ``where`` says where the unit is, for messages; ``ends_with`` is what the
+    recording ends with.
     """
 
     phase: Phase
@@ -55,9 +61,11 @@ class Collection:
         self.pipelines = {s: Pipeline(self.bundle, s) for s in streams}
 
     async def records(self, device: Device, writer: RecordingWriter | None) -> AsyncGenerator[RawBatch]:
-        """What comes off the bus, once it is on its way to disk and through the pipelines.
+        """What comes off the bus, once it is on its way to disk and through the
+        pipelines.
 
-        What the disk has no room for goes to neither, so that an audit sees what the station saw.
+        What the disk has no room for goes to neither, so that an audit sees
+        what the station saw.
         """
         async with aclosing(cast(Any, device.stream(list(self.pipelines)))) as stream:
             async for batch in stream:
@@ -71,7 +79,8 @@ class Collection:
                 yield batch
 
     def _watch(self, stream: str, clock_s: Callable[[], float]) -> _Watch:
-        # Twice what the driver waits, which knows better what is the matter where nothing comes at all.
+        # Twice what the driver waits, which knows better what is the matter
+        # where nothing comes at all.
         timeout_s = 2 * self.bundle.profile.sampling.silence_timeout_s
         return _Watch(self.pipelines[stream], f"{self.where}: stream {stream}", timeout_s, clock_s)
 
@@ -82,7 +91,8 @@ class Collection:
         seconds: float | None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Records so many seconds of the readings' own time; for ever where None."""
+        """Records so many seconds of the readings' own time; for ever where
+        None."""
         pipeline = self.pipelines[READINGS]
         watch = self._watch(READINGS, clock_s)
         async with aclosing(self.records(device, writer)) as records:
@@ -104,11 +114,13 @@ class Collection:
         apart_from: Floats | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Records until ``stream`` shows ``wanted`` distinct poses, and of the readings the first of them once more, if
-        the plan says so; ``tell`` is told how it goes. ``apart_from`` as in `guide`.
+        """Records until ``stream`` shows ``wanted`` distinct poses, and of the
+        readings the first of them once more, if the plan says so; ``tell`` is
+        told how it goes. ``apart_from`` as in `guide`.
 
-        Raises Refused when no new pose has come for the plan's patience, and what the device's stream raises. Where
-        only the repeat does not come, it goes on without.
+        Raises Refused when no new pose has come for the plan's patience, and
+        what the device's stream raises. Where only the repeat does not come, it
+        goes on without.
         """
         pipeline = self.pipelines[stream]
         looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
@@ -153,10 +165,12 @@ class Collection:
 
 
 class _Watch:
-    """Sees that one stream goes on; a device may go on sending another and never this one.
+    """Sees that one stream goes on; a device may go on sending another and
+    never this one.
 
-    The time counts from the first look: before that the driver may have been discarding what was sampled earlier. From
-    one look to the next no more of it counts than `SILENCE_SHARE`: where this process was kept from looking,
+    The time counts from the first look: before that the driver may have been
+    discarding what was sampled earlier. From one look to the next no more of it
+    counts than `SILENCE_SHARE`: where this process was kept from looking,
     samples wait unread.
     """
 

@@ -1,4 +1,5 @@
-"""The station file: which units are where, how they are to be measured, and what is good enough."""
+"""The station file: which units are where, how they are to be measured, and
+what is good enough."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ UNITS_MOST = 128  # as many nodes as a CAN bus has
 
 
 class Plan(Strict):
-    """Poses to record, seconds to hold each, poses to check the device by afterwards."""
+    """Poses to record, seconds to hold each, poses to check the device by
+    afterwards."""
 
     poses: Annotated[int, Field(ge=9, le=1000)] = 26
     hold_s: Annotated[float, Field(ge=0.6, le=3600)] = 3.0
@@ -119,7 +121,8 @@ class StationFile(Strict):
 
     @property
     def reference(self) -> float:
-        """Local gravity in g: as given, or by the place's normal gravity, or 1 where the unit is local gravity."""
+        """Local gravity in g: as given, or by the place's normal gravity, or 1
+        where the unit is local gravity."""
         if self.latitude_deg is not None and self.height_m is not None:
             return local_gravity_g(self.latitude_deg, self.height_m)[0]
         return 1.0 if self.given_reference is None else self.given_reference
@@ -130,7 +133,8 @@ class StationFile(Strict):
         return Moment(self.holds_at) if isinstance(self.holds_at, str) else self.holds_at
 
     def stated(self, profile: Profile) -> Stated:
-        """What the station says of uncertainties, and the device's ``profile`` of its thermal sensitivity."""
+        """What the station says of uncertainties, and the device's ``profile``
+        of its thermal sensitivity."""
         own = self.thermal_sensitivity_per_k
         return Stated.at(
             self.latitude_deg,
@@ -165,7 +169,8 @@ class StationFile(Strict):
 
 
 def _farthest_apart_deg(count: int) -> float:
-    """No ``count`` points of a sphere are all farther apart than this (Fejes Tóth 1943; reached by 3, 4, 6 and 12)."""
+    """No ``count`` points of a sphere are all farther apart than this (Fejes
+    Tóth 1943; reached by 3, 4, 6 and 12)."""
     if count < 3:
         return 180.0
     chord = math.sqrt(4 - 1 / math.sin(math.pi * count / (6 * (count - 2))) ** 2)
@@ -190,9 +195,11 @@ class Place:
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Device]:
-        """The device, open and nobody else's until the context ends. Raises DeviceInUse, BusError, DeviceAbsent.
+        """The device, open and nobody else's until the context ends. Raises
+        DeviceInUse, BusError, DeviceAbsent.
 
-        Whoever closes it and opens it again in between, as a reset does, keeps it.
+        Whoever closes it and opens it again in between, as a reset does, keeps
+        it.
         """
         device = self.device()
         async with locked(claim_of(self.bus)):
@@ -237,7 +244,8 @@ def parse_station(text: bytes, *, where: str) -> StationFile:
 
 
 def load_station(path: Path) -> Station:
-    """Opens no bus. Raises InputError, ProfileError, DriverMissing: one line with file, line and field."""
+    """Opens no bus. Raises InputError, ProfileError, DriverMissing: one line
+    with file, line and field."""
     try:
         text = read_whole(path, SIZE_MOST, pipe=True)
     except OSError as e:
@@ -264,7 +272,8 @@ def load_station(path: Path) -> Station:
 
 
 def _check_distinct(places: Sequence[Place], *, where: str) -> None:
-    """No two units are one device. Raises InputError with the field of the later one."""
+    """No two units are one device. Raises InputError with the field of the
+    later one."""
     for (_, a), (i, b) in combinations(enumerate(places), 2):
         if claim_of(a.bus) == claim_of(b.bus):
             raise InputError(
@@ -282,8 +291,9 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
 
 
 def check_lines(places: Sequence[Place], *, where: str) -> None:
-    """Every shared line carries those of its units that are recorded, and all of them drive it alike. A unit alone
-    has what the line gives, and its losses are counted. Raises InputError with the arithmetic."""
+    """Every shared line carries those of its units that are recorded, and all
+    of them drive it alike. A unit alone has what the line gives, and its losses
+    are counted. Raises InputError with the arithmetic."""
     lines: dict[str, list[tuple[int, str, LineLoad]]] = {}
     for i, place in enumerate(places):
         loads = getattr(driver_named(place.bundle.profile.driver), "loads", None)
@@ -315,7 +325,8 @@ _OTHER_ROLES = ("reference_temperature", "calibration_date", "calibration_crc", 
 
 
 def _check_roles(bundle: Bundle, *, where: str) -> None:
-    """Only the daemon knows the effects, whose coefficients are roles. Raises InputError with the nearest one."""
+    """Only the daemon knows the effects, whose coefficients are roles. Raises
+    InputError with the nearest one."""
     known = [f"{name}.{axis}" for name in ("scale_factor", "misalignment", "bias") for axis in "xyz"]
     known += [f"{e.name}.{c.name}" for e in CATALOGUE for c in e.coefficients]
     known += _OTHER_ROLES

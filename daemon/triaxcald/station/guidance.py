@@ -1,4 +1,5 @@
-"""What to tell the operator: how many poses are there, is it still now, where to turn next. Pure."""
+"""What to tell the operator: how many poses are there, is it still now, where
+to turn next. Pure."""
 
 from __future__ import annotations
 
@@ -12,18 +13,22 @@ from triaxcal.model.directions import Direction, directions, elsewhere
 from triaxcal.poses.pose import StillSpan
 
 COVERED_DEG = 25.0
-"""A pose covers the direction of the plan that it is nearest to, up to this far off."""
+"""A pose covers the direction of the plan that it is nearest to, up to this far
+off."""
 SAME_DEG = 10.0
-"""A repeated pose need not be nearer to the first than this, however near others may be to each other."""
+"""A repeated pose need not be nearer to the first than this, however near
+others may be to each other."""
 
 
 @dataclass(frozen=True)
 class Guide:
-    """``found`` of ``wanted`` distinct poses; ``held_s`` how long the unit has been still now (0 when it moves).
+    """``found`` of ``wanted`` distinct poses; ``held_s`` how long the unit has
+    been still now (0 when it moves).
 
-    ``missing`` are the labels of the plan's poses that none has come near to, in the plan's order. ``repeat_due`` says
-    that the first pose is wanted once more, after all others. ``counted_s`` are times inside the poses that were long
-    enough, for the next look.
+    ``missing`` are the labels of the plan's poses that none has come near to,
+    in the plan's order. ``repeat_due`` says that the first pose is wanted once
+    more, after all others. ``counted_s`` are times inside the poses that were
+    long enough, for the next look.
     """
 
     found: int
@@ -54,13 +59,16 @@ def guide(
     counted_s: Collection[float] = (),
     apart_from: Floats | None = None,
 ) -> Guide:
-    """Judge the poses so far, which may come in any order; ``repeat`` asks for the first of them again at the end.
+    """Judge the poses so far, which may come in any order; ``repeat`` asks for
+    the first of them again at the end.
 
-    With ``apart_from`` (n,3), directions of up, only poses apart from those count. Who offers none of these is asked
-    no longer once twice as many others have come as are wanted, or as many as there are to be apart from.
+    With ``apart_from`` (n,3), directions of up, only poses apart from those
+    count. Who offers none of these is asked no longer once twice as many others
+    have come as are wanted, or as many as there are to be apart from.
 
-    ``now_s`` is the time of the latest sample, counted as the poses' times are. A pose that lies about one of
-    ``counted_s`` was long enough once: it stays so where its ends have moved since, as more of the noise was seen.
+    ``now_s`` is the time of the latest sample, counted as the poses' times are.
+    A pose that lies about one of ``counted_s`` was long enough once: it stays
+    so where its ends have moved since, as more of the noise was seen.
     """
     last = poses[-1] if poses else None
     # A pose that is still growing ends a guard window before the latest sample.
@@ -123,7 +131,8 @@ def _nearest(targets: Sequence[Direction], v: Floats) -> str:
 
 
 def _said(label: str, targets: Sequence[Direction]) -> str:
-    """The axes that point up; for a direction that only a number names, its components."""
+    """The axes that point up; for a direction that only a number names, its
+    components."""
     if label.startswith(("+", "-")):
         return f"{label} up"
     x, y, z = next(v for name, v in targets if name == label)
@@ -131,7 +140,8 @@ def _said(label: str, targets: Sequence[Direction]) -> str:
 
 
 def ups(poses: Sequence[StillSpan], nominal: Sequence[float] | None) -> Floats:
-    """Up in the unit's frame, roughly: by the nominal scale factor, else by the range of the outputs so far."""
+    """Up in the unit's frame, roughly: by the nominal scale factor, else by the
+    range of the outputs so far."""
     if not poses:
         return np.zeros((0, 3))
     u = np.array([p.mean for p in poses])

@@ -1,9 +1,12 @@
-"""One command at a time on a device, and on a serial port, whichever process or user it is of.
+"""One command at a time on a device, and on a serial port, whichever process or
+user it is of.
 
-The kernel keeps a lock (flock) on a file for each and releases it when the process ends, however it ends. What a file
-holds only says who has locked it; what a killed process left there means nothing. The files lie in one folder for all
-users of the machine, and stay there: somebody may be about to lock one. Where there is no flock (outside POSIX)
-commands of one process exclude each other, and processes do not.
+The kernel keeps a lock (flock) on a file for each and releases it when the
+process ends, however it ends. What a file holds only says who has locked it;
+what a killed process left there means nothing. The files lie in one folder for
+all users of the machine, and stay there: somebody may be about to lock one.
+Where there is no flock (outside POSIX) commands of one process exclude each
+other, and processes do not.
 """
 
 from __future__ import annotations
@@ -33,10 +36,12 @@ except ImportError:
     fcntl = None  # type: ignore[assignment]
 
 FOLDER_VARIABLE = "TRIAXCAL_LOCK_FOLDER"
-"""For processes that share neither /run/lock nor /tmp, as in containers. All of them must be given the same folder."""
+"""For processes that share neither /run/lock nor /tmp, as in containers. All of
+them must be given the same folder."""
 _FOLDERS = ("/run/lock", "/tmp")
 _LOOKUP_S = 2.0
-"""A name that takes longer to look up is locked by its spelling; connecting by it will fail as well."""
+"""A name that takes longer to look up is locked by its spelling; connecting by
+it will fail as well."""
 _TRIES, _PAUSE_S = 20, 0.01
 """Who has a lock says so in its file right after; nobody waits longer for that."""
 _HOLDER_BYTES, _COMMAND_LENGTH = 4096, 200
@@ -75,7 +80,8 @@ class Holder:
 
 @dataclass
 class _Held:
-    """A lock of this process, with the number of its users. ``descriptor`` is None where there is no flock."""
+    """A lock of this process, with the number of its users. ``descriptor`` is
+    None where there is no flock."""
 
     descriptor: int | None
     holder: Holder
@@ -87,9 +93,11 @@ _held: dict[str, _Held] = {}
 
 @asynccontextmanager
 async def locked(claim: Claim) -> AsyncIterator[None]:
-    """Has what is claimed until the context ends. Units of one process share its serial port.
+    """Has what is claimed until the context ends. Units of one process share
+    its serial port.
 
-    Raises DeviceInUse, which names the holder; StationError where a lock's file is not to be had.
+    Raises DeviceInUse, which names the holder; StationError where a lock's file
+    is not to be had.
     """
     with ExitStack() as stack:
         if claim.serial_port is not None:
@@ -109,7 +117,8 @@ async def _lock(name: str, stack: ExitStack, *, shared: bool = False) -> None:
 
 
 def _taken(name: str, shared: bool) -> bool:
-    """False where it has to be tried again, because a new holder has not yet said who it is."""
+    """False where it has to be tried again, because a new holder has not yet
+    said who it is."""
     held = _held.get(name)
     if held is not None and not shared:
         raise DeviceInUse(f"{name} is in use by {held.holder}")
@@ -172,8 +181,10 @@ def _flocked(path: Path, content: Mapping[str, Any]) -> int:
 def _opened(path: Path) -> int:
     """The lock's file, which any user may write; made where there is none.
 
-    The folder is anybody's: a link in the file's place is not followed, and a file with another name is not touched.
-    Only a file that is not there is opened with O_CREAT, which Linux refuses for other users' files in such folders.
+    The folder is anybody's: a link in the file's place is not followed, and a
+    file with another name is not touched. Only a file that is not there is
+    opened with O_CREAT, which Linux refuses for other users' files in such
+    folders.
     """
     flags = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
     while True:
@@ -203,7 +214,8 @@ def file_name(name: str) -> str:
 
 
 def folder() -> Path:
-    """Where the locks of this machine are; the same for all its users, hence no matter of what one may write."""
+    """Where the locks of this machine are; the same for all its users, hence no
+    matter of what one may write."""
     chosen = os.environ.get(FOLDER_VARIABLE)
     if chosen:
         return Path(chosen)
@@ -219,7 +231,8 @@ def _for_everybody(name: str) -> bool:
 
 
 async def _addresses(host: str | None) -> Sequence[str | None]:
-    """The host's addresses, each of which is locked, so that its names and its addresses exclude each other."""
+    """The host's addresses, each of which is locked, so that its names and its
+    addresses exclude each other."""
     if host is None or not is_name(host):
         return [host]
     try:
@@ -231,5 +244,6 @@ async def _addresses(host: str | None) -> Sequence[str | None]:
 
 
 def _printable(text: object) -> str:
-    """On one line: a command may hold anything, and anybody can write into a lock's file."""
+    """On one line: a command may hold anything, and anybody can write into a
+    lock's file."""
     return "".join(c if c.isprintable() else "?" for c in str(text))[:_COMMAND_LENGTH]

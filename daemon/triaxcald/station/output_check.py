@@ -1,4 +1,5 @@
-"""A short look at a device's readings and its corrected output at the same moments."""
+"""A short look at a device's readings and its corrected output at the same
+moments."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from triaxcald.provision.plausible import Doubt
 from triaxcald.provision.snapshot import Snapshot
 
 SAMPLES = 20
-"""Their median is not moved by a knock, and at the slowest usual rate they take two seconds."""
+"""Their median is not moved by a knock, and at the slowest usual rate they take
+two seconds."""
 
 
 async def doubts_of_live_output(device: Device, bundle: Bundle, snapshot: Snapshot) -> list[Doubt]:

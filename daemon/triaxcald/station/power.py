@@ -13,7 +13,8 @@ from triaxcald.station.config import Place, Station
 def power_cycle_asked(
     ask: Callable[[str], None], link: RegisterLink, place: Place, station: Station
 ) -> Callable[[], Awaitable[bool]]:
-    """For `Provisioning.power_cycle`: whether the supply was seen off and on within the plan's patience."""
+    """For `Provisioning.power_cycle`: whether the supply was seen off and on
+    within the plan's patience."""
 
     async def asked() -> bool:
         ask(text.switch_supply(least_off_s(place.bundle.profile)))

@@ -1,4 +1,5 @@
-"""Tables by pyarrow, behind the one file that knows it: text and Parquet in, Parquet out."""
+"""Tables by pyarrow, behind the one file that knows it: text and Parquet in,
+Parquet out."""
 
 from __future__ import annotations
 
@@ -22,10 +23,12 @@ if TYPE_CHECKING:
 
 _NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
 CELLS_MOST = 2**25
-"""A number that never changes takes no room in a Parquet file, and 8 bytes here."""
+"""A number that never changes takes no room in a Parquet file, and 8 bytes
+here."""
 DAY_NS = 86_400 * 10**9
 BYTES_MOST = 2**30
-"""Of a Parquet file's values as they are stored, before compression; in memory they take a few times as much."""
+"""Of a Parquet file's values as they are stored, before compression; in memory
+they take a few times as much."""
 _NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 
@@ -33,10 +36,11 @@ _NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 class Column:
     """One column of a table of n rows.
 
-    ``numbers`` (n,), NaN where a cell holds none; ``moments_ns`` (n,) where the cells are moments, from 1970 or from
-    midnight. ``gaps`` (n,) are cells that hold nothing, and ``strange`` (n,) those with something else than a number or
-    a moment. ``whole`` are all numbers without a fraction, exactly, as far as they fit 64 bits. ``cells`` are what
-    stood there.
+    ``numbers`` (n,), NaN where a cell holds none; ``moments_ns`` (n,) where the
+    cells are moments, from 1970 or from midnight. ``gaps`` (n,) are cells that
+    hold nothing, and ``strange`` (n,) those with something else than a number
+    or a moment. ``whole`` are all numbers without a fraction, exactly, as far
+    as they fit 64 bits. ``cells`` are what stood there.
     """
 
     numbers: NDArray[np.float64]
@@ -52,7 +56,8 @@ class Column:
         return ~(self.gaps | self.strange)
 
     def equals(self, value: str) -> NDArray[np.bool_]:
-        """(n,) whether a cell has this text, or in a file of typed columns this number."""
+        """(n,) whether a cell has this text, or in a file of typed columns this
+        number."""
         import pyarrow as pa
         import pyarrow.compute as pc
 
@@ -77,20 +82,23 @@ class Column:
         return [str(cell) for cell in found[:100].to_pylist()]
 
     def text(self, row: int) -> str:
-        """On one line, though a stray quote may have drawn several into the cell."""
+        """On one line, though a stray quote may have drawn several into the
+        cell."""
         return "" if self.texts is None else " ".join(str(self.texts[row]).split())
 
 
 @dataclass(frozen=True)
 class Ragged:
-    """A line that has another number of fields than the others: its index among the lines read."""
+    """A line that has another number of fields than the others: its index among
+    the lines read."""
 
     row: int
     fields: int
 
 
 def read_text(text: str, separator: str, decimal: str, fields: int) -> tuple[list[Column], list[Ragged]]:
-    """The columns of lines of ``fields`` fields each, and the lines that have another number, which are left out.
+    """The columns of lines of ``fields`` fields each, and the lines that have
+    another number, which are left out.
 
     Raises ValueError for what is no table at all.
     """
@@ -121,7 +129,8 @@ def read_text(text: str, separator: str, decimal: str, fields: int) -> tuple[lis
 
 
 def read_parquet(path: Path) -> tuple[list[str], list[Column]]:
-    """Names and columns, nested ones by their path as in a.b. Raises InputError."""
+    """Names and columns, nested ones by their path as in a.b. Raises
+    InputError."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -144,7 +153,8 @@ def read_parquet(path: Path) -> tuple[list[str], list[Column]]:
 
 
 def _text_bytes(file: Any) -> int:
-    """At most, of the columns of text, by the longest value that the file's statistics tell of each."""
+    """At most, of the columns of text, by the longest value that the file's
+    statistics tell of each."""
     total = 0
     for group in range(file.metadata.num_row_groups):
         for i in range(file.metadata.num_columns):
@@ -240,10 +250,11 @@ def _whole_of_text(
 
 
 def _moments(texts: pa.StringArray, gaps: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.bool_]] | None:
-    """Nanoseconds where the first cells are moments or times of day, and which cells hold none of these.
+    """Nanoseconds where the first cells are moments or times of day, and which
+    cells hold none of these.
 
-    Of dates that are not those of ISO 8601 nothing is understood: where all rows have the same, the time of day is the
-    time.
+    Of dates that are not those of ISO 8601 nothing is understood: where all
+    rows have the same, the time of day is the time.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -281,7 +292,8 @@ def _moments(texts: pa.StringArray, gaps: NDArray[np.bool_]) -> tuple[NDArray[np
 
 
 def _as_moments(texts: pa.Array, kind: pa.DataType) -> pa.Array:
-    """Null where a text has the form of a moment and is none, as the thirteenth month."""
+    """Null where a text has the form of a moment and is none, as the thirteenth
+    month."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -295,8 +307,9 @@ def _as_moments(texts: pa.Array, kind: pa.DataType) -> pa.Array:
 
 
 def write_parquet(path: Path, blocks: Iterable[Rows], start_ns: int | None = None) -> int:
-    """As `triaxcald.recording.export.write_csv`, times in seconds as floats; the number of samples. ``path`` is
-    overwritten. Raises RecordingError, OSError."""
+    """As `triaxcald.recording.export.write_csv`, times in seconds as floats;
+    the number of samples. ``path`` is overwritten. Raises RecordingError,
+    OSError."""
     import pyarrow as pa  # 50 MB that nothing else needs
     import pyarrow.parquet as pq
 

@@ -1,4 +1,5 @@
-"""The times of a table's samples, in nanoseconds: from numbers whose unit is known, dates, an index or a rate."""
+"""The times of a table's samples, in nanoseconds: from numbers whose unit is
+known, dates, an index or a rate."""
 
 from __future__ import annotations
 
@@ -15,8 +16,9 @@ from triaxcald.tables.naming import ISO, Name, Unclear
 from triaxcald.tables.naming import NANOSECONDS as UNITS
 
 STEP_MOST_S, STEP_LEAST_S = 0.2, 2e-4
-"""Numbers with a fraction in steps between these are seconds: a logger takes from five to five thousand samples a
-second. Shorter steps may be minutes, hours or a spreadsheet's days, longer ones milliseconds."""
+"""Numbers with a fraction in steps between these are seconds: a logger takes
+from five to five thousand samples a second. Shorter steps may be minutes, hours
+or a spreadsheet's days, longer ones milliseconds."""
 OWN_MOST_S, OWN_LEAST_S = 1.0, 1e-5
 """The same of our own layout, whose times are seconds."""
 _RATE = re.compile(
@@ -37,7 +39,8 @@ _THOUSANDS = re.compile(r"\d{1,3},\d{3}")
 
 
 def stated_rate(remarks: Sequence[str]) -> tuple[float, str] | None:
-    """In hertz, as the lines before the header state it, with the line; None where they state none, or two."""
+    """In hertz, as the lines before the header state it, with the line; None
+    where they state none, or two."""
     found: dict[float, str] = {}
     for line in remarks:
         for m in _RATE.finditer(line):
@@ -54,7 +57,8 @@ def stated_rate(remarks: Sequence[str]) -> tuple[float, str] | None:
 
 
 def nanoseconds(column: Column, name: Name, unit: str | None) -> tuple[NDArray[np.int64], str]:
-    """(n,) and their unit. Only usable cells count. Raises Unclear where nothing states the unit."""
+    """(n,) and their unit. Only usable cells count. Raises Unclear where
+    nothing states the unit."""
     usable = column.usable
     if column.moments_ns is not None:
         if unit not in (None, ISO):
@@ -70,9 +74,11 @@ def nanoseconds(column: Column, name: Name, unit: str | None) -> tuple[NDArray[n
 
 
 def of_index(column: Column | None, n: int, rate: float) -> tuple[NDArray[np.int64], bool]:
-    """(n,) for samples evenly spaced by 1/``rate`` s, and whether an index counted them.
+    """(n,) for samples evenly spaced by 1/``rate`` s, and whether an index
+    counted them.
 
-    An index that rises in steps of 1 shows lost samples as gaps; another, or one that starts again, counts no samples.
+    An index that rises in steps of 1 shows lost samples as gaps; another, or
+    one that starts again, counts no samples.
     """
     counted = np.arange(n)
     if column is not None and column.whole is not None and column.usable.all() and n > 1:
@@ -84,7 +90,8 @@ def of_index(column: Column | None, n: int, rate: float) -> tuple[NDArray[np.int
 
 
 def require_seconds(time_ns: NDArray[np.int64], column: str) -> None:
-    """Raises Unclear where times that were taken for seconds could be in another unit."""
+    """Raises Unclear where times that were taken for seconds could be in
+    another unit."""
     whole = bool((time_ns % UNITS["s"] == 0).all())
     _evident(np.asarray(time_ns * 1e-9), whole, Name.of(column), OWN_LEAST_S, OWN_MOST_S)
 
@@ -120,8 +127,8 @@ def _evident(
 
 
 def _are_clock_figures(times: NDArray[np.float64] | NDArray[np.int64], steps: NDArray[Any]) -> bool:
-    """Whether they are times of day as HHMMSS.ss: of hundreds and ten thousands no more than 59 are there, and the
-    hundreds jump on from 60."""
+    """Whether they are times of day as HHMMSS.ss: of hundreds and ten thousands
+    no more than 59 are there, and the hundreds jump on from 60."""
     seconds, minutes = times % 100, times // 100 % 100
     jumps = np.abs(steps - 40) < 1
     return bool((seconds < 60).all() and (minutes < 60).all() and jumps.any() and times.max(initial=0) >= 100)

@@ -1,8 +1,11 @@
-"""How a text table is laid out: encoding, separator, decimal mark, header, row of units, and where its numbers begin.
+"""How a text table is laid out: encoding, separator, decimal mark, header, row
+of units, and where its numbers begin.
 
-Tables come as programs write them: with a byte order mark or in Windows-1252, with `sep=;`, remarks before the header,
-a header behind #, a row of units, a decimal comma, a separator at the end of each line. The numbers themselves say
-which separator is meant: with the right one, most lines have one and the same number of numeric fields.
+Tables come as programs write them: with a byte order mark or in Windows-1252,
+with `sep=;`, remarks before the header, a header behind #, a row of units, a
+decimal comma, a separator at the end of each line. The numbers themselves say
+which separator is meant: with the right one, most lines have one and the same
+number of numeric fields.
 """
 
 from __future__ import annotations
@@ -18,9 +21,11 @@ LINES_LOOKED_AT = 500
 NUMERIC_LEAST = 3
 """Numbers in a line of samples: the three outputs."""
 SEPARATORS = ("\t", ";", ",", "|", " ")
-"""Blanks, in runs and with tabs among them, only where no other parts the lines."""
+"""Blanks, in runs and with tabs among them, only where no other parts the
+lines."""
 MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "inf", "+inf", "-inf", "infinity", "-infinity", "-nan"))
-"""Texts in lower case that stand for no number; so do all that begin with # (#N/A, #NV, #DIV/0!)."""
+"""Texts in lower case that stand for no number; so do all that begin with #
+(#N/A, #NV, #DIV/0!)."""
 NUMBER = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+", re.ASCII)
 """What may be a number with its thousands parted by commas."""
@@ -44,10 +49,12 @@ _REMARK = ("#", "%", "//")
 
 @dataclass(frozen=True)
 class Layout:
-    """``header`` has a name for each of the ``fields``, and is None where there is none; ``units`` likewise.
+    """``header`` has a name for each of the ``fields``, and is None where there
+    is none; ``units`` likewise.
 
-    ``first`` is the line, 0-based, of the first sample; ``remarks`` are the lines before the header. ``unlike`` is the
-    line, 0-based, of what looks like a header and has another number of fields, and that number.
+    ``first`` is the line, 0-based, of the first sample; ``remarks`` are the
+    lines before the header. ``unlike`` is the line, 0-based, of what looks like
+    a header and has another number of fields, and that number.
     """
 
     separator: str
@@ -63,7 +70,8 @@ class Layout:
 
 
 def decoded(data: bytes) -> str:
-    """By the byte order mark, as UTF-16 by its zeros, as UTF-8, else as Windows-1252; with line ends ``\\n``.
+    """By the byte order mark, as UTF-16 by its zeros, as UTF-8, else as
+    Windows-1252; with line ends ``\\n``.
 
     Raises ValueError for bytes that are no text.
     """
@@ -112,7 +120,8 @@ def layout_of(lines: Sequence[str]) -> Layout | None:
 
 
 def _marks(numbers: Sequence[str]) -> str:
-    """What is wrong with the decimal marks, if anything: a comma may part thousands."""
+    """What is wrong with the decimal marks, if anything: a comma may part
+    thousands."""
     commas = [f for f in numbers if "," in f]
     pointed = next((f for f in numbers if "." in f), None)
     if commas and pointed is not None:
@@ -149,7 +158,8 @@ def is_number(field: str, separator: str) -> bool:
 
 @dataclass(frozen=True)
 class _Run:
-    """``lines`` with as many ``fields``, of which at most ``numeric`` are numbers or moments, from line ``first`` on.
+    """``lines`` with as many ``fields``, of which at most ``numeric`` are
+    numbers or moments, from line ``first`` on.
 
     ``trailing``: all of them end with a separator.
     """
@@ -171,7 +181,8 @@ def is_sample(line: str, separator: str) -> bool:
 
 
 def _numeric(row: Sequence[str], separator: str) -> int:
-    """How many fields are numbers or moments; 0 where that are fewer than three."""
+    """How many fields are numbers or moments; 0 where that are fewer than
+    three."""
     count = sum(
         is_number(f, separator) or bool(MOMENT.fullmatch(f) or DATED.fullmatch(f) or DAY_TIME.fullmatch(f)) for f in row
     )
@@ -179,7 +190,8 @@ def _numeric(row: Sequence[str], separator: str) -> int:
 
 
 def _run(lines: Sequence[str], separator: str) -> _Run | None:
-    """The samples: lines with the most common number of fields among those that hold numbers."""
+    """The samples: lines with the most common number of fields among those that
+    hold numbers."""
     counted: dict[int, list[tuple[int, list[str]]]] = {}
     for i, line in enumerate(lines):
         if is_sample(line, separator):
@@ -193,7 +205,8 @@ def _run(lines: Sequence[str], separator: str) -> _Run | None:
 
 
 def _above(lines: Sequence[str], run: _Run, decimal: str, labelled: bool) -> Layout:
-    """The layout, with header and row of units looked for from the first sample upwards."""
+    """The layout, with header and row of units looked for from the first sample
+    upwards."""
     header = units = None
     at = run.first
     counting = [str(i) for i in range(run.fields)]
@@ -223,7 +236,8 @@ def _above(lines: Sequence[str], run: _Run, decimal: str, labelled: bool) -> Lay
 
 
 def _unlike(lines: Sequence[str], run: _Run) -> tuple[int, int] | None:
-    """The line right above the samples, where it has several fields and no number."""
+    """The line right above the samples, where it has several fields and no
+    number."""
     if not lines or not lines[-1].strip():
         return None
     row = split(lines[-1], run.separator)
@@ -232,7 +246,8 @@ def _unlike(lines: Sequence[str], run: _Run) -> tuple[int, int] | None:
 
 
 def _first_after(lines: Sequence[str], run: _Run, at: int, header: bool) -> int:
-    """The first line behind the header that is neither a remark nor a row of units: also one that lacks numbers."""
+    """The first line behind the header that is neither a remark nor a row of
+    units: also one that lacks numbers."""
     if not header:
         return next((i for i in range(run.first) if is_sample(lines[i], run.separator)), run.first)
     for i in range(at + 1, run.first):
@@ -258,7 +273,8 @@ def _labelled(rows: Sequence[Sequence[str]]) -> bool:
 
 
 def _names(line: str, run: _Run, labelled: bool) -> list[str] | None:
-    """Names for all fields of a line that could be the header; None where it is not. ``labelled``: see `_labelled`."""
+    """Names for all fields of a line that could be the header; None where it is
+    not. ``labelled``: see `_labelled`."""
     bare = line.strip(" ").lstrip("#%/;").strip(" ") if is_remark(line.strip(), run.separator) else line
     if not bare.strip():
         return None

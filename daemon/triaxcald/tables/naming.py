@@ -1,7 +1,9 @@
-"""Which columns of a table are its time and its three outputs: as the user says, or as everybody calls them.
+"""Which columns of a table are its time and its three outputs: as the user
+says, or as everybody calls them.
 
-Nothing is guessed where two guesses are possible: `Unclear` says what, and the message names the option that settles
-the question. No number of the table is looked at here.
+Nothing is guessed where two guesses are possible: `Unclear` says what, and the
+message names the option that settles the question. No number of the table is
+looked at here.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Name:
-    """A column's name taken apart: its words in lower case, and the unit that stands in it, or in the row of units."""
+    """A column's name taken apart: its words in lower case, and the unit that
+    stands in it, or in the row of units."""
 
     text: str
     words: tuple[str, ...]
@@ -74,7 +77,8 @@ class Name:
 
     @property
     def time_unit(self) -> str | None:
-        """As `--time-unit` has it, where the name states one; ``t_s`` is what anybody calls a time."""
+        """As `--time-unit` has it, where the name states one; ``t_s`` is what
+        anybody calls a time."""
         if self.text == "t_s":
             return None
         stated = known.UNITS_OF_TIME.get(self.unit.lower())
@@ -84,7 +88,8 @@ class Name:
 
     @property
     def unknown_unit(self) -> bool:
-        """Whether brackets behind the name hold what is no unit that anybody uses: ticks, or 10 ms."""
+        """Whether brackets behind the name hold what is no unit that anybody
+        uses: ticks, or 10 ms."""
         return bool(self.in_brackets) and not self.unit
 
     @property
@@ -106,7 +111,8 @@ class Name:
 
     @property
     def is_either(self) -> bool:
-        """T is a temperature as well as a time: it is a time only where no other column is, and where it rises."""
+        """T is a temperature as well as a time: it is a time only where no
+        other column is, and where it rises."""
         return self.words == ("t",) and self.text.startswith("T") and self.time_unit is None
 
     @property
@@ -118,8 +124,9 @@ class Name:
 
 @dataclass(frozen=True)
 class Triple:
-    """Three columns, 0-based, that differ by x, y, z alone, or by a number. ``letter`` is all that they are called by
-    beside that, where that is one letter and no unit: a quantity's, or a label."""
+    """Three columns, 0-based, that differ by x, y, z alone, or by a number.
+    ``letter`` is all that they are called by beside that, where that is one
+    letter and no unit: a quantity's, or a label."""
 
     columns: tuple[int, int, int]
     kind: Kind
@@ -129,8 +136,9 @@ class Triple:
 
 @dataclass(frozen=True)
 class Roles:
-    """Columns, 0-based. ``time`` are those that may be the time, the likeliest first; ``channels`` what the user names
-    as such; ``said`` are roles that the user gave. ``rivals`` are triples of what may be the same quantity."""
+    """Columns, 0-based. ``time`` are those that may be the time, the likeliest
+    first; ``channels`` what the user names as such; ``said`` are roles that the
+    user gave. ``rivals`` are triples of what may be the same quantity."""
 
     outputs: tuple[int, int, int]
     time: tuple[int, ...]
@@ -141,7 +149,8 @@ class Roles:
 
 
 class Unclear(Exception):
-    """Two ways to read the names, or none. The text says what to add to the command."""
+    """Two ways to read the names, or none. The text says what to add to the
+    command."""
 
 
 def bare_name(text: str) -> str:
@@ -150,7 +159,8 @@ def bare_name(text: str) -> str:
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Of ``t=time,ux=Acc X (g),…``: a comma parts only where a role and an equals sign follow. Raises ValueError."""
+    """Of ``t=time,ux=Acc X (g),…``: a comma parts only where a role and an
+    equals sign follow. Raises ValueError."""
     found: dict[str, str] = {}
     for part in re.split(r",(?=\s*\w+\s*=)", text):
         role, equals, column = (p.strip() for p in part.partition("="))
@@ -164,7 +174,8 @@ def parse_columns(text: str) -> dict[str, str]:
 
 
 def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str], *, named: bool) -> Roles:
-    """``named`` is False where the table has no header and ``names`` are numbers. Raises Unclear."""
+    """``named`` is False where the table has no header and ``names`` are
+    numbers. Raises Unclear."""
     given = {role: _column(names, column, named=named) for role, column in said.items()}
     by_column: dict[int, str] = {}
     for role, column in given.items():
@@ -199,7 +210,8 @@ def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str]
 
 
 def seconds_and_rest(names: Sequence[str]) -> Iterator[tuple[int, int]]:
-    """The columns of whole seconds and of the nanoseconds behind them, as header.stamp.secs and header.stamp.nsecs."""
+    """The columns of whole seconds and of the nanoseconds behind them, as
+    header.stamp.secs and header.stamp.nsecs."""
     bare = [bare_name(n) for n in names]
     rests = {m[1]: j for j, n in enumerate(bare) if (m := re.fullmatch(r"(.*?)(?:nsecs?|nanosecs?)", n))}
     for i, name in enumerate(bare):
@@ -285,7 +297,8 @@ def _option(names: Sequence[Name], triple: Triple) -> str:
 
 
 def _is_ros(names: Sequence[Name], triple: Triple) -> bool:
-    """sensor_msgs/Imu calls the specific force linear_acceleration, beside angular_velocity."""
+    """sensor_msgs/Imu calls the specific force linear_acceleration, beside
+    angular_velocity."""
     linear = {"linear", "acceleration"} <= set(names[triple.columns[0]].words)
     return linear and any({"angular", "velocity"} <= set(n.words) for n in names)
 
@@ -337,7 +350,8 @@ def _kind(words: set[str], unit: str) -> Kind:
 
 
 def _numbered(names: Sequence[Name], free: Sequence[int]) -> list[Triple]:
-    """Three columns with one name and three numbers in a row, as of an ADC or a vector: the first is x."""
+    """Three columns with one name and three numbers in a row, as of an ADC or a
+    vector: the first is x."""
     found: dict[str, list[tuple[int, int]]] = {}
     for i in free:
         text = re.sub(r"[\[(<{]\D*[\])>}]", "", names[i].text).strip()

@@ -1,4 +1,5 @@
-"""Reads samples from text of our own layout: fast where all is well, exact about the first fault where it is not."""
+"""Reads samples from text of our own layout: fast where all is well, exact
+about the first fault where it is not."""
 
 from __future__ import annotations
 
@@ -30,9 +31,11 @@ _NOTHING = re.compile(r"(?:[ \t\r]*(?:#[^\n]*)?\n)*+")
 
 @dataclass(frozen=True)
 class CsvSamples:
-    """``time_ns`` (n,) strictly increasing, on the file's own zero; ``readings`` (n,3); ``channels`` (n,) each.
+    """``time_ns`` (n,) strictly increasing, on the file's own zero;
+    ``readings`` (n,3); ``channels`` (n,) each.
 
-    ``duplicates`` rows that repeated the row before them exactly; they are left out.
+    ``duplicates`` rows that repeated the row before them exactly; they are left
+    out.
     """
 
     time_ns: NDArray[np.int64]
@@ -42,9 +45,11 @@ class CsvSamples:
 
 
 def read_csv(source: Path | str | BinaryIO, name: str | None = None) -> CsvSamples:
-    """From a ``.csv`` or ``.csv.gz`` file, from standard input (``-``) or from a stream of bytes.
+    """From a ``.csv`` or ``.csv.gz`` file, from standard input (``-``) or from
+    a stream of bytes.
 
-    ``name`` stands for the input in messages. Raises InputError: file, line, field, what was expected.
+    ``name`` stands for the input in messages. Raises InputError: file, line,
+    field, what was expected.
     """
     label = name or (label_of(str(source)) if isinstance(source, Path | str) else "CSV")
     return samples_of_blocks(blocks(source, label), label)

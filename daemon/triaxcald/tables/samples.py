@@ -1,4 +1,5 @@
-"""Samples from a table of anybody's making: what is clear is read and said, what is not is asked for by its option."""
+"""Samples from a table of anybody's making: what is clear is read and said,
+what is not is asked for by its option."""
 
 from __future__ import annotations
 
@@ -31,27 +32,33 @@ VALUE_LIMIT = 1e100
 SENSORS = frozenset(("sensor", "sensors", "type", "id", "device", "source", "node", "side", "imu", "name"))
 """Words by which a column of numbers names the sensor that a row is of."""
 VALUES_MOST, IN_TURN = 50, 0.2
-"""Sensors are few, and their rows come in turn; a label of what was done changes rarely."""
+"""Sensors are few, and their rows come in turn; a label of what was done
+changes rarely."""
 SECONDS_MOST = 2**63 // 10**9
 FAR = 1e4
-"""Times what nine in ten samples reach: more is no reading, as a knock reaches the end of the range."""
+"""Times what nine in ten samples reach: more is no reading, as a knock reaches
+the end of the range."""
 RESTARTS = 10
 """A clock rises so many times as often as it starts again, at least."""
 COMPUTED_LEAST = 0.999
-"""Correlation with the magnitude of the outputs above which a column is computed from them; a temperature that is
-measured has not a thousandth of it."""
+"""Correlation with the magnitude of the outputs above which a column is
+computed from them; a temperature that is measured has not a thousandth of
+it."""
 CELSIUS = (-60.0, 150.0)
-"""A thermometer of degrees Celsius beside a sensor shows no other; counts of a converter are beyond."""
+"""A thermometer of degrees Celsius beside a sensor shows no other; counts of a
+converter are beyond."""
 _SENSORS = re.compile(r"acc|gyr|mag|baro|grav|rotat|orient|linear", re.IGNORECASE)
 _LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*)?(?:\n|\Z)"
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How a table is to be read, where the user says so. ``columns`` are names or numbers (from 1) of the table's by
-    role (t, ux, uy, uz, or a channel's name); ``time_unit`` one of `naming.TIME_UNITS`; ``rate`` in Hz; ``where`` are
-    values that the rows to be read have in a column; with ``pose_means`` each row is the mean of a pose, and needs no
-    time. Columns called as one of ``wanted`` are channels under that name, whatever else they may be."""
+    """How a table is to be read, where the user says so. ``columns`` are names
+    or numbers (from 1) of the table's by role (t, ux, uy, uz, or a channel's
+    name); ``time_unit`` one of `naming.TIME_UNITS`; ``rate`` in Hz; ``where``
+    are values that the rows to be read have in a column; with ``pose_means``
+    each row is the mean of a pose, and needs no time. Columns called as one of
+    ``wanted`` are channels under that name, whatever else they may be."""
 
     columns: Mapping[str, str] = field(default_factory=dict)
     time_unit: str | None = None
@@ -64,8 +71,10 @@ class Reading:
 
 @dataclass(frozen=True)
 class Table:
-    """``remarks`` say what was guessed and what was left out, a line each; ``output_unit`` is what the header says.
-    ``beside`` are the cells (n,) of the columns that are neither outputs nor channels, by name, and of the time."""
+    """``remarks`` say what was guessed and what was left out, a line each;
+    ``output_unit`` is what the header says. ``beside`` are the cells (n,) of
+    the columns that are neither outputs nor channels, by name, and of the
+    time."""
 
     samples: CsvSamples
     remarks: tuple[str, ...] = ()
@@ -75,7 +84,8 @@ class Table:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Columns of n rows with their names. ``line_of`` says where a row stands, as in "line 17"."""
+    """Columns of n rows with their names. ``line_of`` says where a row stands,
+    as in "line 17"."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -90,8 +100,9 @@ class _Grid:
 
 
 def read_table(name: str, reading: Reading | None = None, *, beside: bool = False) -> Table:
-    """Of a path, or of text on standard input (``-``); with ``beside`` the cells of all its columns are kept. Raises
-    InputError: file, line, field, what was expected."""
+    """Of a path, or of text on standard input (``-``); with ``beside`` the
+    cells of all its columns are kept. Raises InputError: file, line, field,
+    what was expected."""
     reading = reading or Reading()
     label = label_of(name)
     try:
@@ -251,7 +262,8 @@ def _assembled(grid: _Grid, reading: Reading, beside: bool) -> Table:
 
 
 def _beside(grid: _Grid, roles: Roles, channels: Mapping[str, object], rows: NDArray[np.intp]) -> dict[str, Any]:
-    """What was not read, or under another name than its own, unless that is one of ours."""
+    """What was not read, or under another name than its own, unless that is one
+    of ours."""
     read = {"t_s", *OUTPUTS, *channels}
     found: dict[str, Any] = {}
     for i, column in enumerate(grid.columns):
@@ -266,7 +278,8 @@ def _beside(grid: _Grid, roles: Roles, channels: Mapping[str, object], rows: NDA
 
 
 def _with_joined_times(grid: _Grid) -> _Grid:
-    """Seconds and nanoseconds in two columns, as ROS has them, as one of nanoseconds."""
+    """Seconds and nanoseconds in two columns, as ROS has them, as one of
+    nanoseconds."""
     for i, j in seconds_and_rest(grid.names):
         seconds, rest = grid.columns[i], grid.columns[j]
         if seconds.whole is None or rest.whole is None:
@@ -305,7 +318,8 @@ def _distinct(column: Column, most: int = 20) -> list[str]:
 
 
 def _require_one_sensor(grid: _Grid, chosen: NDArray[np.bool_]) -> None:
-    """Rows of several sensors below each other, as some phones write them, would be read as one that jumps."""
+    """Rows of several sensors below each other, as some phones write them,
+    would be read as one that jumps."""
     for i, column in enumerate(grid.columns):
         values = _in_turn(column, chosen, by_number=bool(set(Name.of(grid.names[i]).words) & SENSORS) and grid.named)
         if values:
@@ -325,7 +339,8 @@ def _require_one_sensor(grid: _Grid, chosen: NDArray[np.bool_]) -> None:
 
 
 def _in_turn(column: Column, chosen: NDArray[np.bool_], by_number: bool) -> list[str]:
-    """The few values that a column of texts, or of numbers that name something, has in turn from row to row."""
+    """The few values that a column of texts, or of numbers that name something,
+    has in turn from row to row."""
     rows = np.flatnonzero(chosen)[:ROWS_LOOKED_AT]
     numbered = by_number and column.whole is not None and column.usable[rows].mean() > 0.5
     if column.moments_ns is not None or len(rows) < 4 or not (numbered or column.strange[rows].mean() > 0.5):
@@ -350,8 +365,9 @@ def _require_numbers(grid: _Grid, i: int, chosen: NDArray[np.bool_]) -> None:
 
 @dataclass(frozen=True)
 class _Timing:
-    """``time_ns`` (n,), None where the samples are counted, by ``index`` where that is a column; ``column`` is the one
-    that the times are of. ``said`` is what is to be said of it."""
+    """``time_ns`` (n,), None where the samples are counted, by ``index`` where
+    that is a column; ``column`` is the one that the times are of. ``said`` is
+    what is to be said of it."""
 
     time_ns: NDArray[np.int64] | None
     column: int | None
@@ -416,7 +432,8 @@ def _rises_at_all(column: Column, chosen: NDArray[np.bool_]) -> bool:
 
 
 def _is_no_time(column: Column, name: Name, chosen: NDArray[np.bool_]) -> bool:
-    """Of a column that may be either: a temperature falls as it rises, a clock at most where it starts again."""
+    """Of a column that may be either: a temperature falls as it rises, a clock
+    at most where it starts again."""
     steps = np.diff(column.numbers[chosen & column.usable])
     return name.is_either and column.moments_ns is None and bool((steps < 0).sum() * RESTARTS > (steps > 0).sum())
 
@@ -424,8 +441,8 @@ def _is_no_time(column: Column, name: Name, chosen: NDArray[np.bool_]) -> bool:
 def _timed(
     grid: _Grid, candidates: Sequence[int], names: Sequence[Name], unit: str | None, chosen: NDArray[np.bool_]
 ) -> _Timing:
-    """Of the candidates whose unit is clear the first whose times all rise; they have to agree about how long the
-    recording took."""
+    """Of the candidates whose unit is clear the first whose times all rise;
+    they have to agree about how long the recording took."""
     unstated = [i for i in candidates if names[i].time_unit is None and grid.columns[i].moments_ns is None]
     of_unit = (unstated or list(candidates))[0] if unit is not None else None
     found: list[tuple[bool, int, NDArray[np.int64], str]] = []
@@ -488,8 +505,9 @@ def _counted(
 def _kept(
     grid: _Grid, needed: Sequence[int], chosen: NDArray[np.bool_], reading: Reading
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """The rows with a number in each of the columns that are needed. Raises Unclear where there are others, unless they
-    are to be skipped; what to say of them."""
+    """The rows with a number in each of the columns that are needed. Raises
+    Unclear where there are others, unless they are to be skipped; what to say
+    of them."""
     usable = chosen.copy()
     for i in needed:
         usable &= grid.columns[i].usable
@@ -516,8 +534,8 @@ def _kept(
 
 
 def _far(grid: _Grid, outputs: Sequence[int], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(3,n) cells that hold something else than outputs: a line garbled on its way, a moment in the place of a
-    header."""
+    """(3,n) cells that hold something else than outputs: a line garbled on its
+    way, a moment in the place of a header."""
     sizes = np.abs(np.nan_to_num([grid.columns[i].numbers for i in outputs]))
     if not usable.any():
         return np.zeros(sizes.shape, bool)
@@ -533,8 +551,8 @@ def _channels(
     readings: NDArray[np.float64],
     wanted: frozenset[str],
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, int], list[str]]:
-    """All other columns of numbers without gaps, which of them have another name than their column, and why the others
-    are not among them."""
+    """All other columns of numbers without gaps, which of them have another
+    name than their column, and why the others are not among them."""
     channels = {role: grid.columns[i].numbers[rows] for role, i in roles.channels.items()}
     renamed: dict[str, int] = {}
     left_out: list[str] = []
@@ -591,7 +609,8 @@ def _unfit(column: Column, rows: NDArray[np.intp], magnitude: NDArray[np.float64
 
 
 def _counts(column: Column, rows: NDArray[np.intp]) -> bool:
-    """Whether it numbers the rows, whatever its name: as a channel it would be the time again."""
+    """Whether it numbers the rows, whatever its name: as a channel it would be
+    the time again."""
     return column.whole is not None and len(rows) > 2 and bool((np.diff(column.whole[rows]) == np.diff(rows)).all())
 
 
@@ -607,7 +626,8 @@ def _rising(
     readings: NDArray[np.float64],
     channels: Mapping[str, NDArray[np.float64]],
 ) -> NDArray[np.bool_]:
-    """Which rows are no exact repetition of the one before. Raises Unclear where times do not rise."""
+    """Which rows are no exact repetition of the one before. Raises Unclear
+    where times do not rise."""
     step = np.diff(time_ns)
     values = np.column_stack([readings, *channels.values()])
     repeated = (step == 0) & (values[1:] == values[:-1]).all(axis=1)

@@ -1,4 +1,5 @@
-"""The bytes of a table, a few MiB at a time: of a file, a gzip file, a pipe or standard input."""
+"""The bytes of a table, a few MiB at a time: of a file, a gzip file, a pipe or
+standard input."""
 
 from __future__ import annotations
 
@@ -14,8 +15,9 @@ from triaxcald.errors import InputError
 
 BLOCK = 2**22
 EXPANSION_MOST = 200
-"""So many times what is read of it may a gzip file unpack to, and one block. Text of numbers comes to a third or a
-tenth, with two hundred columns that never change to a hundredth; nothing but one and the same, to a thousandth."""
+"""So many times what is read of it may a gzip file unpack to, and one block.
+Text of numbers comes to a third or a tenth, with two hundred columns that never
+change to a hundredth; nothing but one and the same, to a thousandth."""
 
 
 def label_of(name: str) -> str:
@@ -23,7 +25,8 @@ def label_of(name: str) -> str:
 
 
 def blocks(source: Path | str | BinaryIO, label: str) -> Iterator[bytes]:
-    """Of a file, ``.gz`` unpacked, of standard input (``-``) or of a stream. Raises InputError."""
+    """Of a file, ``.gz`` unpacked, of standard input (``-``) or of a stream.
+    Raises InputError."""
     if not isinstance(source, Path | str):
         yield from _of(source, label)
     elif str(source) == "-":

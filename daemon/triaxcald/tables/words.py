@@ -1,4 +1,5 @@
-"""The words that programs call columns by, in lower case, and the units that they write behind them."""
+"""The words that programs call columns by, in lower case, and the units that
+they write behind them."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ COMPUTED = frozenset((
     "azimuth", "tilt", "inclination", "angle", "norm", "magnitude", "absolute", "abs", "total", "resultant", "svm",
     "vm", "enmo", "vel", "velocity", "pos", "position", "displacement", "jerk", "delta", "dt",
 ))  # fmt: skip
-"""Of columns that are computed from the outputs, or from the motion of the whole."""
+"""Of columns that are computed from the outputs, or from the motion of the
+whole."""
 TURNED = frozenset(("earth", "world", "global", "ned", "enu", "nav", "geo"))
 """Of readings that were turned into another frame than the sensor's."""
 NOT_CELSIUS = frozenset(("f", "fahrenheit", "k", "kelvin", "raw", "mv", "v", "adc", "counts", "lsb", "code"))

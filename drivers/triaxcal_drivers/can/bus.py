@@ -25,7 +25,8 @@ def open_bus(settings: CanBus) -> can.BusABC:
 
 
 async def opened_bus(settings: CanBus) -> can.BusABC:
-    """In a thread, which shuts the bus down again where nobody waits for it any more. Raises BusError."""
+    """In a thread, which shuts the bus down again where nobody waits for it any
+    more. Raises BusError."""
     given_up = threading.Event()
 
     def open_unless_given_up() -> can.BusABC:

@@ -1,4 +1,5 @@
-"""Which settings of python-can's interfaces say which bus it is; the others only say how it is driven."""
+"""Which settings of python-can's interfaces say which bus it is; the others
+only say how it is driven."""
 
 from __future__ import annotations
 
@@ -30,12 +31,13 @@ _CHOOSING: Mapping[str, Mapping[str, object]] = {
     "neousys": {"device": 0},
     **dict.fromkeys(_SERIAL, _NOTHING),
 }
-"""Options that choose the adapter or the network, with python-can's default. Of an interface that is not here every
-option counts."""
+"""Options that choose the adapter or the network, with python-can's default. Of
+an interface that is not here every option counts."""
 
 
 def claim_on_can(interface: str, channel: str | int, node_id: int, options: Mapping[str, object]) -> Claim:
-    """A node is one process's, its bus is not, unless the adapter is behind a serial port."""
+    """A node is one process's, its bus is not, unless the adapter is behind a
+    serial port."""
     name, port = str(channel), None
     if interface in _SERIAL:
         name = port = canonical_port(name.partition("@")[0])

@@ -1,8 +1,9 @@
 """The messages of a DBC file: the only place that reads one.
 
-Of a DBC it takes what a stream can need: messages, their signals, and which of these are floats. Comments, value
-tables and whatever else somebody put there are passed over unread, so that a vehicle's DBC takes a fraction of a second
-and a hostile one no longer.
+Of a DBC it takes what a stream can need: messages, their signals, and which of
+these are floats. Comments, value tables and whatever else somebody put there
+are passed over unread, so that a vehicle's DBC takes a fraction of a second and
+a hostile one no longer.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ class _Described:
 
 
 def dbc_messages(data: bytes, *, base_node_id: int | None, where: str) -> list[Message]:
-    """Every message of a DBC file; multiplexed signals, which only some frames hold, are left out.
+    """Every message of a DBC file; multiplexed signals, which only some frames
+    hold, are left out.
 
     Raises ProfileError.
     """

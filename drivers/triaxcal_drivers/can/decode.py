@@ -1,4 +1,5 @@
-"""Raw CAN records to samples: put together by counter, in order, the same however the records are cut."""
+"""Raw CAN records to samples: put together by counter, in order, the same
+however the records are cut."""
 
 from __future__ import annotations
 
@@ -15,14 +16,16 @@ Ints = NDArray[np.int64]
 
 _EXTENDED_KEY = 1 << 32
 LATEST = 8
-"""A message may come this many samples late; an unfinished sample is waited for so long."""
+"""A message may come this many samples late; an unfinished sample is waited for
+so long."""
 RETURN = 32
 """A counter that goes back further than this has started anew."""
 
 
 @dataclass(frozen=True)
 class _Parts:
-    """Records that belong to the stream: host time, message number, counter, and the values they hold."""
+    """Records that belong to the stream: host time, message number, counter,
+    and the values they hold."""
 
     time_ns: Ints
     message: Ints
@@ -47,23 +50,26 @@ class _Parts:
 class CanDecoder:
     """Decodes one stream of one unit.
 
-    **Node.** Where identifiers shift with the node, the unit is the one whose message comes first; those of
-    other nodes are passed over.
+    **Node.** Where identifiers shift with the node, the unit is the one whose
+    message comes first; those of other nodes are passed over.
 
-    **Counter.** It is unwrapped against the record before, by the shorter way round. Two kinds of jump are
-    taken for a restart of the device: backwards by more than `RETURN`, and forwards by more than 1/64 of
-    the counter's range to a count in its first 1/256. The sample after a restart continues the
-    unwrapped counter by the host time since the record before, in whole periods and by one at least; so
-    time never goes backwards, and the pause counts as missing samples. (A restart within the last 1/64 of
-    the range, or one whose first messages are not seen, cannot be told from lost samples.)
+    **Counter.** It is unwrapped against the record before, by the shorter way
+    round. Two kinds of jump are taken for a restart of the device: backwards by
+    more than `RETURN`, and forwards by more than 1/64 of the counter's range to
+    a count in its first 1/256. The sample after a restart continues the
+    unwrapped counter by the host time since the record before, in whole periods
+    and by one at least; so time never goes backwards, and the pause counts as
+    missing samples. (A restart within the last 1/64 of the range, or one whose
+    first messages are not seen, cannot be told from lost samples.)
 
-    **Time.** Host time of the first record, plus the periods counted since; host time where there is no
-    counter.
+    **Time.** Host time of the first record, plus the periods counted since;
+    host time where there is no counter.
 
-    **Samples.** One is delivered when every message of it has come and the ones before it are settled. One
-    that lacks messages is given up, and counted ``incomplete``, once the counter is more than `LATEST` past
-    it; one of which nothing came counts as ``missing``. Each message that is repeated, or comes after its
-    sample was given up, counts as one duplicate.
+    **Samples.** One is delivered when every message of it has come and the ones
+    before it are settled. One that lacks messages is given up, and counted
+    ``incomplete``, once the counter is more than `LATEST` past it; one of which
+    nothing came counts as ``missing``. Each message that is repeated, or comes
+    after its sample was given up, counts as one duplicate.
     """
 
     def __init__(self, layout: Layout, *, rate_hz: float) -> None:

@@ -1,4 +1,5 @@
-"""The messages of a stream, out of the DBC or EDS file that it names: the only place that reads an EDS."""
+"""The messages of a stream, out of the DBC or EDS file that it names: the only
+place that reads an EDS."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 logging.getLogger("canopen").addHandler(logging.NullHandler())  # what it logs comes back as exceptions too
 
 EDS_MOST, LINES_MOST = 2**20, 30_000
-"""Bytes and lines; a drive of three thousand objects comes near. canopen takes a second for so many."""
+"""Bytes and lines; a drive of three thousand objects comes near. canopen takes
+a second for so many."""
 _COMMENT = re.compile(r"(?:^|\s)[;#].*")
 _BLANKS = re.compile(r"\s+")
 _ENTRY = re.compile(r"\[[^\]]+\]$|[^=:\[][^=:]*[=:]")
@@ -39,15 +41,16 @@ def stream_layout(stream: CanStream, files: Mapping[str, bytes], *, where: str) 
 
 @lru_cache(maxsize=4)
 def _messages(data: bytes, dbc: bool, base_node_id: int | None, where: str) -> list[Message]:
-    """A file is read once for all streams that it lays out, and once for all units of a station."""
+    """A file is read once for all streams that it lays out, and once for all
+    units of a station."""
     if dbc:
         return dbc_messages(data, base_node_id=base_node_id, where=where)
     return pdo_messages(object_dictionary(data, node_id=0, where=where), where=where)
 
 
 def object_dictionary(data: bytes, *, node_id: int, where: str) -> ObjectDictionary:
-    """An EDS file's objects; ``$NODEID`` in it becomes ``node_id``. Raises ProfileError; ModuleNotFoundError without
-    canopen."""
+    """An EDS file's objects; ``$NODEID`` in it becomes ``node_id``. Raises
+    ProfileError; ModuleNotFoundError without canopen."""
     from canopen.objectdictionary.eds import import_eds  # half a second, and only an EDS needs it
 
     text = _entries(data, where)
@@ -61,9 +64,11 @@ def object_dictionary(data: bytes, *, node_id: int, where: str) -> ObjectDiction
 
 
 def _entries(data: bytes, where: str) -> str:
-    """The file's text without comments, blanks single. Raises ProfileError where a line is none of an EDS.
+    """The file's text without comments, blanks single. Raises ProfileError
+    where a line is none of an EDS.
 
-    Of such lines, and of long runs of blanks, configparser takes their square, and its message shows what they hold.
+    Of such lines, and of long runs of blanks, configparser takes their square,
+    and its message shows what they hold.
     """
     if len(data) > EDS_MOST:
         raise ProfileError(f"{where}: larger than the {size(EDS_MOST)} that an EDS file may have")
@@ -79,7 +84,8 @@ def _entries(data: bytes, where: str) -> str:
 
 
 def pdo_messages(objects: ObjectDictionary, *, where: str) -> list[Message]:
-    """The TPDOs in use, by their mapping (0x1A00…) and COB-ID (0x1800…); signals are named ``0x2300:01``."""
+    """The TPDOs in use, by their mapping (0x1A00…) and COB-ID (0x1800…);
+    signals are named ``0x2300:01``."""
     messages = []
     for number in range(512):
         if 0x1800 + number not in objects:

@@ -32,14 +32,17 @@ _NMT_START = 1
 _ABORTED = 0x80
 _DOWNLOAD, _UPLOAD = 1, 2
 _ANSWERED_BY = {_DOWNLOAD: 3, _UPLOAD: 2, 0: 1, 3: 0}
-"""The server's command specifier for the client's (CiA 301): starts of transfers, then segments."""
+"""The server's command specifier for the client's (CiA 301): starts of
+transfers, then segments."""
 
 
 class PatientSdo(SdoClient):
-    """canopen's client, whose time-out counts attention, and which takes no answer to somebody else's request.
+    """canopen's client, whose time-out counts attention, and which takes no
+    answer to somebody else's request.
 
-    It waits in a thread of its own, and where the event loop is held up so may be all else that an answer passes.
-    A late answer, or one to another client of the node, is skipped.
+    It waits in a thread of its own, and where the event loop is held up so may
+    be all else that an answer passes. A late answer, or one to another client
+    of the node, is skipped.
     """
 
     def __init__(self, node_id: int, attention: Attention) -> None:
@@ -55,7 +58,8 @@ class PatientSdo(SdoClient):
         super().send_request(request)  # type: ignore[no-untyped-call]
 
     def read_response(self) -> bytes:
-        """Raises SdoAbortedError, SdoCommunicationError; struct.error for one cut short."""
+        """Raises SdoAbortedError, SdoCommunicationError; struct.error for one
+        cut short."""
         response = self._response()
         if response[0] == _ABORTED:
             raise SdoAbortedError(*struct.unpack_from("<L", response, 4))
@@ -95,7 +99,8 @@ class _Connection:
 class CanDevice:
     """A device behind python-can; a CANopen node where the profile says so.
 
-    One receive thread serves both the open stream and the SDO client; blocking calls run in worker threads.
+    One receive thread serves both the open stream and the SDO client; blocking
+    calls run in worker threads.
     """
 
     def __init__(self, profile: CanProfile, bus: CanBus, layouts: Mapping[str, Layout]) -> None:
@@ -108,7 +113,8 @@ class CanDevice:
 
     @property
     def dropped(self) -> int:
-        """Frames lost in this process so far, because a stream was not read fast enough."""
+        """Frames lost in this process so far, because a stream was not read
+        fast enough."""
         return self._dropped + (self._connection.frames.dropped if self._connection else 0)
 
     async def open(self) -> None:
@@ -150,8 +156,8 @@ class CanDevice:
     async def _start(self) -> None:
         """NMT start, and the check that the right device is there.
 
-        A node that was stopped answers no SDO, one that is still booting misses the command: it is sent
-        before and after the check.
+        A node that was stopped answers no SDO, one that is still booting misses
+        the command: it is sent before and after the check.
         """
         await self._send(0, bytes([_NMT_START, self._settings.node_id]))
         await self._identify()
@@ -175,9 +181,11 @@ class CanDevice:
                 )
 
     async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
-        """Frames of the named streams and error frames, until the iterator is closed; one at a time.
+        """Frames of the named streams and error frames, until the iterator is
+        closed; one at a time.
 
-        Raises DeviceSilent when no frame of theirs has come for ``silence_timeout_s``, BusError.
+        Raises DeviceSilent when no frame of theirs has come for
+        ``silence_timeout_s``, BusError.
         """
         connection = self._connected()
         frames, now_s = connection.frames, connection.attention.now_s
@@ -206,7 +214,8 @@ class CanDevice:
         return {(m.identifier_of(node), m.extended) for name in names for m in self._layouts[name].messages}
 
     async def read(self, register: str) -> bytes:
-        """Least significant byte first. Raises RegisterRefused, DeviceSilent, BusError."""
+        """Least significant byte first. Raises RegisterRefused, DeviceSilent,
+        BusError."""
         address = object_address(self._profile.registers[register].object)
         try:
             return await self._transfer(register, lambda sdo: bytes(sdo.upload(*address)))
@@ -216,7 +225,8 @@ class CanDevice:
             raise DeviceBusy(str(e), register=register, code=e.code) from e
 
     async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
-        """``raw`` least significant byte first. Raises RegisterRefused, DeviceSilent, BusError."""
+        """``raw`` least significant byte first. Raises RegisterRefused,
+        DeviceSilent, BusError."""
         address = object_address(self._profile.registers[register].object)
         await self._transfer(register, lambda sdo: sdo.download(*address, raw), timeout_s)
 

@@ -17,21 +17,24 @@ if TYPE_CHECKING:
 
 
 class CanDriver:
-    """Devices on CAN: streams laid out by a DBC or an EDS file, registers by CANopen SDO."""
+    """Devices on CAN: streams laid out by a DBC or an EDS file, registers by
+    CANopen SDO."""
 
     profile_model = CanProfile
     bus_model = CanBus
     packages = ("can", "canopen", "cantools")
 
     def device(self, bundle: Bundle, bus: CanBus) -> CanDevice:
-        """Raises ProfileError where the profile's files do not hold what it names."""
+        """Raises ProfileError where the profile's files do not hold what it
+        names."""
         from triaxcal_drivers.can.device import CanDevice  # python-can and canopen, which no recording needs
 
         profile = cast(CanProfile, bundle.profile)
         return CanDevice(profile, bus, {name: _layout(bundle, name) for name in profile.streams})
 
     def decoder(self, bundle: Bundle, stream: str) -> CanDecoder:
-        """Raises ProfileError where the profile's files do not hold what it names."""
+        """Raises ProfileError where the profile's files do not hold what it
+        names."""
         return CanDecoder(_layout(bundle, stream), rate_hz=bundle.profile.sampling.rate_hz)
 
 

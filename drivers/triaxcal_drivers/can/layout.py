@@ -1,4 +1,5 @@
-"""Where a stream's channels lie in its CAN messages, and their extraction for many frames at once. No I/O."""
+"""Where a stream's channels lie in its CAN messages, and their extraction for
+many frames at once. No I/O."""
 
 from __future__ import annotations
 
@@ -23,8 +24,9 @@ _FLOATS = {16: np.uint16, 32: np.uint32, 64: np.uint64}
 class Signal:
     """Up to 64 bits of a message, numbered as in a DBC file.
 
-    Bit k is bit k % 8 (0 the least significant) of byte k // 8. ``start`` is the signal's least significant
-    bit where it is little-endian, its most significant one where it is big-endian.
+    Bit k is bit k % 8 (0 the least significant) of byte k // 8. ``start`` is
+    the signal's least significant bit where it is little-endian, its most
+    significant one where it is big-endian.
     """
 
     name: str
@@ -37,7 +39,8 @@ class Signal:
     offset: float = 0.0
 
     def _place(self) -> tuple[range, int]:
-        """The bytes it touches, least significant first, and how far it lies above their lowest bit."""
+        """The bytes it touches, least significant first, and how far it lies
+        above their lowest bit."""
         if not self.big_endian:
             return range(self.start // 8, (self.start + self.length - 1) // 8 + 1), self.start % 8
         last = 8 * (self.start // 8) + 7 - self.start % 8 + self.length - 1  # counted from the first byte's top
@@ -49,7 +52,8 @@ class Signal:
         return max(self._place()[0]) + 1
 
     def raw(self, data: NDArray[np.uint8]) -> NDArray[Any]:
-        """The unscaled numbers (n,) in messages ``data`` (n, bytes): uint64, int64 or a float type."""
+        """The unscaled numbers (n,) in messages ``data`` (n, bytes): uint64,
+        int64 or a float type."""
         places, shift = self._place()
         bits = np.zeros(len(data), dtype=np.uint64)
         for k, place in enumerate(places[:8]):
@@ -75,7 +79,8 @@ class Signal:
 
 @dataclass(frozen=True)
 class Message:
-    """A CAN message. Where it is ``per_node``, a unit at node N sends it as ``identifier`` + N."""
+    """A CAN message. Where it is ``per_node``, a unit at node N sends it as
+    ``identifier`` + N."""
 
     name: str
     identifier: int
@@ -89,7 +94,8 @@ class Message:
 
 @dataclass(frozen=True)
 class Layout:
-    """A stream: its messages, the (message, signal) of each channel, and the counter in each message."""
+    """A stream: its messages, the (message, signal) of each channel, and the
+    counter in each message."""
 
     messages: tuple[Message, ...]
     channels: Mapping[str, tuple[int, Signal]]
@@ -103,8 +109,9 @@ class Layout:
 def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> Layout:
     """The layout of ``stream`` in a file's messages.
 
-    A name that several messages hold is taken from one that another channel needs in any case.
-    Raises ProfileError (one line: ``where``, the name, the nearest right one).
+    A name that several messages hold is taken from one that another channel
+    needs in any case. Raises ProfileError (one line: ``where``, the name, the
+    nearest right one).
     """
     wanted = stream.wanted()
     index = _Index(messages)
@@ -185,7 +192,8 @@ def _counters(used: Sequence[Message], counter: str | None, where: str) -> tuple
 
 
 def _check_identifiers(used: Sequence[Message], where: str) -> None:
-    """Identifiers that shift with the node must tell messages apart whichever node sends them."""
+    """Identifiers that shift with the node must tell messages apart whichever
+    node sends them."""
     for a, b in combinations([m for m in used if m.per_node], 2):
         if a.extended == b.extended and abs(a.identifier - b.identifier) < NODES:
             raise ProfileError(

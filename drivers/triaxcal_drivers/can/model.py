@@ -27,7 +27,8 @@ def object_address(name: str) -> tuple[int, int]:
 
 
 class Scaling(Strict):
-    """Takes the place of the file's own scaling where given: value = raw * scale + offset."""
+    """Takes the place of the file's own scaling where given: value = raw *
+    scale + offset."""
 
     scale: float | None = None
     offset: float | None = None
@@ -63,9 +64,10 @@ def _has_readings(channels: Mapping[str, object]) -> None:
 class DbcStream(Strict):
     """A stream whose messages a DBC file describes.
 
-    The sample is made of the messages that hold its channels; ``counter`` names a signal that each of them
-    holds. ``base_node_id`` is the node for which the DBC's identifiers are written: given it, a unit at
-    another node sends them shifted by the difference.
+    The sample is made of the messages that hold its channels; ``counter`` names
+    a signal that each of them holds. ``base_node_id`` is the node for which the
+    DBC's identifiers are written: given it, a unit at another node sends them
+    shifted by the difference.
     """
 
     layout: Literal["dbc"]
@@ -87,7 +89,8 @@ class DbcStream(Strict):
 
 
 class PdoStream(Strict):
-    """A stream whose messages are the TPDOs that an EDS file maps; channels are the mapped objects."""
+    """A stream whose messages are the TPDOs that an EDS file maps; channels are
+    the mapped objects."""
 
     layout: Literal["pdo"]
     eds: str
@@ -114,20 +117,23 @@ CanStream = Annotated[DbcStream | PdoStream, Field(discriminator="layout")]
 
 
 class CanRegister(Register):
-    """A register that is an object of the CANopen object dictionary, reached by SDO."""
+    """A register that is an object of the CANopen object dictionary, reached by
+    SDO."""
 
     object: ObjectName
 
 
 class CanProfile(Profile):
-    """A device on CAN. With registers, or streams laid out by an EDS, it is taken for a CANopen node."""
+    """A device on CAN. With registers, or streams laid out by an EDS, it is
+    taken for a CANopen node."""
 
     streams: Annotated[Mapping[str, CanStream], Field(max_length=STREAMS_MOST)]
     registers: Mapping[str, CanRegister] = {}
     busy_codes: Annotated[
         tuple[int, ...], Field(description="SDO abort codes by which a read is refused for now, and may be repeated")
     ] = (0x08000022,)
-    """By default "because of the present device state"; a write refused by it may as well be locked."""
+    """By default "because of the present device state"; a write refused by it
+    may as well be locked."""
 
     @property
     def canopen(self) -> bool:
@@ -137,7 +143,8 @@ class CanProfile(Profile):
         return tuple(dict.fromkeys(stream.file for stream in self.streams.values()))
 
     def encode(self, name: str, value: float) -> bytes:
-        """``value`` as register bytes on the wire, least significant first. Raises RegisterValueError."""
+        """``value`` as register bytes on the wire, least significant first.
+        Raises RegisterValueError."""
         return codec.encode(self.registers[name], value, order="little", name=name)
 
     def decode(self, name: str, raw: bytes) -> float:
@@ -146,9 +153,11 @@ class CanProfile(Profile):
 
 
 class CanBus(Strict):
-    """Where a unit is: a python-can interface and channel, and its node on that bus.
+    """Where a unit is: a python-can interface and channel, and its node on that
+    bus.
 
-    ``options`` are passed on to python-can as they are; its configuration files are not read.
+    ``options`` are passed on to python-can as they are; its configuration files
+    are not read.
     """
 
     interface: Annotated[str, Field(description='a python-can interface: "socketcan", "udp_multicast"…')]

@@ -1,4 +1,5 @@
-"""The way of frames from python-can's receive thread to asyncio: bounded, in batches, with host time."""
+"""The way of frames from python-can's receive thread to asyncio: bounded, in
+batches, with host time."""
 
 from __future__ import annotations
 
@@ -26,12 +27,14 @@ Identifier = tuple[int, bool]
 class HostClock:
     """Message time stamps as nanoseconds of the host's epoch.
 
-    python-can gives seconds as a float, good to about 0.2 µs at today's date. Interfaces differ in where
-    they start from: socketcan and udp_multicast have the kernel's time of reception, virtual the time of
-    sending, kvaser, vector and pcan an adapter's clock laid on the epoch; gs_usb, serial and some others an
-    adapter's clock that starts at 0 and may wrap. A stamp more than 10 s off the host's clock is
-    therefore read as the adapter's: from there on its differences count, starting from the host's time.
-    Where there is no stamp, the host's time is taken.
+    python-can gives seconds as a float, good to about 0.2 µs at today's date.
+    Interfaces differ in where they start from: socketcan and udp_multicast have
+    the kernel's time of reception, virtual the time of sending, kvaser, vector
+    and pcan an adapter's clock laid on the epoch; gs_usb, serial and some
+    others an adapter's clock that starts at 0 and may wrap. A stamp more than
+    10 s off the host's clock is therefore read as the adapter's: from there on
+    its differences count, starting from the host's time. Where there is no
+    stamp, the host's time is taken.
     """
 
     def __init__(self, now_ns: Callable[[], int] = time.time_ns) -> None:
@@ -49,10 +52,12 @@ class HostClock:
 
 
 class FrameQueue(can.Listener):
-    """Takes the frames of the given identifiers, and error frames, while a stream is open.
+    """Takes the frames of the given identifiers, and error frames, while a
+    stream is open.
 
-    When asyncio does not keep up, ``capacity`` bounds what is held: further frames are dropped and counted
-    in ``dropped``, and the next one kept carries RawFlag.LOST_BEFORE.
+    When asyncio does not keep up, ``capacity`` bounds what is held: further
+    frames are dropped and counted in ``dropped``, and the next one kept carries
+    RawFlag.LOST_BEFORE.
     """
 
     def __init__(self, attention: Attention, *, capacity: int = CAPACITY) -> None:
@@ -111,7 +116,8 @@ class FrameQueue(can.Listener):
             self._tell(self._some if waiting == 1 else self._enough)
 
     def on_error(self, exc: Exception) -> None:
-        """Called in python-can's thread when receiving fails, which ends the thread: it would try for ever."""
+        """Called in python-can's thread when receiving fails, which ends the
+        thread: it would try for ever."""
         self._failure = exc
         self._tell(self._some)
         raise SystemExit  # which a thread ends by without a trace back
@@ -126,7 +132,8 @@ class FrameQueue(can.Listener):
             raise BusError(f"receiving failed: {self._failure}") from self._failure
 
     async def batch(self, timeout_s: float) -> RawBatch | None:
-        """The next frames: up to 256, or those of 50 ms. None when nothing comes for ``timeout_s`` of attention.
+        """The next frames: up to 256, or those of 50 ms. None when nothing
+        comes for ``timeout_s`` of attention.
 
         Raises BusError when receiving has failed.
         """

@@ -1,4 +1,5 @@
-"""One unit on a Modbus line: its registers read and written, and its replies checked."""
+"""One unit on a Modbus line: its registers read and written, and its replies
+checked."""
 
 from __future__ import annotations
 
@@ -32,8 +33,9 @@ class ModbusClient:
     async def joined(
         cls, where: TcpAddress | SerialLine, *, unit_id: int, reply_timeout_s: float, owed_s: float = 0.0
     ) -> ModbusClient:
-        """``owed_s`` is what an earlier client of this unit still owed the line. Raises BusError where a connection is
-        refused or not made in time, a port cannot be opened, or other units have it with other settings."""
+        """``owed_s`` is what an earlier client of this unit still owed the
+        line. Raises BusError where a connection is refused or not made in time,
+        a port cannot be opened, or other units have it with other settings."""
         line = await join(where, reply_timeout_s)
         line.owe(unit_id, owed_s)
         return cls(line, unit_id, reply_timeout_s)
@@ -48,8 +50,9 @@ class ModbusClient:
 
     @property
     def own_s(self) -> float:
-        """Time [s] that goes on while this unit has the line or could have it: `attention`, less what other units took
-        while a request of this one waited."""
+        """Time [s] that goes on while this unit has the line or could have it:
+        `attention`, less what other units took while a request of this one
+        waited."""
         return self._last.attention.now_s() - self._last.waited_s(self._unit_id)
 
     @property
@@ -66,7 +69,8 @@ class ModbusClient:
     async def read(self, function: int, address: int, count: int) -> bytes:
         """``count`` registers as 2·count bytes, as on the wire.
 
-        Raises ModbusRefusal, MalformedReply, DeviceSilent (no reply in time), BusError (connection lost).
+        Raises ModbusRefusal, MalformedReply, DeviceSilent (no reply in time),
+        BusError (connection lost).
         """
         pdu = await self._transact(read_request(function, address, count))
         if pdu[0] != function or len(pdu) != 2 + 2 * count or pdu[1] != 2 * count:
@@ -78,9 +82,11 @@ class ModbusClient:
         return pdu[2:]
 
     async def write(self, address: int, data: bytes, *, single: bool = False, timeout_s: float | None = None) -> None:
-        """Register bytes, most significant of each word first; ``single`` writes one word with function 6.
+        """Register bytes, most significant of each word first; ``single``
+        writes one word with function 6.
 
-        ``timeout_s`` takes the place of the client's time-out. Raises as `read` does.
+        ``timeout_s`` takes the place of the client's time-out. Raises as `read`
+        does.
         """
         words = struct.unpack(f">{len(data) // 2}H", data)
         if single:

@@ -26,7 +26,8 @@ Bytes = NDArray[np.uint8]
 
 
 class ModbusDecoder:
-    """Decodes one stream. A failed request (exception, silence, malformed reply) counts as an error."""
+    """Decodes one stream. A failed request (exception, silence, malformed
+    reply) counts as an error."""
 
     def __init__(self, profile: ModbusProfile, stream: str) -> None:
         self._stream = profile.streams[stream]
@@ -52,7 +53,8 @@ class ModbusDecoder:
         errors = np.cumsum(mine & failed)[good]
         total = int((mine & failed).sum())
         if isinstance(self._stream, FifoStream):
-            # A count past the window is no reply of this device: an error like any other.
+            # A count past the window is no reply of this device: an error like
+            # any other.
             broken = self._number(replies, self._stream.header.count) > self._stream.record_capacity
             errors, total = errors + np.cumsum(broken), total + int(broken.sum())
             replies, host_ns, errors = replies[~broken], host_ns[~broken], errors[~broken]
@@ -67,8 +69,8 @@ class ModbusDecoder:
     def _records(
         self, stream: FifoStream, replies: Bytes, host_ns: NDArray[np.int64]
     ) -> tuple[Bytes, NDArray[np.int64], NDArray[np.int64], NDArray[np.intp]]:
-        """The windows' records one after the other, when each was taken by the host's clock, samples lost
-        before each, and the window each is of."""
+        """The windows' records one after the other, when each was taken by the
+        host's clock, samples lost before each, and the window each is of."""
         count = self._number(replies, stream.header.count)
         inside = np.arange(stream.record_capacity) < count[:, None]
         body = replies[:, 2 * stream.record_start :].reshape(
@@ -82,7 +84,8 @@ class ModbusDecoder:
         return body[inside], arrival_ns, self._skipped(stream, replies, of), of
 
     def _skipped(self, stream: FifoStream, replies: Bytes, of: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Samples lost to overflow between each record and the one before it, by the device's own count."""
+        """Samples lost to overflow between each record and the one before it,
+        by the device's own count."""
         if stream.header.lost is None or not len(replies):
             return np.zeros(len(of), np.int64)
         raw = self._number(replies, stream.header.lost)
@@ -131,7 +134,8 @@ class ModbusDecoder:
             np.stack([values.pop(name) for name in READING_CHANNELS], axis=1),
             values,
             missing=placed.missing,
-            # A block of the newest sample is read oftener than that changes; a record comes out of a FIFO once.
+            # A block of the newest sample is read oftener than that changes; a
+            # record comes out of a FIFO once.
             duplicates=len(records) - len(kept) if isinstance(stream, FifoStream) else 0,
             errors=errors,
         )

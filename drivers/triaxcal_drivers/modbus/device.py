@@ -29,12 +29,15 @@ from triaxcal_drivers.modbus.protocol import (
 from triaxcal_drivers.register_types import TYPES
 
 _BATCH_REPLIES = 32
-"""A stream hands out what it has after so many replies, though more may be waiting in the device."""
+"""A stream hands out what it has after so many replies, though more may be
+waiting in the device."""
 _DISCARD_S = 60.0
-"""A FIFO that does not say how much is in it is read for so long until it is empty: it may fill as fast as it is read.
-4096 records of 20 bytes take 48 s at 19200 baud."""
+"""A FIFO that does not say how much is in it is read for so long until it is
+empty: it may fill as fast as it is read. 4096 records of 20 bytes take 48 s at
+19200 baud."""
 _DOUBLINGS = 10
-"""Of the pause before a unit that does not answer is asked again: a thousand time-outs at most."""
+"""Of the pause before a unit that does not answer is asked again: a thousand
+time-outs at most."""
 
 _EMPTY = "it answers, but its FIFO stays empty"
 
@@ -43,7 +46,8 @@ Record = tuple[int, int, int, bytes]
 
 @dataclass
 class _Polled:
-    """A stream while it is polled. ``due_s`` is of the loop's time, ``heard_s`` of the unit's own time."""
+    """A stream while it is polled. ``due_s`` is of the loop's time, ``heard_s``
+    of the unit's own time."""
 
     name: str
     stream: PollStream | FifoStream
@@ -59,10 +63,13 @@ class _Polled:
 
 
 class ModbusDevice:
-    """One unit on one connection. Register access and polling share it, one request at a time.
+    """One unit on one connection. Register access and polling share it, one
+    request at a time.
 
-    Registers go most significant byte first, whatever the word order of the profile. ``now_ns`` is the host's
-    clock, for the receive times. ``discarded`` counts the records that were in FIFOs before streams were opened.
+    Registers go most significant byte first, whatever the word order of the
+    profile. ``now_ns`` is the host's clock, for the receive times.
+    ``discarded`` counts the records that were in FIFOs before streams were
+    opened.
     """
 
     def __init__(self, profile: ModbusProfile, bus: ModbusBus, *, now_ns: Callable[[], int] = time.time_ns) -> None:
@@ -92,7 +99,8 @@ class ModbusDevice:
             await client.close()
 
     async def _probe(self, client: ModbusClient) -> None:
-        """Any answer shows that the unit is there, an exception too. Takes no samples from it."""
+        """Any answer shows that the unit is there, an exception too. Takes no
+        samples from it."""
         function, address, count = self._probe_request()
         for last in (False, True):
             try:
@@ -115,10 +123,12 @@ class ModbusDevice:
         return stream.function, stream.address, stream.record_start if isinstance(stream, FifoStream) else 1
 
     async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
-        """Replies of the named streams, polled in turn. A failed request is a record too: an exception's code,
-        a malformed reply as it came, nothing for a missing reply. What FIFOs hold by now is discarded first.
+        """Replies of the named streams, polled in turn. A failed request is a
+        record too: an exception's code, a malformed reply as it came, nothing
+        for a missing reply. What FIFOs hold by now is discarded first.
 
-        Raises DeviceSilent, BusError; ProfileError where the profile has no such stream.
+        Raises DeviceSilent, BusError; ProfileError where the profile has no
+        such stream.
         """
         loop = asyncio.get_running_loop()
         for name in names:
@@ -146,8 +156,10 @@ class ModbusDevice:
             )
 
     def _pause_s(self, p: _Polled) -> float:
-        """Before a unit that does not answer is asked again: twice as long each time, so that it takes ever less of a
-        line that it shares, but not beyond the moment at which it counts as silent. A lost reply costs no pause."""
+        """Before a unit that does not answer is asked again: twice as long each
+        time, so that it takes ever less of a line that it shares, but not
+        beyond the moment at which it counts as silent. A lost reply costs no
+        pause."""
         patience_s = self._profile.sampling.reply_timeout_s
         until_silent_s = p.heard_s + self._profile.sampling.silence_timeout_s - self._connected().own_s
         pause_s = patience_s * (float(2 ** min(p.unanswered - 1, _DOUBLINGS)) - 1)
@@ -158,7 +170,8 @@ class ModbusDevice:
         return _Polled(name, self._profile.streams[name], now_s, self._connected().own_s)
 
     async def _discard(self, p: _Polled) -> None:
-        """Takes out of a stream's FIFO what it held at the first reply; whole windows. Raises DeviceSilent."""
+        """Takes out of a stream's FIFO what it held at the first reply; whole
+        windows. Raises DeviceSilent."""
         if not isinstance(p.stream, FifoStream):
             return
         loop = asyncio.get_running_loop()
@@ -180,7 +193,8 @@ class ModbusDevice:
                 await asyncio.sleep(p.stream.poll_period_s)
 
     async def _drain(self, p: _Polled) -> list[Record]:
-        """One read of a stream, or reads until its FIFO is empty, but not for ever."""
+        """One read of a stream, or reads until its FIFO is empty, but not for
+        ever."""
         records: list[Record] = []
         for _ in range(_BATCH_REPLIES):
             flags, data = await self._request(p)
@@ -234,7 +248,8 @@ class ModbusDevice:
         return self._ordered(entry, raw)
 
     async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
-        """Raises RegisterValueError where ``raw`` is not as long as the register; nothing is sent then."""
+        """Raises RegisterValueError where ``raw`` is not as long as the
+        register; nothing is sent then."""
         entry = self._register(register)
         size = TYPES[entry.type].size
         if len(raw) != size:
@@ -260,7 +275,8 @@ class ModbusDevice:
         return self._profile.registers[name]
 
     def _ordered(self, register: ModbusRegister, raw: bytes) -> bytes:
-        """From most significant first to the device's order, or back: the same exchange both ways."""
+        """From most significant first to the device's order, or back: the same
+        exchange both ways."""
         words = [raw[i : i + 2] for i in range(0, len(raw), 2)]
         if (register.word_order or self._profile.word_order) == "little":
             words.reverse()

@@ -31,7 +31,8 @@ class ModbusDriver:
         return ModbusDevice(_profile(bundle), bus)
 
     def loads(self, bundle: Bundle, bus: Any) -> Mapping[str, LineLoad]:
-        """By stream; nothing where no baud rate tells how fast the line is: over TCP, and on a pseudo-terminal."""
+        """By stream; nothing where no baud rate tells how fast the line is:
+        over TCP, and on a pseudo-terminal."""
         where = bus.where
         if not isinstance(where, SerialLine) or (port := canonical_port(where.port)).startswith("/dev/pts/"):
             return {}

@@ -1,8 +1,10 @@
-"""A Modbus line: one open connection for all units of this process that are reached by it.
+"""A Modbus line: one open connection for all units of this process that are
+reached by it.
 
-A serial port has one owner, and a gateway serves few connections. So the units on them share one `Line`, which asks
-one unit at a time, in the order in which they come, also by TCP: what is behind a gateway is mostly one line. A unit
-that does not answer costs the others one time-out.
+A serial port has one owner, and a gateway serves few connections. So the units
+on them share one `Line`, which asks one unit at a time, in the order in which
+they come, also by TCP: what is behind a gateway is mostly one line. A unit that
+does not answer costs the others one time-out.
 """
 
 from __future__ import annotations
@@ -42,8 +44,9 @@ class Line:
         self._expected: asyncio.Future[bytes] | None = None
 
     async def open(self, timeout_s: float) -> None:
-        """Nothing where it is open and answers; a TCP connection that went mute is made anew. Raises BusError where it
-        cannot be opened, by TCP within ``timeout_s``."""
+        """Nothing where it is open and answers; a TCP connection that went mute
+        is made anew. Raises BusError where it cannot be opened, by TCP within
+        ``timeout_s``."""
         async with self._opening:
             if self._link is not None and self._link.transport is not None and not self._mute:
                 return
@@ -73,8 +76,9 @@ class Line:
         self._on_lost()
 
     def owed_s(self, unit: int) -> float:
-        """So long the late reply of a request to this unit that was given up may still come, which on RTU would pass
-        for the reply to the next one."""
+        """So long the late reply of a request to this unit that was given up
+        may still come, which on RTU would pass for the reply to the next
+        one."""
         now_s = self.attention.now_s()
         if not self._frame_gap_s or math.isinf(now_s):  # closed: nothing is asked any more
             return 0.0
@@ -86,17 +90,20 @@ class Line:
             self._late_until_s[unit] = now_s + seconds
 
     def waited_s(self, unit: int) -> float:
-        """So long a unit's requests have waited, all in all, while other units had the line."""
+        """So long a unit's requests have waited, all in all, while other units
+        had the line."""
         return self._waited_s.get(unit, 0.0)
 
     def forsake(self, unit: int) -> None:
-        """A request of this unit that is under way fails: nobody waits for it any more."""
+        """A request of this unit that is under way fails: nobody waits for it
+        any more."""
         if self._asked == unit and self._expected is not None and not self._expected.done():
             self._expected.set_exception(BusError(f"{self.name} unit {unit}: the device is closed"))
 
     async def transact(self, unit: int, pdu: bytes, *, patience_s: float, late_s: float) -> bytes:
-        """The reply to a request, function code first. A reply that does not come within ``patience_s`` may come
-        ``late_s`` later still. Raises DeviceSilent, BusError."""
+        """The reply to a request, function code first. A reply that does not
+        come within ``patience_s`` may come ``late_s`` later still. Raises
+        DeviceSilent, BusError."""
         async with self._turn_of(unit):
             if self._link is None or self._link.transport is None:
                 raise BusError(f"{self.name} unit {unit}: the connection is closed")
@@ -123,8 +130,9 @@ class Line:
 
     @asynccontextmanager
     async def _turn_of(self, unit: int) -> AsyncIterator[None]:
-        """The line, once no late reply of this unit is to come; the others have it meanwhile. RTU frames have no
-        transaction number: a late reply would pass for the next one's."""
+        """The line, once no late reply of this unit is to come; the others have
+        it meanwhile. RTU frames have no transaction number: a late reply would
+        pass for the next one's."""
         while True:
             while (left_s := self.owed_s(unit)) > 0:
                 await asyncio.sleep(min(left_s, _LOOK_S))
@@ -166,7 +174,8 @@ _lines: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, Line]] = WeakKeyD
 async def join(where: TcpAddress | SerialLine, timeout_s: float) -> Line:
     """The line there, opened where it is not; to be given back by `leave`.
 
-    Raises BusError where it cannot be opened, or where other units have the port with other settings.
+    Raises BusError where it cannot be opened, or where other units have the
+    port with other settings.
     """
     lines = _lines.setdefault(asyncio.get_running_loop(), {})
     line = lines.get(_key(where))

@@ -61,7 +61,8 @@ class Counter(Strict):
 
 
 class TimeStamp(Strict):
-    """The device's time of a sample, in ticks of ``unit_s``; it wraps with its type."""
+    """The device's time of a sample, in ticks of ``unit_s``; it wraps with its
+    type."""
 
     word: Word
     type: TimeType
@@ -108,7 +109,8 @@ class _Stream(Strict):
 
 
 class PollStream(_Stream):
-    """A block of registers that holds the newest sample; read once a poll period."""
+    """A block of registers that holds the newest sample; read once a poll
+    period."""
 
     layout: Literal["poll"]
 
@@ -117,7 +119,8 @@ class PollStream(_Stream):
         return self._span
 
     def reads_per_s(self, rate_hz: float) -> float:
-        """A read for each sample, and none more often than the poll period says."""
+        """A read for each sample, and none more often than the poll period
+        says."""
         return min(rate_hz, 1 / self.poll_period_s) if self.poll_period_s else rate_hz
 
 
@@ -177,7 +180,8 @@ class ModbusRegister(Register):
 
 
 class ModbusProfile(Profile):
-    """A Modbus device. Orders: "big" is most significant first, of words in a value, of bytes in a word."""
+    """A Modbus device. Orders: "big" is most significant first, of words in a
+    value, of bytes in a word."""
 
     streams: Annotated[dict[str, Stream], Field(max_length=STREAMS_MOST)]
     registers: dict[str, ModbusRegister] = Field(default_factory=dict)
@@ -247,7 +251,8 @@ class ModbusBus(Strict):
         return TcpAddress(self.host or "", self.port)
 
     def claim(self) -> Claim:
-        """A serial line is one process's; a gateway's units may be different processes'."""
+        """A serial line is one process's; a gateway's units may be different
+        processes'."""
         if self.serial_port is not None:
             port = canonical_port(self.serial_port)
             return Claim(f"Modbus unit {self.unit_id} on {port}", serial_port=port)

@@ -1,4 +1,5 @@
-"""The Modbus application protocol as far as it is used here: names, errors, and what a unit answers. No I/O."""
+"""The Modbus application protocol as far as it is used here: names, errors, and
+what a unit answers. No I/O."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class ModbusRefusal(DriverError):
 
 
 class MalformedReply(DriverError):
-    """A reply of the wrong function, length or address; ``pdu`` is what came, function code first."""
+    """A reply of the wrong function, length or address; ``pdu`` is what came,
+    function code first."""
 
     def __init__(self, message: str, pdu: bytes) -> None:
         super().__init__(message)
@@ -59,7 +61,8 @@ class SerialLine:
 
     @property
     def frame_gap_s(self) -> float:
-        """The silence that separates RTU frames: 3.5 characters, 1.75 ms above 19200 baud."""
+        """The silence that separates RTU frames: 3.5 characters, 1.75 ms above
+        19200 baud."""
         return 1.75e-3 if self.baudrate > 19200 else 3.5 * self.character_s
 
     @property
@@ -72,8 +75,8 @@ class SerialLine:
         return f"{self.baudrate} baud, parity {self.parity}, {self.stopbits} stop bits"
 
     def read_s(self, words: int) -> float:
-        """The least time for which a read of so many registers keeps the line: request and reply with their gaps, of a
-        unit that answers at once."""
+        """The least time for which a read of so many registers keeps the line:
+        request and reply with their gaps, of a unit that answers at once."""
         request, reply = 8, 5 + 2 * words
         return (request + reply) * self.character_s + 2 * self.frame_gap_s
 
@@ -83,7 +86,8 @@ class Unanswered(Exception):
 
 
 class Handler(Protocol):
-    """What a served unit does. While ``alive`` is False it leaves every request without a reply."""
+    """What a served unit does. While ``alive`` is False it leaves every request
+    without a reply."""
 
     def alive(self) -> bool: ...
 
@@ -95,7 +99,8 @@ class Handler(Protocol):
 
 
 def answer(handler: Handler, pdu: bytes) -> bytes:
-    """The reply PDU to a request PDU, an exception where the request is wrong or refused."""
+    """The reply PDU to a request PDU, an exception where the request is wrong
+    or refused."""
     try:
         return _carry_out(handler, pdu)
     except ModbusRefusal as e:

@@ -1,8 +1,9 @@
 """Modbus over TCP and serial lines: the one file that knows pymodbus.
 
-pymodbus frames (MBAP, RTU with its CRC), encodes requests and drives the serial port. Its client and server
-are not used: the client closes the connection on a reply that it cannot decode, where ours hands the bytes
-on; the server can neither stay silent for a while nor refuse a bad count in the protocol's terms.
+pymodbus frames (MBAP, RTU with its CRC), encodes requests and drives the serial
+port. Its client and server are not used: the client closes the connection on a
+reply that it cannot decode, where ours hands the bytes on; the server can
+neither stay silent for a while nor refuse a bad count in the protocol's terms.
 What leaves this file is plain bytes and our own errors.
 """
 
@@ -36,7 +37,8 @@ with suppress(ImportError):  # there is none outside POSIX
     _SETTINGS_REFUSED = (termios.error,)  # not an OSError
 
 _MAX_ADU = 260
-# Silent where the application has not set up logging: what matters comes out as an error.
+# Silent where the application has not set up logging: what matters comes out as
+# an error.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 
@@ -44,7 +46,8 @@ Received = Callable[["Link", int, int, bytes], None]
 
 
 class Link(asyncio.Protocol):
-    """Bytes of one connection cut into frames, each handed on as (unit, transaction, PDU)."""
+    """Bytes of one connection cut into frames, each handed on as (unit,
+    transaction, PDU)."""
 
     def __init__(self, framer: FramerBase, received: Received) -> None:
         self.framer = framer
@@ -103,7 +106,8 @@ async def connect_tcp(address: TcpAddress, received: Received) -> Link:
 
 
 async def connect_serial(line: SerialLine, received: Received) -> Link:
-    """A serial port, as the master of its line. Raises BusError where it cannot be opened."""
+    """A serial port, as the master of its line. Raises BusError where it cannot
+    be opened."""
     return await _open_serial(line, lambda: Link(FramerRTU(DecodePDU(False)), received))
 
 
@@ -114,7 +118,8 @@ def read_request(function: int, address: int, count: int) -> bytes:
 
 
 def write_request(address: int, words: Sequence[int], *, single: bool) -> bytes:
-    """The PDU that writes registers; ``single`` writes one word with function 6."""
+    """The PDU that writes registers; ``single`` writes one word with function
+    6."""
     if single:
         return _pdu(WriteSingleRegisterRequest(address=address, registers=list(words[:1])))
     return _pdu(WriteMultipleRegistersRequest(address=address, registers=list(words)))
@@ -126,7 +131,8 @@ def _pdu(request: ModbusPDU) -> bytes:
 
 @asynccontextmanager
 async def serve_tcp(units: Mapping[int, Handler], address: TcpAddress) -> AsyncIterator[int]:
-    """Serves units by their ids over TCP and gives the port listened on. Raises BusError."""
+    """Serves units by their ids over TCP and gives the port listened on. Raises
+    BusError."""
     links: set[Link] = set()
 
     def accept() -> Link:
@@ -149,7 +155,8 @@ async def serve_tcp(units: Mapping[int, Handler], address: TcpAddress) -> AsyncI
 
 @asynccontextmanager
 async def serve_serial(units: Mapping[int, Handler], line: SerialLine) -> AsyncIterator[None]:
-    """Serves units by their ids as RTU on a serial port. Raises BusError where it cannot be opened."""
+    """Serves units by their ids as RTU on a serial port. Raises BusError where
+    it cannot be opened."""
     link = await _open_serial(line, lambda: Link(FramerRTU(DecodePDU(True)), _answering(units)))
     try:
         yield
@@ -192,7 +199,8 @@ async def _open_serial(line: SerialLine, make: Callable[[], Link]) -> Link:
 
 
 def reason_of(e: Exception) -> str:
-    """What an operating system's error says, without its number and the path it repeats."""
+    """What an operating system's error says, without its number and the path it
+    repeats."""
     if isinstance(e, OSError) and e.errno and e.errno > 0:
         return os.strerror(e.errno)
     return str(e.args[-1]) if e.args else type(e).__name__

@@ -1,12 +1,16 @@
-"""Wrapping counters and time stamps of a device laid on one line that never goes back.
+"""Wrapping counters and time stamps of a device laid on one line that never
+goes back.
 
-Host time is not used to tell how often a counter wrapped: it says when a reply came, not when a sample was
-taken, and a simulated device may run many times faster than the host's clock. It is used where the device
-gives nothing else: for the first sample, and to bridge a restart.
+Host time is not used to tell how often a counter wrapped: it says when a reply
+came, not when a sample was taken, and a simulated device may run many times
+faster than the host's clock. It is used where the device gives nothing else:
+for the first sample, and to bridge a restart.
 
-A restart is seen where the time stamp goes back or contradicts the counter; without a time stamp, where the
-counter is near zero again after failed requests. The first sample after it follows the last one before by the
-time between their arrivals, at least one period. The counter goes on by one: what was lost is not known.
+A restart is seen where the time stamp goes back or contradicts the counter;
+without a time stamp, where the counter is near zero again after failed
+requests. The first sample after it follows the last one before by the time
+between their arrivals, at least one period. The counter goes on by one: what
+was lost is not known.
 """
 
 from __future__ import annotations
@@ -24,9 +28,11 @@ NEAR_START_S = 10.0
 
 @dataclass(frozen=True)
 class Clockwork:
-    """What a stream's samples carry. ``repeat_window``: so many samples may come again after a repeated reply.
+    """What a stream's samples carry. ``repeat_window``: so many samples may
+    come again after a repeated reply.
 
-    ``counted``: without a counter, samples follow one another at the period; else they are placed by arrival.
+    ``counted``: without a counter, samples follow one another at the period;
+    else they are placed by arrival.
     """
 
     period_ns: float
@@ -39,9 +45,11 @@ class Clockwork:
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Samples in the order received. ``counter``, ``stamp`` raw (n,); ``skipped`` (n,) samples known to be lost
-    before each (for streams without a counter); ``arrival_ns`` (n,) host time, less the age in the FIFO;
-    ``broken`` (n,) whether a request failed between the sample before and this one."""
+    """Samples in the order received. ``counter``, ``stamp`` raw (n,);
+    ``skipped`` (n,) samples known to be lost before each (for streams without a
+    counter); ``arrival_ns`` (n,) host time, less the age in the FIFO;
+    ``broken`` (n,) whether a request failed between the sample before and this
+    one."""
 
     counter: Int64 | None
     stamp: Int64 | None
@@ -52,7 +60,8 @@ class Arrivals:
 
 @dataclass(frozen=True)
 class Placed:
-    """``new`` (n,) marks the samples that are not repeats; ``counter``, ``time_ns`` are of those alone."""
+    """``new`` (n,) marks the samples that are not repeats; ``counter``,
+    ``time_ns`` are of those alone."""
 
     new: NDArray[np.bool_]
     counter: Int64
@@ -61,7 +70,8 @@ class Placed:
 
 
 class Timeline:
-    """Places samples; the result does not depend on how they are cut into calls."""
+    """Places samples; the result does not depend on how they are cut into
+    calls."""
 
     def __init__(self, clockwork: Clockwork) -> None:
         self._clock = clockwork
@@ -97,7 +107,8 @@ class Timeline:
         return Placed(new, counter[new], time_ns[new], missing)
 
     def _steps(self, a: Arrivals) -> tuple[Int64, Int64, NDArray[np.bool_]]:
-        """Of each sample to the one before: samples, ticks of the time stamp, and whether it restarted."""
+        """Of each sample to the one before: samples, ticks of the time stamp,
+        and whether it restarted."""
         n = len(a.arrival_ns)
         no_ticks = np.zeros(n, np.int64)
         last_counter, last_stamp, _ = self._last or (0, 0, 0)
@@ -143,7 +154,8 @@ class Timeline:
         counter: Int64,
         time_ns: Int64,
     ) -> int:
-        """Place the samples of one epoch, or of its part in this call; returns how many are missing."""
+        """Place the samples of one epoch, or of its part in this call; returns
+        how many are missing."""
         by_stamp_alone = self._clock.counter_bits is None and self._clock.stamp_bits is not None
         progress = self._progress + np.cumsum(steps[part])
         passed = self._ticks + np.cumsum(ticks[part])

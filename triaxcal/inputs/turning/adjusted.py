@@ -1,7 +1,9 @@
-"""Adjusted least squares for an ellipsoid: moments corrected for noise, and the noise at which they fit one exactly.
+"""Adjusted least squares for an ellipsoid: moments corrected for noise, and the
+noise at which they fit one exactly.
 
-Markovsky, Kukush and Van Huffel 2004, Numer. Math. 98:177. Everything here is in the scaled units of
-`triaxcal.inputs.turning.moments.Summary`, whose monomials have values of the order of one.
+Markovsky, Kukush and Van Huffel 2004, Numer. Math. 98:177. Everything here is
+in the scaled units of `triaxcal.inputs.turning.moments.Summary`, whose
+monomials have values of the order of one.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ class NoEllipsoid(Refused):
 
 
 class DirectionsLacking(Refused):
-    """They cannot carry nine parameters; ``dilution`` by how much, where that is known, and its limit."""
+    """They cannot carry nine parameters; ``dilution`` by how much, where that
+    is known, and its limit."""
 
     def __init__(self, dilution: tuple[float, float] | None = None) -> None:
         by = "" if dilution is None else " (dilution {:.3g}, limit {:g})".format(*dilution)
@@ -44,14 +47,16 @@ class DirectionsLacking(Refused):
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """``|T x − o| = 1``, T (3,3) upper triangular with positive diagonal; ``variance`` (3,) of the noise of x."""
+    """``|T x − o| = 1``, T (3,3) upper triangular with positive diagonal;
+    ``variance`` (3,) of the noise of x."""
 
     T: Floats
     o: Floats
     variance: Floats
 
     def coefficients(self, held: Summary, reference: float) -> tuple[Floats, Floats, Floats]:
-        """Scale factor, misalignment and bias in the units of output and reference, all signs plus."""
+        """Scale factor, misalignment and bias in the units of output and
+        reference, all signs plus."""
         return coefficients_of(self.T, self.o, held, reference)
 
 
@@ -59,12 +64,14 @@ def coefficients_of(T: Floats, o: Floats, held: Summary, reference: float) -> tu
     return coefficients(T / held.half * reference, held.middle + held.half * np.linalg.solve(T, o))
 
 
-# Hermite polynomials undo what Gaussian noise of variance v does to a power: coefficients of x^(n-2m) v^m.
+# Hermite polynomials undo what Gaussian noise of variance v does to a power:
+# coefficients of x^(n-2m) v^m.
 _UNDO = {0: (1.0,), 1: (1.0,), 2: (1.0, -1.0), 3: (1.0, -3.0), 4: (1.0, -6.0, 3.0)}
 
 
 def _undoing() -> list[tuple[tuple[int, int], tuple[int, int], tuple[int, ...], float]]:
-    """Terms of the correction: entry corrected, entry that holds the lower moment, powers of the variances, factor."""
+    """Terms of the correction: entry corrected, entry that holds the lower
+    moment, powers of the variances, factor."""
     at: dict[tuple[int, ...], tuple[int, int]] = {}
     for (i, left), (j, right) in itertools.product(enumerate(MONOMIALS), repeat=2):
         at.setdefault(tuple(p + q for p, q in zip(left, right, strict=True)), (i, j))
@@ -85,7 +92,8 @@ _FACTOR = np.array([t[3] for t in _TERMS])  # products of the coefficients of `_
 
 
 def corrected(moments: Floats, variance: Floats) -> Floats:
-    """Moments (…,10,10) of the noiseless samples, for noise of ``variance`` (3,)."""
+    """Moments (…,10,10) of the noiseless samples, for noise of ``variance``
+    (3,)."""
     terms = _FACTOR * np.prod(variance**_POWERS, axis=1) * moments[..., _FROM[0], _FROM[1]]
     out = np.zeros(moments.shape)
     np.add.at(out, (..., *_TO), terms)
@@ -93,7 +101,8 @@ def corrected(moments: Floats, variance: Floats) -> Floats:
 
 
 def fitted(held: Summary, shape: Floats) -> Ellipsoid:
-    """The ellipsoid for noise whose variances are as ``shape`` (3,); how large, follows.
+    """The ellipsoid for noise whose variances are as ``shape`` (3,); how large,
+    follows.
 
     Raises Refused where there is none.
     """
@@ -102,8 +111,9 @@ def fitted(held: Summary, shape: Floats) -> Ellipsoid:
 
 
 def noise(mean: Floats, shape: Floats) -> float:
-    """The noise at which the corrected moments first become singular, as a multiple of ``shape`` (3,); 0 where the
-    arithmetic cannot tell it from none."""
+    """The noise at which the corrected moments first become singular, as a
+    multiple of ``shape`` (3,); 0 where the arithmetic cannot tell it from
+    none."""
     unit = shape / np.max(shape)
     none = corrected(mean, 0 * unit)
     once, twice = corrected(mean, unit) - none, corrected(mean, 2 * unit) - none
@@ -145,7 +155,8 @@ def _ellipsoid(mean: Floats, variance: Floats) -> Ellipsoid:
 
 
 def as_monomials(Q: Floats) -> Floats:
-    """(10,): the quadratic form ``(x, 1)ᵀ Q (x, 1)``, Q (4,4), as coefficients of the monomials."""
+    """(10,): the quadratic form ``(x, 1)ᵀ Q (x, 1)``, Q (4,4), as coefficients
+    of the monomials."""
     out = np.zeros(len(MONOMIALS))
     for row, powers in enumerate(MONOMIALS):
         axes = [axis for axis in range(3) for _ in range(powers[axis])]
@@ -155,7 +166,8 @@ def as_monomials(Q: Floats) -> Floats:
 
 
 def design(e: Ellipsoid) -> Floats:
-    """(9,10): derivative of |T x − o|²/2 by the entries of T (row by row) and o, as coefficients of the monomials."""
+    """(9,10): derivative of |T x − o|²/2 by the entries of T (row by row) and
+    o, as coefficients of the monomials."""
     forms = np.zeros((9, 4, 4))
     for n, (i, j) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
         forms[n, j] = *e.T[i], -e.o[i]  # a_i x_j
@@ -165,7 +177,8 @@ def design(e: Ellipsoid) -> Floats:
 
 
 def coefficients_by_entries(e: Ellipsoid, held: Summary, reference: float) -> Floats:
-    """(9,9) derivative of scale factor, misalignment and bias by the entries of T and o, by differences."""
+    """(9,9) derivative of scale factor, misalignment and bias by the entries of
+    T and o, by differences."""
     rows, columns = np.triu_indices(3)
     start = np.concatenate([e.T[rows, columns], e.o])
 

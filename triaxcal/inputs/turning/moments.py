@@ -1,8 +1,11 @@
-"""What is kept of the raw samples of a turning unit: sums up to the fourth degree, in one pass and constant memory.
+"""What is kept of the raw samples of a turning unit: sums up to the fourth
+degree, in one pass and constant memory.
 
-The stream is cut into stretches of equal length; whenever their number reaches `STRETCHES_MOST` neighbours are put
-together. Where stretches begin and end depends on the samples alone, not on the blocks they came in. What differs
-between stretches by more than noise tells later how far the samples may be trusted.
+The stream is cut into stretches of equal length; whenever their number reaches
+`STRETCHES_MOST` neighbours are put together. Where stretches begin and end
+depends on the samples alone, not on the blocks they came in. What differs
+between stretches by more than noise tells later how far the samples may be
+trusted.
 """
 
 from __future__ import annotations
@@ -16,28 +19,35 @@ from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.errors import InvalidData
 
 MONOMIALS = [e for e in itertools.product(range(3), repeat=3) if sum(e) <= 2]
-"""Exponents of the ten monomials of a quadric; products of two of them give all up to the fourth degree."""
+"""Exponents of the ten monomials of a quadric; products of two of them give all
+up to the fourth degree."""
 STRETCHES_MOST = 128
-"""Bounds the memory. Once they are put together in pairs half of them are left, twice
-as many as a judgement of their scatter needs. Even, so that pairs come out."""
+"""Bounds the memory. Once they are put together in pairs half of them are left,
+twice as many as a judgement of their scatter needs. Even, so that pairs come
+out."""
 STRETCH_LEAST = 16
 """Samples in a stretch to begin with: as many as are kept of one (`SAMPLED`)."""
 SAMPLED = 16
 """Samples that are kept of every stretch, to know the directions."""
 DIFFERENCE = 4
-"""Order of the differences from sample to sample: they see the noise, and of a smooth motion next to nothing."""
+"""Order of the differences from sample to sample: they see the noise, and of a
+smooth motion next to nothing."""
 _DIFFERENCE_GAIN = 70.0
-"""What it does to the variance of white noise: the sum of the squares of 1, 4, 6, 4, 1."""
+"""What it does to the variance of white noise: the sum of the squares of 1, 4,
+6, 4, 1."""
 _PIECE = 1 << 13
-"""Samples of which products are formed at once, which bounds the memory. A power of
-two, as a stretch's length is one: either holds the other a whole number of times."""
+"""Samples of which products are formed at once, which bounds the memory. A
+power of two, as a stretch's length is one: either holds the other a whole
+number of times."""
 _SPAN_LIMIT = 1e60
-"""Outputs whose range, or its inverse, is larger would not survive the fourth power."""
+"""Outputs whose range, or its inverse, is larger would not survive the fourth
+power."""
 
 
 @dataclass
 class Moments:
-    """Sums of products of monomials of the samples, by stretch. ``feed`` blocks of any size, then `summary`."""
+    """Sums of products of monomials of the samples, by stretch. ``feed`` blocks
+    of any size, then `summary`."""
 
     count: int = 0
     _origin: Floats = field(default_factory=lambda: np.zeros(3))
@@ -53,7 +63,8 @@ class Moments:
     _rest: Floats = field(default_factory=lambda: np.zeros((0, 4)))
 
     def feed(self, u: Floats, temp_c: Floats | None = None) -> None:
-        """``u`` (n,3) raw outputs, ``temp_c`` (n,) beside them, None or NaN where it is not known.
+        """``u`` (n,3) raw outputs, ``temp_c`` (n,) beside them, None or NaN
+        where it is not known.
 
         Raises InvalidData where an output is not a finite number.
         """
@@ -104,7 +115,8 @@ class Moments:
         self._pieces = half * self._size // min(self._size, _PIECE)
 
     def summary(self) -> Summary:
-        """Of all samples so far. Raises InvalidData where an axis never moved, or beyond what numbers can hold."""
+        """Of all samples so far. Raises InvalidData where an axis never moved,
+        or beyond what numbers can hold."""
         piece = min(self._size, _PIECE)
         closed = -(-self._pieces * piece // self._size)
         counts = np.full(closed, self._size)
@@ -123,8 +135,9 @@ class Moments:
 
 @dataclass(frozen=True)
 class _Stretches:
-    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in `Moments`. ``low`` and
-    ``high`` (m,4) have the temperature too, and ``warmth`` (m,) its sum."""
+    """Sums as they were fed, about ``origin`` (3,); (m,…) each, as in
+    `Moments`. ``low`` and ``high`` (m,4) have the temperature too, and
+    ``warmth`` (m,) its sum."""
 
     origin: Floats
     counts: Ints
@@ -192,12 +205,14 @@ class Temperature:
 
 @dataclass(frozen=True)
 class Summary:
-    """Samples scaled to ``x = (u − middle)/half``, which lies between −1 and 1 in every axis.
+    """Samples scaled to ``x = (u − middle)/half``, which lies between −1 and 1
+    in every axis.
 
-    ``counts`` (m,) samples in each stretch, ``moments`` (m,10,10) mean products of `MONOMIALS` in it; ``quick`` (3,)
-    variance of the noise of one sample, in scaled units, as far as differences from sample to sample show it;
-    ``sampled`` (k,3) some of the outputs, from everywhere; ``temperature`` None where it is not
-    known of all samples.
+    ``counts`` (m,) samples in each stretch, ``moments`` (m,10,10) mean products
+    of `MONOMIALS` in it; ``quick`` (3,) variance of the noise of one sample, in
+    scaled units, as far as differences from sample to sample show it;
+    ``sampled`` (k,3) some of the outputs, from everywhere; ``temperature`` None
+    where it is not known of all samples.
     """
 
     middle: Floats
@@ -215,7 +230,8 @@ class Summary:
 
     @property
     def reach(self) -> Floats:
-        """(m,3) how far the outputs of each stretch go from the median, at most."""
+        """(m,3) how far the outputs of each stretch go from the median, at
+        most."""
         middle = np.median(self.sampled, axis=0)
         return np.maximum(np.abs(self._fed.low[:, :3] - middle), np.abs(self._fed.high[:, :3] - middle))
 
@@ -229,7 +245,8 @@ class Summary:
 
 
 def _sums_of(x: Floats) -> tuple[Floats, Floats]:
-    """Of pieces (m,n,3): sums of products of the monomials (m,10,10), and of squared differences (m,3)."""
+    """Of pieces (m,n,3): sums of products of the monomials (m,10,10), and of
+    squared differences (m,3)."""
     columns = np.ascontiguousarray(x.transpose(0, 2, 1))
     terms = np.empty((len(x), 10, x.shape[1]))
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # judged by the range, in `summary`

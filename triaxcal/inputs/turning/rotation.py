@@ -1,14 +1,18 @@
-"""Calibration from a unit that turns slowly and never rests: adjusted least squares from streaming moments.
+"""Calibration from a unit that turns slowly and never rests: adjusted least
+squares from streaming moments.
 
-Ordinary fits of an ellipsoid to raw samples are biased by the square of the noise, which more samples do not cure.
-Adjusted least squares (`triaxcal.inputs.turning.adjusted`) corrects the moments of the samples for the noise instead,
-and estimates it. All it needs of the samples are their moments up to the fourth degree
-(`triaxcal.inputs.turning.moments`).
+Ordinary fits of an ellipsoid to raw samples are biased by the square of the
+noise, which more samples do not cure. Adjusted least squares
+(`triaxcal.inputs.turning.adjusted`) corrects the moments of the samples for the
+noise instead, and estimates it. All it needs of the samples are their moments
+up to the fourth degree (`triaxcal.inputs.turning.moments`).
 
-How the noise is shared between the axes the ellipsoid does not show; differences from sample to sample do, where the
-unit turns slowly. Whether noise is all there is, is judged by stretches of the recording: the mean magnitude of each
-differs from the reference by no more than the noise of one sample over the root of their number, if the noise is
-white, the model complete, and gravity alone was felt.
+How the noise is shared between the axes the ellipsoid does not show;
+differences from sample to sample do, where the unit turns slowly. Whether noise
+is all there is, is judged by stretches of the recording: the mean magnitude of
+each differs from the reference by no more than the noise of one sample over the
+root of their number, if the noise is white, the model complete, and gravity
+alone was felt.
 """
 
 from __future__ import annotations
@@ -41,32 +45,38 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pure_error import LACK_OF_FIT
 
 SAMPLES_LEAST = 100
-"""Nine parameters and three noises by fewer samples would be chance. Errs on the side
-of refusing."""
+"""Nine parameters and three noises by fewer samples would be chance. Errs on
+the side of refusing."""
 ROUNDS_MOST = 20
-"""The noises of the axes follow the scale factors from fit to fit; it ends sooner where
-these no longer change."""
+"""The noises of the axes follow the scale factors from fit to fit; it ends
+sooner where these no longer change."""
 DILUTION_MOST = 100.0
-"""Largest standard error of a combination of parameters, in noises of one sample over the root of their number."""
+"""Largest standard error of a combination of parameters, in noises of one
+sample over the root of their number."""
 DILUTION_WARNING = 10.0
 """A tenth of what is refused: errors still hold, but are large."""
 UNSEEN_WARNING = 0.2
-"""Share of a coefficient's variance from which on the unknown share of the noise is worth a word."""
+"""Share of a coefficient's variance from which on the unknown share of the
+noise is worth a word."""
 QUICK = 0.7
-"""Share of what differences from sample to sample show that the scatter about the ellipsoid must at least have; with
-less the unit turns too fast for its sample rate, and they are not noise."""
+"""Share of what differences from sample to sample show that the scatter about
+the ellipsoid must at least have; with less the unit turns too fast for its
+sample rate, and they are not noise."""
 UNEQUAL = 2.5
-"""Ratio of the axes' noises from which on weights, which this fit has not, would lower the errors by a tenth."""
+"""Ratio of the axes' noises from which on weights, which this fit has not,
+would lower the errors by a tenth."""
 STRETCHES_LEAST = 30
-"""With fewer, the scatter between stretches says too little for nine parameters."""
+"""With fewer, the scatter between stretches says too little for nine
+parameters."""
 OUTLIER_SIGMA = 6.0
-"""Robust standard deviations, which noise passes twice in 10⁹: sound stretches stay.
-What is off by less stays too, and raises the standard errors."""
+"""Robust standard deviations, which noise passes twice in 10⁹: sound stretches
+stay. What is off by less stays too, and raises the standard errors."""
 OUTLIERS_MOST = 0.05
-"""Stretches that stand out so far from the others are excluded, if they are no more than this share."""
+"""Stretches that stand out so far from the others are excluded, if they are no
+more than this share."""
 OUTLIER_ROUNDS = 4
-"""Large outliers hide lesser ones, so that it is looked again without them; ends sooner
-where none is left."""
+"""Large outliers hide lesser ones, so that it is looked again without them;
+ends sooner where none is left."""
 SPIKE = 10.0
 """How many times farther than nine tenths of all others a stretch may reach."""
 STEPS = 0.5
@@ -88,7 +98,8 @@ class FewDirections(Caution):
 
 @dataclass(frozen=True)
 class StretchesDiffer(Caution):
-    """``ratio`` times as much as white noise explains; the standard errors are raised by up to ``raised``."""
+    """``ratio`` times as much as white noise explains; the standard errors are
+    raised by up to ``raised``."""
 
     ratio: float
     raised: float
@@ -96,31 +107,36 @@ class StretchesDiffer(Caution):
 
 @dataclass(frozen=True)
 class NoiseUnseen(Caution):
-    """A ``share`` of the noise does not show from sample to sample, and how the axes share it is not known."""
+    """A ``share`` of the noise does not show from sample to sample, and how the
+    axes share it is not known."""
 
     share: float
 
 
 @dataclass(frozen=True)
 class NoiseUnequal(Caution):
-    """The noise of one axis is ``ratio`` times that of another; the fit has no weights."""
+    """The noise of one axis is ``ratio`` times that of another; the fit has no
+    weights."""
 
     ratio: float
 
 
 @dataclass(frozen=True)
 class CoarseSteps(Caution):
-    """The outputs are rounded to steps larger than their noise, which the standard errors do not contain."""
+    """The outputs are rounded to steps larger than their noise, which the
+    standard errors do not contain."""
 
 
 @dataclass(frozen=True)
 class RotationFit:
-    """``calibration`` has no poses; its residual is that of ``stretches`` of the recording, and its dilution is in
-    noises of one sample over the root of ``samples``. ``noise_g`` (3,) of one sample along each sensitive axis.
+    """``calibration`` has no poses; its residual is that of ``stretches`` of
+    the recording, and its dilution is in noises of one sample over the root of
+    ``samples``. ``noise_g`` (3,) of one sample along each sensitive axis.
 
-    ``unseen_share`` of the noise, 0…1, does not show from sample to sample: how the axes share it is not known.
-    ``temperature`` is that of the samples that were fitted, at whose mean the coefficients hold; None where it is not
-    known of all.
+    ``unseen_share`` of the noise, 0…1, does not show from sample to sample: how
+    the axes share it is not known. ``temperature`` is that of the samples that
+    were fitted, at whose mean the coefficients hold; None where it is not known
+    of all.
     """
 
     calibration: Calibration
@@ -134,8 +150,9 @@ class RotationFit:
 def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), reference: float = 1.0) -> RotationFit:
     """Fit the linear model to the moments of a turning unit.
 
-    ``signs`` (3,) of the scale factors, which |a| does not show. Raises Refused where the samples cannot carry nine
-    parameters, with the sides that were never up; InvalidData where they are no sensor's.
+    ``signs`` (3,) of the scale factors, which |a| does not show. Raises Refused
+    where the samples cannot carry nine parameters, with the sides that were
+    never up; InvalidData where they are no sensor's.
     """
     if moments.count < SAMPLES_LEAST:
         raise Refused(f"{moments.count} samples of a turning unit; at least {SAMPLES_LEAST} are needed")
@@ -183,7 +200,8 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
 
 
 def _without_outliers(held: Summary) -> tuple[Summary, Ellipsoid, float]:
-    """Without stretches that a knock or a lost word makes outliers, which stand out from all the others."""
+    """Without stretches that a knock or a lost word makes outliers, which stand
+    out from all the others."""
     spikes = _spiky(held)
     if spikes.any() and spikes.sum() <= max(OUTLIERS_MOST * len(spikes), 1):
         held = held.only(~spikes)
@@ -201,13 +219,15 @@ def _without_outliers(held: Summary) -> tuple[Summary, Ellipsoid, float]:
 
 
 def _spiky(held: Summary) -> Bools:
-    """Stretches that reach far beyond nearly all others: no fit could begin with them."""
+    """Stretches that reach far beyond nearly all others: no fit could begin
+    with them."""
     reach = held.reach
     return np.asarray((reach > SPIKE * np.quantile(reach, 0.9, axis=0)).any(axis=1))
 
 
 def _ellipsoid_and_noise(held: Summary) -> tuple[Ellipsoid, float]:
-    """And the share of the noise of which it is not known how the axes share it."""
+    """And the share of the noise of which it is not known how the axes share
+    it."""
     mean = held.mean()
     if np.all(held.quick > 0):
         ratio = noise(mean, held.quick)
@@ -224,7 +244,8 @@ def _ellipsoid_and_noise(held: Summary) -> tuple[Ellipsoid, float]:
 
 
 def _by_share(held: Summary, e: Ellipsoid, reference: float) -> Floats:
-    """(9,3): change of the coefficients were the share of the noise in one axis twice as large as it was taken."""
+    """(9,3): change of the coefficients were the share of the noise in one axis
+    twice as large as it was taken."""
     step = 0.05
     start = np.concatenate(e.coefficients(held, reference))
     if not np.all(e.variance > 0):
@@ -234,7 +255,8 @@ def _by_share(held: Summary, e: Ellipsoid, reference: float) -> Floats:
 
 
 class _Judged:
-    """Stretches under a fit. ``error`` (m,): mean of |a| − 1 in each, ``noise`` (m,) its standard error."""
+    """Stretches under a fit. ``error`` (m,): mean of |a| − 1 in each, ``noise``
+    (m,) its standard error."""
 
     def __init__(self, held: Summary, e: Ellipsoid) -> None:
         self.counts, self.count = held.counts, held.count
@@ -273,9 +295,11 @@ class _Judged:
         return float(f_sf(float(np.sum((self.error / self.noise) ** 2)) / left, left, self.count - 9))
 
     def covariance(self, *, raised: bool) -> tuple[Floats, float]:
-        """(9,9) of the entries of T and o, and by how much its standard errors were raised at most.
+        """(9,9) of the entries of T and o, and by how much its standard errors
+        were raised at most.
 
-        From white noise; where that is not all, what the stretches scatter, wherever it is more.
+        From white noise; where that is not all, what the stretches scatter,
+        wherever it is more.
         """
         inverse = np.linalg.inv(self.information)
         white = inverse * float(self.variance @ self.counts) / self.count**2
@@ -293,8 +317,10 @@ class _Judged:
         return white * np.outer(factor, factor), float(factor.max())
 
     def _unequal(self) -> Floats:
-        """(9,) by what factor noise that differs from direction to direction changes the standard errors."""
-        # The moments end at the fourth degree, this needs the sixth; some of the samples tell it well enough.
+        """(9,) by what factor noise that differs from direction to direction
+        changes the standard errors."""
+        # The moments end at the fourth degree, this needs the sixth; some of
+        # the samples tell it well enough.
         J = linear_design(self.directions, self.directions)
         variance = np.sum((self.directions @ self.across) ** 2, axis=1)
         bread = np.linalg.pinv(J.T @ J)
@@ -303,8 +329,10 @@ class _Judged:
 
 
 def _wanted(held: Summary, signs: Floats, refusal: Refused) -> tuple[str, ...]:
-    """Sides that were never up, as far as the directions can be determined without a fit."""
-    # Without one scale for all, an axis that hardly moved would look like one that swung from end to end.
+    """Sides that were never up, as far as the directions can be determined
+    without a fit."""
+    # Without one scale for all, an axis that hardly moved would look like one
+    # that swung from end to end.
     u = (held.sampled - np.median(held.sampled, axis=0)) / np.max(held.half) * signs
     wanted = most_wanted(u + 1e-12)
     if not wanted and not isinstance(refusal, NoEllipsoid):
@@ -313,7 +341,8 @@ def _wanted(held: Summary, signs: Floats, refusal: Refused) -> tuple[str, ...]:
 
 
 def _cautions(found: RotationFit, whole: Summary, held: Summary, unseen: float) -> Iterator[Caution]:
-    """``unseen``: the largest share that the unknown share of the noise has in the variance of a coefficient."""
+    """``unseen``: the largest share that the unknown share of the noise has in
+    the variance of a coefficient."""
     c = found.calibration
     if gone := whole.count - held.count:
         yield StretchesExcluded(len(whole.counts) - len(held.counts), gone)

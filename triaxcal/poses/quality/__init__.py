@@ -1,4 +1,5 @@
-"""What the raw stream is to be blamed for, found before any fit: rails, frozen outputs, gaps, mains, coarse steps."""
+"""What the raw stream is to be blamed for, found before any fit: rails, frozen
+outputs, gaps, mains, coarse steps."""
 
 from triaxcal.poses.quality.detector import QualityDetector
 from triaxcal.poses.quality.finding import Finding, untrusted_poses

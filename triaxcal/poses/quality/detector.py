@@ -1,8 +1,10 @@
-"""The detector: fed a stream in blocks of any size, it keeps what the judges of data quality need.
+"""The detector: fed a stream in blocks of any size, it keeps what the judges of
+data quality need.
 
-The stream is cut anew into chunks that depend on the samples alone, so that live and replayed streams are judged alike.
-Memory grows with time, not with the sample rate: about a hundred bytes for each tenth of a second, and three thousand
-for a second of spectra.
+The stream is cut anew into chunks that depend on the samples alone, so that
+live and replayed streams are judged alike. Memory grows with time, not with the
+sample rate: about a hundred bytes for each tenth of a second, and three
+thousand for a second of spectra.
 """
 
 from __future__ import annotations
@@ -23,15 +25,17 @@ from triaxcal.poses.stillness.quantization import OTHERWISE, shown_step
 from triaxcal.poses.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, WINDOW_LEAST, WINDOW_S, Windows
 
 CHUNK_LEAST = 4096
-"""Samples that are judged at once, 256 blocks of noise: enough for their quantiles, and
-little memory. Not less at slow rates, where a chunk then lasts longer."""
+"""Samples that are judged at once, 256 blocks of noise: enough for their
+quantiles, and little memory. Not less at slow rates, where a chunk then lasts
+longer."""
 
 
 @dataclass
 class QualityDetector:
     """Feed it blocks of any size, `finish`, then ask for `findings`.
 
-    Before `finish` the findings are those of the samples up to the last whole chunk.
+    Before `finish` the findings are those of the samples up to the last whole
+    chunk.
     """
 
     samples: int = 0
@@ -43,8 +47,8 @@ class QualityDetector:
     _high: Floats = field(default_factory=lambda: np.full(3, -np.inf))
 
     def feed(self, time_ns: Ints, readings: Floats, channels: Mapping[str, Floats] | None = None) -> None:
-        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3) finite, output units; ``channels`` are
-        not judged.
+        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3)
+        finite, output units; ``channels`` are not judged.
         """
         if not len(time_ns):
             return
@@ -65,7 +69,8 @@ class QualityDetector:
             self._take_chunks(last=True)
 
     def _learn_rate(self) -> None:
-        """As that of the windows: over a quarter of the first samples at a time."""
+        """As that of the windows: over a quarter of the first samples at a
+        time."""
         time_ns = np.concatenate([p[0] for p in self._pending])
         enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
         time_ns = time_ns[:enough]
@@ -102,13 +107,15 @@ class QualityDetector:
         self._spectra.feed(time_ns, u)
 
     def findings(self, w: Windows | None, spans: Sequence[Span]) -> list[Finding]:
-        """One for each kind of fault, with the still ``spans`` that windows ``w`` of the same stream show."""
+        """One for each kind of fault, with the still ``spans`` that windows
+        ``w`` of the same stream show."""
         if not self.samples or self._begin_ns is None:
             return []
         holds = StillIntervals.of(self._begin_ns, w, spans)
         step, roughness = self._steps.step(), self._steps.roughness()
         if w is not None:
-            # Printed decimals that are no multiples of the step hide it from single differences.
+            # Printed decimals that are no multiples of the step hide it from
+            # single differences.
             shown = shown_step(w)
             step = np.where(shown > OTHERWISE * step, shown, step)
         noisy = self._steps.scatters(step)

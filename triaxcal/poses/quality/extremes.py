@@ -1,4 +1,5 @@
-"""The extremes of every tenth of a second and how often they were read, and the step of the output."""
+"""The extremes of every tenth of a second and how often they were read, and the
+step of the output."""
 
 from __future__ import annotations
 
@@ -11,24 +12,24 @@ from triaxcal.arrays import Bools, Floats, Ints
 LATTICE = 20.5
 """Differences up to so many steps tell whether there are steps at all."""
 OFF_LATTICE = 0.05
-"""Steps by which a difference may miss a whole number of them; one in ten is as near by
-chance."""
+"""Steps by which a difference may miss a whole number of them; one in ten is as
+near by chance."""
 LATTICE_LEAST = 8
 """Differences that have to lie on the lattice: by chance as many do once in ten
 million."""
 COARSE = 0.5
 """Noise in steps, of a sample: with less, readings rest on one value for long."""
 HUSHED = 0.35
-"""The same for the quietest tenth of the blocks, which chance makes quieter than the
-rest."""
+"""The same for the quietest tenth of the blocks, which chance makes quieter
+than the rest."""
 BLOCK = 16
-"""Samples in a block. Longer ones hold noise and motion at once; of shorter ones chance
-decides which it is."""
+"""Samples in a block. Longer ones hold noise and motion at once; of shorter
+ones chance decides which it is."""
 BLOCKS_LEAST = 4
 """Blocks of noise in a chunk below which their quantiles say nothing."""
 NOISE_LIKE = 0.4
-"""Variance by fourth differences over that by second ones: 1 for white noise, next to 0
-for smooth motion. Nearer to 1 sound noise is lost by chance."""
+"""Variance by fourth differences over that by second ones: 1 for white noise,
+next to 0 for smooth motion. Nearer to 1 sound noise is lost by chance."""
 NOISY_SHARE = 0.2
 """Of all blocks: moves and stretches without noise may fill the others."""
 NOISELESS = 1e-13
@@ -39,8 +40,9 @@ FINEST = 1e-10
 
 @dataclass(frozen=True)
 class Cells:
-    """Stretches of equal length: ``start_ns``, ``end_ns`` (m,); ``high``, ``low`` (m,3) extremes of the readings,
-    ``at_high``, ``at_low`` (m,3) how many samples read exactly that. ``size`` samples in each.
+    """Stretches of equal length: ``start_ns``, ``end_ns`` (m,); ``high``,
+    ``low`` (m,3) extremes of the readings, ``at_high``, ``at_low`` (m,3) how
+    many samples read exactly that. ``size`` samples in each.
     """
 
     size: int
@@ -83,7 +85,8 @@ class CellKeeper:
 
 @dataclass
 class StepEstimator:
-    """Learns the smallest step of each axis, and its noise from sample to sample, from chunks of the stream."""
+    """Learns the smallest step of each axis, and its noise from sample to
+    sample, from chunks of the stream."""
 
     _least: list[Floats] = field(default_factory=list)
     _rough: list[list[float]] = field(default_factory=lambda: [[], [], []])
@@ -101,7 +104,8 @@ class StepEstimator:
         self._least.append(np.array([_step(size[axis], FINEST * largest[axis]) for axis in range(3)]))
         second, count = np.diff(difference, axis=1), (u.shape[1] - 4) // BLOCK
         rough = _mean_square(second, count) / 6
-        # Noise is as large in fourth differences as in second ones; what moves smoothly all but vanishes there.
+        # Noise is as large in fourth differences as in second ones; what moves
+        # smoothly all but vanishes there.
         like_noise = (_mean_square(np.diff(second, n=2, axis=1), count) / 70 > NOISE_LIKE * rough) & (
             rough > (NOISELESS * largest[:, None]) ** 2
         )
@@ -115,7 +119,8 @@ class StepEstimator:
                 self._least_rough[axis] = min(self._least_rough[axis], float(low))
 
     def step(self) -> Floats:
-        """(3,) the smallest difference between readings, zero where they lie on no lattice of steps that shows."""
+        """(3,) the smallest difference between readings, zero where they lie on
+        no lattice of steps that shows."""
         if not self._least:
             return np.zeros(3)
         least = np.array(self._least)
@@ -123,8 +128,8 @@ class StepEstimator:
         return np.where(np.isfinite(found), found, 0.0)
 
     def roughness(self) -> Floats:
-        """(3,) standard deviation of the noise of a sample, as far as it differs from sample to sample; zero where most
-        of the stream has none.
+        """(3,) standard deviation of the noise of a sample, as far as it
+        differs from sample to sample; zero where most of the stream has none.
         """
         out = np.zeros(3)
         for axis in np.flatnonzero(self._noisy > NOISY_SHARE * self._blocks).tolist():
@@ -132,8 +137,10 @@ class StepEstimator:
         return out
 
     def scatters(self, step: Floats) -> Bools:
-        """(3,) whether the noise is wider than half a ``step`` (3,), so that readings rest on no value for long: as a
-        rule, and not much less in any part of the stream, as where a machine that shakes the stand is switched off.
+        """(3,) whether the noise is wider than half a ``step`` (3,), so that
+        readings rest on no value for long: as a rule, and not much less in any
+        part of the stream, as where a machine that shakes the stand is switched
+        off.
         """
         return np.asarray((self.roughness() > COARSE * step) & (np.sqrt(self._least_rough) > HUSHED * step))
 

@@ -1,4 +1,5 @@
-"""Judges of what was kept of a stream: rails, frozen outputs, repeated samples, steps too coarse for the noise."""
+"""Judges of what was kept of a stream: rails, frozen outputs, repeated samples,
+steps too coarse for the noise."""
 
 from __future__ import annotations
 
@@ -25,35 +26,39 @@ from triaxcal.poses.quality.run_lengths import ROWS, EqualRun, RunLengths
 from triaxcal.poses.stillness.quantization import noise_of
 
 RAIL_LEAST = 10
-"""Readings at a rail beyond `RAIL_TIMES` those of other poses: poses of few are not
-judged."""
+"""Readings at a rail beyond `RAIL_TIMES` those of other poses: poses of few are
+not judged."""
 RAIL_TIMES = 3
 """As often as any other pose reads its own extreme: vibration too dwells at its
 extremes."""
 REFERENCES_LEAST = 4
-"""Other poses that say how often an extreme is read; with fewer, chance says it."""
+"""Other poses that say how often an extreme is read; with fewer, chance says
+it."""
 CLIPPED_LEAST = 3
 """Readings at a known rail: one or two are the tail of the noise, or a knock."""
 CLIPPED_SHARE = 0.005
-"""Of a pose. Gaussian noise that is cut off there has its mean shifted by 0.0016 of its
-standard deviation: less than that does no harm."""
+"""Of a pose. Gaussian noise that is cut off there has its mean shifted by
+0.0016 of its standard deviation: less than that does no harm."""
 SMOOTH = 2.0
-"""Scatter in steps above which no single code is much more frequent than those beside it."""
+"""Scatter in steps above which no single code is much more frequent than those
+beside it."""
 APART = 20.0
-"""Steps between the extreme and the fifth value below it from which on a coincidence is
-reckoned: nearer ones are the tail of the noise."""
+"""Steps between the extreme and the fifth value below it from which on a
+coincidence is reckoned: nearer ones are the tail of the noise."""
 COINCIDENCE = 1e-4
-"""Probability below which the same extreme, reached several times, is a rail and no
-chance."""
+"""Probability below which the same extreme, reached several times, is a rail
+and no chance."""
 FULL_SCALE_BITS = (15, 17, 19, 23, 31)
-"""Largest magnitudes of two's complement numbers that no nominal scale factor makes out of 1 g."""
+"""Largest magnitudes of two's complement numbers that no nominal scale factor
+makes out of 1 g."""
 SLOW_SHARE = 0.1
-"""Of samples that repeat: up to this some came twice, above it the sensor updates more
-slowly than it is read."""
+"""Of samples that repeat: up to this some came twice, above it the sensor
+updates more slowly than it is read."""
 REPEATS_LEAST = 10
 """Repeats from which on their number says more than chance."""
 REPEATED_SHARE = 0.002
-"""Beyond twice what chance expects, which is itself an estimate: less does no harm."""
+"""Beyond twice what chance expects, which is itself an estimate: less does no
+harm."""
 
 
 def saturation(
@@ -85,8 +90,8 @@ def _extremes(cells: Cells, axis: int) -> tuple[float, float]:
 
 
 def frozen_runs(cells: Cells, runs: RunLengths, noisy: Bools) -> list[list[EqualRun]]:
-    """By axis, and last of all axes at once, the runs that are longer than noise allows. Those of one axis at its
-    extremes are rails.
+    """By axis, and last of all axes at once, the runs that are longer than
+    noise allows. Those of one axis at its extremes are rails.
     """
     found: list[list[EqualRun]] = [[], [], [], []]
     if not (len(cells) and noisy.any()):
@@ -106,14 +111,16 @@ def frozen_runs(cells: Cells, runs: RunLengths, noisy: Bools) -> list[list[Equal
 
 
 def _side(cells: Cells, axis: int, side: int) -> tuple[Floats, Floats]:
-    """Extremes of one side, turned so that they are the highest, and how often they were read."""
+    """Extremes of one side, turned so that they are the highest, and how often
+    they were read."""
     if side > 0:
         return cells.high[:, axis], cells.at_high[:, axis].astype(float)
     return -cells.low[:, axis], cells.at_low[:, axis].astype(float)
 
 
 def _piled(value: Floats, count: Floats, place: Ints, rail: float) -> list[int]:
-    """Poses in which the rail was read far more often than the extremes of other poses."""
+    """Poses in which the rail was read far more often than the extremes of
+    other poses."""
     tops: dict[int, tuple[float, float, int]] = {}
     for pose in np.unique(place[place >= 0]):
         inside = place == pose
@@ -141,7 +148,8 @@ def _clipped(at_rail: Floats, place: Ints, size: int) -> list[int]:
 
 
 def _coincident(value: Floats, step: float, scatter: float) -> bool:
-    """Whether the same extreme was reached at several times, where the next ones lie too far apart for chance."""
+    """Whether the same extreme was reached at several times, where the next
+    ones lie too far apart for chance."""
     number = int(np.count_nonzero(np.diff(np.flatnonzero(value == value.max())) > 1)) + 1
     if number < 2 or scatter < SMOOTH * step:
         return False
@@ -176,8 +184,9 @@ def stuck_output(
 def repeated_samples(
     runs: RunLengths, noisy: Bools, rate_hz: float
 ) -> tuple[SlowUpdate | None, DuplicateSamples | None]:
-    """Samples that repeat the one before on all axes: of a sensor that is read faster than it updates, or single ones
-    that came twice. Neither where noise explains them.
+    """Samples that repeat the one before on all axes: of a sensor that is read
+    faster than it updates, or single ones that came twice. Neither where noise
+    explains them.
     """
     most = runs.allowed(3)
     if noisy.sum() < 2 or not np.isfinite(most):
@@ -196,8 +205,9 @@ def repeated_samples(
 
 
 def coarse_quantization(holds: StillIntervals, affected: Sequence[set[int]], step: Floats) -> Finding | None:
-    """Where steps are wider than twice the scatter in the poses, so that a mean keeps part of its rounding error;
-    ``affected`` are poses, by axis, that lack their scatter for another reason.
+    """Where steps are wider than twice the scatter in the poses, so that a mean
+    keeps part of its rounding error; ``affected`` are poses, by axis, that lack
+    their scatter for another reason.
     """
     axes = []
     for axis in np.flatnonzero(step > 0).tolist():
@@ -213,9 +223,10 @@ def coarse_quantization(holds: StillIntervals, affected: Sequence[set[int]], ste
 
 
 def _rounding_error(variance: float) -> float:
-    """The largest error of a mean of rounded readings over all places between two steps, in steps, where rounded
-    readings have ``variance`` on average over the places (Widrow and Kollár 2008, Quantization Noise: the harmonics of
-    the rounding error under Gaussian noise).
+    """The largest error of a mean of rounded readings over all places between
+    two steps, in steps, where rounded readings have ``variance`` on average
+    over the places (Widrow and Kollár 2008, Quantization Noise: the harmonics
+    of the rounding error under Gaussian noise).
     """
     noise = float(noise_of(np.array([variance]))[0])
     k, place = np.arange(1, 50)[:, None], np.linspace(0, 0.5, 101)

@@ -1,4 +1,5 @@
-"""One kind of fault of a raw stream, and the still spans as the judges of it need them."""
+"""One kind of fault of a raw stream, and the still spans as the judges of it
+need them."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ UNTRUSTED = ("saturation", "stuck_output")
 
 @dataclass(frozen=True)
 class Touched:
-    """The still spans that a fault touches, by index, and where each begins, in seconds from the first sample."""
+    """The still spans that a fault touches, by index, and where each begins, in
+    seconds from the first sample."""
 
     poses: tuple[int, ...] = ()
     starts_s: tuple[float, ...] = ()
@@ -27,7 +29,8 @@ class Touched:
 
 @dataclass(frozen=True)
 class Finding:
-    """A kind of fault, ``name`` as in data-quality lines. `triaxcal.text` says what, which axis, how much and where."""
+    """A kind of fault, ``name`` as in data-quality lines. `triaxcal.text` says
+    what, which axis, how much and where."""
 
     name: ClassVar[str]
 
@@ -60,8 +63,8 @@ class Saturation(Finding):
 
 @dataclass(frozen=True)
 class Freeze:
-    """An axis (None: all at once) repeats a reading, so many ``times``, for up to ``longest`` samples; ``value`` is
-    that of the longest, output units."""
+    """An axis (None: all at once) repeats a reading, so many ``times``, for up
+    to ``longest`` samples; ``value`` is that of the longest, output units."""
 
     axis: str | None
     value: float
@@ -73,7 +76,8 @@ class Freeze:
 
 @dataclass(frozen=True)
 class SlowUpdate:
-    """There are new values only ``every`` so many samples, of a stream of ``rate_hz``."""
+    """There are new values only ``every`` so many samples, of a stream of
+    ``rate_hz``."""
 
     every: float
     rate_hz: float
@@ -116,7 +120,8 @@ class DuplicateSamples(Finding):
 
 @dataclass(frozen=True)
 class Tone:
-    """``amplitude`` by axis, output units. ``alias_of_hz``: the frequency that it may be the alias of."""
+    """``amplitude`` by axis, output units. ``alias_of_hz``: the frequency that
+    it may be the alias of."""
 
     frequency_hz: float
     amplitude: tuple[float, float, float]
@@ -132,7 +137,8 @@ class MainsPickup(Finding):
 
 @dataclass(frozen=True)
 class Steps:
-    """Of an axis, with the scatter in the poses and by how much pose means may be off, output units."""
+    """Of an axis, with the scatter in the poses and by how much pose means may
+    be off, output units."""
 
     axis: str
     step: float
@@ -147,14 +153,16 @@ class CoarseQuantization(Finding):
 
 
 def untrusted_poses(findings: Iterable[Finding]) -> dict[int, str]:
-    """By index, the still spans in which the outputs do not follow the acceleration, with the name of the fault."""
+    """By index, the still spans in which the outputs do not follow the
+    acceleration, with the name of the fault."""
     return {i: f.name for f in findings if f.name in UNTRUSTED for i in f.poses}
 
 
 @dataclass(frozen=True)
 class StillIntervals:
-    """The still spans of a stream: ``start_ns``, ``end_ns`` (k,); ``begin_ns`` is where its seconds begin. ``variance``
-    (k,3) of the readings in each, slow noise included.
+    """The still spans of a stream: ``start_ns``, ``end_ns`` (k,); ``begin_ns``
+    is where its seconds begin. ``variance`` (k,3) of the readings in each, slow
+    noise included.
     """
 
     begin_ns: int
@@ -179,7 +187,8 @@ class StillIntervals:
         return (time_ns - self.begin_ns) * 1e-9
 
     def within(self, start_ns: Ints, end_ns: Ints) -> Ints:
-        """(n,) index of the span in which each stretch of time lies whole, else -1."""
+        """(n,) index of the span in which each stretch of time lies whole, else
+        -1."""
         if not len(self):
             return np.full(len(start_ns), -1, dtype=np.int64)
         at = np.searchsorted(self.start_ns, start_ns, side="right") - 1

@@ -1,7 +1,9 @@
-"""Lines of the mains in the spectrum of still poses, at their own frequency or folded down by the sampling.
+"""Lines of the mains in the spectrum of still poses, at their own frequency or
+folded down by the sampling.
 
-Segments of a second, half overlapping, through a Hann window (Welch 1967); of each only the bins about the
-frequencies in question are kept until it is known where the unit stood still.
+Segments of a second, half overlapping, through a Hann window (Welch 1967); of
+each only the bins about the frequencies in question are kept until it is known
+where the unit stood still.
 """
 
 from __future__ import annotations
@@ -19,40 +21,45 @@ from triaxcal.poses.quality.finding import MainsPickup, StillIntervals, Tone
 MAINS_HZ = (50.0, 60.0)
 """Nominal frequencies of the public grids."""
 HARMONICS = (1, 2, 3)
-"""The mains and two harmonics. Each more is one more place at which noise, or a motor,
-may pass for it."""
+"""The mains and two harmonics. Each more is one more place at which noise, or a
+motor, may pass for it."""
 TOLERANCE = 0.02
-"""The mains wander by half a hertz in fifty, and the sampling clock is off by up to one percent."""
+"""The mains wander by half a hertz in fifty, and the sampling clock is off by
+up to one percent."""
 SEGMENT_S = 1.0
-"""One bin is 1 Hz then. Longer segments fit into fewer poses; shorter ones do not part
-a line from the noise beside it."""
+"""One bin is 1 Hz then. Longer segments fit into fewer poses; shorter ones do
+not part a line from the noise beside it."""
 SEGMENT_LEAST = 16
-"""Samples in a segment where the rate is low; no band of the mains has room in so few
-bins."""
+"""Samples in a segment where the rate is low; no band of the mains has room in
+so few bins."""
 SEGMENTS_LEAST = 8
-"""Segments of still poses below which their mean spectrum is too rough to judge."""
+"""Segments of still poses below which their mean spectrum is too rough to
+judge."""
 GAP = 4.0
 """A silence longer than this many sample periods ends a segment."""
 GUARD = 3
 """Bins from a band to its flank: a line at its edge reaches two through a Hann
 window."""
 FLANK = 8
-"""Bins beside a band: a line at its edge reaches the first ones, the others show the noise."""
+"""Bins beside a band: a line at its edge reaches the first ones, the others
+show the noise."""
 FALSE_ALARM = 3e-4
 """Of all tests of a recording together."""
 OUTLYING = 4.0
-"""Standard deviations above the noise beside a band: bins beyond hold a line of their
-own."""
+"""Standard deviations above the noise beside a band: bins beyond hold a line of
+their own."""
 LOUD = 4.0  # over the median level: a machine was on, or somebody knocked
 KNOCK = 12.0
-"""Segments this much louder than most are left out, and bins of a single one count no more than this: knocks."""
+"""Segments this much louder than most are left out, and bins of a single one
+count no more than this: knocks."""
 WIDEST = 0.125
 """Share of the sampling rate that the band of a folded line may cover."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """Bins (b,) about the frequency ``at_hz`` at which a line of ``source_hz`` shows, ``folded`` where as an alias.
+    """Bins (b,) about the frequency ``at_hz`` at which a line of ``source_hz``
+    shows, ``folded`` where as an alias.
 
     ``inside`` (b,) may hold the line, ``flank`` (b,) tell the noise.
     """
@@ -76,8 +83,9 @@ class Line:
 
 
 def bands(rate_hz: float, size: int) -> list[Band]:
-    """Where the lines of the mains may show in segments of ``size`` samples. A folded harmonic could be anything and is
-    not among them; nor is what folds to the slow noise at the bottom of the spectrum.
+    """Where the lines of the mains may show in segments of ``size`` samples. A
+    folded harmonic could be anything and is not among them; nor is what folds
+    to the slow noise at the bottom of the spectrum.
     """
     top, bin_hz = size // 2, rate_hz / size
     found: list[Band] = []
@@ -101,7 +109,8 @@ def bands(rate_hz: float, size: int) -> list[Band]:
 
 @dataclass
 class Spectra:
-    """Power of segments of the stream, in the bins of `bands`. Fed chunks in order."""
+    """Power of segments of the stream, in the bins of `bands`. Fed chunks in
+    order."""
 
     period_ns: float
     size: int = 0
@@ -134,7 +143,8 @@ class Spectra:
         self._held_ns, self._held = times[at:].copy(), held[:, at:].copy()
 
     def _take(self, time_ns: Ints, u: Floats) -> None:
-        """One at a time, so that the figures do not depend on how many come at once."""
+        """One at a time, so that the figures do not depend on how many come at
+        once."""
         rest = (u - u.mean(axis=1, keepdims=True)) * self._taper
         spectrum = fft.rfft(rest, axis=1)[:, self._kept]
         self._power.append((spectrum.real**2 + spectrum.imag**2).astype(np.float32))
@@ -167,7 +177,8 @@ class Spectra:
             sound = (level > 1e-12 * power[:, axis].max(initial=0.0)) & (level < LOUD * np.median(level))
             if sound.sum() < SEGMENTS_LEAST:
                 continue
-            # One level for all: a bin over its own segment's level is small where that is drawn from it.
+            # One level for all: a bin over its own segment's level is small
+            # where that is drawn from it.
             usual = float(np.mean(level[sound]))
             ratios = power[sound, axis] / usual
             ratio, clipped = ratios.mean(axis=0), np.minimum(ratios, KNOCK).mean(axis=0)
@@ -187,8 +198,9 @@ class Spectra:
 
 
 def _peak(band: Band, ratio: Floats, clipped: Floats, segments: int, top: int) -> tuple[int, float, Floats]:
-    """The highest bin inside the band, or -1 where it is the skirt of a line outside; the probability that noise raises
-    it so, by the means without knocks; and the noise (b,), smooth over the flanks.
+    """The highest bin inside the band, or -1 where it is the skirt of a line
+    outside; the probability that noise raises it so, by the means without
+    knocks; and the noise (b,), smooth over the flanks.
     """
     x = np.log(band.bins / band.bins.mean())
     log = np.log(np.maximum(clipped, 1e-300))
@@ -210,23 +222,27 @@ def _peak(band: Band, ratio: Floats, clipped: Floats, segments: int, top: int) -
     about = ratio[max(peak - 2, 0) : peak + 3]
     if ratio[peak] < about.max():
         return -1, 1.0, np.exp(fitted)
-    # Degrees of freedom that give the spread seen, fewer at the top of the spectrum, where there is no imaginary part.
+    # Degrees of freedom that give the spread seen, fewer at the top of the
+    # spectrum, where there is no imaginary part.
     shape = 1 / spread**2 / (2 if band.bins[peak] == top else 1)
     p_value = _raised(float(np.exp(off[peak])), shape, int(used.sum()) / (order + 1))
-    # A line is narrow: three bins away it is gone, while the skirt of something broad is not.
+    # A line is narrow: three bins away it is gone, while the skirt of something
+    # broad is not.
     beside = [clipped[i] for d in (3, 4) for i in (peak - d, peak + d) if 0 <= i < len(clipped)]
     narrow = _raised(float(clipped[peak] / np.mean(beside)), shape, len(beside))
     return peak, max(p_value, narrow), np.exp(fitted)
 
 
 def _raised(excess: float, shape: float, bins: float) -> float:
-    """Probability that noise of ``shape`` degrees of freedom raises a bin by ``excess`` above a level from ``bins``."""
+    """Probability that noise of ``shape`` degrees of freedom raises a bin by
+    ``excess`` above a level from ``bins``."""
     held = shape / (1 + 1 / bins)
     return float(gamma_sf(excess * held, held))
 
 
 def _offset(excess: Floats, peak: int) -> float:
-    """Of a line from the bin at its peak, in bins: by the ratio of the amplitudes beside it, through a Hann window."""
+    """Of a line from the bin at its peak, in bins: by the ratio of the
+    amplitudes beside it, through a Hann window."""
     beside = [excess[i] if 0 <= i < len(excess) else 0.0 for i in (peak - 1, peak + 1)]
     up = beside[1] > beside[0]
     share = float(np.sqrt(max(beside[int(up)], 0.0) / max(excess[peak], 1e-300)))

@@ -11,14 +11,14 @@ from triaxcal.arrays import Bools, Floats, Ints
 ROWS = 4
 """The three axes, and all of them together."""
 LONGEST_COUNTED = 4096
-"""Lengths that are counted each by itself; longer runs count as this long, and are kept
-besides."""
+"""Lengths that are counted each by itself; longer runs count as this long, and
+are kept besides."""
 KEPT_LEAST = 8
-"""Samples in a run from which on it is kept by itself: shorter ones are common in sound
-noise. A frozen output of fewer samples is not told."""
+"""Samples in a run from which on it is kept by itself: shorter ones are common
+in sound noise. A frozen output of fewer samples is not told."""
 KEPT_MOST = 256
-"""Longest runs that are kept of each row, which bounds the memory; all others are
-counted."""
+"""Longest runs that are kept of each row, which bounds the memory; all others
+are counted."""
 RUNS_LEAST = 200
 """Runs from which it is learned how long they are."""
 FALSE_ALARM = 1e-4
@@ -27,8 +27,9 @@ MARGIN = 1.5
 """By which the tail may fall more slowly than was learned, from one run in a
 thousand."""
 SCALE_LEAST = 0.3
-"""Samples over which the tail falls by a factor of e, at least: as though one sample in
-28 repeated, where fewer do. Errs on the side of calling nothing a fault."""
+"""Samples over which the tail falls by a factor of e, at least: as though one
+sample in 28 repeated, where fewer do. Errs on the side of calling nothing a
+fault."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,13 @@ class RunLengths:
         return sorted(_longest(self._long[row], 0) + open_run, key=lambda r: r.start_ns)
 
     def allowed(self, row: int) -> float:
-        """The longest run that the noise makes, by how the tail of the run lengths falls; infinite where not known.
+        """The longest run that the noise makes, by how the tail of the run
+        lengths falls; infinite where not known.
 
-        Runs of a scattering output end at any sample with some chance, so that their tail is exponential at most. It is
-        learned from how often samples repeat, and where one run in a hundred and one in a thousand end, which a frozen
-        output does not shift.
+        Runs of a scattering output end at any sample with some chance, so that
+        their tail is exponential at most. It is learned from how often samples
+        repeat, and where one run in a hundred and one in a thousand end, which
+        a frozen output does not shift.
         """
         counts = self.counts[row]
         total = int(counts.sum())
@@ -111,7 +114,8 @@ class RunLengths:
         return float(higher + MARGIN * scale * np.log(max(total / 1000, 1.0) / FALSE_ALARM))
 
     def repeated(self, row: int, most: float) -> tuple[int, int]:
-        """Samples that repeat the one before, in runs of up to ``most``, and all samples in such runs."""
+        """Samples that repeat the one before, in runs of up to ``most``, and
+        all samples in such runs."""
         upto = min(int(most), LONGEST_COUNTED - 1) + 1
         length = np.arange(upto)
         counts = self.counts[row, :upto]
@@ -119,8 +123,9 @@ class RunLengths:
 
 
 def _by_chance(changed: Bools) -> float:
-    """From ``changed`` (3,n): what the other combinations of axes that repeat let expect, whatever any two axes have in
-    common (the log-linear model without the interaction of all three; Bishop, Fienberg and Holland 1975).
+    """From ``changed`` (3,n): what the other combinations of axes that repeat
+    let expect, whatever any two axes have in common (the log-linear model
+    without the interaction of all three; Bishop, Fienberg and Holland 1975).
     """
     n = np.bincount((~changed).astype(np.int8).T @ np.array([1, 2, 4], dtype=np.int8), minlength=8).astype(float)
     return float(n[0] * n[3] * n[5] * n[6] / np.maximum(n[[1, 2, 4]], 1.0).prod())

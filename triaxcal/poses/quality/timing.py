@@ -9,26 +9,29 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 
 OFF_LATTICE = 0.2
-"""Time stamps of an even clock: steps within this many periods of a whole number of them."""
+"""Time stamps of an even clock: steps within this many periods of a whole
+number of them."""
 EVEN_SHARE = 0.95
-"""Of steps that are whole periods, from which on the clock is even: a few may be
-late."""
+"""Of steps that are whole periods, from which on the clock is even: a few may
+be late."""
 EVEN_LEAST = 0.4
-"""Median step over the average period below which samples come in bursts: half of the
-steps lie within one then, and say nothing of the period."""
+"""Median step over the average period below which samples come in bursts: half
+of the steps lie within one then, and say nothing of the period."""
 BESIDE = 64
 """Samples on each side of a gap whose earliest stamps are compared: more find a
 prompter one, but two gaps within them count as one."""
 SHIFT_LEAST = 0.75
-"""Of uneven time stamps, a gap is what shifts all that follow by so many periods."""
+"""Of uneven time stamps, a gap is what shifts all that follow by so many
+periods."""
 LONG = 3.5
-"""Periods: of uneven stamps only steps above three are looked at, since late ones make
-others."""
+"""Periods: of uneven stamps only steps above three are looked at, since late
+ones make others."""
 
 
 @dataclass
 class Gaps:
-    """Counts what is missing between samples. Fed chunks of the stream; judges a step when what follows it is known."""
+    """Counts what is missing between samples. Fed chunks of the stream; judges
+    a step when what follows it is known."""
 
     missing: int = 0
     gaps: int = 0
@@ -68,8 +71,9 @@ class Gaps:
 
 
 def _shifts(periods: Floats, ratio: Floats) -> Floats:
-    """(n-1,) whole periods by which each long step shifts the clock for good: samples that are only late catch up.
-    ``periods`` (n,) are the times in average periods.
+    """(n-1,) whole periods by which each long step shifts the clock for good:
+    samples that are only late catch up. ``periods`` (n,) are the times in
+    average periods.
     """
     late = periods - np.arange(len(periods))
     lost = np.zeros(len(ratio))
@@ -82,7 +86,8 @@ def _shifts(periods: Floats, ratio: Floats) -> Floats:
             continue
         before, after = late[max(0, i - BESIDE) : i + 1], late[i + 1 : i + 1 + BESIDE]
         if min(len(before), len(after)) >= BESIDE // 4:
-            # Delays only add: the earliest of each side is nearest to the truth.
+            # Delays only add: the earliest of each side is nearest to the
+            # truth.
             shift = float(after.min() - before.min())
             lost[i] = np.rint(shift) if shift > least else 0.0
         if lost[i]:  # seen from the steps beside it too

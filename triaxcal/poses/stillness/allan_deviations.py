@@ -1,7 +1,9 @@
-"""How averages over neighbouring windows differ where nothing moves, learned from the stream at every scale.
+"""How averages over neighbouring windows differ where nothing moves, learned
+from the stream at every scale.
 
-The standard deviation of the difference of two neighbouring averages is √2 times the Allan deviation (IEEE Std 952,
-annex C). It is learned by medians, so that the moves among the windows do not matter, and nothing is assumed of the
+The standard deviation of the difference of two neighbouring averages is √2
+times the Allan deviation (IEEE Std 952, annex C). It is learned by medians, so
+that the moves among the windows do not matter, and nothing is assumed of the
 noise's colour.
 """
 
@@ -23,8 +25,9 @@ ENOUGH = 12
 
 @dataclass(frozen=True)
 class NoiseScales:
-    """Standard deviations (3,) of differences of averages: ``step`` of two over as many windows, ``edge`` of one over
-    a number of windows and the one over four times as many beside it. ``scatter`` is that inside a window.
+    """Standard deviations (3,) of differences of averages: ``step`` of two over
+    as many windows, ``edge`` of one over a number of windows and the one over
+    four times as many beside it. ``scatter`` is that inside a window.
     """
 
     step: dict[int, Floats]
@@ -33,9 +36,11 @@ class NoiseScales:
 
     @classmethod
     def learned(cls, w: Windows, still: Bools, rounding: Rounding, *, first: bool = False) -> NoiseScales:
-        """``rounding`` is what the step of the output adds. ``first``: most windows may move as yet.
+        """``rounding`` is what the step of the output adds. ``first``: most
+        windows may move as yet.
 
-        Where steps are wide, most differences are zero, and a median says nothing of places half-way between two steps.
+        Where steps are wide, most differences are zero, and a median says
+        nothing of places half-way between two steps.
         """
         base = w.variance[still] if still.any() else w.variance
         scatter = np.sqrt(np.median(base, axis=0))
@@ -54,30 +59,35 @@ class NoiseScales:
         return cls(step, edge, scatter)
 
     def of_edge(self, scale: int, before: int) -> Floats:
-        """(3,) ``edge`` for an average over ``before`` windows beside that over ``scale``, fewer than four times."""
+        """(3,) ``edge`` for an average over ``before`` windows beside that over
+        ``scale``, fewer than four times."""
         return np.asarray(self.edge[scale] * np.sqrt((1 / scale + 1 / before) / (1.25 / scale)))
 
 
 def _scale(differences: Floats, quantile: float, least: Floats, white: Floats, half: Floats | None) -> Floats:
-    """From a quantile of the absolute differences; without enough of them, as white noise falls from half the scale. At
-    least the variance ``least`` (3,)."""
+    """From a quantile of the absolute differences; without enough of them, as
+    white noise falls from half the scale. At least the variance ``least``
+    (3,)."""
     if len(differences) >= ENOUGH:
-        # A normal variable is within 0.3186 and 0.6745 standard deviations in a quarter and in half of all cases.
+        # A normal variable is within 0.3186 and 0.6745 standard deviations in a
+        # quarter and in half of all cases.
         sigma = np.quantile(np.abs(differences), quantile, axis=0) / {0.25: 0.31864, 0.5: 0.67449}[quantile]
     elif half is not None:
         sigma = half / np.sqrt(2)
     else:
         sigma = np.sqrt(white)
     sigma = np.maximum(sigma, np.sqrt(least))
-    # An axis that hardly ever changes from window to window may still scatter inside them.
+    # An axis that hardly ever changes from window to window may still scatter
+    # inside them.
     return np.asarray(np.where(sigma > 0, sigma, np.sqrt(white)))
 
 
 def contrasts(
     values: Floats, still: Bools, joined: Bools, before: int, after: int, at: Ints | None = None
 ) -> tuple[Ints, Floats]:
-    """Where ``before`` windows and the ``after`` windows behind them are unbroken and still: the index of the first of
-    the latter (k,), and how much their average exceeds that of the former (k,3).
+    """Where ``before`` windows and the ``after`` windows behind them are
+    unbroken and still: the index of the first of the latter (k,), and how much
+    their average exceeds that of the former (k,3).
     """
     n = len(values)
     sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - values[0], axis=0)])
@@ -86,7 +96,8 @@ def contrasts(
         broken[1:n] = ~(still[:-1] & still[1:] & joined[1:])
         breaks = np.cumsum(broken)
         i = np.arange(before, n - after + 1)
-        # Between the first and the last of them no boundary is broken; a single window must be still itself.
+        # Between the first and the last of them no boundary is broken; a single
+        # window must be still itself.
         at = i[breaks[i + after - 1] == breaks[i - before]]
         at = at[still[at - before]] if len(at) else at
     here = (sums[at] - sums[at - before]) / max(before, 1)

@@ -1,9 +1,12 @@
-"""Where the unit stood still: a detector that learns the noise from the stream itself.
+"""Where the unit stood still: a detector that learns the noise from the stream
+itself.
 
-It works on the windows of `triaxcal.poses.stillness.windows`, in three steps. What scatters inside a window as the
-quietest windows do is calm. Among calm windows a move shows in the difference of neighbouring averages over one window
-and more, judged by how such differences scatter in this very stream, whatever the colour of its noise. What is left are
-runs, trimmed where a move sets out or settles, and put together where only a bump parts them. Where a machine shakes
+It works on the windows of `triaxcal.poses.stillness.windows`, in three steps.
+What scatters inside a window as the quietest windows do is calm. Among calm
+windows a move shows in the difference of neighbouring averages over one window
+and more, judged by how such differences scatter in this very stream, whatever
+the colour of its noise. What is left are runs, trimmed where a move sets out or
+settles, and put together where only a bump parts them. Where a machine shakes
 the stand, `triaxcal.poses.stillness.shaken` looks for the poses that are left.
 """
 
@@ -27,29 +30,36 @@ from triaxcal.poses.stillness.windows import WindowCutter, Windows
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
 
 SPAN_LEAST_S = 0.4
-"""Four windows (decision 0008): in less there is hardly a middle beside the ends."""
+"""Four windows (decision 0008): in less there is hardly a middle beside the
+ends."""
 REJOIN_S = 1.5
-"""A disturbance shorter than this, with the same mean before and after, is a bump inside one pose."""
+"""A disturbance shorter than this, with the same mean before and after, is a
+bump inside one pose."""
 FALSE_ALARM = 1e-6
-"""Probability that the noise of an axis takes a still window for motion: once in 28
-hours."""
+"""Probability that the noise of an axis takes a still window for motion: once
+in 28 hours."""
 STEP_SIGMA = 7.0
 """Of a single step, tested on noise that need not be Gaussian."""
 BESIDE = 6
 """Windows beside a run in which a move shows."""
 MOTION = 2.0
-"""Of a random walk, the strongest colour that noise has, a quarter of the squared steps is below 0.4 of the scatter."""
+"""Of a random walk, the strongest colour that noise has, a quarter of the
+squared steps is below 0.4 of the scatter."""
 SLIGHT = 0.01
-"""Slow vibration moves the outputs from window to window by no more than this share of their range."""
+"""Slow vibration moves the outputs from window to window by no more than this
+share of their range."""
 FROZEN_WINDOWS = 3
-"""An output is frozen that repeats one reading over so many windows, though noise is wider than its steps."""
+"""An output is frozen that repeats one reading over so many windows, though
+noise is wider than its steps."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A still span as indices of windows. ``used`` (k,) are the windows in it that no bump disturbs.
+    """A still span as indices of windows. ``used`` (k,) are the windows in it
+    that no bump disturbs.
 
-    ``since_s`` is how long the disturbance before it lasted, where that left the mean as it was; else infinite.
+    ``since_s`` is how long the disturbance before it lasted, where that left
+    the mean as it was; else infinite.
     """
 
     used: Ints
@@ -76,12 +86,15 @@ class StillnessDetector(WindowCutter):
 def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
     """The still spans of a stream of windows, at least 0.4 s long.
 
-    A unit that turns about the vertical on a level table comes to rest with the mean that it had: no reading tells the
-    turn from a bump. Where the unit may have turned so, ``turn_s`` says how long a turn takes at least; a disturbance
-    of that length parts spans then, whatever the means, and what stands out of it for a while is no span of its own
+    A unit that turns about the vertical on a level table comes to rest with the
+    mean that it had: no reading tells the turn from a bump. Where the unit may
+    have turned so, ``turn_s`` says how long a turn takes at least; a
+    disturbance of that length parts spans then, whatever the means, and what
+    stands out of it for a while is no span of its own
     (`triaxcal.poses.stillness.turns`).
     """
-    # Rounding of a digital output leaves windows without any scatter; a step of it is noise all the same.
+    # Rounding of a digital output leaves windows without any scatter; a step of
+    # it is noise all the same.
     raw, step = w.variance, resolution(w)
     frozen = _frozen(w, step)
     live, stuck = np.asarray(~frozen.any(axis=1)), np.asarray(frozen.all(axis=1))
@@ -110,13 +123,14 @@ def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
 
 
 def _rounding(step: Floats, quiet: Floats) -> Rounding:
-    """What the step adds, by the variances (k,3) of quiet windows: of their mean, since a median of windows with one
-    reading or two says little."""
+    """What the step adds, by the variances (k,3) of quiet windows: of their
+    mean, since a median of windows with one reading or two says little."""
     return Rounding.of(step, quiet.mean(axis=0) if len(quiet) else np.zeros(3))
 
 
 def _quiet_pieces(w: Windows, found: list[Ints], noise: NoiseScales) -> tuple[list[Ints], list[Ints]]:
-    """Runs that are settled, one way or the other, and the still pieces of them."""
+    """Runs that are settled, one way or the other, and the still pieces of
+    them."""
     taken, pieces = [], []
     for run in found:
         if _under_way(w, run, noise):
@@ -130,11 +144,12 @@ def _quiet_pieces(w: Windows, found: list[Ints], noise: NoiseScales) -> tuple[li
 
 
 def _frozen(w: Windows, step: Floats) -> Bools:
-    """(m,3) windows in which an axis is frozen: they show no noise, and nothing is learned from them. Nor is it a pose
-    where all axes are: what the unit does meanwhile, nobody knows.
+    """(m,3) windows in which an axis is frozen: they show no noise, and nothing
+    is learned from them. Nor is it a pose where all axes are: what the unit
+    does meanwhile, nobody knows.
 
-    An output whose ``step`` is as wide as its noise repeats readings too, but it does so again and again, or else
-    changes by a step or two.
+    An output whose ``step`` is as wide as its noise repeats readings too, but
+    it does so again and again, or else changes by a step or two.
     """
     frozen = np.zeros((len(w), 3), dtype=bool)
     # One reading that differs by a step makes more of either.
@@ -151,7 +166,8 @@ def _frozen(w: Windows, step: Floats) -> Bools:
 
 
 def _still_runs(w: Windows, calm: Bools, live: Bools, rounding: Rounding) -> tuple[list[Ints], NoiseScales]:
-    """Runs of windows that are calm and do not move, and the noise they were judged by, learned from the ``live``."""
+    """Runs of windows that are calm and do not move, and the noise they were
+    judged by, learned from the ``live``."""
     noise = NoiseScales.learned(w, calm & live, rounding, first=True)
     for _ in range(2):
         noise = NoiseScales.learned(w, _steady(w, calm, noise) & live, rounding)
@@ -160,7 +176,8 @@ def _still_runs(w: Windows, calm: Bools, live: Bools, rounding: Rounding) -> tup
 
 
 def _under_way(w: Windows, run: Ints, noise: NoiseScales) -> bool:
-    """Whether a run that climbs steadily is the middle of a move: a pose that creeps lies between faster moves."""
+    """Whether a run that climbs steadily is the middle of a move: a pose that
+    creeps lies between faster moves."""
     x = run - run.mean()
     pace = x @ w.mean[run] / max(float(x @ x), 1.0) / noise.step[1]
     if np.abs(pace).max() < 1:
@@ -175,10 +192,12 @@ def _under_way(w: Windows, run: Ints, noise: NoiseScales) -> bool:
 
 
 def quiet_limit(variance: Floats, dof: int) -> Floats:
-    """(3,) the largest scatter that noise alone makes in a window, learned from the quietest windows.
+    """(3,) the largest scatter that noise alone makes in a window, learned from
+    the quietest windows.
 
-    Still windows crowd around one scatter while moving ones spread over decades above it: the mode of the logarithm
-    is the noise, and how far the windows below it reach tells its effective degrees of freedom, which are fewer than
+    Still windows crowd around one scatter while moving ones spread over decades
+    above it: the mode of the logarithm is the noise, and how far the windows
+    below it reach tells its effective degrees of freedom, which are fewer than
     the samples where the noise is coloured.
     """
     limit = np.zeros(3)
@@ -195,7 +214,8 @@ def quiet_limit(variance: Floats, dof: int) -> Floats:
 
 
 def _half_sample_mode(ordered: Floats) -> float:
-    """The densest place of sorted values: the densest half, again and again (Robertson and Cryer 1974)."""
+    """The densest place of sorted values: the densest half, again and again
+    (Robertson and Cryer 1974)."""
     while len(ordered) > 8:
         half = (len(ordered) + 1) // 2
         widths = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
@@ -205,8 +225,9 @@ def _half_sample_mode(ordered: Floats) -> float:
 
 
 def _limit_within(variance: Floats, most: int) -> Floats:
-    """(3,) the same limit from windows of which all but a few are known to be still: chi-square with the degrees of
-    freedom, ``most`` at most, that the spread between the quartiles of the logarithm shows.
+    """(3,) the same limit from windows of which all but a few are known to be
+    still: chi-square with the degrees of freedom, ``most`` at most, that the
+    spread between the quartiles of the logarithm shows.
     """
     log = np.log(np.maximum(variance, 1e-300))
     low, middle, high = np.quantile(log, [0.25, 0.5, 0.75], axis=0)
@@ -217,7 +238,8 @@ def _limit_within(variance: Floats, most: int) -> Floats:
 
 
 def _inside(w: Windows, pieces: list[Ints]) -> Bools:
-    """Windows from the first to the last of each span, those that were excluded as well."""
+    """Windows from the first to the last of each span, those that were excluded
+    as well."""
     inside = np.zeros(len(w), dtype=bool)
     for piece in pieces:
         inside[piece] = True
@@ -228,10 +250,12 @@ def _inside(w: Windows, pieces: list[Ints]) -> Bools:
 
 
 def _only_moves(w: Windows, calm: Bools) -> bool:
-    """Whether the quietest windows are those of a motion, and nothing in the stream stands still.
+    """Whether the quietest windows are those of a motion, and nothing in the
+    stream stands still.
 
-    Steadily moving outputs step 12 times as far from window to window, squared, as they scatter inside one. Slow
-    vibration does so too, but it is small beside the differences of poses, and leads nowhere.
+    Steadily moving outputs step 12 times as far from window to window, squared,
+    as they scatter inside one. Slow vibration does so too, but it is small
+    beside the differences of poses, and leads nowhere.
     """
     at, step = contrasts(w.mean, calm, w.joined, 1, 1)
     if not len(at):
@@ -246,7 +270,8 @@ def _only_moves(w: Windows, calm: Bools) -> bool:
 
 
 def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
-    """The calm windows at which no difference of neighbouring averages, short or long, is more than noise."""
+    """The calm windows at which no difference of neighbouring averages, short
+    or long, is more than noise."""
     steady = calm.copy()
     for scale in SCALES:
         at, difference = contrasts(w.mean, steady, w.joined, scale, scale)
@@ -266,7 +291,8 @@ def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
 
 
 def _common_climb(at: Ints, z: Floats) -> Floats:
-    """(len, 3) what the quietest quarter of the differences of each run have in common: the pace of a steady creep."""
+    """(len, 3) what the quietest quarter of the differences of each run have in
+    common: the pace of a steady creep."""
     out = np.zeros_like(z)
     for part in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) > 1) + 1):
         quiet = part[np.argsort(np.abs(z[part]).max(axis=1), kind="stable")[: max(len(part) // 4, 1)]]
@@ -276,7 +302,8 @@ def _common_climb(at: Ints, z: Floats) -> Floats:
 
 
 def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
-    """Windows of short bumps: averages that differ from those before and from those after alike."""
+    """Windows of short bumps: averages that differ from those before and from
+    those after alike."""
     if scale not in noise.edge:
         return np.zeros(0, dtype=np.int64)
     limit = MOVE_SIGMA * noise.edge[scale]
@@ -289,7 +316,8 @@ def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
 
 
 def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools, longest_s: float) -> list[Span]:
-    """Pieces of one pose on either side of a bump, which is shorter than ``longest_s``, put together."""
+    """Pieces of one pose on either side of a bump, which is shorter than
+    ``longest_s``, put together."""
     period_s = w.period_ns * 1e-9
     spans: list[Span] = []
     for piece in pieces:

@@ -1,10 +1,14 @@
-"""Poses during which a machine shakes the stand: the outputs scatter as much as in a move, but their mean stays put.
+"""Poses during which a machine shakes the stand: the outputs scatter as much as
+in a move, but their mean stays put.
 
-A move carries the means of the windows away; shaking leaves them where they are, but for what of it a window does not
-average out. That is bounded. Shaking without a rhythm adds a random part, the variance of a sample over the samples. A
-tone of frequency f adds to an average over T at most its amplitude over πfT, also where the windows fall in step with
-it and the means wander slowly; from 5 Hz on two neighbouring averages over s windows of 0.1 s so differ by at most 2.3
-times the scatter inside a window, over s. Neither grows with s as the way of a move does.
+A move carries the means of the windows away; shaking leaves them where they
+are, but for what of it a window does not average out. That is bounded. Shaking
+without a rhythm adds a random part, the variance of a sample over the samples.
+A tone of frequency f adds to an average over T at most its amplitude over πfT,
+also where the windows fall in step with it and the means wander slowly; from 5
+Hz on two neighbouring averages over s windows of 0.1 s so differ by at most 2.3
+times the scatter inside a window, over s. Neither grows with s as the way of a
+move does.
 """
 
 from __future__ import annotations
@@ -22,26 +26,30 @@ from triaxcal.poses.stillness.windows import Windows
 LEAST_S = 1.0
 """A shorter rest between shaking is not told from a hand that hesitates."""
 ALONE_S = 1.5
-"""A span that is shaken throughout lasts longer than a hand hesitates; a part of one need not."""
+"""A span that is shaken throughout lasts longer than a hand hesitates; a part
+of one need not."""
 MOVE_SIGMA = 5.0
-"""Of a difference of averages: noise passes it once in two million. Less would cut
-poses in pieces; more lets slight moves pass."""
+"""Of a difference of averages: noise passes it once in two million. Less would
+cut poses in pieces; more lets slight moves pass."""
 TONE = 0.5
-"""The bound for tones over `MOVE_SIGMA`, about: a standard deviation to judge by."""
+"""The bound for tones over `MOVE_SIGMA`, about: a standard deviation to judge
+by."""
 LONGEST = 16
-"""Windows in the longest averages compared: jitter of a hand hides a slow turn from shorter ones."""
+"""Windows in the longest averages compared: jitter of a hand hides a slow turn
+from shorter ones."""
 ABOUT = 7
 """Windows over which the usual scatter is taken."""
 UNEVEN = 5.0
-"""A window belongs to a move or a knock if the median variance around it exceeds that of the run by this factor, or its
-own variance by the square."""
+"""A window belongs to a move or a knock if the median variance around it
+exceeds that of the run by this factor, or its own variance by the square."""
 SHARE = 0.03
-"""Shaking makes the outputs scatter by no more than this share of the range of the poses."""
+"""Shaking makes the outputs scatter by no more than this share of the range of
+the poses."""
 
 
 def shaken_noise(noise: NoiseScales, variance: Floats, size: int) -> NoiseScales:
-    """Of averages over windows of ``size`` samples that scatter with ``variance`` (3,), where that is more than the
-    quiet noise makes.
+    """Of averages over windows of ``size`` samples that scatter with
+    ``variance`` (3,), where that is more than the quiet noise makes.
     """
     excess = np.maximum(variance - noise.scatter**2, 0.0)
     return replace(
@@ -52,14 +60,17 @@ def shaken_noise(noise: NoiseScales, variance: Floats, size: int) -> NoiseScales
 
 
 def _share(scale: int, size: int) -> float:
-    """Of the variance inside windows that remains in the difference of averages over ``scale`` of them."""
+    """Of the variance inside windows that remains in the difference of averages
+    over ``scale`` of them."""
     return 2 / (size * scale) + (TONE / scale) ** 2
 
 
 def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]:
-    """Runs, trimmed, among the windows outside the quiet runs ``taken``, in which the mean stands still.
+    """Runs, trimmed, among the windows outside the quiet runs ``taken``, in
+    which the mean stands still.
 
-    Only what is small beside the differences of poses can be distinguished from a hand that shakes the unit.
+    Only what is small beside the differences of poses can be distinguished from
+    a hand that shakes the unit.
     """
     if len(taken) < 2:
         return []
@@ -70,7 +81,8 @@ def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]
         rest[max(quiet[0] - 1, 0) : quiet[-1] + 2] = False
     level = _level(w)
     found = []
-    # What scatters otherwise is something else: the end of a move, which is slow, is no part of what comes after it.
+    # What scatters otherwise is something else: the end of a move, which is
+    # slow, is no part of what comes after it.
     total = np.maximum(level.sum(axis=1), 1e-300)
     alike = w.joined & (np.abs(np.diff(np.log(total), prepend=np.log(total[0]))) < np.log(UNEVEN))
     for run in runs(_staying(w, rest, alike, level, noise), alike):
@@ -85,12 +97,14 @@ def shaken_runs(w: Windows, taken: list[Ints], noise: NoiseScales) -> list[Ints]
 
 
 def _level(w: Windows) -> Floats:
-    """(m,3) the usual variance about each window: a window that is shorter than a swing shows now more, now less."""
+    """(m,3) the usual variance about each window: a window that is shorter than
+    a swing shows now more, now less."""
     return np.asarray(scipy.ndimage.median_filter(w.variance, size=(ABOUT, 1), mode="nearest"))
 
 
 def _staying(w: Windows, rest: Bools, alike: Bools, level: Floats, noise: NoiseScales) -> Bools:
-    """Those of the windows at which no difference of neighbouring averages is more than shaking explains."""
+    """Those of the windows at which no difference of neighbouring averages is
+    more than shaking explains."""
     staying = rest.copy()
     excess = np.maximum(level - noise.scatter**2, 0.0)
     for scale in (*SCALES, LONGEST):

@@ -11,16 +11,20 @@ from triaxcal.poses.stillness.windows import Windows
 SPAN_LEAST_WINDOWS = 3
 """Windows in a span: fewer have no middle that ends could differ from."""
 EDGE_SIGMA = 3.5
-"""At the ends of a run, where a false alarm costs a few windows and nothing else."""
+"""At the ends of a run, where a false alarm costs a few windows and nothing
+else."""
 EVENLY = 0.1
-"""The scatter of a steady tone repeats itself to less than that: a little more of it at an end is no sign of a move."""
+"""The scatter of a steady tone repeats itself to less than that: a little more
+of it at an end is no sign of a move."""
 ONSET_SIGMA = 6.0  # standard deviations of the mean of a window, which no noise reaches
 ONSET_WINDOWS = 30
-"""Where the onset of a move is judged by what follows: well above the noise, and within this reach."""
+"""Where the onset of a move is judged by what follows: well above the noise,
+and within this reach."""
 
 
 def trimmed(w: Windows, run: Ints, noise: NoiseScales) -> Ints:
-    """Without one guard window at either end, nor those where a move sets out or settles."""
+    """Without one guard window at either end, nor those where a move sets out
+    or settles."""
     late, early = _onset(w, run, noise), _onset(w, run[::-1], noise)
     run = run[max(early, 1) : len(run) - max(late, 1)]
     for direction in (1, -1):
@@ -29,16 +33,19 @@ def trimmed(w: Windows, run: Ints, noise: NoiseScales) -> Ints:
             cut = _unsettled(w, run[::direction], noise)
             if not cut:
                 break
-            # As many again: what comes before the part that shows is smaller, but the same.
+            # As many again: what comes before the part that shows is smaller,
+            # but the same.
             run = run[: -2 * cut] if direction == 1 else run[2 * cut :]
     return run
 
 
 def _onset(w: Windows, run: Ints, noise: NoiseScales) -> int:
-    """How many windows at the end of a run belong to the move behind it, though noise hides it there.
+    """How many windows at the end of a run belong to the move behind it, though
+    noise hides it there.
 
-    A move sets out smoothly, its displacement growing as the cube of time or slower (a minimum-jerk path: as the cube):
-    from two moments at which it is well above the noise follows when it began.
+    A move sets out smoothly, its displacement growing as the cube of time or
+    slower (a minimum-jerk path: as the cube): from two moments at which it is
+    well above the noise follows when it began.
     """
     n, way = len(run), int(run[-1] - run[-2]) if len(run) > 1 else 1
     behind = run[-1] + way * np.arange(1, ONSET_WINDOWS)
@@ -52,11 +59,13 @@ def _onset(w: Windows, run: Ints, noise: NoiseScales) -> int:
     if z[-1] < ONSET_SIGMA:
         return 0
     first = int(np.argmax(z >= ONSET_SIGMA))
-    # A move that is there at once has no onset; what noise adds to its end is none of it.
+    # A move that is there at once has no onset; what noise adds to its end is
+    # none of it.
     second = int(np.argmax(z >= min(4 * z[first], 0.9 * z[-1])))
     if second <= first:
         return 0
-    # The sum of displacements up to the end of a window grows as the fourth power of the time since the onset.
+    # The sum of displacements up to the end of a window grows as the fourth
+    # power of the time since the onset.
     area = np.abs(np.cumsum(away, axis=0))[:, int(np.argmax(np.abs(away[second])))]
     ratio = min(float(area[first] / area[second]), 1.0) ** 0.25
     began = first + 1 - (second - first) * ratio / max(1 - ratio, 1e-3)
@@ -64,14 +73,16 @@ def _onset(w: Windows, run: Ints, noise: NoiseScales) -> int:
 
 
 def _unsettled(w: Windows, run: Ints, noise: NoiseScales) -> int:
-    """How many windows at the end of a run differ from those before, in mean or in scatter."""
+    """How many windows at the end of a run differ from those before, in mean or
+    in scatter."""
     n = len(run)
     inner = run[n // 4 : n - n // 4]
     climb = np.zeros(3)
     if len(inner) >= 8:
         x = inner - inner.mean()
         climb = x @ w.mean[inner] / (x @ x) * np.sign(run[1] - run[0])
-    # Of the logarithm, which is nearly normal also where coloured noise leaves few degrees of freedom to a window.
+    # Of the logarithm, which is nearly normal also where coloured noise leaves
+    # few degrees of freedom to a window.
     share = np.log((w.variance[run] / np.median(w.variance[inner], axis=0)).mean(axis=1))
     middle = share[n // 4 : n - n // 4]
     spread = max(1.4826 * float(np.median(np.abs(middle - np.median(middle)))), EVENLY)
@@ -82,7 +93,8 @@ def _unsettled(w: Windows, run: Ints, noise: NoiseScales) -> int:
         if before < 2 * scale or n < 5 * scale:
             break
         change = w.mean[run[-scale:]].mean(axis=0) - w.mean[run[-scale - before : -scale]].mean(axis=0)
-        # What the middle climbs explains any part of it: whether that is a creep, or the noise, one need not know.
+        # What the middle climbs explains any part of it: whether that is a
+        # creep, or the noise, one need not know.
         crept = climb * (scale + before) / 2
         change -= np.clip(change, np.minimum(crept, 0), np.maximum(crept, 0))
         if (np.abs(change) > EDGE_SIGMA * noise.of_edge(scale, before)).any():

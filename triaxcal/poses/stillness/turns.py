@@ -1,9 +1,11 @@
-"""A unit that turns in place: what a turn about the vertical shows between the poses about it.
+"""A unit that turns in place: what a turn about the vertical shows between the
+poses about it.
 
-On a level table such a turn leaves the reading where it was. On its way the reading may stand
-still, or seem to: where the hand changes its grip, where a slow turn is steady and so is the pull
-towards its axis, where the hand shakes the unit about one mean as a machine would. None of that is
-a pose. All of it lies in place: as near to the poses before and after as the tilt of a table and
+On a level table such a turn leaves the reading where it was. On its way the
+reading may stand still, or seem to: where the hand changes its grip, where a
+slow turn is steady and so is the pull towards its axis, where the hand shakes
+the unit about one mean as a machine would. None of that is a pose. All of it
+lies in place: as near to the poses before and after as the tilt of a table and
 that pull make it.
 """
 
@@ -18,18 +20,22 @@ from triaxcal.arrays import Floats, Ints
 from triaxcal.poses.stillness.windows import Windows
 
 TURN_S = 1.0
-"""Turning a fixture by half a circle and putting it down takes as long; some knocks that ring do.
-What noise makes of the longest averages, which are over 0.8 s, is shorter, but for rare chance."""
+"""Turning a fixture by half a circle and putting it down takes as long; some
+knocks that ring do. What noise makes of the longest averages, which are over
+0.8 s, is shorter, but for rare chance."""
 IN_PLACE = 0.01
-"""Of the range of the outputs. Where poses cover the sphere this is 20 mrad: two orientations on a
-table that tilts by 10 mrad, or the pull 8 cm off the axis of half a turn in 2 s, on average."""
+"""Of the range of the outputs. Where poses cover the sphere this is 20 mrad:
+two orientations on a table that tilts by 10 mrad, or the pull 8 cm off the axis
+of half a turn in 2 s, on average."""
 PAUSE = 1 / 2
-"""What stands still on the way is shorter than this share of poses before and after it. A pose that
-is lost so costs its data; a piece of a turn that is taken for one puts its pull into the face."""
+"""What stands still on the way is shorter than this share of poses before and
+after it. A pose that is lost so costs its data; a piece of a turn that is taken
+for one puts its pull into the face."""
 
 
 def without_turns(w: Windows, quiet: list[Ints], shaken: list[Ints]) -> list[Ints]:
-    """Still pieces in order of time, but those that turns in place show between quiet ones."""
+    """Still pieces in order of time, but those that turns in place show between
+    quiet ones."""
     known = {int(piece[0]) for piece in quiet}
     pieces = sorted([*quiet, *shaken], key=lambda p: int(p[0]))
     kept: list[Ints] = []

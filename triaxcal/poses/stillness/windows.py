@@ -1,7 +1,9 @@
-"""A stream cut into windows of a tenth of a second, of which mean, scatter and times are all that is kept.
+"""A stream cut into windows of a tenth of a second, of which mean, scatter and
+times are all that is kept.
 
-Memory grows by about a hundred bytes a window, whatever the sample rate. The windows depend on the samples alone, not
-on how they were fed, so live and replayed streams give the same ones.
+Memory grows by about a hundred bytes a window, whatever the sample rate. The
+windows depend on the samples alone, not on how they were fed, so live and
+replayed streams give the same ones.
 """
 
 from __future__ import annotations
@@ -15,18 +17,19 @@ from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.errors import InvalidData
 
 WINDOW_S = 0.1
-"""Short beside a pose and a move, so that edges cost little; long beside a sample, so
-that summaries are few (decision 0008)."""
+"""Short beside a pose and a move, so that edges cost little; long beside a
+sample, so that summaries are few (decision 0008)."""
 WINDOW_LEAST = 3
 """Samples in a window at low rates: fewer tell no scatter."""
 GAP = 4.0
 """A silence longer than this many sample periods ends a window, and a span."""
 RATE_SAMPLES = 64  # steps are taken over a quarter of them, so that bursts average out
 RATE_S = 1.0
-"""The sample period is learned from at least so many samples over at least so long."""
+"""The sample period is learned from at least so many samples over at least so
+long."""
 RATE_LEAST = 12
-"""Samples of a stream that ends before that; with fewer the period is not known, and
-there is no window."""
+"""Samples of a stream that ends before that; with fewer the period is not
+known, and there is no window."""
 READING_MOST = 1e100
 """Squares of readings, and sums of them, have to be numbers too."""
 
@@ -35,9 +38,10 @@ READING_MOST = 1e100
 class Windows:
     """Summaries of consecutive windows of ``size`` samples, (m,) or (m,3) each.
 
-    ``start_ns`` and ``end_ns`` are the times of a window's first and last sample; ``variance`` of a sample by axis,
-    ``cross`` covariance of axes xy, yz, zx; ``hop`` is the difference of its readings where there are two only, else
-    zero; ``joined`` says that no gap lies between it and the one before.
+    ``start_ns`` and ``end_ns`` are the times of a window's first and last
+    sample; ``variance`` of a sample by axis, ``cross`` covariance of axes xy,
+    yz, zx; ``hop`` is the difference of its readings where there are two only,
+    else zero; ``joined`` says that no gap lies between it and the one before.
     """
 
     size: int
@@ -55,7 +59,8 @@ class Windows:
 
     @property
     def period_ns(self) -> float:
-        """From the start of a window to the start of the next, where no gap lies between."""
+        """From the start of a window to the start of the next, where no gap
+        lies between."""
         return float(np.median((self.end_ns - self.start_ns) * self.size / (self.size - 1)))
 
 
@@ -74,9 +79,11 @@ class WindowCutter:
     _broken: bool = False
 
     def feed(self, time_ns: Ints, readings: Floats, channels: Mapping[str, Floats] | None = None) -> None:
-        """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3), ``channels`` each (n,).
+        """``time_ns`` (n,) strictly increasing across calls, ``readings``
+        (n,3), ``channels`` each (n,).
 
-        Raises InvalidData for a reading that is not a finite number: it would hide every pose.
+        Raises InvalidData for a reading that is not a finite number: it would
+        hide every pose.
         """
         if not len(time_ns):
             return
@@ -93,13 +100,15 @@ class WindowCutter:
             self._close_windows()
 
     def finish(self) -> None:
-        """No more samples come: what is pending is cut into windows as far as it goes."""
+        """No more samples come: what is pending is cut into windows as far as
+        it goes."""
         if not self._size and self._held >= RATE_LEAST:
             self._learn_rate()
             self._close_windows()
 
     def _learn_rate(self) -> None:
-        """Over a quarter of the samples at a time, so that neither bursts nor a gap mislead."""
+        """Over a quarter of the samples at a time, so that neither bursts nor a
+        gap mislead."""
         time_ns = np.concatenate([p[0] for p in self._pending])
         enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
         time_ns = time_ns[:enough]
@@ -131,7 +140,8 @@ class WindowCutter:
 
     def _summarise(self, time_ns: Ints, u: Floats, channels: dict[str, Floats], count: int) -> None:
         blocks = u.reshape(count, self._size, 3)
-        # Sums over a contiguous last axis, so that a window's figures do not depend on how many come at once.
+        # Sums over a contiguous last axis, so that a window's figures do not
+        # depend on how many come at once.
         columns = np.ascontiguousarray(blocks.transpose(0, 2, 1))
         mean = columns.mean(axis=2)
         rest = columns - mean[:, :, None]
@@ -164,7 +174,8 @@ class WindowCutter:
 
 
 def _hop(columns: Floats) -> Floats:
-    """(m,3) how far the two readings of a window lie apart, of ``columns`` (m,3,size); zero where there are others."""
+    """(m,3) how far the two readings of a window lie apart, of ``columns``
+    (m,3,size); zero where there are others."""
     high, low = columns.max(axis=2), columns.min(axis=2)
     two = ((columns == high[:, :, None]) | (columns == low[:, :, None])).all(axis=2)
     return np.asarray(np.where(two, high - low, 0.0))
