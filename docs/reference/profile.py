@@ -1,4 +1,5 @@
-"""Writes what stands here of the table of register types and the models of profiles: `python docs/reference/profile.py`."""  # noqa: E501
+"""Writes what stands here of the table of register types and the models of
+profiles: `python docs/reference/profile.py`."""
 
 from __future__ import annotations
 

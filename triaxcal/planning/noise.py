@@ -1,4 +1,4 @@
-"""The noise that a recording foretells: what its poses leave beside the effects
+"""The noise that a recording predicts: what its poses leave beside the effects
 that a plan is for."""
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.initial_estimate import started_problem
 from triaxcal.estimate.likelihood import Problem, State, linearise, solve
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.estimate.pose_slopes import residual_chi2
 from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.clock import OnPlansClock
 from triaxcal.planning.design import VISIBLE, combinations
@@ -64,8 +65,9 @@ def fitted_beside(
     problem, begin = started_problem(sound, signs=signs, reference=reference, effects=effects)
     state = solve(problem, begin, ())
     chosen = tuple(_shaped(problem, state, e) for e in effects)
-    J = _weighted(problem, state.extended(chosen))[1]
-    seen, _ = combinations(J[:, :LINEAR], J[:, LINEAR:], VISIBLE)
+    _, J, s = linearise(problem, state.extended(chosen))
+    weighted = J / s[:, None]
+    seen, _ = combinations(weighted[:, :LINEAR], weighted[:, LINEAR:], VISIBLE)
     if not seen.shape[1]:
         return linear
     try:
@@ -78,18 +80,7 @@ def _shaped(problem: Problem, state: State, effect: Effect) -> Effect:
     if not isinstance(effect, OnPlansClock):
         return effect
     variants = effect.whole.variants(problem.covariates)
-    return min(variants, key=lambda e: _left(*_weighted(problem, state.extended([e]))))
-
-
-def _weighted(problem: Problem, state: State) -> tuple[Floats, Floats]:
-    r, J, s = linearise(problem, state)
-    return r / s, J / s[:, None]
-
-
-def _left(r: Floats, J: Floats) -> float:
-    norms = np.linalg.norm(J, axis=0)
-    J = J / np.where(norms > 0, norms, 1.0)
-    return float(np.sum((r - J @ np.linalg.lstsq(J, r, rcond=1e-10)[0]) ** 2))
+    return min(variants, key=lambda e: residual_chi2(linearise(problem, state.extended([e]))))
 
 
 def noise_of(calibration: Calibration) -> Floats | None:

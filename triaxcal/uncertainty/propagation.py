@@ -95,6 +95,6 @@ def gain_given_prior(weighted: Floats, spread: Floats | None) -> Floats:
     norms = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
     rows = weighted / norms
     if spread is not None and len(spread):
-        covariates = np.eye(len(norms))[9 : 9 + len(spread)] / np.maximum(spread, 1e-300)[:, None]
-        rows = np.concatenate([rows, covariates / norms])
+        prior_rows = np.eye(len(norms))[9 : 9 + len(spread)] / np.maximum(spread, 1e-300)[:, None]
+        rows = np.concatenate([rows, prior_rows / norms])
     return np.asarray(np.linalg.pinv(rows, rcond=1e-13)[:, : len(weighted)] / norms[:, None])

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import struct
 
-from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.modbus.line import Line, join, leave
 from triaxcal_drivers.modbus.protocol import (
@@ -24,8 +23,8 @@ class ModbusClient:
 
     def __init__(self, line: Line, unit_id: int, reply_timeout_s: float) -> None:
         self.where = f"{line.name} unit {unit_id}"
-        self._line: Line | None = line
-        self._last = line
+        self._line = line
+        self._closed = False
         self._unit_id = unit_id
         self._reply_timeout_s = reply_timeout_s
 
@@ -41,30 +40,26 @@ class ModbusClient:
         return cls(line, unit_id, reply_timeout_s)
 
     @property
-    def attention(self) -> Attention:
-        return self._last.attention
-
-    @property
     def owed_s(self) -> float:
-        return self._last.owed_s(self._unit_id)
+        return self._line.owed_s(self._unit_id)
 
     @property
     def own_s(self) -> float:
         """Time [s] that goes on while this unit has the line or could have it:
-        `attention`, less what other units took while a request of this one
-        waited."""
-        return self._last.attention.now_s() - self._last.waited_s(self._unit_id)
+        the line's attention, less what other units took while a request of this
+        one waited."""
+        return self._line.attention.now_s() - self._line.waited_s(self._unit_id)
 
     @property
     def alone(self) -> bool:
         """Whether no other unit uses the line."""
-        return self._last.users < 2
+        return self._line.users < 2
 
     async def close(self) -> None:
-        line, self._line = self._line, None
-        if line is not None:
-            line.forsake(self._unit_id)
-            leave(line)
+        if not self._closed:
+            self._closed = True
+            self._line.forsake(self._unit_id)
+            leave(self._line)
 
     async def read(self, function: int, address: int, count: int) -> bytes:
         """``count`` registers as 2·count bytes, as on the wire.
@@ -98,7 +93,7 @@ class ModbusClient:
             raise MalformedReply(f"{self.where}: reply to a write at 0x{address:04X}: {pdu.hex(' ')}", pdu)
 
     async def _transact(self, request: bytes, timeout_s: float | None = None) -> bytes:
-        if self._line is None:
+        if self._closed:
             raise BusError(f"{self.where}: the device is closed")
         patience_s = self._reply_timeout_s if timeout_s is None else timeout_s
         reply = await self._line.transact(self._unit_id, request, patience_s=patience_s, late_s=self._reply_timeout_s)

@@ -140,7 +140,7 @@ class Line:
             async with self._turn:
                 if math.isfinite(waited_s := self.attention.now_s() - begun_s):
                     self._waited_s[unit] = self._waited_s.get(unit, 0.0) + waited_s
-                if not self.owed_s(unit) > 0:
+                if self.owed_s(unit) == 0:
                     yield
                     return
 
