@@ -24,11 +24,13 @@ class RawFlag(IntFlag):
     """What the receiver knew about a raw record besides its bytes."""
 
     EXTENDED_ID = 1
-    REMOTE = 2
+    REMOTE = 2  # of a CAN FD frame, which cannot be remote: its sender was error passive
     ERROR = 4  # CAN error frame; Modbus exception reply
     FD = 8
-    LOST_BEFORE = 16  # the receiver dropped records just before this one
+    LOST_BEFORE = 16  # records were lost just before this one: see the `Gap`
     INVALID = 32  # reply of the wrong length, function or address
+    BIT_RATE_SWITCH = 64  # of a CAN FD frame: its data came at the faster rate
+    SENT = 128  # this host sent it
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,22 @@ class SampleBlock:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Records that were sent, or would have been, and are not in a stream.
+
+    Host time ``from_ns`` is of the last record before it, or of the moment at
+    which the gap was noticed where there was none; ``to_ns`` of the first
+    record after it, which carries `RawFlag.LOST_BEFORE`, and None while nothing
+    has come again. ``lost`` counts the records where somebody counted them.
+    """
+
+    from_ns: int
+    to_ns: int | None
+    cause: str
+    lost: int | None = None
 
 
 class Decoder(Protocol):

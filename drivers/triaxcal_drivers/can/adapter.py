@@ -1,0 +1,43 @@
+"""What is behind a CAN bus: an open socket or adapter, which sends and
+receives."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import NamedTuple, Protocol
+
+Identifier = tuple[int, bool]
+"""A CAN identifier and whether it is an extended one."""
+
+
+class Frame(NamedTuple):
+    """A received frame. ``time_ns`` is host time of its reception, ``source``
+    its identifier (of an error frame its class, as SocketCAN has them),
+    ``flags`` of `RawFlag`; ``lost`` frames are known to have been lost just
+    before it. A remote frame has as many zero bytes as it asks for."""
+
+    time_ns: int
+    source: int
+    flags: int
+    data: bytes
+    lost: int = 0
+
+
+class Adapter(Protocol):
+    """One open bus. Its calls block: one thread receives, any may send, and
+    `close` ends both."""
+
+    def receive(self, timeout_s: float) -> list[Frame]:
+        """What has come, in order; nothing where nothing comes for
+        ``timeout_s``. Raises BusError where the bus has failed: interface gone
+        or down, adapter unplugged."""
+
+    def only(self, identifiers: Collection[Identifier] | None) -> None:
+        """Frames of these identifiers and error frames are enough from now on;
+        None for all. An adapter that cannot filter gives more."""
+
+    def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
+        """Raises BusError."""
+
+    def close(self) -> None:
+        """Raises nothing."""
