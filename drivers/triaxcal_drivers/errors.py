@@ -30,6 +30,10 @@ class DeviceSilent(DriverError):
     stopped."""
 
 
+class DeviceRestarted(DeviceSilent):
+    """The device has started anew, and is to be opened again."""
+
+
 class RegisterRefused(DriverError):
     """The device refused to read or write a register.
 

@@ -34,6 +34,22 @@ class RawFlag(IntFlag):
 
 
 @dataclass(frozen=True)
+class Gap:
+    """Records that were sent, or would have been, and are not in a stream.
+
+    Host time ``from_ns`` is of the last record before it, or of the moment at
+    which the gap was noticed where there was none; ``to_ns`` of the first
+    record after it, which carries `RawFlag.LOST_BEFORE`, and None while nothing
+    has come again. ``lost`` counts the records where somebody counted them.
+    """
+
+    from_ns: int
+    to_ns: int | None
+    cause: str
+    lost: int | None = None
+
+
+@dataclass(frozen=True)
 class RawBatch:
     """Records as they came off the bus, undecoded.
 
@@ -41,7 +57,9 @@ class RawBatch:
     uint32 CAN identifier, or for Modbus ``function << 16 | first address``;
     ``flags`` (n,) uint8 of `RawFlag`; ``length`` (n,) uint16 bytes of each
     record; ``payload`` the records' bytes, one after the other (CAN data;
-    Modbus register bytes as on the wire, most significant first).
+    Modbus register bytes as on the wire, most significant first). ``gap`` is
+    what was lost just before the first record; a batch without records may
+    have one that is not over.
     """
 
     time_ns: NDArray[np.int64]
@@ -49,6 +67,7 @@ class RawBatch:
     flags: NDArray[np.uint8]
     length: NDArray[np.uint16]
     payload: bytes
+    gap: Gap | None = None
 
     def __post_init__(self) -> None:
         n = len(self.time_ns)
@@ -98,22 +117,6 @@ class SampleBlock:
         return len(self.time_ns)
 
 
-@dataclass(frozen=True)
-class Gap:
-    """Records that were sent, or would have been, and are not in a stream.
-
-    Host time ``from_ns`` is of the last record before it, or of the moment at
-    which the gap was noticed where there was none; ``to_ns`` of the first
-    record after it, which carries `RawFlag.LOST_BEFORE`, and None while nothing
-    has come again. ``lost`` counts the records where somebody counted them.
-    """
-
-    from_ns: int
-    to_ns: int | None
-    cause: str
-    lost: int | None = None
-
-
 class Decoder(Protocol):
     """Turns one stream's raw records into samples; keeps what it needs between
     batches.
@@ -141,7 +144,9 @@ class Device(Protocol):
         unit did before is no pose.
 
         Raises DeviceSilent when nothing has come for the profile's
-        ``silence_timeout_s``.
+        ``silence_timeout_s``, DeviceRestarted where the unit says so, BusError.
+        Whoever wants to go on closes the device, opens it and begins a new
+        stream; a stream does not come back by itself.
         """
 
     async def read(self, register: str) -> bytes:

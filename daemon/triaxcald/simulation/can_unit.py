@@ -17,9 +17,10 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 from numpy.typing import NDArray
 
-from triaxcal_drivers.can.bus import close_bus, opened_bus
+from triaxcal_drivers.can.bus import opened
 from triaxcal_drivers.can.description import object_dictionary
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
+from triaxcal_drivers.can.python_can import open_python_can
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.loading import BUILT_IN, load_bundle
 from triaxcald.simulation.frames_waiting import reader_is_behind
@@ -121,7 +122,7 @@ class CanUnit:
         time_base.wait_for_reader(lambda: self._reader_behind)
 
     async def __aenter__(self) -> Self:
-        self._bus = await opened_bus(self._settings)
+        self._bus = await opened(lambda: open_python_can(self._settings), can.BusABC.shutdown)
         node = self._node_id
         self._bus.set_filters([{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x000, 0x600 + node)])
         self._requests = _Requests(asyncio.get_running_loop(), self._received)
@@ -137,11 +138,15 @@ class CanUnit:
         try:
             outcome = (await asyncio.gather(self._task, return_exceptions=True))[0]
         finally:
-            await close_bus(self._bus, self._notifier)
+            await asyncio.to_thread(self._close)
         if isinstance(outcome, (can.CanError, OSError)):
             raise BusError(f"simulated unit, {self._settings}: {outcome}") from outcome
         if isinstance(outcome, Exception):
             raise outcome
+
+    def _close(self) -> None:
+        self._notifier.stop()
+        self._bus.shutdown()
 
     async def _run(self) -> None:
         while True:

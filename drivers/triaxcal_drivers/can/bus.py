@@ -1,52 +1,37 @@
-"""Opening and closing a CAN bus, both of which block."""
+"""Opening a CAN bus, which blocks."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
-from typing import Any
+from collections.abc import Callable
+from typing import TypeVar
 
-import can
-
+from triaxcal_drivers.can.adapter import Adapter
 from triaxcal_drivers.can.model import CanBus
-from triaxcal_drivers.errors import BusError
+from triaxcal_drivers.can.python_can import PythonCan
+
+T = TypeVar("T")
 
 
-def open_bus(settings: CanBus) -> can.BusABC:
+def open_bus(settings: CanBus) -> Adapter:
     """Blocking. Raises BusError."""
-    options: dict[str, Any] = dict(settings.options)
-    if settings.bitrate is not None:
-        options["bitrate"] = settings.bitrate
-    try:
-        return can.Bus(settings.channel, settings.interface, ignore_config=True, **options)
-    except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as e:
-        reason = " ".join(str(e).split()) or type(e).__name__
-        raise BusError(f"cannot open {settings.interface} {settings.channel}: {reason}") from e
+    return PythonCan(settings)
 
 
-async def opened_bus(settings: CanBus) -> can.BusABC:
-    """In a thread, which shuts the bus down again where nobody waits for it any
-    more. Raises BusError."""
+async def opened(opening: Callable[[], T], closing: Callable[[T], object]) -> T:
+    """What ``opening`` gives, called in a thread, which closes it again where
+    nobody waits for it any more. Raises what ``opening`` does."""
     given_up = threading.Event()
 
-    def open_unless_given_up() -> can.BusABC:
-        bus = open_bus(settings)
+    def open_unless_given_up() -> T:
+        made = opening()
         if given_up.is_set():
-            bus.shutdown()
-        return bus
+            closing(made)
+        return made
 
     try:
         return await asyncio.to_thread(open_unless_given_up)
     except asyncio.CancelledError:
         given_up.set()
         raise
-
-
-async def close_bus(bus: can.BusABC, notifier: can.Notifier) -> None:
-    """In a thread, which does both also where nobody waits for it any more."""
-
-    def close() -> None:
-        notifier.stop()
-        bus.shutdown()
-
-    await asyncio.to_thread(close)

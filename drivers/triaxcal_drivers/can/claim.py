@@ -35,12 +35,11 @@ _CHOOSING: Mapping[str, Mapping[str, object]] = {
 an interface that is not here every option counts."""
 
 
-def claim_on_can(interface: str, channel: str | int, node_id: int, options: Mapping[str, object]) -> Claim:
-    """A node is one process's, its bus is not, unless the adapter is behind a
-    serial port."""
-    name, port = str(channel), None
+def bus_name(interface: str, channel: str | int, options: Mapping[str, object]) -> str:
+    """The physical bus, the same however it is spelt."""
+    name = str(channel)
     if interface in _SERIAL:
-        name = port = canonical_port(name.partition("@")[0])
+        name = _serial_port(name)
     elif interface == "virtual":
         name = f"{name} of process {os.getpid()}"
     elif interface == "udp_multicast":
@@ -48,8 +47,19 @@ def claim_on_can(interface: str, channel: str | int, node_id: int, options: Mapp
     defaults = _CHOOSING.get(interface)
     chosen = options if defaults is None else {key: options.get(key, default) for key, default in defaults.items()}
     words = [f"{key} {value}" for key, value in sorted(chosen.items()) if value is not None]
+    return ", ".join([f"{interface} {name}", *words])
+
+
+def claim_on_can(interface: str, channel: str | int, node_id: int, options: Mapping[str, object]) -> Claim:
+    """A node is one process's, its bus is not, unless the adapter is behind a
+    serial port."""
+    port = _serial_port(str(channel)) if interface in _SERIAL else None
     host = str(options["host"]) if interface == "socketcand" and "host" in options else None
-    return Claim(", ".join([f"node {node_id} on {interface} {name}", *words]), host=host, serial_port=port)
+    return Claim(f"node {node_id} on {bus_name(interface, channel, options)}", host=host, serial_port=port)
+
+
+def _serial_port(channel: str) -> str:
+    return canonical_port(channel.partition("@")[0])
 
 
 def _address(text: str) -> str:

@@ -9,26 +9,37 @@ import threading
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TypeVar, cast
 
-import can
 import canopen
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from triaxcal_drivers.attention import TICK_S, Attention
-from triaxcal_drivers.can.bus import close_bus, opened_bus
+from triaxcal_drivers.can.adapter import Frame, Identifier
 from triaxcal_drivers.can.layout import Layout
+from triaxcal_drivers.can.line import CanLine, join, leave
 from triaxcal_drivers.can.model import CanBus, CanProfile, object_address
-from triaxcal_drivers.can.receive import BATCH_FRAMES, FrameQueue, Identifier
-from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, ProfileError, RegisterRefused
+from triaxcal_drivers.can.receive import BATCH_FRAMES, FrameQueue
+from triaxcal_drivers.errors import (
+    BusError,
+    DeviceAbsent,
+    DeviceBusy,
+    DeviceRestarted,
+    DeviceSilent,
+    ProfileError,
+    RegisterRefused,
+)
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.nearest import nearest
 
 T = TypeVar("T")
 
-_POLL_S = 0.1  # how long closing waits for python-can's receive thread to look up
 _NMT_START = 1
+_HEARTBEAT, _BOOTED = 0x700, b"\0"
+"""Of CiA 301: a node that has booted says so by a heartbeat of state 0."""
+_BOOT_LOOK_S = 0.1
+"""How often a stream that brings nothing looks whether the node has booted."""
 _ABORTED = 0x80
 _DOWNLOAD, _UPLOAD = 1, 2
 _ANSWERED_BY = {_DOWNLOAD: 3, _UPLOAD: 2, 0: 1, 3: 0}
@@ -86,21 +97,29 @@ class PatientSdo(SdoClient):
         return self._asked not in (_DOWNLOAD, _UPLOAD) or response[1:4] == self._object
 
 
+class _Sender:
+    """In the place of canopen's network, which wants a bus of its own."""
+
+    def __init__(self, line: CanLine) -> None:
+        self._line = line
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Raises BusError."""
+        self._line.send(can_id, bytes(data))
+
+
 @dataclass(frozen=True)
 class _Connection:
-    bus: can.BusABC
-    attention: Attention
-    notifier: can.Notifier
+    line: CanLine
     frames: FrameQueue
-    network: canopen.Network
     sdo: PatientSdo
 
 
 class CanDevice:
-    """A device behind python-can; a CANopen node where the profile says so.
+    """A unit on a CAN bus; a CANopen node where the profile says so.
 
-    One receive thread serves both the open stream and the SDO client; blocking
-    calls run in worker threads.
+    The bus may have other units of this process; blocking calls run in worker
+    threads.
     """
 
     def __init__(self, profile: CanProfile, bus: CanBus, layouts: Mapping[str, Layout]) -> None:
@@ -109,6 +128,7 @@ class CanDevice:
         self._layouts = layouts
         self._connection: _Connection | None = None
         self._dropped = 0
+        self._booted: asyncio.Event | None = None  # while a stream is open
         self._sdo_lock = threading.Lock()  # one transfer at a time, also after a caller was cancelled
 
     @property
@@ -120,15 +140,15 @@ class CanDevice:
     async def open(self) -> None:
         """Raises BusError, DeviceAbsent."""
         await self.close()
-        bus = await opened_bus(self._settings)
-        network = canopen.Network(bus)
-        attention = Attention(asyncio.get_running_loop())
-        frames = FrameQueue(attention)
-        notifier = can.Notifier(bus, [frames, *network.listeners], _POLL_S)
-        self._connection = _Connection(bus, attention, notifier, frames, network, self._sdo(network, attention))
+        line = await join(self._settings)
+        sdo = PatientSdo(self._settings.node_id, line.attention)
+        sdo.network = cast(canopen.Network, _Sender(line))
+        self._connection = _Connection(line, FrameQueue(line.attention), sdo)
         started = False
         try:
             if self._profile.canopen:
+                line.listen(sdo.tx_cobid, lambda frame: sdo.responses.put(frame.data))
+                line.listen(self._boot_up, self._on_heartbeat)
                 await self._start()
             started = True
         finally:
@@ -139,19 +159,28 @@ class CanDevice:
         connection, self._connection = self._connection, None
         if connection is not None:
             self._dropped += connection.frames.dropped
-            connection.attention.close()
-            await close_bus(connection.bus, connection.notifier)
+            connection.line.unhear(connection.frames)
+            if self._profile.canopen:
+                connection.line.ignore(connection.sdo.tx_cobid)
+                connection.line.ignore(self._boot_up)
+            connection.frames.fail(BusError(f"{self._settings} is closed"))
+            await leave(connection.line)
 
     def _connected(self) -> _Connection:
         if self._connection is None:
             raise BusError(f"{self._settings} is not open")
         return self._connection
 
-    def _sdo(self, network: canopen.Network, attention: Attention) -> PatientSdo:
-        client = PatientSdo(self._settings.node_id, attention)
-        client.network = network
-        network.subscribe(client.tx_cobid, client.on_response)
-        return client
+    @property
+    def _boot_up(self) -> int:
+        return _HEARTBEAT + self._settings.node_id
+
+    def _on_heartbeat(self, frame: Frame) -> None:
+        """In the receive thread."""
+        booted, connection = self._booted, self._connection
+        if frame.data == _BOOTED and booted is not None and connection is not None:
+            with suppress(RuntimeError):  # the loop has ended
+                connection.line.attention.loop.call_soon_threadsafe(booted.set)
 
     async def _start(self) -> None:
         """NMT start, and the check that the right device is there.
@@ -185,26 +214,33 @@ class CanDevice:
         closed; one at a time.
 
         Raises DeviceSilent when no frame of theirs has come for
-        ``silence_timeout_s``, BusError.
+        ``silence_timeout_s``, DeviceRestarted when the node has booted,
+        BusError.
         """
         connection = self._connected()
-        frames, now_s = connection.frames, connection.attention.now_s
+        frames, now_s = connection.frames, connection.line.attention.now_s
         opened = frames.open(self._identifiers(names))
+        booted = self._booted = asyncio.Event()
+        connection.line.hear(frames)
         timeout_s = self._profile.sampling.silence_timeout_s
         deadline_s = now_s() + timeout_s
         try:
             while True:
-                batch = await frames.batch(deadline_s - now_s())
+                batch = await frames.batch(min(deadline_s - now_s(), _BOOT_LOOK_S))
                 if batch is not None and ((batch.flags & RawFlag.ERROR) == 0).any():
                     deadline_s = now_s() + timeout_s
                 more_waits = batch is not None and len(batch) == BATCH_FRAMES
                 silent = now_s() >= deadline_s and not more_waits
                 if batch:
                     yield batch  # which may take whoever has it a while
+                if booted.is_set():
+                    raise DeviceRestarted(f"{self._settings} has restarted: it sent its boot-up message")
                 if silent:
                     raise DeviceSilent(f"{self._settings} has sent nothing of {', '.join(names)} for {timeout_s:g} s")
         finally:
-            frames.close(opened)
+            if frames.close(opened):
+                self._booted = None
+                connection.line.unhear(frames)
 
     def _identifiers(self, names: Sequence[str]) -> set[Identifier]:
         for name in names:
@@ -246,13 +282,10 @@ class CanDevice:
             reason = SdoAbortedError.CODES.get(e.code, "unknown reason")
             raise RegisterRefused(f"{place}: refused, 0x{e.code:08X} {reason}", register=register, code=e.code) from e
         except (SdoCommunicationError, struct.error) as e:  # the latter: an answer cut short
-            connection.frames.check()
+            connection.line.check()
             raise DeviceSilent(f"{place}: no valid answer within {patience_s:g} s") from e
-        except (can.CanError, OSError) as e:
+        except BusError as e:
             raise BusError(f"{place}: {e}") from e
 
     async def _send(self, identifier: int, data: bytes) -> None:
-        try:
-            await asyncio.to_thread(self._connected().network.send_message, identifier, data)
-        except (can.CanError, OSError) as e:
-            raise BusError(f"cannot send to {self._settings}: {e}") from e
+        await asyncio.to_thread(self._connected().line.send, identifier, data)

@@ -169,5 +169,11 @@ class CanBus(Strict):
     def __str__(self) -> str:
         return f"node {self.node_id} on {self.interface} {self.channel}"
 
+    @property
+    def driven(self) -> str:
+        """How the bus is driven, which all units on it must agree on."""
+        given = {"bitrate": self.bitrate, **self.options}
+        return ", ".join(f"{key} {value}" for key, value in sorted(given.items()) if value is not None) or "no options"
+
     def claim(self) -> Claim:
         return claim_on_can(self.interface, self.channel, self.node_id, self.options)

@@ -7,19 +7,19 @@ import threading
 from collections.abc import Iterator
 from typing import Any, cast
 
-import can
 import canopen
 import pytest
 from canopen.sdo.exceptions import SdoCommunicationError
 
 from tests.drivers.virtual_time import run, virtual
 from triaxcal_drivers.attention import TICK_S, Attention
+from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import PatientSdo
 from triaxcal_drivers.can.receive import FrameQueue
 
 HELD_UP_S = 30.0
 ANSWER = bytes.fromhex("43 18 10 01 41 49 52 54")
-FRAME = can.Message(arbitration_id=0x185, is_extended_id=False, data=b"\1\2")
+FRAME = Frame(1_700_000_000_000_000_000, 0x185, 0, b"\1\2")
 
 
 def opened() -> FrameQueue:
@@ -34,7 +34,7 @@ def test_frames_that_wait_unread_are_in_time() -> None:
 
         def held_up() -> None:
             loop.now_s += HELD_UP_S
-            frames.on_message_received(FRAME)
+            frames.put([FRAME])
 
         loop.call_later(0.99, held_up)
         batch = await frames.batch(1.0)
@@ -50,7 +50,7 @@ def test_a_frame_is_seen_before_giving_up_though_nobody_has_told_of_it_yet(monke
     async def work() -> bytes:
         frames = opened()
         monkeypatch.setattr(frames, "_tell", lambda event: None)
-        frames.on_message_received(FRAME)
+        frames.put([FRAME])
         batch = await frames.batch(1.0)
         assert batch is not None
         return batch.payload

@@ -1,0 +1,177 @@
+"""A CAN bus of this process: one open adapter for all units on it.
+
+Most adapters can be opened once, and a socket for each unit would hand every
+frame of the bus to each of them. So the units share one `CanLine`: one thread
+receives, and passes each frame to those who listen to its identifier.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from weakref import WeakKeyDictionary
+
+from triaxcal_drivers.attention import Attention
+from triaxcal_drivers.can.adapter import Adapter, Frame, Identifier
+from triaxcal_drivers.can.bus import open_bus, opened
+from triaxcal_drivers.can.claim import bus_name
+from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.can.receive import FrameQueue
+from triaxcal_drivers.errors import BusError
+from triaxcal_drivers.interface import RawFlag
+
+POLL_S = 0.1
+"""How long closing waits for the receive thread to look up."""
+MUTE_S = 5.0
+"""A bus on which nobody was heard for so long is opened anew when a unit on it
+is: an adapter may hang without an error. Ten times the slowest heartbeat that
+is usual on a bus in use."""
+
+
+class CanLine:
+    """To be had by `join`. ``attention`` is what its time-outs count."""
+
+    def __init__(self, settings: CanBus) -> None:
+        self.settings = settings
+        self.name = f"{settings.interface} {settings.channel}"
+        self.users = 0
+        self.attention = Attention(asyncio.get_running_loop())
+        self._opening = asyncio.Lock()
+        self._adapter: Adapter | None = None
+        self._thread: threading.Thread | None = None
+        self._heard_s = 0.0
+        self._queues: list[FrameQueue] = []
+        self._listeners: dict[Identifier, Callable[[Frame], None]] = {}
+        self._failure: BusError | None = None
+
+    async def open(self) -> None:
+        """Nothing where it is open and heard from. Raises BusError."""
+        async with self._opening:
+            if self._adapter is not None and self.attention.now_s() - self._heard_s < MUTE_S:
+                return
+            await self._close()
+            adapter = await opened(lambda: open_bus(self.settings), Adapter.close)
+            self._adapter, self._failure, self._heard_s = adapter, None, self.attention.now_s()
+            self._filter()
+            self._thread = threading.Thread(target=self._receive, args=(adapter,), name=self.name, daemon=True)
+            self._thread.start()
+
+    async def close(self) -> None:
+        """Also the time-outs of all who still wait for something."""
+        self.attention.close()
+        async with self._opening:
+            await self._close()
+
+    async def _close(self) -> None:
+        adapter, self._adapter = self._adapter, None
+        thread, self._thread = self._thread, None
+
+        def close() -> None:
+            if thread is not None:
+                thread.join()
+            if adapter is not None:
+                adapter.close()
+
+        if adapter is not None:
+            await asyncio.to_thread(close)
+
+    def check(self) -> None:
+        """Raises BusError where receiving has failed."""
+        if self._failure is not None:
+            raise BusError(str(self._failure)) from self._failure
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Blocking. Raises BusError."""
+        adapter = self._adapter
+        if adapter is None:
+            self.check()
+            raise BusError(f"{self.name} is not open")
+        adapter.send(identifier, data)
+
+    def hear(self, queue: FrameQueue) -> None:
+        """``queue`` gets the frames that it has been opened for."""
+        self._queues = [*(q for q in self._queues if q is not queue), queue]
+        self._filter()
+
+    def unhear(self, queue: FrameQueue) -> None:
+        self._queues = [q for q in self._queues if q is not queue]
+        self._filter()
+
+    def listen(self, identifier: int, listener: Callable[[Frame], None]) -> None:
+        """``listener`` is called in the receive thread; one for each
+        identifier."""
+        self._listeners = {**self._listeners, (identifier, False): listener}
+        self._filter()
+
+    def ignore(self, identifier: int) -> None:
+        self._listeners = {key: heard for key, heard in self._listeners.items() if key != (identifier, False)}
+        self._filter()
+
+    def _filter(self) -> None:
+        if self._adapter is not None:
+            wanted = set(self._listeners).union(*(q.identifiers for q in self._queues))
+            with suppress(BusError):  # the receive thread finds out
+                self._adapter.only(wanted)
+
+    def _receive(self, adapter: Adapter) -> None:
+        """In a thread of its own, until the adapter is closed or fails."""
+        while self._adapter is adapter:
+            try:
+                frames = adapter.receive(POLL_S)
+            except BusError as e:
+                if self._adapter is adapter:
+                    self._adapter, self._failure = None, e
+                    for queue in self._queues:
+                        queue.fail(e)
+                    adapter.close()
+                return
+            if frames:
+                self._heard_s = self.attention.now_s()
+                for queue in self._queues:
+                    queue.put(frames)
+                listeners = self._listeners
+                for frame in frames:
+                    extended = bool(frame.flags & RawFlag.EXTENDED_ID)
+                    listener = listeners.get((frame.source, extended))
+                    if listener is not None and not frame.flags & (RawFlag.ERROR | RawFlag.REMOTE):
+                        listener(frame)
+
+
+_lines: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, CanLine]] = WeakKeyDictionary()
+"""The buses that this process has open, by event loop and name."""
+
+
+async def join(settings: CanBus) -> CanLine:
+    """The bus there, opened where it is not; to be given back by `leave`.
+
+    Raises BusError where it cannot be opened, or where other units have it with
+    other settings.
+    """
+    lines = _lines.setdefault(asyncio.get_running_loop(), {})
+    name = bus_name(settings.interface, settings.channel, settings.options)
+    line = lines.get(name)
+    if line is None:
+        line = lines[name] = CanLine(settings)
+    elif settings.driven != line.settings.driven:
+        raise BusError(
+            f"{line.name}: another unit has it with {line.settings.driven}; this one asks for {settings.driven}"
+        )
+    line.users += 1
+    try:
+        await line.open()
+    except BaseException:
+        await leave(line)
+        raise
+    return line
+
+
+async def leave(line: CanLine) -> None:
+    """Closes the bus once nobody uses it any more."""
+    line.users -= 1
+    if line.users == 0:
+        lines = _lines.get(line.attention.loop, {})
+        for name in [name for name, known in lines.items() if known is line]:
+            del lines[name]
+        await line.close()
