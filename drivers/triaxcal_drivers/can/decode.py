@@ -20,20 +20,26 @@ LATEST = 8
 so long."""
 RETURN = 32
 """A counter that goes back further than this has started anew."""
+CONTRADICTS = 0.1
+"""Of a gap: host time and the device's count of it differ by less, since no
+device's rate is a tenth off."""
 
 
 @dataclass(frozen=True)
 class _Parts:
     """Records that belong to the stream: host time, message number, counter,
-    and the values they hold."""
+    the values they hold, and whether records were lost since the one before."""
 
     time_ns: Ints
     message: Ints
     counter: Ints
     values: NDArray[np.float64]  # (n, channels), nan where the message does not hold the channel
+    after_gap: NDArray[np.bool_]
 
     def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _Parts:
-        return _Parts(self.time_ns[rows], self.message[rows], self.counter[rows], self.values[rows])
+        return _Parts(
+            self.time_ns[rows], self.message[rows], self.counter[rows], self.values[rows], self.after_gap[rows]
+        )
 
     def __len__(self) -> int:
         return len(self.counter)
@@ -44,6 +50,7 @@ class _Parts:
             np.concatenate([self.message, other.message]),
             np.concatenate([self.counter, other.counter]),
             np.concatenate([self.values, other.values]),
+            np.concatenate([self.after_gap, other.after_gap]),
         )
 
 
@@ -60,7 +67,11 @@ class CanDecoder:
     unwrapped counter by the host time since the record before, in whole periods
     and by one at least; so time never goes backwards, and the pause counts as
     missing samples. (A restart within the last 1/64 of the range, or one whose
-    first messages are not seen, cannot be told from lost samples.)
+    first messages are not seen, cannot be told from lost samples.) After a gap
+    that the receiver knows of (`RawFlag.LOST_BEFORE`) the host time since the
+    record before says how often the counter wrapped meanwhile; a count that
+    contradicts it by more than `CONTRADICTS` and may have begun in the gap is
+    that of a restarted device.
 
     **Time.** Host time of the first record, plus the periods counted since;
     host time where there is no counter.
@@ -90,7 +101,8 @@ class CanDecoder:
         self._top = 0  # highest unwrapped counter so far
         self._settled = 0  # every sample below is delivered or given up
         empty = np.zeros(0, dtype=np.int64)
-        self._held = _Parts(empty, empty, empty, np.zeros((0, len(self._names))))
+        self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
+        self._held = _Parts(empty, empty, empty, np.zeros((0, len(self._names))), empty.astype(bool))
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         parts, errors = self._extract(batch)
@@ -126,7 +138,16 @@ class CanDecoder:
                     values[mine, column] = signal.values(data)
             if self._layout.counters:
                 counter[mine] = self._layout.counters[number].raw(data).astype(np.int64) % self._range
-        return _Parts(batch.time_ns[rows], message, counter, values), int(bad.sum() + short.sum())
+        after_gap = self._after_gap(batch, rows)
+        return _Parts(batch.time_ns[rows], message, counter, values, after_gap), int(bad.sum() + short.sum())
+
+    def _after_gap(self, batch: RawBatch, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Of the records ``rows``, also where the mark is on another's."""
+        gaps = self._gaps + np.cumsum((batch.flags & RawFlag.LOST_BEFORE) != 0)
+        after = np.diff(gaps[rows], prepend=self._gaps_at_last) > 0
+        self._gaps = int(gaps[-1]) if len(gaps) else self._gaps
+        self._gaps_at_last = int(gaps[rows[-1]]) if len(rows) else self._gaps_at_last
+        return np.asarray(after)
 
     def _messages(self, batch: RawBatch, usable: NDArray[np.bool_]) -> Ints:
         """Which message of the stream each record is; -1 for none."""
@@ -160,12 +181,23 @@ class CanDecoder:
         step = (parts.counter - before + half) % self._range - half
         restarted = step < -self._return
         restarted |= (step > self._range // 64) & (parts.counter < self._range // 256)
-        pause_ns = np.diff(parts.time_ns, prepend=self._last_ns)
-        step[restarted] = np.maximum(1, np.rint(pause_ns[restarted] / self._period_ns))
+        pause = np.diff(parts.time_ns, prepend=self._last_ns) / self._period_ns
+        for i in np.flatnonzero(parts.after_gap):
+            step[i], restarted[i] = self._across(int(parts.counter[i] - before[i]), int(parts.counter[i]), pause[i])
+        step[restarted] = np.maximum(1, np.rint(pause[restarted]))
         unwrapped = self._last + np.cumsum(step)
         self._last_ns, self._last_raw = int(parts.time_ns[-1]), int(parts.counter[-1])
         self._last = int(unwrapped[-1])
         return unwrapped
+
+    def _across(self, difference: int, counter: int, pause: float) -> tuple[int, bool]:
+        """The step over a gap of ``pause`` periods, and whether the device
+        restarted in it."""
+        step = difference % self._range + self._range * round((pause - difference % self._range) / self._range)
+        if step < -self._latest:
+            step += self._range
+        slack = max(self._return, CONTRADICTS * pause)
+        return step, abs(step - pause) > slack and counter <= pause + slack
 
     def _assemble(self, raw: _Parts) -> SampleBlock:
         parts = replace(raw, counter=self._unwrap(raw))

@@ -37,6 +37,7 @@ class ModbusDecoder:
         self._source = self._stream.function << 16 | self._stream.address
         self._timeline = Timeline(_clockwork(self._stream, self._period_ns))
         self._errors = self._errors_at_last = 0
+        self._gaps = self._gaps_at_last = 0
         self._lost_raw: int | None = None
         self._lost = self._lost_at_last = 0
 
@@ -51,19 +52,21 @@ class ModbusDecoder:
             replies = replies.reshape(len(replies), -1, 2)[:, :, ::-1].reshape(len(replies), -1)
         host_ns = batch.time_ns[good]
         errors = np.cumsum(mine & failed)[good]
+        gaps = np.cumsum((batch.flags & RawFlag.LOST_BEFORE) != 0)
+        gaps_before, all_gaps = self._gaps + gaps[good], self._gaps + (int(gaps[-1]) if len(gaps) else 0)
         total = int((mine & failed).sum())
         if isinstance(self._stream, FifoStream):
             # A count past the window is no reply of this device: an error like
             # any other.
             broken = self._number(replies, self._stream.header.count) > self._stream.record_capacity
             errors, total = errors + np.cumsum(broken), total + int(broken.sum())
-            replies, host_ns, errors = replies[~broken], host_ns[~broken], errors[~broken]
+            replies, host_ns, errors, gaps_before = (each[~broken] for each in (replies, host_ns, errors, gaps_before))
             records, arrivals_ns, skipped, of = self._records(self._stream, replies, host_ns)
         else:
             records, arrivals_ns = replies, host_ns
             skipped, of = np.zeros(len(replies), np.int64), np.arange(len(replies))
-        block = self._samples(records, arrivals_ns, skipped, self._errors + errors[of], total)
-        self._errors += total
+        block = self._samples(records, arrivals_ns, skipped, self._errors + errors[of], gaps_before[of], total)
+        self._errors, self._gaps = self._errors + total, all_gaps
         return block
 
     def _records(
@@ -105,12 +108,14 @@ class ModbusDecoder:
         arrival_ns: NDArray[np.int64],
         skipped: NDArray[np.int64],
         errors_before: NDArray[np.int64],
+        gaps_before: NDArray[np.int64],
         errors: int,
     ) -> SampleBlock:
         stream = self._stream
         broken = np.diff(errors_before, prepend=self._errors_at_last) > 0
+        after_gap = np.diff(gaps_before, prepend=self._gaps_at_last) > 0
         if len(errors_before):
-            self._errors_at_last = int(errors_before[-1])
+            self._errors_at_last, self._gaps_at_last = int(errors_before[-1]), int(gaps_before[-1])
         placed = self._timeline.place(
             Arrivals(
                 self._value(records, stream.counter).astype(np.int64) & (1 << stream.counter.modulus_bits) - 1
@@ -120,6 +125,7 @@ class ModbusDecoder:
                 skipped,
                 arrival_ns,
                 broken,
+                after_gap,
             )
         )
         kept = records[placed.new]

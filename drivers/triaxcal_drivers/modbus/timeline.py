@@ -8,7 +8,8 @@ for the first sample, and to bridge a restart.
 
 A restart is seen where the time stamp goes back or contradicts the counter;
 without a time stamp, where the counter is near zero again after failed
-requests. The first sample after it follows the last one before by the time
+requests. A gap that the host knows of, in which it lost the device, is treated
+alike. The first sample after it follows the last one before by the time
 between their arrivals, at least one period. The counter goes on by one: what
 was lost is not known.
 """
@@ -49,13 +50,14 @@ class Arrivals:
     ``skipped`` (n,) samples known to be lost before each (for streams without a
     counter); ``arrival_ns`` (n,) host time, less the age in the FIFO;
     ``broken`` (n,) whether a request failed between the sample before and this
-    one."""
+    one, ``after_gap`` (n,) whether the device was lost."""
 
     counter: Int64 | None
     stamp: Int64 | None
     skipped: Int64
     arrival_ns: Int64
     broken: NDArray[np.bool_]
+    after_gap: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,7 @@ class Timeline:
             return Placed(np.zeros(0, dtype=bool), np.zeros(0, np.int64), np.zeros(0, np.int64), 0)
         steps, ticks, restart = self._steps(a)
         elapsed_ns = np.diff(a.arrival_ns, prepend=self._last[2] if self._last else a.arrival_ns[0])
+        restart = restart | a.after_gap
         if self._last is None:
             restart[0] = True
             self._next_counter = int(a.counter[0]) if a.counter is not None else 0

@@ -185,6 +185,51 @@ def test_after_a_restart_time_goes_on_by_the_hosts_clock(
     assert decoded["missing"] + more["missing"] == 37
 
 
+def marked(records: Sequence[Record]) -> list[Record]:
+    """The same after a gap that the receiver knows of; the mark is on a frame of another unit."""
+    at_ns = records[0][0] - T0
+    foreign = xy(0, at_ns - 1, node=9)
+    return [(*foreign[:2], RawFlag.LOST_BEFORE, foreign[3]), *records]
+
+
+@pytest.mark.parametrize("lost", [1, 904, 30_000, 40_000, 65_530, 65_536, 200_000, 8_640_000])
+@pytest.mark.parametrize("rate_error", [0.0, 0.002, -0.002])
+def test_over_a_gap_the_hosts_time_tells_how_often_the_counter_wrapped(
+    decoder: CanDecoder, decode_all: DecodeAll, lost: int, rate_error: float
+) -> None:
+    back = 11 + lost
+    at_ns = round(back * PERIOD * (1 + rate_error))
+    after = [(t + at_ns, *rest) for t, *rest in whole(range(back, back + 20))]
+    decoded = decode_all(decoder, [*whole(range(11)), *marked(after)])
+    wraps = round(rate_error * lost / 65536) * 65536  # a counter tells no more than that
+    assert decoded["missing"] == lost + wraps
+    assert decoded["counter"] == [*range(11), *(back + wraps + k for k in range(20))]
+    assert decoded["time_ns"] == [T0 + c * PERIOD for c in decoded["counter"]]
+
+
+@pytest.mark.parametrize("pause_s", [0.5, 30, 3600])
+@pytest.mark.parametrize("counted_s", [0.0, 0.4])
+@pytest.mark.parametrize("before", [500, 30_000, 65_000])
+def test_a_restart_in_a_gap_is_bridged_by_the_hosts_time(
+    decoder: CanDecoder, decode_all: DecodeAll, pause_s: float, counted_s: float, before: int
+) -> None:
+    counted = round(counted_s * 100)
+    pause_ns = 10 * PERIOD + round(pause_s * 1e9)
+    after = [(t + pause_ns, *rest) for t, *rest in whole(range(counted, counted + 20))]
+    decoded = decode_all(decoder, [*whole(range(before, before + 11)), *marked(after)])
+    assert len(decoded["counter"]) == 31
+    assert decoded["time_ns"][11] - decoded["time_ns"][10] == pytest.approx(pause_s * 1e9, rel=0.1, abs=0.4e9)
+    assert np.diff(decoded["time_ns"][11:]).tolist() == [PERIOD] * 19
+
+
+def test_messages_of_one_sample_stay_together_though_a_gap_was_noticed_between_them(
+    decoder: CanDecoder, decode_all: DecodeAll
+) -> None:
+    records = whole(range(20))
+    decoded = decode_all(decoder, [*records[:9], *marked(records[9:])])
+    assert decoded["counter"] == list(range(20))
+
+
 def test_time_never_goes_back_when_a_restart_takes_no_host_time(decoder: CanDecoder, decode_all: DecodeAll) -> None:
     records = [r for k in (40000, 40001, 0, 1, 2) for r in (xy(k), z(k))]  # all at the same host time
     decoded = decode_all(decoder, records)
@@ -217,6 +262,7 @@ def troubled_streams(draw: st.DrawFn) -> list[Record]:
             records.append(draw(st.sampled_from([
                 (T0 + at_ns, 0x20, int(RawFlag.ERROR), bytes(8)), xy(7, at_ns, node=6),
                 (T0 + at_ns, 0x285, 0, b"short"), (T0 + at_ns, 0x7FF, 0, b""),
+                (T0 + at_ns, 0x7FF, int(RawFlag.LOST_BEFORE), b""),
             ])))  # fmt: skip
     swaps = draw(st.lists(st.integers(0, len(records) - 1), max_size=4))
     for at in swaps:

@@ -211,6 +211,7 @@ events = st.lists(
         st.tuples(st.just("error"), st.integers(0, 1)),
         st.tuples(st.just("restart"), st.just(0)),
         st.tuples(st.just("repeat"), st.just(0)),
+        st.tuples(st.just("lost"), st.integers(1, 70_000)),
     ),
     max_size=25,
 )
@@ -230,6 +231,11 @@ def test_samples_do_not_depend_on_how_records_are_cut_into_batches(make_full, hi
             replies.append((RawFlag.ERROR, b"\x04" * number))
         elif kind == "restart":
             at = 0
+        elif kind == "lost":
+            at += number
+            last = window(*range(at, at + 3), remaining=3)
+            at += 3
+            replies.append((RawFlag.LOST_BEFORE, last))
         else:
             replies.append((0, last))
     records = [(i * 50_000_000, FULL_SOURCE, flags, data) for i, (flags, data) in enumerate(replies)]

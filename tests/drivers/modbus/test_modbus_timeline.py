@@ -1,6 +1,7 @@
 """Where samples come to lie in time, and which of them are new."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,16 +17,19 @@ STAMP_ALONE = Clockwork(PERIOD_NS, counter_bits=None, stamp_bits=32, tick_ns=100
 BARE = Clockwork(PERIOD_NS, counter_bits=None, stamp_bits=None)
 
 
-def arrivals(counter=None, stamp_us=None, arrival_ns=None, broken=(), skipped=None):
+def arrivals(counter=None, stamp_us=None, arrival_ns=None, broken=(), skipped=None, after_gap=()):
     n = len(counter if counter is not None else stamp_us if stamp_us is not None else arrival_ns)
     lost = np.zeros(n, dtype=bool)
     lost[list(broken)] = True
+    gap = np.zeros(n, dtype=bool)
+    gap[list(after_gap)] = True
     return Arrivals(
         None if counter is None else np.asarray(counter, dtype=np.int64) % 2**16,
         None if stamp_us is None else np.asarray(stamp_us, dtype=np.int64) % 2**32,
         np.zeros(n, np.int64) if skipped is None else np.asarray(skipped, dtype=np.int64),
         np.full(n, 5_000) if arrival_ns is None else np.asarray(arrival_ns, dtype=np.int64),
         lost,
+        gap,
     )
 
 
@@ -78,6 +82,24 @@ def test_a_time_stamp_back_at_zero_is_a_restart(clockwork):
     assert np.diff(placed.time_ns).tolist() == [PERIOD_NS, 700_000_000, PERIOD_NS]
     assert np.diff(placed.counter).tolist() == [1, 1, 1]
     assert placed.missing == 0
+
+
+@pytest.mark.parametrize(
+    "clockwork", [COUNTED, STAMPED, STAMP_ALONE, BARE, Clockwork(PERIOD_NS, None, None, counted=True)]
+)
+def test_over_a_gap_in_which_the_device_was_lost_the_hosts_time_counts(clockwork):
+    """The counter has wrapped once and more meanwhile, the time stamp too."""
+    hour_ns = 3600 * 10**9
+    placed = Timeline(clockwork).place(
+        arrivals(
+            [5000, 5001, 5001 + 360_000, 5002 + 360_000] if clockwork.counter_bits else None,
+            stamp_us=[0, 10_000, 3_600_010_000, 3_600_020_000] if clockwork.stamp_bits else None,
+            arrival_ns=[1_000, 1_000 + PERIOD_NS, 1_000 + PERIOD_NS + hour_ns, 1_000 + 2 * PERIOD_NS + hour_ns],
+            after_gap=[2],
+        )
+    )
+    assert np.diff(placed.time_ns).tolist() == [PERIOD_NS, hour_ns, PERIOD_NS]
+    assert np.diff(placed.counter).tolist() == [1, 1, 1]
 
 
 def test_a_restart_that_the_time_stamp_alone_could_take_for_its_turn_shows_in_the_counter():
@@ -170,7 +192,7 @@ def test_a_poll_faster_than_the_device_gives_each_sample_once():
 
 histories = st.lists(
     st.tuples(
-        st.sampled_from(["next", "next", "next", "gap", "repeat", "restart"]),
+        st.sampled_from(["next", "next", "next", "gap", "repeat", "restart", "lost"]),
         st.integers(1, 400),
         st.booleans(),
     ),
@@ -181,18 +203,21 @@ histories = st.lists(
 
 @given(histories, st.lists(st.integers(0, 40), max_size=5), st.sampled_from([COUNTED, STAMPED, STAMP_ALONE]))
 def test_the_result_does_not_depend_on_the_cuts(history, cuts, clockwork):
-    counter, stamp, arrival, broken, at = [], [], [], [], 60_000
+    counter, stamp, arrival, broken, after_gap, at = [], [], [], [], [], 60_000
     for i, (kind, number, failed) in enumerate(history):
-        at = {"next": at + 1, "gap": at + number, "repeat": max(0, at - number % 8), "restart": 0}[kind]
+        at = {"next": at + 1, "gap": at + number, "repeat": max(0, at - number % 8), "restart": 0, "lost": at + 70_000}[
+            kind
+        ]
+        after_gap += [i] if kind == "lost" else []
         counter.append(at)
         stamp.append(at * 10_000)
         arrival.append((arrival[-1] if arrival else 0) + number * 1_000_000)
         broken += [i] if failed else []
-    whole = arrivals(counter, stamp, arrival, broken)
+    whole = arrivals(counter, stamp, arrival, broken, after_gap=after_gap)
     if clockwork.counter_bits is None:
-        whole = Arrivals(None, whole.stamp, whole.skipped, whole.arrival_ns, whole.broken)
+        whole = replace(whole, counter=None)
     if clockwork.stamp_bits is None:
-        whole = Arrivals(whole.counter, None, whole.skipped, whole.arrival_ns, whole.broken)
+        whole = replace(whole, stamp=None)
     expected = Timeline(clockwork).place(whole)
     timeline, parts = Timeline(clockwork), []
     edges = [0, *sorted(min(c, len(history)) for c in cuts), len(history)]
@@ -205,6 +230,7 @@ def test_the_result_does_not_depend_on_the_cuts(history, cuts, clockwork):
                     whole.skipped[lo:hi],
                     whole.arrival_ns[lo:hi],
                     whole.broken[lo:hi],
+                    whole.after_gap[lo:hi],
                 )
             )
         )
