@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
 
 from triaxcal.errors import InvalidData, Refused, TriaxcalError
 from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
@@ -11,6 +12,11 @@ from triaxcald.errors import DaemonError
 DONE, OUTSIDE, BAD_INPUT, REFUSED, DEVICE, DISK, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
 SEVEREST = (DEVICE, INTERRUPTED, DISK, REFUSED, BAD_INPUT, OUTSIDE, DONE)
 """Of several units the worst counts, in this order."""
+
+
+def severest(codes: Iterable[int]) -> int:
+    found = set(codes)
+    return next(code for code in SEVEREST if code in found)
 
 
 def exit_code_of(e: BaseException) -> int:

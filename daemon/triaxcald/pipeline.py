@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from triaxcal import text
 from triaxcal.errors import InvalidData
@@ -22,22 +23,16 @@ COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_or
 
 
 @dataclass
-class Pipeline:
-    """Decoder, stillness and quality detector of one stream of one unit; counts
-    whatever does not come through."""
+class DecodedStream:
+    """One stream of one unit, decoded; counts whatever does not come through.
+    It keeps no samples, however many come."""
 
     bundle: Bundle
     stream: str
     counts: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(COUNTS, 0)))
-    turn_s: float | None = None
-    """Where the unit may turn in place, as for `find_spans`."""
 
     def __post_init__(self) -> None:
         self._decoder = driver_named(self.bundle.profile.driver).decoder(self.bundle, self.stream)
-        self._detector = StillnessDetector()
-        self._quality = QualityDetector()
-        self._spans: tuple[int, list[Span]] = (0, [])
-        self._findings: list[Finding] | None = None
         self._last_ns: int | None = None
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
@@ -46,6 +41,11 @@ class Pipeline:
     def first_host_ns(self) -> int | None:
         """Host time of the first raw record."""
         return self._first_host_ns
+
+    @property
+    def seconds(self) -> float:
+        """From the first sample to the latest."""
+        return 0.0 if self._last_ns is None or self._begin_ns is None else (self._last_ns - self._begin_ns) * 1e-9
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         """Takes raw records; gives the samples that they complete."""
@@ -56,7 +56,6 @@ class Pipeline:
         for name in ("missing", "duplicates", "incomplete", "errors"):
             self.counts[name] += getattr(block, name)
         if len(block):
-            self._findings = None
             if self._begin_ns is None:
                 self._begin_ns = int(block.time_ns[0])
             latest = np.maximum.accumulate(np.r_[self._last_ns or -(2**62), block.time_ns[:-1]])
@@ -64,20 +63,38 @@ class Pipeline:
             self.counts["out_of_order"] += int((~fresh).sum())
             self.counts["samples"] += int(fresh.sum())
             self._last_ns = max(int(block.time_ns.max()), self._last_ns or -(2**62))
-            time_ns, readings = block.time_ns[fresh], block.readings[fresh]
-            self._detector.feed(time_ns, readings, {n: v[fresh] for n, v in block.channels.items()})
-            self._quality.feed(time_ns, readings)
+            self._take(block, fresh)
         return block
+
+    def _take(self, block: SampleBlock, fresh: NDArray[np.bool_]) -> None:
+        """The block's samples, of which those that are ``fresh`` go on in
+        time."""
+
+
+@dataclass
+class Pipeline(DecodedStream):
+    """With stillness and quality detector."""
+
+    turn_s: float | None = None
+    """Where the unit may turn in place, as for `find_spans`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._detector = StillnessDetector()
+        self._quality = QualityDetector()
+        self._spans: tuple[int, list[Span]] = (0, [])
+        self._findings: list[Finding] | None = None
+
+    def _take(self, block: SampleBlock, fresh: NDArray[np.bool_]) -> None:
+        self._findings = None
+        time_ns, readings = block.time_ns[fresh], block.readings[fresh]
+        self._detector.feed(time_ns, readings, {n: v[fresh] for n, v in block.channels.items()})
+        self._quality.feed(time_ns, readings)
 
     def feed_all(self, batches: Iterable[RawBatch]) -> Pipeline:
         for batch in batches:
             self.feed(batch)
         return self
-
-    @property
-    def seconds(self) -> float:
-        """From the first sample to the latest."""
-        return 0.0 if self._last_ns is None or self._begin_ns is None else (self._last_ns - self._begin_ns) * 1e-9
 
     @property
     def windows(self) -> Windows | None:
@@ -128,7 +145,8 @@ class Pipeline:
             lost = self.counts["missing"] + self.counts["incomplete"]
             found["missing_samples"] = f"{lost} of {self.counts['samples'] + lost}"
         elif self.counts["receiver_overflows"]:
-            found["missing_samples"] = f"the receiver overflowed {self.counts['receiver_overflows']} times"
+            times = self.counts["receiver_overflows"]
+            found["missing_samples"] = f"the stream was interrupted {'once' if times == 1 else f'{times} times'}"
         if self.counts["duplicates"]:
             found["duplicate_samples"] = str(self.counts["duplicates"])
         if self.counts["out_of_order"]:

@@ -33,6 +33,14 @@ _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
 }
 
 
+IS_BACK = "the unit is back"
+
+
+def waits(trouble: str) -> str:
+    """Of a unit that is lost for now."""
+    return f"waiting for the unit: {trouble}"
+
+
 def switch_supply(off_s: float) -> str:
     """What the operator is to do."""
     return f"switch the supply of the unit off for at least {math.ceil(off_s)} s, then on"

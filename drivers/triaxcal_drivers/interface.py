@@ -9,7 +9,7 @@ out, no I/O, the same from a live bus and from a recording.
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import Any, Protocol
 
@@ -78,6 +78,12 @@ class RawBatch:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def after(self, gap: Gap) -> RawBatch:
+        """The same records, with a gap before the first of them."""
+        flags = self.flags.copy()
+        flags[:1] |= np.uint8(RawFlag.LOST_BEFORE)
+        return replace(self, flags=flags, gap=gap)
 
     @staticmethod
     def of(records: Sequence[tuple[int, int, int, bytes]]) -> RawBatch:

@@ -172,8 +172,8 @@ def test_poses_so_far_can_be_asked_for_at_any_time(records: list[tuple[int, int,
     assert seen[-1] == 7
 
 
-def test_an_overflow_of_the_receiver_is_counted_and_said(records: list[tuple[int, int, int, bytes]]) -> None:
+def test_an_interruption_of_the_stream_is_counted_and_said(records: list[tuple[int, int, int, bytes]]) -> None:
     flagged = [(t, source, 16 if i == 400 else 0, data) for i, (t, source, _, data) in enumerate(records)]
     pipeline = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(flagged)])
     assert pipeline.counts["receiver_overflows"] == 1
-    assert pipeline.data_quality() == ["missing_samples: the receiver overflowed 1 times"]
+    assert pipeline.data_quality() == ["missing_samples: the stream was interrupted once"]

@@ -1,4 +1,4 @@
-"""demo, run, sim, record."""
+"""demo, run, sim."""
 
 from __future__ import annotations
 
@@ -17,23 +17,17 @@ from triaxcal.evidence.prior import Odds
 from triaxcal.rounding import number
 from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal_drivers.extras import absent
-from triaxcal_drivers.profile import READINGS
 from triaxcald import text
-from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import Bars, emit, micro, say, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
-from triaxcald.cli.journals import warn_of_a_journal
 from triaxcald.cli.showing import counted
 from triaxcald.errors import InputError
-from triaxcald.exit_codes import SEVEREST
-from triaxcald.inputs import CALIBRATION
-from triaxcald.pipeline import Pipeline
-from triaxcald.station.collection import Collection
+from triaxcald.exit_codes import severest
 from triaxcald.station.config import check_lines, load_station
 
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit
-    from triaxcald.run.line import Outcome, UnitRun
+    from triaxcald.run.line import Outcome
     from triaxcald.simulation.bench import SimulatedUnit
 
 
@@ -43,7 +37,7 @@ def run_command(a: argparse.Namespace) -> int:
     from triaxcald.run.line import run_station
 
     with Bars() as bars:
-        outcomes = run_interruptible(run_station(station, bars, force=a.force))
+        outcomes = run_interruptible(run_station(station, bars, force=a.force, ended=say_error))
     with suppress(OSError):  # where nobody reads standard output, the exit code is the outcomes' all the same
         if a.json:
             emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
@@ -51,13 +45,11 @@ def run_command(a: argparse.Namespace) -> int:
             for o in outcomes:
                 if o.error is None:
                     show_outcome(o)
-    say_errors(outcomes)
     return worst(outcomes)
 
 
 def worst(outcomes: Sequence[Outcome]) -> int:
-    codes = {o.exit_code for o in outcomes}
-    return next(code for code in SEVEREST if code in codes)
+    return severest(o.exit_code for o in outcomes)
 
 
 def _document(o: Outcome) -> dict[str, Any]:
@@ -85,10 +77,9 @@ def _document(o: Outcome) -> dict[str, Any]:
     }
 
 
-def say_errors(outcomes: Sequence[Outcome]) -> None:
-    for o in outcomes:
-        if o.error:
-            say(f"triaxcal: {o.error}" + (f"; add the poses {', '.join(o.wanted)}" if o.wanted else ""))
+def say_error(o: Outcome) -> None:
+    if o.error:
+        say(f"triaxcal: {o.error}" + (f"; add the poses {', '.join(o.wanted)}" if o.wanted else ""))
 
 
 def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
@@ -162,7 +153,8 @@ def demo_command(a: argparse.Namespace) -> int:
             if u.outcome.error is None:
                 _show_demo(u)
         _show_next(a.out, units)
-    say_errors([u.outcome for u in units])
+    for u in units:
+        say_error(u.outcome)
     return worst([u.outcome for u in units]) or (0 if all(u.found and u.kept for u in units) else 1)
 
 
@@ -226,37 +218,3 @@ async def _serve(simulated: SimulatedUnit, eeprom: Path | None) -> None:
         say(f"serving {name}, serial {device.serial:04d}, on {settings}; Ctrl-C stops it")
         async with keep_eeprom(simulated.unit, eeprom):
             await asyncio.Event().wait()
-
-
-def record_command(a: argparse.Namespace) -> int:
-    writable(a.output)
-    station = load_station(a.station)
-    place = station.place(a.unit)
-    check_lines([place], where=str(station.path))
-    from triaxcald.run.line import UnitRun
-
-    with Bars() as bars:
-        run_interruptible(_record(UnitRun(station, place, bars), a.output, a.seconds))
-    return 0
-
-
-async def _record(run: UnitRun, path: Path, seconds: float | None) -> None:
-    async with run.place.opened() as device:
-        identity = await run.identify(device)
-        warn_of_a_journal(run.station, run.name, identity.serial)
-        collection = Collection(CALIBRATION, run.place.bundle, run.place.address)
-        writer = run.writer(path, identity, ends_with="")
-        try:
-            with writer:
-                run.progress.stage(run.name, "recording")
-                await collection.for_seconds(device, writer, seconds)
-        finally:
-            say(_summary(path, collection.pipelines[READINGS], sum(writer.losses.values())))
-
-
-def _summary(path: Path, pipeline: Pipeline, lost: int) -> str:
-    parts = [f"{path}: {pipeline.counts['samples']} samples in {pipeline.seconds:.1f} s"]
-    parts += [f"{n} {kind}" for kind, n in pipeline.counts.items() if n and kind != "samples"]
-    if lost:
-        parts.append(f"{lost} records lost between bus and disk")
-    return ", ".join(parts)

@@ -38,8 +38,17 @@ def describe(path: Path) -> dict[str, Any]:
                 }
                 for name in recording.attachments
             },
+            "events": [{"time_ns": e.time_ns, "kind": e.kind, "detail": _detail(e)} for e in recording.events()],
             "losses": [asdict(loss) for loss in recording.losses()],
         }
+
+
+def _detail(event: schema.Event) -> Any:
+    """As text where it is no JSON: anybody may have written it."""
+    try:
+        return event.detail
+    except (ValueError, RecursionError):
+        return event.text
 
 
 def _topics(recording: Recording) -> dict[str, dict[str, int]]:

@@ -23,7 +23,7 @@ from triaxcald.documents import to_text
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.exit_codes import DISK
 from triaxcald.files import write_text
-from triaxcald.inputs import CALIBRATION, PROFILE, STATION_FILE, VERIFICATION, preview_channels
+from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.outcome import (
     ATTACHMENT,
     FORMAT,
@@ -37,17 +37,18 @@ from triaxcald.outcome import (
     registers_told,
 )
 from triaxcald.pipeline import Pipeline
-from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.identity import IdentityRead, check_identity
+from triaxcald.provision.identity import IdentityRead
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.journal import Journal, open_journal
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.report.unit import drawn_with, unit_report
+from triaxcald.report.unit import unit_report
 from triaxcald.run.endings import aborted, judged
+from triaxcald.run.session import UnitSession
 from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.station.collection import Collection, Progress
+from triaxcald.station.coming_back import AtWork, Patience, Streaming
 from triaxcald.station.config import Place, Station
 from triaxcald.station.serials import SerialsSeen
 from triaxcald.verification import Verification, fitted_attitudes
@@ -84,9 +85,9 @@ class Outcome:
     lost: int = 0
 
 
-class UnitRun:
+class UnitRun(UnitSession):
     """The whole line for one unit of a station. ``force`` is the reason to
-    write in spite of doubts."""
+    write in spite of doubts, ``others`` the units at work beside it."""
 
     def __init__(
         self,
@@ -97,11 +98,10 @@ class UnitRun:
         serials: SerialsSeen | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
         force: str | None = None,
+        others: AtWork | None = None,
     ) -> None:
-        self.station, self.place, self.progress, self.clock_ns, self.force = station, place, progress, clock_ns, force
-        self.serials = serials or SerialsSeen()
-        self.name = place.unit.name
-        self.profile = place.bundle.profile
+        super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
+        self.others, self.force = others or AtWork(1), force
         self._serial: str | None = None
         self._open_journal = open_journal(station.folder, self.name, place.unit.serial)
         self._recording: Path | None = None
@@ -117,14 +117,14 @@ class UnitRun:
         the outcome."""
         ending: Ending | None = None
         try:
-            async with self.place.opened() as device:
+            async with self.place.opened(Patience(others=self.others), self.waits) as device:
                 identity = await self.identify(device)
                 self._serial = identity.serial
                 self._open_journal = open_journal(self.station.folder, self.name, identity.serial)
                 path = self.recording_path(identity)
                 self._require_readable_journal(identity)
                 self._recording = path
-                with self.writer(self._recording, identity) as writer:
+                with self.writer(self._recording, identity, ends_with=FORMAT) as writer:
                     ending = await self._ending(device, identity, writer)
                     self._seal(writer, ending)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
@@ -264,46 +264,11 @@ class UnitRun:
             self._open_journal = None  # no command goes by it
             raise
 
-    async def identify(self, device: Device) -> IdentityRead:
-        self.progress.stage(self.name, "reading identity")
-        link, where = RegisterLink(device, self.profile), self.place.address
-        identity = await check_identity(link, self.place.bundle, self.place.unit.serial, where=where)
-        self.serials.add(identity.serial, self.name, where)
-        return identity
-
-    def recording_path(self, identity: IdentityRead) -> Path:
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
-        folder = self.station.folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as e:
-            raise InputError(f"{folder}: no folder for recordings: {e.strerror}") from e
-        return folder / f"{self.name}-{identity.serial or 'unknown'}-{stamp}.mcap"
-
-    def writer(self, path: Path, identity: IdentityRead, *, ends_with: str = FORMAT) -> RecordingWriter:
-        unit = {"name": self.name, "serial": identity.serial or "", "signs": ",".join(map(str, self.place.signs))}
-        writer = RecordingWriter(
-            path,
-            metadata={
-                "station": {"name": self.station.file.name},
-                "unit": unit,
-                "software": {**software(), **drawn_with()},
-            },
-            preview_channels=preview_channels(self.profile),
-            preview_unit=self.profile.output.unit,
-            clock_ns=self.clock_ns,
-            ends_with=ends_with,
-        )
-        writer.attach(STATION_FILE, "application/toml", self.station.text)
-        writer.attach(PROFILE, "application/toml", self.place.bundle.text)
-        for name, data in self.place.bundle.files.items():
-            writer.attach(f"profile/{name}", "application/octet-stream", data)
-        return writer
-
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
         tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, writer.ends_with)
-        await self._collect(device, writer, tumble, READINGS, plan.poses)
+        returning = self.returning(device, identity, Patience(plan.comes_back_s, others=self.others))
+        await self._collect(returning, writer, tumble, READINGS, plan.poses)
         self.progress.stage(self.name, "fitting")
         poses = tumble.pipelines[READINGS].finish()
         certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
@@ -330,7 +295,9 @@ class UnitRun:
         async def collect(check: Collection) -> None:
             self.progress.stage(self.name, "verifying by physics")
             fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
-            await self._collect(device, writer, check, CORRECTED, self.station.file.plan.check_poses, fitted)
+            plan = self.station.file.plan
+            returning = self.returning(device, identity, Patience(plan.comes_back_s, others=self.others))
+            await self._collect(returning, writer, check, CORRECTED, plan.check_poses, fitted)
 
         self.progress.stage(self.name, "writing the registers")
         self._write_back = WriteBack(
@@ -360,7 +327,7 @@ class UnitRun:
 
     async def _collect(
         self,
-        device: Device,
+        device: Streaming,
         writer: RecordingWriter | None,
         collection: Collection,
         stream: str,
@@ -394,18 +361,31 @@ class UnitRun:
         return unit_report(certified, pipeline, ending, back.verification if back else None, self._held)
 
 
-async def run_station(station: Station, progress: Progress, *, force: str | None = None) -> list[Outcome]:
-    """All units of a station at once; one that fails does not stop the others.
+async def run_station(
+    station: Station, progress: Progress, *, force: str | None = None, ended: Callable[[Outcome], None] = lambda _: None
+) -> list[Outcome]:
+    """All units of a station at once; one that fails does not stop the others,
+    and ``ended`` is told of each at its end. One that is lost is waited for
+    while others are at work.
 
     When it is cancelled, every unit is, again each time, and put in order
     first; the outcomes then say 130.
     """
-    serials = SerialsSeen()
-    runs = [UnitRun(station, place, progress, serials=serials, force=force) for place in station.places]
+    serials, others = SerialsSeen(), AtWork(len(station.places))
+    runs = [UnitRun(station, place, progress, serials=serials, force=force, others=others) for place in station.places]
+
+    async def work(run: UnitRun) -> Outcome:
+        try:
+            outcome = await run.run()
+        finally:
+            others.leave()
+        ended(outcome)
+        return outcome
+
     with ExitStack() as stack:
         for run in runs:
             stack.enter_context(at_abort(run.left))
-        units = [asyncio.ensure_future(run.run()) for run in runs]
+        units = [asyncio.ensure_future(work(run)) for run in runs]
         while not all(unit.done() for unit in units):
             try:
                 await asyncio.wait(units)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, cast
 
 from triaxcal.arrays import Floats
@@ -14,11 +14,12 @@ from triaxcal.errors import Refused
 from triaxcal.model.directions import directions
 from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceSilent
-from triaxcal_drivers.interface import Device, RawBatch
+from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
-from triaxcald.pipeline import Pipeline
+from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.recording.schema import Phase, RawDigest
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 
@@ -40,13 +41,16 @@ class Progress(Protocol):
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
 
 
+OVERRUN = "the disk did not keep up"
+
+
 @dataclass
-class Collection:
-    """``pipelines`` by stream: the readings, and the corrected output where the
-    device has one.
+class Recorded:
+    """Raw records on their way to disk. ``streams`` are decoded on the way: the
+    readings, and the corrected output where the device has one.
 
     ``where`` says where the unit is, for messages; ``ends_with`` is what the
-    recording ends with.
+    recording ends with. ``gaps_s`` is how long the device was lost, all in all.
     """
 
     phase: Phase
@@ -54,56 +58,98 @@ class Collection:
     where: str
     ends_with: str = ""
     digest: RawDigest = field(init=False)
+    gaps_s: float = 0.0
 
     def __post_init__(self) -> None:
         self.digest = RawDigest(self.ends_with)
-        streams = [s for s in (READINGS, CORRECTED) if s in self.bundle.profile.streams]
-        self.pipelines = {s: Pipeline(self.bundle, s) for s in streams}
+        self.streams: dict[str, DecodedStream] = {s: self._decoded(s) for s in self._names()}
 
-    async def records(self, device: Device, writer: RecordingWriter | None) -> AsyncGenerator[RawBatch]:
-        """What comes off the bus, once it is on its way to disk and through the
-        pipelines.
+    def _names(self) -> list[str]:
+        return [s for s in (READINGS, CORRECTED) if s in self.bundle.profile.streams]
+
+    def _decoded(self, stream: str) -> DecodedStream:
+        return DecodedStream(self.bundle, stream)
+
+    async def records(self, device: Streaming, writer: RecordingWriter | None) -> AsyncGenerator[RawBatch]:
+        """What comes off the bus, once it is on its way to disk and decoded.
 
         What the disk has no room for goes to neither, so that an audit sees
         what the station saw.
         """
-        async with aclosing(cast(Any, device.stream(list(self.pipelines)))) as stream:
+        unwritten: Gap | None = None
+        async with aclosing(cast(Any, device.stream(list(self.streams)))) as stream:
             async for batch in stream:
-                if writer is not None and not writer.raw(self.phase, batch):
+                self._note(writer, batch.gap)
+                if unwritten is not None and len(batch):
+                    unwritten = replace(unwritten, to_ns=int(batch.time_ns[0]))
+                    batch = batch.after(unwritten)
+                if writer is not None and len(batch) and not writer.raw(self.phase, batch):
+                    unwritten = _unwritten(unwritten, batch)
                     continue
+                if unwritten is not None and len(batch):
+                    self._note(writer, unwritten)
+                    unwritten = None
                 self.digest.update(self.phase, batch)
-                for name, pipeline in self.pipelines.items():
-                    block = pipeline.feed(batch)
+                for name, decoded in self.streams.items():
+                    block = decoded.feed(batch)
                     if writer is not None and len(block):
                         writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
                 yield batch
+
+    def _note(self, writer: RecordingWriter | None, gap: Gap | None) -> None:
+        if gap is None:
+            return
+        detail: dict[str, Any] = {"from_ns": gap.from_ns, "cause": gap.cause}
+        if gap.to_ns is not None:
+            self.gaps_s += (gap.to_ns - gap.from_ns) * 1e-9
+            detail |= {"to_ns": gap.to_ns, "lost": gap.lost}
+        if writer is not None:
+            writer.event("interrupted" if gap.to_ns is None else "gap", detail)
 
     def _watch(self, stream: str, clock_s: Callable[[], float]) -> _Watch:
         # Twice what the driver waits, which knows better what is the matter
         # where nothing comes at all.
         timeout_s = 2 * self.bundle.profile.sampling.silence_timeout_s
-        return _Watch(self.pipelines[stream], f"{self.where}: stream {stream}", timeout_s, clock_s)
+        return _Watch(self.streams[stream], f"{self.where}: stream {stream}", timeout_s, clock_s)
 
     async def for_seconds(
         self,
-        device: Device,
+        device: Streaming,
         writer: RecordingWriter,
         seconds: float | None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Records so many seconds of the readings' own time; for ever where
         None."""
-        pipeline = self.pipelines[READINGS]
+        readings = self.streams[READINGS]
         watch = self._watch(READINGS, clock_s)
         async with aclosing(self.records(device, writer)) as records:
             async for _ in records:
                 watch.look()
-                if seconds is not None and pipeline.seconds >= seconds:
+                if seconds is not None and readings.seconds >= seconds:
                     return
+
+
+def _unwritten(before: Gap | None, batch: RawBatch) -> Gap:
+    """The gap that grows while the disk has no room."""
+    lost = len(batch) + (before.lost or 0 if before else 0)
+    from_ns = int(batch.time_ns[0]) if before is None else before.from_ns
+    return Gap(from_ns, None, OVERRUN, lost)
+
+
+class Collection(Recorded):
+    """The same, searched for poses on the way."""
+
+    def __post_init__(self) -> None:
+        self.pipelines = {s: Pipeline(self.bundle, s) for s in self._names()}
+        super().__post_init__()
+
+    def _decoded(self, stream: str) -> DecodedStream:
+        return self.pipelines[stream]
 
     async def until_posed(
         self,
-        device: Device,
+        device: Streaming,
         writer: RecordingWriter | None,
         plan: Plan,
         *,
@@ -124,6 +170,7 @@ class Collection:
         """
         pipeline = self.pipelines[stream]
         looked_s, next_host_s, news_s, found = 0.0, 0.0, 0.0, 0
+        lost_s = self.gaps_s  # time in which the unit was not there is no time without a pose
         counted_s: tuple[float, ...] = ()
         if stream == READINGS:
             directions(wanted)  # put in order once, before there are samples to lose
@@ -153,6 +200,7 @@ class Collection:
                 tell(state)
                 if state.complete:
                     return
+                news_s, lost_s = news_s + self.gaps_s - lost_s, self.gaps_s
                 if state.found > found:
                     found, news_s = state.found, now_s
                 if now_s - news_s > plan.patience_s:
@@ -174,13 +222,13 @@ class _Watch:
     samples wait unread.
     """
 
-    def __init__(self, pipeline: Pipeline, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
-        self._pipeline, self._stream, self._timeout_s, self._clock_s = pipeline, stream, timeout_s, clock_s
+    def __init__(self, decoded: DecodedStream, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
+        self._decoded, self._stream, self._timeout_s, self._clock_s = decoded, stream, timeout_s, clock_s
         self._samples, self._looks = -1, Looks(0.0, 0.0)
 
     def look(self) -> None:
         """Raises DeviceSilent."""
-        now_s, samples = self._clock_s(), self._pipeline.counts["samples"]
+        now_s, samples = self._clock_s(), self._decoded.counts["samples"]
         if samples != self._samples:
             self._samples, self._looks = samples, Looks(now_s, SILENCE_SHARE * self._timeout_s)
         elif self._looks.look(now_s) > self._timeout_s:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from itertools import combinations
@@ -31,6 +31,7 @@ from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
 from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
 from triaxcald.provision.identity import same_serial
+from triaxcald.station.coming_back import Patience, until_open
 from triaxcald.station.lock import locked
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
@@ -49,6 +50,15 @@ class Plan(Strict):
     patience_s: Annotated[
         float, Field(gt=0, description="give up when no new pose has come for so long, in seconds of the samples")
     ] = 300.0
+    comes_back_s: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=3600,
+            description="wait so long for a unit that was lost, though no other is at work; others that are, are "
+            "waited for in any case",
+        ),
+    ] = 10.0
 
 
 class Limits(Strict):
@@ -194,9 +204,12 @@ class Place:
         return driver_named(self.bundle.profile.driver).device(self.bundle, self.bus)
 
     @asynccontextmanager
-    async def opened(self) -> AsyncIterator[Device]:
+    async def opened(
+        self, patience: Patience | None = None, tell: Callable[[Exception], None] = lambda _: None
+    ) -> AsyncIterator[Device]:
         """The device, open and nobody else's until the context ends. Raises
-        DeviceInUse, BusError, DeviceAbsent.
+        DeviceInUse; BusError, DeviceAbsent, with ``patience`` once that ends
+        (``tell`` is told meanwhile).
 
         Whoever closes it and opens it again in between, as a reset does, keeps
         it.
@@ -204,7 +217,10 @@ class Place:
         device = self.device()
         async with locked(claim_of(self.bus)):
             try:
-                await device.open()
+                if patience is None:
+                    await device.open()
+                else:
+                    await until_open(device.open, patience, tell)
                 yield device
             finally:
                 with suppress(DriverError):

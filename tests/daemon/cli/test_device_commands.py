@@ -167,7 +167,7 @@ def _each_is_absent(workshop: Any, triaxcal: Run, station: Path, *words: str) ->
     before = sorted(workshop.folder.iterdir())
     for command in (
         ["run", station],
-        ["record", station, "-o", rec],
+        ["record", station, "-o", rec, "--give-up-after", "0"],
         ["registers", station],
         ["provision", cal, station],
     ):
@@ -240,11 +240,33 @@ def test_a_recording_goes_to_no_folder_that_is_not_there(workshop: Any, triaxcal
     triaxcal("record", station, "-o", rec).failed(2, f"{rec}: there is no folder ")
 
 
+def test_all_units_of_a_station_are_recorded_at_once_into_a_folder(workshop: Any, triaxcal: Run) -> None:
+    channel = {"interface": "virtual", "channel": f"recorded-{id(workshop)}", "node_id": 9}
+    can = workshop.device("can.toml", profile="triax-ref-can", serial=12, bus=channel)
+    with workshop.serve(workshop.device()) as modbus, workshop.serve(can):
+        units = {"bus": modbus.bus}, {"bus": channel, "profile": "triax-ref-can"}
+        station = workshop.station(*units)
+        folder = workshop.folder / "recordings"
+        triaxcal("record", station, "-o", folder, "--seconds", "5").failed(
+            2, f"{station}: there are 2 units; name one of unit0, unit1 with --unit, or record all of them into a folder"
+        )
+        folder.mkdir()
+        done = triaxcal("record", station, "-o", folder, "--seconds", "5")
+    assert done.code == 0, done.err
+    one, other = sorted(folder.iterdir())
+    assert (one.name[:11], other.name[:11]) == ("unit0-4711-", "unit1-0012-")
+    for path in (one, other):
+        info = triaxcal("log", "info", path, "--json").json
+        assert info["finished"] is True
+        assert str(path) in done.err
+        assert info["events"][-1]["kind"] == "ended"
+
+
 def test_a_unit_that_stops_in_the_middle_of_a_recording_leaves_a_finished_file(workshop: Any, triaxcal: Run) -> None:
     rec = workshop.folder / "rec.mcap"
     with workshop.serve(workshop.device(speed=10.0), Faults(die_at_s=22.0)) as served:
         station = workshop.station({"bus": served.bus, "profile": workshop.impatient_profile()})
-        triaxcal("record", station, "-o", rec).failed(4, "127.0.0.1", "silent")
+        triaxcal("record", station, "-o", rec, "--give-up-after", "0").failed(4, "127.0.0.1", "nothing answers")
     assert len(triaxcal("poses", rec, "--json").json["poses"]) >= 5
 
 

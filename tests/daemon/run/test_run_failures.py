@@ -21,7 +21,7 @@ from triaxcald.simulation.unit import Faults
 OLD = Stored(factory_calibration())
 QUICK: Mapping[str, Any] = {"speed": 60.0, "fixture": {"poses": 12, "hold_s": 1.4, "move_s": 0.6}}
 BACK = "the device holds the old calibration, read back after a restart"
-PLAN = {"poses": 12, "hold_s": 0.6, "check_poses": 2}
+PLAN = {"poses": 12, "hold_s": 0.6, "check_poses": 2, "comes_back_s": 0.5}
 
 
 @pytest.fixture(autouse=True)

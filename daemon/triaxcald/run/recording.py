@@ -1,0 +1,123 @@
+"""Units that are recorded and nothing else, for as long as anybody likes; they
+may be lost meanwhile, and come back."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from triaxcal_drivers.interface import Device
+from triaxcal_drivers.profile import READINGS
+from triaxcald.errors import RecordingError
+from triaxcald.exit_codes import DONE, exit_code_of
+from triaxcald.inputs import CALIBRATION
+from triaxcald.provision.identity import IdentityRead
+from triaxcald.recording.writer import RecordingWriter
+from triaxcald.run.endings import aborted
+from triaxcald.run.session import UnitSession
+from triaxcald.station.collection import Recorded
+from triaxcald.station.coming_back import Patience
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a unit's recording has come to. ``counts`` are of its readings,
+    which span ``seconds``; ``gaps_s`` of them it was lost, and ``lost`` raw
+    records did not get to the disk. ``error`` is one line where it failed."""
+
+    unit: str
+    path: Path | None
+    counts: dict[str, int]
+    seconds: float = 0.0
+    gaps_s: float = 0.0
+    lost: int = 0
+    exit_code: int = DONE
+    error: str | None = None
+
+
+class UnitRecording:
+    """One unit's recording, at ``path_of`` its identity; ``identified`` is told
+    who it is, once it is there."""
+
+    def __init__(
+        self,
+        session: UnitSession,
+        path_of: Callable[[IdentityRead], Path],
+        identified: Callable[[UnitSession, IdentityRead], None] = lambda *_: None,
+    ) -> None:
+        self._session, self._path_of, self._identified = session, path_of, identified
+        self._recorded = Recorded(CALIBRATION, session.place.bundle, session.place.address)
+        self._path: Path | None = None
+        self._lost = 0
+
+    async def run(self, seconds: float | None, patience: Patience) -> Kept:
+        """Until there are so many ``seconds`` of samples, for ever where None,
+        or until the unit is given up. Raises nothing, not even when it is
+        cancelled."""
+        session = self._session
+        try:
+            async with session.place.opened(patience, session.waits) as device:
+                identity = await session.identify(device)
+                self._identified(session, identity)
+                self._path = self._path_of(identity)
+                with session.writer(self._path, identity, ends_with="") as writer:
+                    await self._record(device, identity, writer, seconds, patience)
+        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
+            return self._kept(e)
+        return self._kept(None)
+
+    async def _record(
+        self,
+        device: Device,
+        identity: IdentityRead,
+        writer: RecordingWriter,
+        seconds: float | None,
+        patience: Patience,
+    ) -> None:
+        session, because = self._session, "the recording is complete"
+        try:
+            session.progress.stage(session.name, "recording")
+            await self._recorded.for_seconds(session.returning(device, identity, patience), writer, seconds)
+        except (Exception, asyncio.CancelledError) as e:
+            because = aborted(e, None).reason
+            raise
+        finally:
+            self._lost = sum(writer.losses.values())
+            with suppress(RecordingError):  # the disk has failed, which is on its way already
+                writer.event("ended", {"because": because})
+
+    def _kept(self, e: BaseException | None) -> Kept:
+        readings, unit = self._recorded.streams[READINGS], self._session.name
+        kept = Kept(unit, self._path, dict(readings.counts), readings.seconds, self._recorded.gaps_s, self._lost)
+        if e is None:
+            return kept
+        ending = aborted(e, None)
+        return Kept(**{**vars(kept), "exit_code": exit_code_of(e), "error": f"unit {unit}: {ending.reason}"})
+
+
+async def record_units(
+    recordings: Sequence[UnitRecording],
+    seconds: float | None,
+    patience: Patience,
+    ended: Callable[[Kept], None] = lambda _: None,
+) -> list[Kept]:
+    """All units at once; one that ends does not stop the others, and ``ended``
+    is told of each. When it is cancelled every unit is; what was recorded is
+    whole."""
+
+    async def work(recording: UnitRecording) -> Kept:
+        kept = await recording.run(seconds, patience)
+        ended(kept)
+        return kept
+
+    units = [asyncio.ensure_future(work(recording)) for recording in recordings]
+    while not all(unit.done() for unit in units):
+        try:
+            await asyncio.wait(units)
+        except asyncio.CancelledError:
+            for unit in units:
+                unit.cancel()
+    return [unit.result() for unit in units]

@@ -1,0 +1,97 @@
+"""One unit of a station while somebody works with it: who it is, where its
+recording goes, and its coming back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from triaxcal_drivers.interface import Device
+from triaxcald import text
+from triaxcald.certificate import software
+from triaxcald.errors import InputError
+from triaxcald.inputs import PROFILE, STATION_FILE, preview_channels
+from triaxcald.provision.access import RegisterLink
+from triaxcald.provision.identity import IdentityRead, check_identity
+from triaxcald.recording.writer import RecordingWriter
+from triaxcald.report.unit import drawn_with
+from triaxcald.station.collection import Progress
+from triaxcald.station.coming_back import Patience, Returning
+from triaxcald.station.config import Place, Station
+from triaxcald.station.serials import SerialsSeen
+
+
+class UnitSession:
+    """``progress`` shows the operator how it goes, ``serials`` refuses a unit
+    that is there twice, ``clock_ns`` is the host's time since the epoch."""
+
+    def __init__(
+        self,
+        station: Station,
+        place: Place,
+        progress: Progress,
+        *,
+        serials: SerialsSeen | None = None,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.station, self.place, self.progress, self.clock_ns = station, place, progress, clock_ns
+        self.serials = serials or SerialsSeen()
+        self.name = place.unit.name
+        self.profile = place.bundle.profile
+
+    def waits(self, trouble: Exception) -> None:
+        """The unit is not there, for now."""
+        self.progress.stage(self.name, text.waits(str(trouble)))
+
+    def returning(self, device: Device, identity: IdentityRead, patience: Patience) -> Returning:
+        """The device, waited for where it is lost; it is this unit that has to
+        come back."""
+
+        async def identify() -> None:
+            where, expected = self.place.address, identity.serial or self.place.unit.serial
+            await check_identity(device, self.place.bundle, expected, where=where)
+
+        def tell(trouble: str | None) -> None:
+            self.progress.stage(self.name, text.IS_BACK if trouble is None else text.waits(trouble))
+
+        return Returning(device, identify, patience, tell, self.clock_ns)
+
+    async def identify(self, device: Device) -> IdentityRead:
+        self.progress.stage(self.name, "reading identity")
+        link, where = RegisterLink(device, self.profile), self.place.address
+        identity = await check_identity(link, self.place.bundle, self.place.unit.serial, where=where)
+        self.serials.add(identity.serial, self.name, where)
+        return identity
+
+    def recording_name(self, identity: IdentityRead) -> str:
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
+        return f"{self.name}-{identity.serial or 'unknown'}-{stamp}.mcap"
+
+    def recording_path(self, identity: IdentityRead) -> Path:
+        folder = self.station.folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as e:
+            raise InputError(f"{folder}: no folder for recordings: {e.strerror}") from e
+        return folder / self.recording_name(identity)
+
+    def writer(self, path: Path, identity: IdentityRead, *, ends_with: str) -> RecordingWriter:
+        unit = {"name": self.name, "serial": identity.serial or "", "signs": ",".join(map(str, self.place.signs))}
+        writer = RecordingWriter(
+            path,
+            metadata={
+                "station": {"name": self.station.file.name},
+                "unit": unit,
+                "software": {**software(), **drawn_with()},
+            },
+            preview_channels=preview_channels(self.profile),
+            preview_unit=self.profile.output.unit,
+            clock_ns=self.clock_ns,
+            ends_with=ends_with,
+        )
+        writer.attach(STATION_FILE, "application/toml", self.station.text)
+        writer.attach(PROFILE, "application/toml", self.place.bundle.text)
+        for name, data in self.place.bundle.files.items():
+            writer.attach(f"profile/{name}", "application/octet-stream", data)
+        return writer

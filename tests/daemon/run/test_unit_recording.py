@@ -1,0 +1,168 @@
+"""Units that are lost in the middle of a recording and come back, on real buses with simulated units."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from triaxcal_drivers.profile import READINGS
+from triaxcald.inputs import CALIBRATION, bundle_of
+from triaxcald.pipeline import DecodedStream
+from triaxcald.recording.reader import Recording
+from triaxcald.run.recording import Kept, UnitRecording, record_units
+from triaxcald.run.session import UnitSession
+from triaxcald.simulation.bench import load_device, simulate
+from triaxcald.station.coming_back import Patience
+from triaxcald.station.config import Station, load_station
+
+
+class Told:
+    """In the place of the operator: waits for the hints that are shown."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, list[str]] = {}
+
+    def stage(self, unit: str, text: str) -> None:
+        self.stages.setdefault(unit, []).append(text)
+
+    def poses(self, *_: object) -> None: ...
+
+    async def until(self, unit: str, done: Callable[[str], bool]) -> None:
+        while not any(done(text) for text in self.stages.get(unit, ())):
+            await asyncio.sleep(0.01)
+
+
+class Bench:
+    """Simulated units of a station, each of which can be taken away and put
+    back."""
+
+    def __init__(self, workshop: Any, devices: list[dict[str, Any]]) -> None:
+        self.files = [workshop.device(f"device{i}.toml", speed=1.0, **d) for i, d in enumerate(devices)]
+        self.serving: dict[int, Any] = {}
+        self.buses: dict[int, dict[str, Any]] = {}
+
+    async def put(self, i: int, **changed: Any) -> dict[str, Any]:
+        device = load_device(self.files[i])
+        device = device.model_copy(update={"bus": self.buses.get(i, dict(device.bus)), **changed})
+        self.serving[i] = simulate(device, where="device.toml", stored=None).serve()
+        server = await self.serving[i].__aenter__()
+        bus = dict(device.bus)
+        if "port" in bus:
+            bus["port"] = server.bus.port
+        self.buses[i] = bus
+        return bus
+
+    async def take(self, i: int) -> None:
+        await self.serving.pop(i).__aexit__(None, None, None)
+
+
+def recorded(station: Station, folder: Path, told: Told, *, seconds: float | None, patience: Patience) -> Any:
+    recordings = []
+    for place in station.places:
+        session = UnitSession(station, place, told)
+        recordings.append(UnitRecording(session, lambda _, name=session.name: folder / f"{name}.mcap"))
+    return asyncio.ensure_future(record_units(recordings, seconds, patience))
+
+
+def told_by(path: Path) -> tuple[list[tuple[str, Any]], DecodedStream, np.ndarray]:
+    with Recording.open(path) as recording:
+        events = [(e.kind, e.detail) for e in recording.events() if e.kind != "recording_started"]
+        decoded = DecodedStream(bundle_of(recording), READINGS)
+        times = [decoded.feed(batch).time_ns for batch in recording.raw(CALIBRATION)]
+        return events, decoded, np.concatenate(times)
+
+
+CAN = {"profile": "triax-ref-can", "serial": 12}
+MODBUS = {"profile": "triax-ref-modbus", "serial": 4711}
+
+
+@pytest.mark.parametrize("kind", ["can", "modbus"])
+async def test_a_unit_that_goes_and_comes_back_is_in_one_recording_with_the_gap(
+    workshop: Any, kind: str, request: pytest.FixtureRequest
+) -> None:
+    bus = {"interface": "virtual", "channel": request.node.name, "node_id": 9} if kind == "can" else None
+    device = {**(CAN if kind == "can" else MODBUS), **({"bus": bus} if bus else {})}
+    bench, told = Bench(workshop, [device]), Told()
+    where = await bench.put(0)
+    profile = workshop.impatient_profile(str(device["profile"]))
+    station = load_station(workshop.station({"bus": where, "profile": profile}))
+    work = recorded(station, workshop.folder, told, seconds=3.0, patience=Patience())
+    await told.until("unit0", lambda text: text == "recording")
+    await asyncio.sleep(0.7)
+    await bench.take(0)
+    await told.until("unit0", lambda text: text.startswith("waiting for the unit: "))
+    await bench.put(0)
+    (kept,) = await work
+    await bench.take(0)
+    assert kept.error is None
+    events, decoded, times = told_by(workshop.folder / "unit0.mcap")
+    assert [kind for kind, _ in events] == ["interrupted", "gap", "ended"]
+    gap = events[1][1]
+    assert gap["cause"] == events[0][1]["cause"]
+    assert kept.gaps_s == pytest.approx((gap["to_ns"] - gap["from_ns"]) * 1e-9)
+    assert kept.gaps_s > 0.5
+    assert (np.diff(times) > 0).all()
+    longest = int(np.argmax(np.diff(times)))
+    assert times[longest] == pytest.approx(gap["from_ns"], abs=0.2e9)
+    assert times[longest + 1] == pytest.approx(gap["to_ns"], abs=0.2e9)
+    assert decoded.seconds >= 3.0
+
+
+async def test_another_unit_that_is_put_in_its_place_is_not_recorded_as_the_same(workshop: Any) -> None:
+    bench, told = Bench(workshop, [MODBUS]), Told()
+    where = await bench.put(0)
+    station = load_station(workshop.station({"bus": where, "profile": workshop.impatient_profile()}))
+    work = recorded(station, workshop.folder, told, seconds=None, patience=Patience(most_s=3.0))
+    await told.until("unit0", lambda text: text == "recording")
+    await bench.take(0)
+    await bench.put(0, serial=13)
+    (kept,) = await work
+    await bench.take(0)
+    assert kept.exit_code == 4
+    assert kept.error is not None
+    assert "is serial 0013, expected 4711" in kept.error
+    with Recording.open(workshop.folder / "unit0.mcap") as recording:
+        *_, last = recording.events()
+    assert (last.kind, "is serial 0013" in last.text) == ("ended", True)
+
+
+async def test_a_unit_that_is_not_there_keeps_nobody_waiting_and_is_recorded_once_it_is(
+    workshop: Any, request: pytest.FixtureRequest
+) -> None:
+    can = {**CAN, "bus": {"interface": "virtual", "channel": request.node.name, "node_id": 9}}
+    bench, told = Bench(workshop, [MODBUS, can]), Told()
+    where = await bench.put(0)
+    units = (
+        {"bus": where, "profile": workshop.impatient_profile()},
+        {"bus": can["bus"], "profile": workshop.impatient_profile("triax-ref-can")},
+    )
+    station = load_station(workshop.station(*units))
+    work = recorded(station, workshop.folder, told, seconds=1.0, patience=Patience())
+    await told.until("unit1", lambda text: text.startswith("waiting for the unit: nothing answers at node 9"))
+    await told.until("unit0", lambda text: text == "recording")
+    await bench.put(1)
+    kept: list[Kept] = await work
+    await bench.take(0)
+    await bench.take(1)
+    assert [(k.error, k.seconds >= 1.0) for k in kept] == [(None, True)] * 2
+
+
+async def test_a_recording_that_is_cancelled_is_whole_and_says_so(workshop: Any) -> None:
+    bench, told = Bench(workshop, [MODBUS]), Told()
+    where = await bench.put(0)
+    station = load_station(workshop.station({"bus": where, "profile": workshop.impatient_profile()}))
+    work = recorded(station, workshop.folder, told, seconds=None, patience=Patience())
+    await told.until("unit0", lambda text: text == "recording")
+    await asyncio.sleep(0.3)
+    work.cancel()
+    (kept,) = await work
+    await bench.take(0)
+    assert (kept.exit_code, kept.error) == (130, "unit unit0: interrupted")
+    events, decoded, _ = told_by(workshop.folder / "unit0.mcap")
+    assert events == [("ended", {"because": "interrupted"})]
+    assert decoded.counts["samples"] == kept.counts["samples"] > 0

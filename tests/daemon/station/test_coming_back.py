@@ -1,0 +1,200 @@
+"""Units that are lost and come back, on a clock of the test's own."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from contextlib import aclosing
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import pytest
+
+from tests.drivers.virtual_time import run, virtual
+from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceRestarted, DeviceSilent, ProfileError
+from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
+from triaxcald.provision.identity import WrongUnit
+from triaxcald.station.coming_back import LONGEST_PAUSE_S, AtWork, Patience, Returning, until_open
+
+BEGUN_NS = 1_700_000_000_000_000_000
+Step = list[tuple[int, int]] | Exception
+
+
+def records(*times: int, flags: int = 0) -> list[tuple[int, int]]:
+    return [(t, flags) for t in times]
+
+
+@dataclass
+class Played:
+    """A device whose streams and openings go as they are written: batches of
+    (time, flags), or what is raised."""
+
+    streams: list[list[Step]]
+    openings: list[Exception | None] = field(default_factory=list)
+    identities: list[Exception | None] = field(default_factory=list)
+    opened_s: list[float] = field(default_factory=list)
+    told: list[str | None] = field(default_factory=list)
+
+    async def open(self) -> None:
+        self.opened_s.append(virtual().time() - 1000.0)
+        if self.openings and (trouble := self.openings.pop(0)) is not None:
+            raise trouble
+
+    async def close(self) -> None: ...
+
+    async def identify(self) -> None:
+        if self.identities and (trouble := self.identities.pop(0)) is not None:
+            raise trouble
+
+    async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+        assert list(names) == ["readings"]
+        for step in self.streams.pop(0):
+            if isinstance(step, Exception):
+                raise step
+            yield RawBatch.of([(BEGUN_NS + t, 0x185, flags, b"") for t, flags in step])
+
+    async def all(self, patience: Patience) -> list[RawBatch]:
+        returning = Returning(cast(Any, self), self.identify, patience, self.told.append, lambda: BEGUN_NS - 1)
+        async with aclosing(returning.stream(["readings"])) as stream:
+            return [batch async for batch in stream]
+
+
+def shown(batches: Sequence[RawBatch]) -> list[tuple[list[int], list[int], Gap | None]]:
+    return [((b.time_ns - BEGUN_NS).tolist(), b.flags.tolist(), b.gap) for b in batches]
+
+
+def gap(begin: int, end: int | None, cause: str) -> Gap:
+    return Gap(BEGUN_NS + begin, None if end is None else BEGUN_NS + end, cause)
+
+
+def test_a_stream_goes_on_after_the_device_is_opened_again_with_the_gap_in_it() -> None:
+    device = Played([[records(1, 2), DeviceRestarted("it booted")], [records(50, 51), records(52)]])
+    batches = run(device.all(Patience()))
+    assert shown(batches) == [
+        ([1, 2], [0, 0], None),
+        ([], [], gap(2, None, "it booted")),
+        ([50, 51], [RawFlag.LOST_BEFORE, 0], gap(2, 50, "it booted")),
+        ([52], [0], None),
+    ]
+    assert device.opened_s == [0.0], "at once: a unit that restarts is there again soon"
+    assert device.told == [None]
+
+
+def test_a_gap_ends_with_the_first_record_that_is_no_error_however_often_the_unit_is_lost_meanwhile() -> None:
+    device = Played(
+        [
+            [records(1), BusError("the link is down")],
+            [records(7, flags=RawFlag.ERROR), DeviceSilent("still nothing")],
+            [records(8, flags=RawFlag.ERROR), records(9), records(10)],
+        ],
+        [BusError("no such interface"), None, None],
+    )
+    batches = run(device.all(Patience()))
+    assert shown(batches) == [
+        ([1], [0], None),
+        ([], [], gap(1, None, "the link is down")),
+        ([7], [RawFlag.ERROR], None),
+        ([8], [RawFlag.ERROR], None),
+        ([9], [RawFlag.LOST_BEFORE], gap(1, 9, "the link is down")),
+        ([10], [0], None),
+    ]
+    assert device.told == ["no such interface", None]
+
+
+def test_a_unit_that_was_never_heard_is_lost_from_the_moment_it_was_missed() -> None:
+    device = Played([[DeviceSilent("nothing came")], [records(5)]])
+    assert [b.gap for b in run(device.all(Patience()))] == [gap(-1, None, "nothing came"), gap(-1, 5, "nothing came")]
+
+
+def test_attempts_are_ever_rarer_and_go_on_for_ever() -> None:
+    device = Played([[DeviceSilent("gone")], []], [DeviceAbsent("nothing answers")] * 12 + [None])
+    run(device.all(Patience()))
+    pauses = [b - a for a, b in zip(device.opened_s, device.opened_s[1:], strict=False)]
+    assert pauses == pytest.approx([0.5, 1, 2, 4, 8, *[LONGEST_PAUSE_S] * 7])
+    assert device.told == ["nothing answers"], "said once"
+
+
+def test_another_unit_in_its_place_is_not_taken_for_it() -> None:
+    other = WrongUnit("the unit on node 5 is serial 12, expected 11")
+    device = Played([[records(1), DeviceSilent("gone")], [records(2)]], identities=[other, other, None])
+    assert len(run(device.all(Patience()))) == 3
+    assert device.told == [str(other), None]
+    assert len(device.opened_s) == 3
+
+
+@pytest.mark.parametrize(("most_s", "attempts"), [(0.0, 1), (0.4, 2), (0.5, 2), (10.0, 6)])
+def test_who_gives_up_says_the_last_trouble(most_s: float, attempts: int) -> None:
+    device = Played([[records(1), DeviceSilent("gone")]], [BusError(f"attempt {i}") for i in range(20)])
+    with pytest.raises(BusError, match=rf"^attempt {attempts - 1}$"):
+        run(device.all(Patience(most_s=most_s)))
+    assert device.opened_s[-1] == pytest.approx(most_s)
+
+
+def test_a_fault_of_the_profile_is_not_waited_for() -> None:
+    device = Played([[ProfileError("no stream 'reading'")]])
+    with pytest.raises(ProfileError):
+        run(device.all(Patience()))
+    assert device.opened_s == []
+
+
+def lost(patience: Patience, attempts: list[float]) -> Any:
+    async def attempt() -> None:
+        attempts.append(virtual().time() - 1000.0)
+        raise DeviceAbsent("nothing answers")
+
+    return until_open(attempt, patience, lambda _: None)
+
+
+def test_a_lost_unit_is_given_up_when_the_others_are_done() -> None:
+    async def work() -> list[float]:
+        attempts: list[float] = []
+        others = AtWork(2)
+        waiting = asyncio.ensure_future(lost(Patience(others=others), attempts))
+        await asyncio.sleep(100)
+        assert not waiting.done()
+        others.leave()
+        with pytest.raises(DeviceAbsent):
+            await waiting
+        assert virtual().time() - 1000.0 == 100.0, "at once"
+        return attempts
+
+    assert len(run(work())) > 10
+
+
+def test_units_that_are_all_lost_are_all_given_up() -> None:
+    async def work() -> None:
+        others = AtWork(2)
+        both = [lost(Patience(others=others), []) for _ in range(2)]
+        outcomes = await asyncio.gather(*both, return_exceptions=True)
+        assert [type(o) for o in outcomes] == [DeviceAbsent, DeviceAbsent]
+        assert virtual().time() == 1000.0
+
+    run(work())
+
+
+def test_a_unit_alone_is_waited_for_as_long_as_the_plan_says() -> None:
+    async def work() -> list[float]:
+        attempts: list[float] = []
+        with pytest.raises(DeviceAbsent):
+            await lost(Patience(least_s=10.0, others=AtWork(1)), attempts)
+        return attempts
+
+    assert run(work()) == pytest.approx([0, 0.5, 1.5, 3.5, 7.5, 10.0])
+
+
+def test_a_unit_that_is_back_counts_as_at_work_again() -> None:
+    async def work() -> None:
+        others = AtWork(2)
+        troubles: list[Exception] = [DeviceAbsent("once")]
+
+        async def attempt() -> None:
+            if troubles:
+                raise troubles.pop()
+
+        await until_open(attempt, Patience(others=others), lambda _: None)
+        waiting = asyncio.ensure_future(lost(Patience(others=others), []))
+        await asyncio.sleep(1000)
+        assert not waiting.done()
+        waiting.cancel()
+
+    run(work())
