@@ -55,7 +55,7 @@ class UnitSession:
         def tell(trouble: str | None) -> None:
             self.progress.stage(self.name, text.IS_BACK if trouble is None else text.waits(trouble))
 
-        return Returning(device, identify, patience, tell, self.clock_ns)
+        return Returning(device, identify, patience, tell)
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")

@@ -14,6 +14,7 @@ from triaxcal.errors import Refused
 from triaxcal.model.directions import directions
 from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceSilent
+from triaxcal_drivers.host_clock import HOST, SteadyClock
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.pipeline import DecodedStream, Pipeline
@@ -59,6 +60,7 @@ class Recorded:
     ends_with: str = ""
     digest: RawDigest = field(init=False)
     gaps_s: float = 0.0
+    clock: SteadyClock = HOST
 
     def __post_init__(self) -> None:
         self.digest = RawDigest(self.ends_with)
@@ -77,9 +79,13 @@ class Recorded:
         what the station saw.
         """
         unwritten: Gap | None = None
+        stepped_ns = self.clock.steps_ns()
         async with aclosing(cast(Any, device.stream(list(self.streams)))) as stream:
             async for batch in stream:
                 self._note(writer, batch.gap)
+                if (steps_ns := self.clock.steps_ns()) != stepped_ns and writer is not None:
+                    writer.event("clock_step", {"by_s": (steps_ns - stepped_ns) / 1e9})
+                stepped_ns = steps_ns
                 if unwritten is not None and len(batch):
                     unwritten = replace(unwritten, to_ns=int(batch.time_ns[0]))
                     batch = batch.after(unwritten)

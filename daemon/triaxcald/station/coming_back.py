@@ -4,7 +4,6 @@ gap in their stream told."""
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import aclosing, contextmanager
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
+from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Device, Gap, RawBatch, RawFlag
 from triaxcald.provision.identity import WrongUnit
 
@@ -138,7 +138,7 @@ class Returning:
         identify: Callable[[], Awaitable[None]],
         patience: Patience,
         tell: Callable[[str | None], None],
-        now_ns: Callable[[], int] = time.time_ns,
+        now_ns: Callable[[], int] = HOST.now_ns,
     ) -> None:
         self._device, self._identify, self._patience, self._tell = device, identify, patience, tell
         self._now_ns = now_ns

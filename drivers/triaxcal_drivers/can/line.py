@@ -20,6 +20,7 @@ from triaxcal_drivers.can.claim import bus_name
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.can.receive import FrameQueue
 from triaxcal_drivers.errors import BusError
+from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import RawFlag
 
 POLL_S = 0.1
@@ -129,6 +130,8 @@ class CanLine:
                 return
             if frames:
                 self._heard_s = self.attention.now_s()
+                if HOST.steps_ns():
+                    frames = [frame._replace(time_ns=HOST.steady_ns(frame.time_ns)) for frame in frames]
                 for queue in self._queues:
                     queue.put(frames)
                 listeners = self._listeners

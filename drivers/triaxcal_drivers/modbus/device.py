@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 
@@ -17,6 +16,7 @@ from triaxcal_drivers.errors import (
     RegisterRefused,
     RegisterValueError,
 )
+from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.modbus.client import ModbusClient
 from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream, words_of
@@ -72,7 +72,7 @@ class ModbusDevice:
     opened.
     """
 
-    def __init__(self, profile: ModbusProfile, bus: ModbusBus, *, now_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(self, profile: ModbusProfile, bus: ModbusBus, *, now_ns: Callable[[], int] = HOST.now_ns) -> None:
         self._profile = profile
         self._bus = bus
         self._now_ns = now_ns

@@ -248,7 +248,8 @@ def test_all_units_of_a_station_are_recorded_at_once_into_a_folder(workshop: Any
         station = workshop.station(*units)
         folder = workshop.folder / "recordings"
         triaxcal("record", station, "-o", folder, "--seconds", "5").failed(
-            2, f"{station}: there are 2 units; name one of unit0, unit1 with --unit, or record all of them into a folder"
+            2,
+            f"{station}: there are 2 units; name one of unit0, unit1 with --unit, or record all of them into a folder",
         )
         folder.mkdir()
         done = triaxcal("record", station, "-o", folder, "--seconds", "5")

@@ -13,7 +13,8 @@ import pytest
 
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.errors import DeviceSilent
-from triaxcal_drivers.interface import RawBatch
+from triaxcal_drivers.host_clock import SteadyClock
+from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.inputs import CALIBRATION, VERIFICATION
@@ -24,7 +25,7 @@ from triaxcald.simulation.modbus_unit import ModbusUnit
 from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.time_base import SteppedTimeBase
 from triaxcald.simulation.unit import ReferenceUnit
-from triaxcald.station.collection import Collection, _Watch
+from triaxcald.station.collection import OVERRUN, Collection, Recorded, _Watch
 from triaxcald.station.config import Plan
 
 Run = Callable[..., Any]
@@ -179,6 +180,57 @@ def test_record_of_so_many_seconds_ends_where_the_readings_stop(
         done = triaxcal("record", station, "-o", path, "--seconds", "600", "--give-up-after", "0")
     done.failed(4, "node_id=5: stream readings: the device sends, but no whole sample of it for 1 s")
     assert triaxcal("log", "info", path, "--json").json["finished"] is True
+
+
+@dataclass
+class Lossy:
+    """A device that sends one frame a batch, with the gaps that it is given; the host's clock steps at the third."""
+
+    gaps: Sequence[Gap | None]
+    step_ns: int = 0
+
+    async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+        for number, gap in enumerate(self.gaps):
+            batch = RawBatch.of([(number * 10**9, 0x185, 0, bytes(8))] if gap is None or gap.to_ns else [])
+            self.step_ns = 3600 * 10**9 if number > 1 else 0
+            yield batch if gap is None else batch.after(gap)
+
+
+async def events_of(bundle: Bundle, path: Path, device: Lossy) -> tuple[Recorded, list[tuple[str, Any]]]:
+    recorded = Recorded(CALIBRATION, bundle, "node 5", clock=SteadyClock(lambda: device.step_ns, lambda: 0))
+    with RecordingWriter(path, metadata={}, preview_channels=["temp_c", "status"]) as writer:
+        async for _ in recorded.records(device, writer):
+            pass
+    with Recording.open(path) as recording:
+        assert recording.raw_digest().hexdigest() == recorded.digest.hexdigest()
+        return recorded, [(e.kind, e.detail) for e in recording.events() if e.kind != "recording_started"]
+
+
+async def test_gaps_are_events_and_their_time_is_summed(bundle: Bundle, tmp_path: Path) -> None:
+    gaps = [None, Gap(0, None, "the link is down"), Gap(0, 3 * 10**9, "the link is down"), Gap(1, 2, "an overflow", 9)]
+    recorded, events = await events_of(bundle, tmp_path / "rec.mcap", Lossy(gaps))
+    assert [event for event in events if event[0] != "clock_step"] == [
+        ("interrupted", {"from_ns": 0, "cause": "the link is down"}),
+        ("gap", {"from_ns": 0, "to_ns": 3 * 10**9, "cause": "the link is down", "lost": None}),
+        ("gap", {"from_ns": 1, "to_ns": 2, "cause": "an overflow", "lost": 9}),
+    ]
+    assert recorded.gaps_s == pytest.approx(3.0)
+    assert recorded.streams[READINGS].counts["receiver_overflows"] == 2
+
+
+async def test_a_step_of_the_hosts_clock_is_an_event(bundle: Bundle, tmp_path: Path) -> None:
+    _, events = await events_of(bundle, tmp_path / "rec.mcap", Lossy([None] * 5))
+    assert events == [("clock_step", {"by_s": 3600.0})]
+
+
+async def test_what_the_disk_has_no_room_for_is_a_gap_before_the_next_records(
+    bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken, raw = iter([True, False, False, True, True]), RecordingWriter.raw
+    monkeypatch.setattr(RecordingWriter, "raw", lambda self, phase, batch: next(taken) and raw(self, phase, batch))
+    recorded, events = await events_of(bundle, tmp_path / "rec.mcap", Lossy([None] * 5))
+    assert events[1] == ("gap", {"from_ns": 10**9, "to_ns": 3 * 10**9, "cause": OVERRUN, "lost": 2})
+    assert recorded.streams[READINGS].counts["receiver_overflows"] == 1
 
 
 @pytest.mark.parametrize("held_up_s", [4.5, 3600.0])

@@ -18,6 +18,7 @@ from triaxcal_drivers.can.line import MUTE_S, join, leave
 from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.can.receive import OVERFLOW
 from triaxcal_drivers.errors import BusError, DeviceRestarted
+from triaxcal_drivers.host_clock import SteadyClock
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
@@ -158,6 +159,26 @@ async def test_a_bus_on_which_nobody_is_heard_is_opened_anew_with_the_next_unit(
     assert len(await coming) == 1, "the stream of the other unit goes on"
     await first.close()
     await second.close()
+
+
+async def test_a_step_of_the_hosts_clock_does_not_move_the_frames(
+    opened: list[Played], unit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host = {"running": 0, "step": 0}
+    clock = SteadyClock(lambda: BEGUN_NS + host["running"] + host["step"], lambda: host["running"])
+    monkeypatch.setattr(can_line, "HOST", clock)
+    device = unit(1)
+    await device.open()
+    times = []
+    stream = device.stream(["readings"])
+    for second, step in enumerate([0, 0, 3600, 3600, -7200]):
+        host.update(running=second * 10**9, step=step * 10**9)
+        coming = asyncio.ensure_future(anext(stream))
+        await asyncio.sleep(0)
+        opened[0].waiting.put([Frame(clock._now_ns(), 0x181, 0, b"")])
+        times += (await coming).time_ns.tolist()
+    assert times == [BEGUN_NS + second * 10**9 for second in range(5)]
+    await device.close()
 
 
 async def test_units_that_drive_one_bus_differently_are_refused(opened: list[Played], unit) -> None:

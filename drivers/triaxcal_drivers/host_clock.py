@@ -1,0 +1,59 @@
+"""The host's time as a line that runs on, whatever is done to its clock."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+STEP_NS = 100_000_000
+"""What the clock moves by between two looks is a step from here on: slewing it
+moves the running clock too, and reading both takes microseconds, on a busy
+machine some milliseconds."""
+
+
+def _running_ns() -> int:
+    """Time since the start of the machine, while it slept too where the system
+    counts that."""
+    return time.clock_gettime_ns(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+class SteadyClock:
+    """Host time since the epoch, by the clock as it was set when this was made:
+    a step of it later on (set by hand, a first contact with a time server) does
+    not move the line.
+    """
+
+    def __init__(self, now_ns: Callable[[], int] = time.time_ns, running_ns: Callable[[], int] = _running_ns) -> None:
+        self._now_ns, self._running = now_ns, running_ns
+        self._begun_ns = now_ns() - running_ns()
+        self._lock = threading.Lock()
+        self._steps_ns = self._before_ns = 0
+
+    def now_ns(self) -> int:
+        return self._running() + self._begun_ns
+
+    def steps_ns(self) -> int:
+        """All steps that the clock has made by now, as far as anybody
+        looked."""
+        with self._lock:
+            step_ns = self._now_ns() - self.now_ns() - self._steps_ns
+            if abs(step_ns) >= STEP_NS:
+                self._before_ns, self._steps_ns = self._steps_ns, self._steps_ns + step_ns
+            return self._steps_ns
+
+    def steady_ns(self, stamp_ns: int) -> int:
+        """The stamp of a record that has just been received on the steady line.
+
+        A stamp by the host's clock was made before the last step or after it,
+        one by an adapter's own clock knows nothing of it: what is nearer to now
+        is meant. Call `steps_ns` first.
+        """
+        if self._steps_ns == self._before_ns == 0:
+            return stamp_ns
+        now_ns = self.now_ns()
+        return min((stamp_ns - steps for steps in (self._steps_ns, self._before_ns)), key=lambda t: abs(t - now_ns))
+
+
+HOST = SteadyClock()
+"""Of this process: what is opened anew after a step stays on the line."""
