@@ -86,6 +86,20 @@ class RawBatch:
         return replace(self, flags=flags, gap=gap)
 
     @staticmethod
+    def joined(batches: Sequence[RawBatch]) -> RawBatch:
+        """One after the other as one. Their gaps are lost: the flags tell of
+        them."""
+        if len(batches) == 1:
+            return batches[0]
+        return RawBatch(
+            np.concatenate([b.time_ns for b in batches]),
+            np.concatenate([b.source for b in batches]),
+            np.concatenate([b.flags for b in batches]),
+            np.concatenate([b.length for b in batches]),
+            b"".join(b.payload for b in batches),
+        )
+
+    @staticmethod
     def of(records: Sequence[tuple[int, int, int, bytes]]) -> RawBatch:
         """From (time_ns, source, flags, data) records."""
         return RawBatch(

@@ -35,6 +35,9 @@ from triaxcald.recording.frames import (
 T = TypeVar("T")
 METADATA_MOST = 2**20  # bytes; ours has some hundred
 ATTACHMENTS_MOST = 1000  # a run leaves a dozen
+JOINED = 1 << 15
+"""Raw records that are decoded at once: so many that the cost of a call no
+longer counts, and less than a MiB."""
 
 
 class TopicMessage(NamedTuple):
@@ -132,8 +135,19 @@ class Recording:
         return list(dict.fromkeys(phase for phase, _ in self.raw_batches()))
 
     def raw(self, phase: schema.Phase) -> Iterator[RawBatch]:
-        """The phase's raw records in the order in which they came."""
-        return (batch for found, batch in self.raw_batches() if found == phase)
+        """The phase's raw records in the order in which they came, some
+        `JOINED` at a time: a live bus hands out few."""
+        waiting: list[RawBatch] = []
+        records = 0
+        for found, batch in self.raw_batches():
+            if found == phase:
+                waiting.append(batch)
+                records += len(batch)
+                if records >= JOINED:
+                    yield RawBatch.joined(waiting)
+                    waiting, records = [], 0
+        if waiting:
+            yield RawBatch.joined(waiting)
 
     def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
         """All raw records with their phase."""

@@ -39,10 +39,27 @@ def test_what_was_written_is_read(
 
 def test_iterators_do_not_disturb_each_other(recording: Path) -> None:
     with Recording.open(recording) as rec:
-        pairs = list(zip(rec.raw("calibration"), rec.raw("calibration"), strict=True))
-        assert len(pairs) == 4
-        for a, b in pairs:
+        pairs = list(zip(rec.raw_batches(), rec.raw_batches(), strict=True))
+        assert len(pairs) > 4
+        for (_, a), (_, b) in pairs:
             np.testing.assert_array_equal(a.time_ns, b.time_ns)
+
+
+def test_records_of_a_phase_come_many_at_a_time_however_few_a_message_has(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Recording.open(recording) as rec:
+        single = [batch for phase, batch in rec.raw_batches() if phase == "calibration"]
+        (joined,) = rec.raw("calibration")
+        monkeypatch.setattr("triaxcald.recording.reader.JOINED", len(single[0]) + 1)
+        parts = list(rec.raw("calibration"))
+    assert len(single) == 4
+    assert [len(p) for p in parts] == [len(single[0]) + len(single[1]), len(single[2]) + len(single[3])]
+    for column in ("time_ns", "source", "flags", "length"):
+        whole = np.concatenate([getattr(b, column) for b in single])
+        np.testing.assert_array_equal(getattr(joined, column), whole)
+        np.testing.assert_array_equal(np.concatenate([getattr(p, column) for p in parts]), whole)
+    assert joined.payload == b"".join(b.payload for b in single) == b"".join(p.payload for p in parts)
 
 
 class Frugal(io.BytesIO):

@@ -246,7 +246,7 @@ def test_no_write_is_larger_than_a_chunk_however_much_is_given(
         for _ in range(10):
             writer.raw("calibration", big)
     with Recording.open(tmp_path / "rec.mcap") as rec:
-        assert [len(b) for b in rec.raw("calibration")] == [schema.MAX_RECORDS] * 30
+        assert [len(b) for _, b in rec.raw_batches()] == [schema.MAX_RECORDS] * 30
 
 
 def test_the_same_input_by_the_same_clock_is_the_same_file(write_recording: Callable[[str], Path]) -> None:
