@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.daemon.tables.exports import EXPORTS, Export
+from tests.daemon.tables.written import EVERY, GOOD, asked, lines, read
 from triaxcald.errors import InputError
-from triaxcald.tables import arrow
 from triaxcald.tables.samples import Reading, Table, read_table
 
 CLEAR = [e for e in EXPORTS if e.hint is None]
@@ -44,50 +44,6 @@ def test_a_table_with_two_readings_is_asked_about_and_read_as_the_option_says(tm
         read_table(path)
     assert export.asked in str(caught.value)
     require_right(read_table(path, export.hint), export)
-
-
-def read(folder: Path, content: str | bytes, reading: Reading | None = None, name: str = "a.csv") -> Table:
-    path = folder / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_table(str(path), reading)
-
-
-def asked(folder: Path, content: str | bytes, reading: Reading | None = None) -> str:
-    with pytest.raises(InputError) as caught:
-        read(folder, content, reading)
-    return str(caught.value).removeprefix(f"{folder / 'a.csv'}: ")
-
-
-GOOD = "time,ax,ay,az\n0.00,1,2,3\n0.01,1,2,3.5\n0.02,1,2,4\n"
-
-
-@pytest.mark.parametrize(
-    ("content", "fault", "left"),
-    [
-        (GOOD + "0.03,1,NaN,4\n0.04,1,2,5\n", "line 5: column ay: 'NaN', expected a finite number", 4),
-        (GOOD + "0.03,1,,4\n0.04,1,2,5\n", "line 5: column ay: empty, expected a finite number", 4),
-        (GOOD + "0.03,1,#N/A,4\n0.04,1,2,5\n", "line 5: column ay: '#N/A', expected a finite number", 4),
-        (GOOD + "# pause\n\n0.03,1,2x,4\n", "line 7: column ay: '2x', expected a finite number", 3),
-        (GOOD + "0.03,1,2,4\n0.04,1", "line 6: 2 fields, expected 4", 4),
-        (GOOD + "0.03,1,2,4,5,6\n0.04,1,2,7\n", "line 5: 6 fields, expected 4", 4),
-        (GOOD.replace("0.00,1,2,3", "0.00,,,"), "line 2: column ax: empty, expected a finite number", 2),
-        (GOOD + "End of file\n", "line 5: 1 fields, expected 4", 3),
-    ],
-)
-def test_lines_that_lack_a_number_are_named_and_left_out_where_the_user_says(
-    tmp_path: Path, content: str, fault: str, left: int
-) -> None:
-    assert asked(tmp_path, content) == f"{fault}; 1 such lines: --skip-bad leaves them out"
-    table = read(tmp_path, content, Reading(skip_bad=True))
-    assert len(table.samples.time_ns) == left
-    assert table.remarks[-1] == f"1 of {left + 1} lines left out (--skip-bad); {fault}"
-
-
-def test_of_a_garbled_line_the_column_is_named_that_is_garbled(tmp_path: Path) -> None:
-    lines = [f"{i / 100:.2f},1,2,3" for i in range(30)]
-    lines[20] = "0.20,1,2e9,3"
-    fault = asked(tmp_path, "time,ax,ay,az\n" + "\n".join(lines) + "\n")
-    assert fault.startswith("line 22: column ay: '2e9', expected a number within 10000 times most others; 1 such")
 
 
 @pytest.mark.parametrize(
@@ -155,45 +111,6 @@ def test_names_may_be_given_without_the_blanks_quotes_and_marks_of_the_file(tmp_
         assert read(tmp_path, content, reading).samples.readings.tolist() == [[1, 2, 3], [1, 2, 3.5]]
 
 
-def test_an_index_with_gaps_shows_the_samples_that_were_lost(tmp_path: Path) -> None:
-    content = "index,ax,ay,az\n10,1,2,3\n11,1,2,3\n14,1,2,3\n15,1,2,3\n"
-    assert read(tmp_path, content, Reading(rate=10.0)).samples.time_ns.tolist() == [0, 10**8, 4 * 10**8, 5 * 10**8]
-
-
-def test_other_columns_are_channels_where_they_are_whole_and_measured(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    u, supply = rng.normal(size=(50, 3)), rng.normal(5, 0.1, 50)
-    rows = [
-        f"{i * 0.01:.2f},{i},{x:.6f},{y:.6f},{z:.6f},{np.hypot(np.hypot(x, y), z):.6f},{s:.4f},,ok,{i % 7}"
-        for i, ((x, y, z), s) in enumerate(zip(u, supply, strict=True))
-    ]
-    content = "\n".join(["time,counter,ax,ay,az,strength,Supply (V),gap,status,phase", *rows])
-    table = read(tmp_path, content)
-    assert list(table.samples.channels) == ["Supply (V)", "phase"]
-    assert table.remarks[1] == (
-        "left out: counter (an index); strength (computed from the outputs); gap (50 of 50 cells empty); "
-        "status (no numbers)"
-    )
-
-
-def test_rows_that_repeat_exactly_count_once(tmp_path: Path) -> None:
-    table = read(tmp_path, GOOD + "0.02,1,2,4\n0.03,1,2,4\n")
-    assert table.samples.duplicates == 1
-    assert len(table.samples.time_ns) == 4
-
-
-def test_nanoseconds_since_1970_keep_their_last_digits(tmp_path: Path) -> None:
-    content = "ns,ax,ay,az\n1700000000000000001,1,2,3\n1700000000010000003,1,2,4\n"
-    assert read(tmp_path, content).samples.time_ns.tolist() == [1700000000000000001, 1700000000010000003]
-
-
-def test_times_with_a_zone_are_compared_as_what_they_are(tmp_path: Path) -> None:
-    content = (
-        "when,x,y,z\n2026-01-31T12:00:00.5+01:00,1,2,3\n2026-01-31T11:00:01Z,1,2,4\n2026-01-31 11:00:01.25 UTC,1,2,5\n"
-    )
-    assert np.diff(read(tmp_path, content).samples.time_ns).tolist() == [500_000_000, 250_000_000]
-
-
 def test_rows_that_are_means_of_poses_need_no_time(tmp_path: Path) -> None:
     content = "pose;X [V];Y [V];Z [V];std X;std Y;std Z;se_ux;se_uy;se_uz\n" + "".join(
         f"{i};{i};{-i};{i * i};0,1;0,1;0,1;0,01;0,02;0,03\n" for i in range(1, 5)
@@ -205,40 +122,9 @@ def test_rows_that_are_means_of_poses_need_no_time(tmp_path: Path) -> None:
     assert table.output_unit == "V"
 
 
-def test_a_column_that_numbers_the_rows_is_no_channel_whatever_its_name(tmp_path: Path) -> None:
-    table = read(tmp_path, "time,ax,ay,az,foo\n0.00,1,2,3,7\n0.01,1,2,3.5,8\n0.02,1,2,4,9\n")
-    assert table.remarks[1] == "left out: foo (an index)"
-
-
-def test_what_is_no_parquet_file_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"a\.parquet: not readable as Parquet: "):
-        read(tmp_path, b"PAR1 and no more", name="a.parquet")
-    with pytest.raises(InputError, match=r"b\.parquet: cannot be read: No such file or directory"):
-        read_table(str(tmp_path / "b.parquet"))
-    (tmp_path / "c.parquet").mkdir()
-    with pytest.raises(InputError, match=r"c\.parquet: cannot be read: "):
-        read_table(str(tmp_path / "c.parquet"))
-
-
-def test_a_parquet_file_of_more_cells_than_memory_holds_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(arrow, "CELLS_MOST", 100)
-    (tmp_path / "a.parquet").write_bytes(next(e.data for e in EXPORTS if e.suffix == ".parquet"))
-    with pytest.raises(InputError, match=r"a\.parquet: more than 100 cells"):
-        read_table(str(tmp_path / "a.parquet"))
-
-
 def test_forty_exports_and_more_are_tried_each_of_another_program() -> None:
     assert len(EXPORTS) >= 40
     assert len({e.program for e in EXPORTS}) == len(EXPORTS)
-
-
-def lines(rows: list[str], header: str = "time,ax,ay,az") -> str:
-    return "\n".join([header, *rows]) + "\n"
-
-
-EVERY = [f"{i / 100:.2f},{0.1 + i % 3:.3f},0.2,0.9" for i in range(40)]
 
 
 @pytest.mark.parametrize(
@@ -274,98 +160,6 @@ def test_what_a_second_reader_found_read_wrongly_is_asked_about(tmp_path: Path, 
     assert words in asked(tmp_path, content)
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "# baud rate: 115200", "# Abtastzeit: 0,01 s", "# sample rate: 10 ms", "# Sampling rate [ms]: 10",
-        "# Sample frequency (Hz): 1,000", "# FS: +-8 g", "# low-pass filter at 42 Hz",
-    ],
-)  # fmt: skip
-def test_a_number_that_is_no_rate_in_hertz_is_none(tmp_path: Path, line: str) -> None:
-    content = f"{line}\n" + lines([f"{i},1,2,3" for i in range(20)], "sample,ax,ay,az")
-    assert "column sample is an index, and nothing states a rate: --rate HZ" in asked(tmp_path, content)
-
-
 def test_numbered_accelerations_are_taken_rather_than_letters_of_something_else(tmp_path: Path) -> None:
     table = read(tmp_path, lines([f"{row},0.1,0.2,0.9" for row in EVERY], "time,a1,a2,a3,ex,ey,ez"))
     assert "ux = a1, uy = a2, uz = a3" in table.remarks[0]
-
-
-@pytest.mark.parametrize("name", ["ms_elapsed", "time ms since boot", "Time (ms)"])
-def test_a_unit_of_time_counts_wherever_it_stands_in_the_name(tmp_path: Path, name: str) -> None:
-    table = read(tmp_path, lines([f"{i * 10.5},1,2,3" for i in range(20)], f"{name},ax,ay,az"))
-    assert table.samples.time_ns[-1] == round(19 * 10.5e6)
-
-
-def test_rows_of_another_sensor_take_no_time_where_the_rate_is_told(tmp_path: Path) -> None:
-    content = lines([f"{('ACC', 'GYR')[i % 2]},1,2,{i}" for i in range(40)], "sensor,x,y,z")
-    table = read(tmp_path, content, Reading(where={"sensor": "ACC"}, rate=100.0))
-    assert set(np.diff(table.samples.time_ns)) == {10_000_000}
-
-
-def test_an_index_that_counts_no_samples_is_not_said_to(tmp_path: Path) -> None:
-    content = lines([f"{2 * i},1,2,{i % 3}" for i in range(40)], "packet,ax,ay,az")
-    assert read(tmp_path, content, Reading(rate=100.0)).remarks[0].startswith("read as t = rows, 100 Hz")
-
-
-@pytest.mark.parametrize("header", ["time_ms,ax,ay,az,T", "t [ms],ax,ay,az,T [°C]", "Zeit [ms],ax,ay,az,T"])
-def test_t_is_a_temperature_beside_a_time(tmp_path: Path, header: str) -> None:
-    table = read(tmp_path, lines([f"{10 * i},1,2,{i % 3},{20 + i % 7}" for i in range(40)], header))
-    assert set(np.diff(table.samples.time_ns)) == {10_000_000}
-    assert table.samples.channels["temp_c"][6] == 26
-    assert ", temp_c = T" in table.remarks[0]
-
-
-def test_t_alone_is_a_time_where_it_rises_and_else_a_temperature(tmp_path: Path) -> None:
-    rising = lines([f"{i / 100},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az")
-    assert set(np.diff(read(tmp_path, rising).samples.time_ns)) == {10_000_000}
-    falling = lines([f"{20 + i % 7},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az")
-    with pytest.raises(InputError, match="no column of time"):
-        read(tmp_path, falling)
-    assert "temp_c" in read(tmp_path, falling, Reading(rate=100.0)).samples.channels
-
-
-def test_t_is_the_time_that_the_user_says_it_is_whatever_it_does(tmp_path: Path) -> None:
-    once_back = lines([f"{(i % 30) / 100},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az")
-    with pytest.raises(InputError, match="column T: the time is before that of the line before"):
-        read(tmp_path, once_back, Reading(columns={"t": "T"}))
-    with pytest.raises(InputError, match="column T: the time falls back"):
-        read(tmp_path, lines([f"{(i % 39) / 100},1,2,{i % 3}" for i in range(40)], "T,ax,ay,az"))
-    assert len(read(tmp_path, once_back, Reading(columns={"t": "T"}, rate=100.0)).samples.time_ns) == 40
-
-
-def test_a_column_that_says_temperature_comes_before_t(tmp_path: Path) -> None:
-    rows = [f"{10 * i},1,2,{i % 3},{i % 5},{20 + i % 7}" for i in range(40)]
-    channels = read(tmp_path, lines(rows, "t_ms,ax,ay,az,T,temp")).samples.channels
-    assert channels["temp_c"][6] == 26
-    assert channels["T"][6] == 1
-
-
-def test_a_t_that_always_rises_beside_a_time_is_another_time(tmp_path: Path) -> None:
-    rows = [f"{10 * i},1,2,{i % 3},{i / 100}" for i in range(40)]
-    assert not read(tmp_path, lines(rows, "t_ms,ax,ay,az,T")).samples.channels
-
-
-def test_without_a_column_that_counts_the_rows_are_counted(tmp_path: Path) -> None:
-    content = lines([f"{i % 5},1,2,{i % 3}" for i in range(40)], "q,ax,ay,az")
-    assert set(np.diff(read(tmp_path, content, Reading(time_unit="index", rate=100.0)).samples.time_ns)) == {10**7}
-
-
-@pytest.mark.parametrize("name", ["temp_f", "Temp [°F]", "temp_raw", "temp_mv"])
-def test_a_temperature_in_another_unit_keeps_its_name(tmp_path: Path, name: str) -> None:
-    channels = read(tmp_path, lines([f"{row},{70 + i % 7}" for i, row in enumerate(EVERY)], f"time,ax,ay,az,{name}"))
-    assert "temp_c" not in channels.samples.channels
-
-
-def test_one_wrong_date_is_one_wrong_line(tmp_path: Path) -> None:
-    rows = [f"2024-12-01 10:00:00.{i:02d},1,2,{i % 3}" for i in range(40)]
-    rows[7] = rows[7].replace("2024-12", "2024-13")
-    assert asked(tmp_path, lines(rows)).startswith("line 9: column time: '2024-13-01 10:00:00.07', expected")
-    assert len(read(tmp_path, lines(rows), Reading(skip_bad=True)).samples.time_ns) == 39
-
-
-def test_times_of_day_go_on_after_midnight(tmp_path: Path) -> None:
-    rows = [f"23:59:59.{i:02d},1,2,{i % 3}" for i in range(50, 100)] + [
-        f"00:00:00.{i:02d},1,2,{i % 3}" for i in range(50)
-    ]
-    assert set(np.diff(read(tmp_path, lines(rows)).samples.time_ns)) == {10_000_000}
