@@ -23,7 +23,7 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import Effect, reshaped
 from triaxcal.errors import NotStill, Refused
-from triaxcal.model.sensor import Sensor
+from triaxcal.model.sensor import Radius, Sensor
 from triaxcal.poses.covariates import covariates, references
 
 Linearised = tuple[Floats, Floats, Floats]
@@ -196,22 +196,22 @@ def linearise(problem: Problem, state: State, jacobian: bool = True) -> Linearis
     if not jacobian:
         length = np.linalg.norm(sensor.specific_force(problem.u, covariates), axis=1)
         return length - problem.reference, np.empty((0, 0)), np.empty(0)
-    length, s, a, by_s, by_v = sensor.radius(problem.u, covariates)
-    x = (problem.u - problem.middle) / problem.half
-    angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
-    effects = [by_coefficients(by_v, e.basis(s, covariates)) for e in state.effects]
-    J = np.concatenate([by_v * x, -by_v, angles, *effects], axis=1)
-    by_u = by_v / sensor.scale_factor
+    radius = sensor.radius(problem.u, covariates)
+    effects = [radius.by_coefficients(e, covariates) for e in state.effects]
+    J = np.concatenate([radius_by_linear(problem, radius, problem.u), *effects], axis=1)
+    by_u = radius.by_v / sensor.scale_factor
     variance = np.einsum("ni,nij,nj->n", by_u, problem.covariance, by_u)
     # Poses without any scatter (made up, or below the resolution) would
     # otherwise weigh infinitely.
     variance = np.maximum(variance, (1e-12 * problem.reference) ** 2) + problem.excess**2
-    return length - problem.reference, J, np.sqrt(variance)
+    return radius.length - problem.reference, J, np.sqrt(variance)
 
 
-def by_coefficients(by_v: Floats, basis: Floats) -> Floats:
-    """(n,p) derivatives of |a| by an effect's coefficients."""
-    return np.asarray(-np.einsum("ni,nip->np", by_v, basis))
+def radius_by_linear(problem: Problem, radius: Radius, u: Floats) -> Floats:
+    """(n,9) derivatives of |a| at outputs u (n,3) by D, w and the angles, the
+    linear parameters of the search."""
+    x = (u - problem.middle) / problem.half
+    return np.concatenate([radius.by_v * x, -radius.by_v, radius.by_misalignment], axis=1)
 
 
 def by_shape(problem: Problem, state: State) -> Floats:

@@ -56,11 +56,11 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
     sensor = Sensor(c.sensor.scale_factor, c.sensor.misalignment, c.sensor.bias, tuple(kept))
     for _ in range(STEPS):
         off = np.linalg.norm(sensor.specific_force(u, covariates), axis=1) - c.reference
-        sensor = sensor.moved(-_gain(_by_parameters(sensor, u, covariates)) @ off)
+        sensor = sensor.moved(-_gain(sensor.radius_by_parameters(u, covariates)) @ off)
     off = np.linalg.norm(sensor.specific_force(u, covariates), axis=1) - c.reference
     # What an error of the whole calibration becomes: the kept parameters follow
     # |a| as nearly as they can.
-    through = _gain(_by_parameters(sensor, u, covariates)) @ _by_parameters(c.sensor, u, covariates)
+    through = _gain(sensor.radius_by_parameters(u, covariates)) @ c.sensor.radius_by_parameters(u, covariates)
     own = np.concatenate([np.ones(9, bool), *(np.full(len(q), keep(e)) for e, q in c.sensor.effects)])
     names = {effect.name for effect, _ in kept}
     needed = {name for effect, _ in kept for name in effect.needs}
@@ -102,16 +102,6 @@ def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Map
     some = by_first[np.linspace(0, len(by_first) - 1, COVARIATES).astype(int)] if logged else by_first
     covariates = {n: logged[n][some] if n in logged else np.repeat(v, len(some)) for n, v in in_use.items()}
     return np.tile(up, (len(some), 1)), {n: np.repeat(v, len(up)) for n, v in covariates.items()}
-
-
-def _by_parameters(sensor: Sensor, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
-    """(m,9+p) derivatives of |a| by scale factors, misalignments, biases and
-    coefficients."""
-    found = sensor.radius(u, covariates)
-    s, a, by_s, by_v = found.s, found.a, found.by_s, found.by_v
-    angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
-    effects = [-np.einsum("ni,nip->np", by_v, e.basis(s, covariates)) for e, _ in sensor.effects]
-    return np.concatenate([-by_v * u / sensor.scale_factor**2, angles, -by_v, *effects], axis=1)
 
 
 def _gain(by_parameters: Floats) -> Floats:

@@ -15,7 +15,7 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import without_creep
 from triaxcal.estimate.initial_estimate import started_problem
-from triaxcal.estimate.likelihood import Problem, State, by_coefficients, linearise_all
+from triaxcal.estimate.likelihood import Problem, State, linearise_all
 from triaxcal.estimate.pose_slopes import PoseSlopes
 from triaxcal.model.sensor import LINEAR, Radius
 from triaxcal.poses.covariates import channels_of, with_scale
@@ -129,7 +129,7 @@ class Rows:
         """(N,p) derivatives of the rows by the coefficients of an effect."""
         if id(effect) not in self._known:
             problems, slopes = self._radii, self.problem.slopes
-            each = [by_coefficients(r.by_v, effect.basis(r.s, problem.covariates)) for problem, r in problems]
+            each = [radius.by_coefficients(effect, problem.covariates) for problem, radius in problems]
             both = each if slopes is None else [each[0], slopes.along(each[1])]
             self._known[id(effect)] = effect, np.concatenate(both) / self.error[:, None]
         return self._known[id(effect)][1]

@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,10 +42,6 @@ only adds coefficients that nobody knows."""
 STEPS = 3
 """Of Newton's method, for nine parameters a few parts in a thousand from where
 they go."""
-
-
-_NextReadings = tuple[Floats, Floats, Floats, dict[str, Floats]]
-"""As `_next_readings` has it."""
 
 
 class Refusal(StrEnum):
@@ -172,7 +169,7 @@ class _Projection:
         there = _next_readings(posterior, at)
         each = [_derivatives(posterior, effect, there) for effect in likeliest]
         ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
-        linear = np.concatenate([rows.linear, there[0]])
+        linear = np.concatenate([rows.linear, there.linear])
         by_term = np.zeros((9 + ends[-1], evidence.columns.shape[1]))
         of_name = {effect.name: k for k, effect in enumerate(likeliest)}
         nothing = np.empty((len(linear), 0))
@@ -228,28 +225,36 @@ def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
     return np.asarray(found)
 
 
-def _derivatives(posterior: Posterior, effect: Effect, next_readings: _NextReadings) -> Floats:
+def _derivatives(posterior: Posterior, effect: Effect, there: _NextReadings) -> Floats:
     """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of
     |a| in the next recording."""
     rows = posterior.evidence.rows
-    _, along, by_v, covariates = next_readings
     try:
-        there = -np.einsum("ni,nip->np", by_v, effect.basis(along, covariates)) / rows.median_standard_error
+        basis = effect.basis(there.along, there.covariates)
+        of_radius = np.einsum("ni,nip->np", there.by_bias, basis) / rows.median_standard_error
     except EffectFault:  # of another package, which does not say what it adds there
-        there = np.zeros((len(along), len(effect.coefficients)))
-    return np.concatenate([rows.by_coefficients(effect), there])
+        of_radius = np.zeros((len(there.along), len(effect.coefficients)))
+    return np.concatenate([rows.by_coefficients(effect), of_radius])
+
+
+class _NextReadings(NamedTuple):
+    """M readings all over the sphere, as of the next recording: derivatives of
+    |a| by the ``linear`` parameters (M,9) over the error of a pose and by the
+    biases (M,3), readings ``along`` the axes (M,3), and the covariates."""
+
+    linear: Floats
+    by_bias: Floats
+    along: Floats
+    covariates: Mapping[str, Floats]
 
 
 def _next_readings(posterior: Posterior, at: HoldsAt) -> _NextReadings:
-    """Of M readings all over the sphere, as of the next recording: derivatives
-    by the linear parameters (M,9) over the error of a pose, readings along the
-    axes and derivatives by the biases (M,3), and the covariates."""
     rows = posterior.evidence.rows
     up = np.array([v for _, v in cube_directions()]) * rows.problem.reference
     found = reading_geometry(rows, rows.state.sensor(rows.problem).output(up, {}))
     reference = rows.problem.channel_reference
     covariates = at_moment(reference, len(up), at.clocks)
-    return found.linear / rows.median_standard_error, found.along, -found.by_v, covariates
+    return _NextReadings(found.linear / rows.median_standard_error, found.by_bias, found.along, covariates)
 
 
 def _mean(posterior: Posterior, projection: _Projection) -> tuple[Floats, dict[int, Floats]]:

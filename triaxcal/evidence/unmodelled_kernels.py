@@ -18,6 +18,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import BEFORE
+from triaxcal.estimate.likelihood import radius_by_linear
 from triaxcal.evidence.linearised_data import Rows
 from triaxcal.model.directions import spiral
 
@@ -54,12 +55,13 @@ class UnmodelledKind(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class ReadingGeometry:
-    """k readings: ``up`` (k,3) unit vectors, ``by_v`` (k,3) how |a| goes with
-    the bias of each axis, ``along`` (k,3) the readings along the sensitive axes
-    in g, ``linear`` (k,9) derivatives by the nine parameters."""
+    """k readings: ``up`` (k,3) unit vectors, ``by_bias`` (k,3) derivatives of
+    |a| by the bias of each axis, ``along`` (k,3) the readings along the
+    sensitive axes in g, ``linear`` (k,9) derivatives by the nine parameters, in
+    the scale of `Rows.linear`."""
 
     up: Floats
-    by_v: Floats
+    by_bias: Floats
     along: Floats
     linear: Floats
 
@@ -129,8 +131,8 @@ class UnmodelledCovariance:
         apart = t_s - rows.t_s
         near = np.exp(-(apart**2) / 2 / length**2) * (rows.run == rows.run.max())
         both = [near] if not rows.slopes else [near, near * apart / length**2 * rows.duration_s]
-        by_v = reading_geometry(rows, rows.problem.u).by_v
-        return np.asarray(self.scale * np.concatenate([each[:, None] * by_v for each in both]).T / rows.error)
+        by_bias = reading_geometry(rows, rows.problem.u).by_bias
+        return np.asarray(self.scale * np.concatenate([each[:, None] * by_bias for each in both]).T / rows.error)
 
 
 def duration_of(rows: Rows) -> float:
@@ -189,14 +191,14 @@ def _of_slopes(p: PoseInputs, q: PoseInputs, covariance: Floats) -> Floats:
 
 def _by_the_pose_before(p: PoseInputs, q: PoseInputs) -> Floats:
     near = np.exp(-np.sum((p.before[:, None] - q.before[None]) ** 2, axis=2) / 2 / MEMORY**2)
-    return _of_means(p, q, near * (p.reading_geometry.by_v @ q.reading_geometry.by_v.T))
+    return _of_means(p, q, near * (p.reading_geometry.by_bias @ q.reading_geometry.by_bias.T))
 
 
 def _in_time(p: PoseInputs, q: PoseInputs, length: float) -> Floats:
     """A bias of each axis that wanders smoothly, in each recording anew: one
     process for means and slopes, or slow drift is paid twice."""
     apart = p.t_s[:, None] - q.t_s[None]
-    together = (p.reading_geometry.by_v @ q.reading_geometry.by_v.T) * (p.run[:, None] == q.run)
+    together = (p.reading_geometry.by_bias @ q.reading_geometry.by_bias.T) * (p.run[:, None] == q.run)
     near = np.exp(-(apart**2) / 2 / length**2) * together
     if not p.slopes:
         return np.asarray(near)
@@ -243,11 +245,8 @@ class _Sphere:
 def reading_geometry(rows: Rows, u: Floats) -> ReadingGeometry:
     sensor, problem = rows.state.sensor(rows.problem), rows.problem
     radius = sensor.radius(u, {})
-    x = (u - problem.middle) / problem.half
-    a, by_s = radius.a, radius.by_s
-    angles = -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
-    linear = np.concatenate([radius.by_v * x, -radius.by_v, angles], axis=1) / rows.lengths
-    return ReadingGeometry(a / radius.length[:, None], -radius.by_v, radius.s, linear)
+    linear = radius_by_linear(problem, radius, u) / rows.lengths
+    return ReadingGeometry(radius.a / radius.length[:, None], -radius.by_v, radius.s, linear)
 
 
 def _smooth(p: ReadingGeometry, q: ReadingGeometry, length: float) -> Floats:
@@ -259,5 +258,5 @@ def _by_axis(p: ReadingGeometry, q: ReadingGeometry, sign: int, length: float) -
     for i in range(3):
         same = np.exp(-((p.along[:, None, i] - q.along[None, :, i]) ** 2) / 2 / length**2)
         mirrored = np.exp(-((p.along[:, None, i] + q.along[None, :, i]) ** 2) / 2 / length**2)
-        total += np.outer(p.by_v[:, i], q.by_v[:, i]) * (same + sign * mirrored)
+        total += np.outer(p.by_bias[:, i], q.by_bias[:, i]) * (same + sign * mirrored)
     return total

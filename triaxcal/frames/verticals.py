@@ -97,7 +97,7 @@ def _directions(
     poses.
     """
     u = np.array([p.mean for p in poses])
-    a, by_u, by_parameter = _derivatives(sensor, u, covariates)
+    a, by_u, by_parameter = sensor.specific_force_and_derivatives(u, covariates)
     length = np.linalg.norm(a, axis=1)
     if not np.all(length > 0):
         raise InvalidData("a pose reads no specific force at all under the calibration")
@@ -118,17 +118,3 @@ def _directions(
         V[block, block] += noise[i] - np.outer(gain[i], along[i])
         across[block, block] = (np.eye(3) - np.outer(direction[i], direction[i])) / size[i]
     return direction, across @ V @ across
-
-
-def _derivatives(sensor: Sensor, u: Floats, covariates: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """a (n,3), and its derivatives by the outputs (n,3,3) and by scale factor,
-    misalignment, bias, effects (n,3,p)."""
-    s = sensor.along_axes(u, covariates)
-    inverse = np.linalg.inv(sensor.axes)
-    a = s @ inverse.T
-    by_v = inverse @ np.linalg.inv(np.eye(3) + sensor.departure_slope(s, covariates))
-    by_u = by_v / sensor.scale_factor
-    angles = -np.stack([inverse[:, 1] * a[:, 2:3], inverse[:, 0] * a[:, 2:3], inverse[:, 0] * a[:, 1:2]], axis=2)
-    effects = [-by_v @ effect.basis(s, covariates) for effect, _ in sensor.effects]
-    by_scale_factor = -by_u * (u / sensor.scale_factor)[:, None, :]
-    return a, by_u, np.concatenate([by_scale_factor, angles, -by_v, *effects], axis=2)

@@ -40,6 +40,17 @@ class Radius(NamedTuple):
     by_s: Floats
     by_v: Floats
 
+    @property
+    def by_misalignment(self) -> Floats:
+        """(n,3) derivatives by the three angles."""
+        by_s, a = self.by_s, self.a
+        return -np.stack([by_s[:, 1] * a[:, 2], by_s[:, 0] * a[:, 2], by_s[:, 0] * a[:, 1]], axis=1)
+
+    def by_coefficients(self, effect: Effect, covariates: Mapping[str, Floats]) -> Floats:
+        """(n,p) derivatives by the coefficients of an effect, whether the
+        sensor has it or not."""
+        return np.asarray(-np.einsum("ni,nip->np", self.by_v, effect.basis(self.s, covariates)))
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -135,6 +146,29 @@ class Sensor:
         if self.effects:
             by_v = _solved(self.departure_slope(s, covariates).transpose(0, 2, 1), by_s)
         return Radius(length, s, a, by_s, by_v)
+
+    def specific_force_and_derivatives(
+        self, u: Floats, covariates: Mapping[str, Floats]
+    ) -> tuple[Floats, Floats, Floats]:
+        """a (n,3), its derivatives by the outputs (n,3,3), and by scale
+        factors, misalignments, biases and coefficients (n,3,9+p)."""
+        s = self.along_axes(u, covariates)
+        inverse = np.linalg.inv(self.axes)
+        a = s @ inverse.T
+        by_v = inverse @ np.linalg.inv(np.eye(3) + self.departure_slope(s, covariates))
+        by_u = by_v / self.scale_factor
+        angles = -np.stack([inverse[:, 1] * a[:, 2:3], inverse[:, 0] * a[:, 2:3], inverse[:, 0] * a[:, 1:2]], axis=2)
+        effects = [-by_v @ effect.basis(s, covariates) for effect, _ in self.effects]
+        by_scale_factor = -by_u * (u / self.scale_factor)[:, None, :]
+        return a, by_u, np.concatenate([by_scale_factor, angles, -by_v, *effects], axis=2)
+
+    def radius_by_parameters(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        """(n,9+p) derivatives of |a| by scale factors, misalignments, biases
+        and coefficients."""
+        found = self.radius(u, covariates)
+        effects = [found.by_coefficients(effect, covariates) for effect, _ in self.effects]
+        by_scale_factor = -found.by_v * u / self.scale_factor**2
+        return np.concatenate([by_scale_factor, found.by_misalignment, -found.by_v, *effects], axis=1)
 
     def magnitude(self, u: Floats, covariates: Mapping[str, Floats]) -> tuple[Floats, Floats]:
         """|a| (n,) and its gradient by the outputs (n,3)."""
