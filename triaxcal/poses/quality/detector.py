@@ -22,7 +22,7 @@ from triaxcal.poses.quality.run_lengths import RunLengths
 from triaxcal.poses.quality.timing import Gaps
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.quantization import OTHERWISE, shown_step
-from triaxcal.poses.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, WINDOW_LEAST, WINDOW_S, Windows
+from triaxcal.poses.stillness.windows import RATE_LEAST, RATE_S, RATE_SAMPLES, Windows, first_period_ns, window_size
 
 CHUNK_LEAST = 4096
 """Samples that are judged at once, 256 blocks of noise: enough for their
@@ -69,14 +69,8 @@ class QualityDetector:
             self._take_chunks(last=True)
 
     def _learn_rate(self) -> None:
-        """As that of the windows: over a quarter of the first samples at a
-        time."""
-        time_ns = np.concatenate([p[0] for p in self._pending])
-        enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
-        time_ns = time_ns[:enough]
-        lag = len(time_ns) // 4
-        self._period_ns = max(float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag, 1.0)
-        size = max(WINDOW_LEAST, round(WINDOW_S * 1e9 / self._period_ns))
+        self._period_ns = max(first_period_ns(np.concatenate([p[0] for p in self._pending])), 1.0)
+        size = window_size(self._period_ns)
         self._chunk = -(-CHUNK_LEAST // size) * size
         self._cells, self._steps, self._runs = CellKeeper(size), StepEstimator(), RunLengths()
         self._gaps, self._spectra = Gaps(), mains.Spectra(self._period_ns)

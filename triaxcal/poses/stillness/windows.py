@@ -34,6 +34,20 @@ READING_MOST = 1e100
 """Squares of readings, and sums of them, have to be numbers too."""
 
 
+def first_period_ns(time_ns: Ints) -> float:
+    """The sample period of the first samples of a stream, over a quarter of
+    them at a time, so that neither bursts nor a gap mislead."""
+    enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
+    time_ns = time_ns[:enough]
+    lag = len(time_ns) // 4
+    return float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag
+
+
+def window_size(period_ns: float) -> int:
+    """Samples in a window."""
+    return max(WINDOW_LEAST, round(WINDOW_S * 1e9 / period_ns))
+
+
 @dataclass(frozen=True)
 class Windows:
     """Summaries of consecutive windows of ``size`` samples, (m,) or (m,3) each.
@@ -107,16 +121,10 @@ class WindowCutter:
             self._close_windows()
 
     def _learn_rate(self) -> None:
-        """Over a quarter of the samples at a time, so that neither bursts nor a
-        gap mislead."""
-        time_ns = np.concatenate([p[0] for p in self._pending])
-        enough = max(RATE_SAMPLES, int(np.searchsorted(time_ns, time_ns[0] + RATE_S * 1e9)) + 1)
-        time_ns = time_ns[:enough]
-        lag = len(time_ns) // 4
-        self._period_ns = float(np.median(time_ns[lag:] - time_ns[:-lag])) / lag
+        self._period_ns = first_period_ns(np.concatenate([p[0] for p in self._pending]))
         if self._period_ns <= 0:
             raise InvalidData("time does not increase from sample to sample")
-        self._size = max(WINDOW_LEAST, round(WINDOW_S * 1e9 / self._period_ns))
+        self._size = window_size(self._period_ns)
 
     def _close_windows(self) -> None:
         time_ns = np.concatenate([p[0] for p in self._pending])
