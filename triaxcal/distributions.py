@@ -78,3 +78,10 @@ def log_sum_exp(log: Sequence[Any] | Floats, axis: int | tuple[int, ...] | None 
     with np.errstate(divide="ignore"):
         found = np.log(np.sum(np.exp(values - largest), axis=axis)) + np.squeeze(largest, axis=axis)
     return np.asarray(found)
+
+
+def softmax(log: Sequence[Any] | Floats, axis: int | None = None) -> Floats:
+    """Probabilities that are given by their logarithms but for a constant; they
+    add up to one along the axis."""
+    values, total = np.asarray(log), log_sum_exp(log, axis=axis)
+    return np.asarray(np.exp(values - (total if axis is None else np.expand_dims(total, axis))))

@@ -104,4 +104,4 @@ def _nothing(posterior: Posterior) -> float:
     """The empty set is always among the sets, and no unmodelled part always
     among its parts (`likely_sets`)."""
     weight, empty = next(pair for pair in zip(posterior.weight, posterior.sets, strict=True) if not pair[1].members)
-    return float(weight * np.exp(empty.by_part[empty.parts.index(0)] - empty.total))
+    return float(weight * empty.part_probabilities[empty.parts.index(0)])

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.distributions import log_sum_exp
+from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.evidence.linearised_data import Rows
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import Term
@@ -65,6 +65,16 @@ class SetEvidence:
     def by_part(self) -> Floats:
         """(P,) logarithms."""
         return np.asarray(log_sum_exp(self.log, axis=1))
+
+    @cached_property
+    def part_probabilities(self) -> Floats:
+        """(P,) of each part, if this set is the one."""
+        return np.asarray(np.exp(self.by_part - self.total))
+
+    @property
+    def coefficients(self) -> Floats:
+        """(q,) means of the scaled coefficients, over parts and sizes."""
+        return np.asarray(self.part_probabilities @ self.mean)
 
 
 class Evidence:
@@ -214,8 +224,7 @@ class Evidence:
             base[row] = self.parts[part].log_prior + 0.5 * np.log(weight).sum() + prior
         gain, log_det, mean = _marginalised(information, score, [self.terms[i].rank for i in members], grids)
         log = self.rows.log_likelihood(chi2 - gain) - 0.5 * log_det + base
-        share = np.exp(log - log_sum_exp(log, axis=1)[:, None])
-        return SetEvidence(members, tuple(parts), sizes, log, np.einsum("ps,psq->pq", share, mean))
+        return SetEvidence(members, tuple(parts), sizes, log, np.einsum("ps,psq->pq", softmax(log, axis=1), mean))
 
 
 def _squared(columns: Floats) -> Floats:

@@ -197,7 +197,7 @@ def _likeliest(posterior: Posterior) -> list[Effect]:
     effects: dict[int, Effect] = {}
     corrects: dict[str, float] = defaultdict(float)
     for w, found in zip(posterior.weight, posterior.sets, strict=True):
-        scaled = np.exp(found.by_part - found.total) @ found.mean
+        scaled = found.coefficients
         ends = np.cumsum([0, *(posterior.evidence.terms[i].rank for i in found.members)])
         for i, first, last in zip(found.members, ends, ends[1:], strict=False):
             term = posterior.evidence.terms[i]
@@ -267,7 +267,7 @@ def _mean(posterior: Posterior, projection: _Projection) -> tuple[Floats, dict[i
     for found, weight in zip(posterior.sets, posterior.weight, strict=True):
         if weight < NEGLIGIBLE:
             continue
-        share = np.exp(found.by_part - found.total) * weight
+        share = found.part_probabilities * weight
         mean = share[:, None] * found.mean
         places = evidence.places(found.members)
         scaled[places] += mean.sum(axis=0)

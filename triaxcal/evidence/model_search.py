@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.distributions import log_sum_exp
+from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
 
 Scores = dict[tuple[int, ...], float]
@@ -97,5 +97,5 @@ def _parts_that_matter(evidence: Evidence, leaders: list[tuple[int, ...]]) -> li
     share = np.zeros(len(evidence.parts))
     for members in leaders:
         by_part = evidence.of_set(members, range(len(evidence.parts))).by_part
-        share = np.maximum(share, np.exp(by_part - log_sum_exp(by_part)))
+        share = np.maximum(share, softmax(by_part))
     return [part for part in range(len(share)) if part == 0 or share[part] > NO_PART]

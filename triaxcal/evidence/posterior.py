@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.distributions import log_sum_exp
+from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.effects import catalogue_for
 from triaxcal.effects.contract import Effect
 from triaxcal.effects.plugins import EffectFault
@@ -48,8 +48,7 @@ class Posterior:
     @cached_property
     def weight(self) -> Floats:
         """(S,) probability of each set."""
-        total = np.array([found.total for found in self.sets])
-        return np.asarray(np.exp(total - log_sum_exp(total)))
+        return softmax([found.total for found in self.sets])
 
     def names_of(self, found: SetEvidence) -> frozenset[str]:
         """The effects in a set."""
@@ -313,7 +312,7 @@ def _point_of(posterior: Posterior) -> State | None:
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
     if any(term.change_point >= 0 for term in terms) or not posterior.names_of(best):
         return None
-    scaled = np.exp(best.by_part - best.total) @ best.mean
+    scaled = best.coefficients
     inverse = np.linalg.inv(evidence.covariance(best.parts[int(np.argmax(best.by_part))]))
     left = inverse @ (rows.y - evidence.columns[:, evidence.places(best.members)] @ scaled)
     linear = np.linalg.solve(rows.linear.T @ inverse @ rows.linear, rows.linear.T @ left)

@@ -105,7 +105,7 @@ def probabilities(posterior: Posterior) -> Mapping[Hypothesis, float]:
     """Of every hypothesis."""
     out: dict[Hypothesis, float] = defaultdict(float)
     for weight, found in zip(posterior.weight, posterior.sets, strict=True):
-        share = weight * np.exp(found.by_part - found.total)
+        share = weight * found.part_probabilities
         by_what: dict[UnmodelledKind | None, float] = defaultdict(float)
         for part, p in zip(found.parts, share, strict=True):
             by_what[_what(posterior, part)] += float(p)
