@@ -35,6 +35,23 @@ class Residual:
     noise_floor_g: float
     lack_of_fit_p: float | None
 
+    @classmethod
+    def of(
+        cls,
+        misses: Floats,
+        noise: Floats,
+        *,
+        cross_validated_rms_g: float | None = None,
+        lack_of_fit_p: float | None = None,
+    ) -> Residual:
+        """Of the poses that a fit used: ``misses`` (n,) of |a| and the standard
+        errors (n,) of their noise."""
+        return cls(_rms(misses), float(np.max(np.abs(misses))), cross_validated_rms_g, _rms(noise), lack_of_fit_p)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
 
 @dataclass(frozen=True)
 class HoldsAt:
@@ -115,6 +132,42 @@ class PoseResult:
     @property
     def used(self) -> bool:
         return self.excluded is None
+
+
+def pose_results(
+    poses: Sequence[Pose],
+    direction: Floats,
+    misses: Floats,
+    noise: Floats,
+    studentized: Floats,
+    leverage: Floats,
+    *,
+    total: Floats | None = None,
+    excluded: Mapping[int, Exclusion] | None = None,
+) -> tuple[PoseResult, ...]:
+    """Of arrays with a row for each pose; ``total`` are the standard errors
+    with what residuals show beyond noise, ``excluded`` has the reasons by row."""
+    reasons = excluded or {}
+    return tuple(
+        PoseResult(
+            pose,
+            direction[i],
+            float(misses[i]),
+            float(noise[i]),
+            float(studentized[i]),
+            float(leverage[i]),
+            reasons.get(i),
+            None if total is None else float(total[i]),
+        )
+        for i, pose in enumerate(poses)
+    )
+
+
+def studentized(misses: Floats, error: Floats, leverage: Floats, least: float = 1e-6) -> Floats:
+    """(n,) residuals over their own standard errors; 0 where a pose leaves less
+    than the share ``least`` of its error to show as a residual."""
+    free = np.sqrt(np.maximum(1 - leverage, 0.0))
+    return np.where(free > least, misses / error / np.maximum(free, least), 0.0)
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ import scipy
 
 from triaxcal.arrays import Floats
 from triaxcal.errors import NotStill
-from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise
-from triaxcal.estimate.pose_slopes import residual_chi2
+from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise, residual_chi2
 from triaxcal.poses.pure_error import lack_of_fit_p
 
 NO_CHANCE = 1e-4

@@ -214,6 +214,24 @@ def radius_by_linear(problem: Problem, radius: Radius, u: Floats) -> Floats:
     return np.concatenate([radius.by_v * x, -radius.by_v, radius.by_misalignment], axis=1)
 
 
+def residual_chi2(linearised: Linearised) -> float:
+    """The sum of squares that is left of residuals at the minimum, in linear
+    reckoning from near it."""
+    r, J, s = linearised
+    return residual_sum_of_squares(J / s[:, None], r / s)
+
+
+def residual_sum_of_squares(columns: Floats, misses: Floats) -> float:
+    """Sum of squares of what is left of misses (n,) beside columns (n,p),
+    however different these are in size; infinite where the model does not
+    hold."""
+    if not (np.isfinite(columns).all() and np.isfinite(misses).all()):
+        return np.inf
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    step = np.linalg.lstsq(columns / size, misses, rcond=1e-13)[0]
+    return float(np.sum((misses - columns / size @ step) ** 2))
+
+
 def by_shape(problem: Problem, state: State) -> Floats:
     """Derivatives of all residuals (`linearise_all`) by the shapes of the
     effects (`Effect.shape`), (n,m), in thousandths of each."""

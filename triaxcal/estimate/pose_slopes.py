@@ -18,7 +18,7 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
 from triaxcal.effects.contract import DURATION, SINCE_START, TIME, Effect, channel_of, is_derived, lag_in, rate_of
-from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise, linearise_all
+from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise, linearise_all, residual_chi2
 from triaxcal.poses.covariates import rate_of_lag
 from triaxcal.poses.pose import Pose
 
@@ -126,32 +126,8 @@ def left_by_slopes(problem: Problem, state: State) -> float:
     """By how much the sum of squares of a fit to everything is larger than that
     of a fit to the means alone."""
     r, _, s = linearise_all(problem, state)
-    apart = float(np.sum((r / s) ** 2)) - left_by_means(problem, state)
+    apart = float(np.sum((r / s) ** 2)) - residual_chi2(linearise(problem, state))
     return max(apart, 0.0) if np.isfinite(apart) else np.inf
-
-
-def left_by_means(problem: Problem, state: State) -> float:
-    """The sum of squares that a fit to the means alone leaves; ``state`` is
-    that of a fit to everything."""
-    return residual_chi2(linearise(problem, state))
-
-
-def residual_chi2(linearised: Linearised) -> float:
-    """The sum of squares that is left of residuals at the minimum, in linear
-    reckoning from near it."""
-    r, J, s = linearised
-    return residual_sum_of_squares(J / s[:, None], r / s)
-
-
-def residual_sum_of_squares(columns: Floats, misses: Floats) -> float:
-    """Sum of squares of what is left of misses (n,) beside columns (n,p),
-    however different these are in size; infinite where the model does not
-    hold."""
-    if not (np.isfinite(columns).all() and np.isfinite(misses).all()):
-        return np.inf
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    step = np.linalg.lstsq(columns / size, misses, rcond=1e-13)[0]
-    return float(np.sum((misses - columns / size @ step) ** 2))
 
 
 def _moved(values: Floats, change: Floats) -> Floats:

@@ -9,8 +9,7 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.effects.contract import DURATION, SINCE_START, Effect, reshaped
-from triaxcal.estimate.likelihood import Problem, State, linearise_all
-from triaxcal.estimate.pose_slopes import residual_chi2
+from triaxcal.estimate.likelihood import Problem, State, linearise_all, residual_chi2
 
 UNLIKELY = 16.0
 """Chi-square over its minimum beyond which a value, and what is next to it,

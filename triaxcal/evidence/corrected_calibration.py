@@ -87,8 +87,7 @@ def _with_known_residuals(c: Calibration, rows: Rows, model_average: Average, pl
     poses = [p.pose for p in c.poses]
     u, covariates = np.array([p.mean for p in poses]), c.covariates_of(poses)
     length, by_u = c.sensor.magnitude(u, covariates)
-    direction = c.sensor.specific_force(u, covariates)
-    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = c.sensor.up(u, covariates)
     r = length - c.reference
     error = np.sqrt(np.einsum("ni,nij,nj->n", by_u, np.array([p.covariance for p in poses]), by_u))
     leverage = np.zeros(len(poses))
@@ -111,11 +110,10 @@ def _with_known_residuals(c: Calibration, rows: Rows, model_average: Average, pl
     )
     own, noise, left = r[of_used], error[of_used], len(used) - float(leverage.sum())
     pure = pure_error_dof([poses[i] for i in of_used])
-    residual = Residual(
-        rms_g=float(np.sqrt(np.mean(own**2))),
-        max_abs_g=float(np.max(np.abs(own))),
+    residual = Residual.of(
+        own,
+        noise,
         cross_validated_rms_g=float(np.sqrt(np.mean((own / free[of_used]) ** 2))),
-        noise_floor_g=float(np.sqrt(np.mean(noise**2))),
         lack_of_fit_p=lack_of_fit_p(float(np.sum((own / noise) ** 2)), left, pure),
     )
     return replace(c, residual=residual, poses=results)

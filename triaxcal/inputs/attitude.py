@@ -21,7 +21,15 @@ import scipy.linalg
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt, PoseResult, Residual
+from triaxcal.estimate.calibration import (
+    Calibration,
+    Exclusion,
+    HoldsAt,
+    PoseResult,
+    Residual,
+    pose_results,
+    studentized,
+)
 from triaxcal.estimate.caution import BirgeRatio, Caution, FewPoses
 from triaxcal.inputs.turntable import (
     ERROR_MOST,
@@ -47,6 +55,8 @@ are added to it."""
 RAISED = 1.5
 """By how much the error of the attitudes has to raise a standard error to be
 worth a word."""
+FREE_LEAST = 1e-3
+"""Poses of which less of the error shows as a residual are not judged by it."""
 PARAMETERS, LEFT_LEAST = 12, 6
 """Degrees of freedom below which the residual proves little: half a degree for
 each of the parameters."""
@@ -277,53 +287,24 @@ def _concluded(
 ) -> AttitudeFit:
     flips = _signs(s, signs)
     sensor, C = _parts(s.P, s.c, flips)
-    rest_p = s.p
-    raised = 1.0
-    if rest_p is not None and rest_p < LACK_OF_FIT:
-        raised = max(1.0, float(np.sqrt(s.chi2 / s.left)))
+    raised = max(1.0, float(np.sqrt(s.chi2 / s.left))) if s.p is not None and s.p < LACK_OF_FIT else 1.0
     G = _by_differences(s, flips, C)
     covariance = G @ s.covariance @ G.T * raised**2
     covariance += np.diag(_of_second_order(covariance, sensor, data.reference) ** 2)
-    a = sensor.specific_force(data.u, {})
-    length, by_u = sensor.magnitude(data.u, {})
-    noise = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", by_u, data.covariance, by_u), (1e-12 * data.reference) ** 2))
-    fitted = np.einsum("nip,pq,njq->nij", s.design, s.covariance, s.design)
-    taken = np.zeros(len(poses))
-    taken[kept] = np.einsum("ni,nij,nj->n", by_u[kept], fitted, by_u[kept])
-    leverage = np.clip(taken / noise**2, 0.0, 1.0)
-    miss = length - data.reference
-    free = np.sqrt(np.maximum(1 - leverage, 0.0))
-    studentized = np.where(free > 1e-3, miss / noise / np.maximum(free, 1e-3), 0.0)
-    direction = a / length[:, None]
-    results = tuple(
-        PoseResult(
-            p,
-            direction[i],
-            float(miss[i]),
-            float(noise[i]),
-            float(studentized[i]),
-            float(leverage[i]),
-            excluded=None if i in kept else Exclusion.FAULT if p.fault else Exclusion.OUTLIER,
-        )
-        for i, p in enumerate(poses)
-    )
-    attitudes = _judged(data, s, direction, C, names)
-    norms = np.sqrt(np.diag(np.linalg.inv(s.covariance)))
-    crossed = _left_out(s)
+    results = _results(poses, data, s, sensor, kept)
+    misses, noise = (np.array(v) for v in zip(*((p.residual_g, p.standard_error_g) for p in results), strict=True))
+    information = np.linalg.inv(s.covariance)
+    norms = np.sqrt(np.diag(information))
+    attitudes = _judged(data, s, np.array([p.direction for p in results]), C, names)
+    residual = Residual.of(misses[kept], noise[kept], cross_validated_rms_g=_left_out(s), lack_of_fit_p=s.p)
     calibration = Calibration(
         sensor=sensor,
         covariance=covariance[:9, :9],
         reference=data.reference,
         channel_reference={},
-        residual=Residual(
-            rms_g=float(np.sqrt(np.mean(miss[kept] ** 2))),
-            max_abs_g=float(np.max(np.abs(miss[kept]))),
-            cross_validated_rms_g=crossed,
-            noise_floor_g=float(np.sqrt(np.mean(noise[kept] ** 2))),
-            lack_of_fit_p=rest_p,
-        ),
+        residual=residual,
         poses=results,
-        condition=float(np.sqrt(np.linalg.cond(np.linalg.inv(s.covariance) / np.outer(norms, norms)))),
+        condition=float(np.sqrt(np.linalg.cond(information / np.outer(norms, norms)))),
         dilution=_dilution(s.data.ups),
         birge_ratio=raised,
         dof=float(s.left if raised > 1 or s.estimated else max(s.data.dof, 1.0)),
@@ -340,6 +321,23 @@ def _concluded(
         s.error_uncertainty_rad if s.estimated else None,
     )
     return replace(found, calibration=replace(calibration, cautions=tuple(_cautions(found, s))))
+
+
+def _results(
+    poses: Sequence[Pose], data: TurntableData, s: TurntableSolution, sensor: Sensor, kept: Ints
+) -> tuple[PoseResult, ...]:
+    """|a| in all poses under the fit to those ``kept``."""
+    a = sensor.specific_force(data.u, {})
+    length, by_u = sensor.magnitude(data.u, {})
+    noise = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", by_u, data.covariance, by_u), (1e-12 * data.reference) ** 2))
+    fitted = np.einsum("nip,pq,njq->nij", s.design, s.covariance, s.design)
+    taken = np.zeros(len(poses))
+    taken[kept] = np.einsum("ni,nij,nj->n", by_u[kept], fitted, by_u[kept])
+    leverage = np.clip(taken / noise**2, 0.0, 1.0)
+    misses = length - data.reference
+    off = studentized(misses, noise, leverage, least=FREE_LEAST)
+    gone = {i: Exclusion.FAULT if p.fault else Exclusion.OUTLIER for i, p in enumerate(poses) if i not in kept}
+    return pose_results(poses, a / length[:, None], misses, noise, off, leverage, excluded=gone)
 
 
 def _signs(s: TurntableSolution, signs: Sequence[float] | None) -> Floats:

@@ -17,7 +17,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.errors import InvalidData, Refused
-from triaxcal.estimate.calibration import Calibration, HoldsAt, PoseResult, Residual
+from triaxcal.estimate.calibration import Calibration, HoldsAt, PoseResult, Residual, pose_results, studentized
 from triaxcal.estimate.caution import Caution
 from triaxcal.estimate.likelihood import Problem, State, linearise, parameters_by_theta
 from triaxcal.model.directions import dilution, linear_design
@@ -296,26 +296,15 @@ def _solved(problem: Problem, datasheet: Datasheet, root: Floats) -> tuple[Float
 
 def _residual(r: Floats, s: Floats, leverage: Floats, p: float | None) -> Residual:
     alone = r / np.maximum(1 - leverage, 1e-9)  # of each pose under datasheet and all other poses
-    return Residual(
-        rms_g=float(np.sqrt(np.mean(r**2))),
-        max_abs_g=float(np.max(np.abs(r))),
-        cross_validated_rms_g=float(np.sqrt(np.mean(alone**2))) if np.all(leverage < 1 - 1e-6) else None,
-        noise_floor_g=float(np.sqrt(np.mean(s**2))),
-        lack_of_fit_p=p,
-    )
+    crossed = float(np.sqrt(np.mean(alone**2))) if np.all(leverage < 1 - 1e-6) else None
+    return Residual.of(r, s, cross_validated_rms_g=crossed, lack_of_fit_p=p)
 
 
 def _results(
     problem: Problem, state: State, poses: Sequence[Pose], r: Floats, s: Floats, leverage: Floats
 ) -> tuple[PoseResult, ...]:
-    a = state.sensor(problem).specific_force(problem.u, problem.covariates)
-    direction = a / np.linalg.norm(a, axis=1, keepdims=True)
-    free = np.sqrt(np.maximum(1 - leverage, 0.0))
-    studentized = np.where(free > 1e-6, r / s / np.maximum(free, 1e-6), 0.0)
-    return tuple(
-        PoseResult(p, direction[i], float(r[i]), float(s[i]), float(studentized[i]), float(leverage[i]))
-        for i, p in enumerate(poses)
-    )
+    direction = state.sensor(problem).up(problem.u, problem.covariates)
+    return pose_results(poses, direction, r, s, studentized(r, s, leverage), leverage)
 
 
 def _condition(information: Floats) -> float:
@@ -325,9 +314,8 @@ def _condition(information: Floats) -> float:
 
 def _dilution(problem: Problem, state: State) -> float:
     """Of the poses alone, without the datasheet."""
-    a = state.sensor(problem).specific_force(problem.u, problem.covariates)
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    return dilution(a, linear_design(a, (problem.u - problem.middle) / problem.half))
+    up = state.sensor(problem).up(problem.u, problem.covariates)
+    return dilution(up, linear_design(up, (problem.u - problem.middle) / problem.half))
 
 
 def _cautions(found: Refinement) -> Iterator[Caution]:

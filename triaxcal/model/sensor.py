@@ -136,6 +136,11 @@ class Sensor:
         """a (n,3) in g, sensor frame."""
         return np.linalg.solve(self.axes, self.along_axes(u, covariates).T).T
 
+    def up(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
+        """(n,3) direction of the specific force, unit vectors."""
+        a = self.specific_force(u, covariates)
+        return np.asarray(a / np.linalg.norm(a, axis=1, keepdims=True))
+
     def radius(self, u: Floats, covariates: Mapping[str, Floats]) -> Radius:
         """The magnitude of the specific force and its gradients."""
         s = self.along_axes(u, covariates)

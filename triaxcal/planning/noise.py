@@ -13,9 +13,8 @@ from triaxcal.effects.contract import Coefficient, Effect
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.initial_estimate import started_problem
-from triaxcal.estimate.likelihood import Problem, State, linearise, solve
+from triaxcal.estimate.likelihood import Problem, State, linearise, residual_chi2, solve
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.pose_slopes import residual_chi2
 from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.clock import OnPlansClock
 from triaxcal.planning.design import VISIBLE, combinations

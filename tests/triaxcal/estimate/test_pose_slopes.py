@@ -17,9 +17,9 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.cross_validation import cross_validated
 from triaxcal.estimate.excess import Excess
 from triaxcal.estimate.initial_estimate import problem_of, start
-from triaxcal.estimate.likelihood import State, linearise, linearise_all, solve
+from triaxcal.estimate.likelihood import State, linearise, linearise_all, residual_sum_of_squares, solve
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.pose_slopes import PoseSlopes, left_by_slopes, residual_sum_of_squares, slopes_p, with_slopes
+from triaxcal.estimate.pose_slopes import PoseSlopes, left_by_slopes, slopes_p, with_slopes
 from triaxcal.evidence import Posterior, Refusal, posterior_of
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.sensor import Sensor
