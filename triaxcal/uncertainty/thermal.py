@@ -3,6 +3,9 @@ by the thermometer of those it has."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from triaxcal.arrays import Floats
@@ -50,37 +53,66 @@ def temperature(
     missing = _thermal_but(linearised.effects)
     if TEMPERATURE not in linearised.problem.channel_reference or not missing:
         return [], 1.0
-    extra = sum(len(e.coefficients) for e in missing)
-    r, J, _ = linearise_all(linearised.problem, linearised.state.extended(missing))
-    # What residuals show beyond noise may be these very effects.
-    s = linearised.noise
-    spread = np.concatenate([[_sensitivity(e, calibration.reference, stated)] * len(e.coefficients) for e in missing])
-    p = len(linearised.state.theta)
-    Z = J[:, p:] * spread / s[:, None]
-    absorbed = linearised.gain @ (J[:, p:] * spread / linearised.error[:, None])
-    rest = Z - linearised.weighted * (linearised.error / s)[:, None] @ absorbed
-    # With the prior's width as unit: what the poses do not show stays as wide
-    # as it was. By the means alone: slopes know nothing of an effect whose
-    # coefficients, and so its covariates' errors, are zero.
-    n = len(linearised.problem.u)
-    left = _posterior(rest[:n])
-    mean = -left @ rest[:n].T @ (r / s)[:n]
-    through = linearised.G @ absorbed[:p]
-    after = r / s + rest @ mean
-    taken = extra - float(np.trace(left))  # degrees of freedom, fewer than coefficients where the data say little
-    before_ratio, after_ratio = (
-        float(v @ v) / max(len(r) - linearised.weighted.shape[1] - dof, 1e-9)
-        for v, dof in ((r / s, 0.0), (after, taken))
-    )
-    excess = min(max(after_ratio - 1, 0.0) / (before_ratio - 1), 1.0) if before_ratio > 1 else 1.0
-    covariances = np.eye(extra), left, _posterior(Z[:n]), left + np.outer(mean, mean)
-    of_parameters = [through @ c @ through.T for c in covariances]
+    widths = [[_sensitivity(e, calibration.reference, stated)] * len(e.coefficients) for e in missing]
+    lacking = _Lacking.of(linearised, missing, np.concatenate(widths))
+    mean, left = lacking.posterior()
+    covariances = np.eye(len(mean)), left, _posterior(lacking.of_means), left + np.outer(mean, mean)
+    of_parameters = [lacking.through @ c @ lacking.through.T for c in covariances]
     moved = float(np.ptp(linearised.problem.channels[TEMPERATURE]))
     names = tuple(e.name for e in missing)
     by = _halved_by(calibration, names, *map(linearised.magnitude, of_parameters))
     identifiable = not isinstance(by, PosesAtOtherTemperatures)
     basis = UnmodelledTemperature(names, moved, identifiable, stated=stated.thermal_sensitivity is not None)
-    return [Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)], excess
+    component = Component.of(linearised, "temperature", "B", np.inf, of_parameters[-1], basis, by)
+    return [component], lacking.unexplained(mean, left, linearised.weighted.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Lacking:
+    """Effects that the model lacks, by coefficients (q,) in units of their
+    prior widths. ``misses`` (N,) are the residuals of the fit in standard
+    errors of their noise, ``columns`` (N,q) their derivatives, of which the
+    fitted parameters leave the ``rest``; ``through`` (p,q) is what a
+    coefficient does to these parameters. The first ``n`` rows are means."""
+
+    misses: Floats
+    columns: Floats
+    rest: Floats
+    through: Floats
+    n: int
+
+    @classmethod
+    def of(cls, linearised: ErrorPropagation, effects: Sequence[Effect], widths: Floats) -> _Lacking:
+        r, J, _ = linearise_all(linearised.problem, linearised.state.extended(effects))
+        # What residuals show beyond noise may be these very effects.
+        s, p = linearised.noise, len(linearised.state.theta)
+        columns = J[:, p:] * widths / s[:, None]
+        absorbed = linearised.gain @ (J[:, p:] * widths / linearised.error[:, None])
+        rest = columns - linearised.weighted * (linearised.error / s)[:, None] @ absorbed
+        return cls(r / s, columns, rest, linearised.G @ absorbed[:p], len(linearised.problem.u))
+
+    @property
+    def of_means(self) -> Floats:
+        return self.columns[: self.n]
+
+    def posterior(self) -> tuple[Floats, Floats]:
+        """Mean (q,) and covariance (q,q). With the prior's width as unit: what
+        the poses do not show stays as wide as it was. By the means alone:
+        slopes know nothing of an effect whose coefficients, and so its
+        covariates' errors, are zero."""
+        rest = self.rest[: self.n]
+        left = _posterior(rest)
+        return -left @ rest.T @ self.misses[: self.n], left
+
+    def unexplained(self, mean: Floats, left: Floats, fitted: int) -> float:
+        """The share of the residuals' variance beyond noise that is no such
+        effect, 0…1; ``fitted`` parameters took their degrees of freedom."""
+        taken = len(mean) - float(np.trace(left))  # fewer than coefficients where the data say little
+        before, after = (
+            float(v @ v) / max(len(v) - fitted - dof, 1e-9)
+            for v, dof in ((self.misses, 0.0), (self.misses + self.rest @ mean, taken))
+        )
+        return min(max(after - 1, 0.0) / (before - 1), 1.0) if before > 1 else 1.0
 
 
 def _as_probable(calibration: Calibration, linearised: ErrorPropagation) -> list[Component]:
