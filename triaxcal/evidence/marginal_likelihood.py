@@ -272,8 +272,8 @@ def _marginalised(
 def _parts(rows: Rows, odds: Odds) -> list[UnmodelledPart]:
     kinds = kinds_of(rows)
     sizes = np.geomspace(odds.unmodelled_smallest, odds.unmodelled_largest, odds.unmodelled_sizes)
-    share = float(np.log(odds.unmodelled / len(kinds) / len(sizes)))
-    none = UnmodelledPart(None, 0.0, float(np.log1p(-odds.unmodelled)))
+    share = float(np.log(odds.unmodelled_probability / len(kinds) / len(sizes)))
+    none = UnmodelledPart(None, 0.0, float(np.log1p(-odds.unmodelled_probability)))
     return [none, *(UnmodelledPart(kind, float(tau), share) for kind in kinds for tau in sizes)]
 
 

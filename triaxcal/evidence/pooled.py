@@ -114,14 +114,48 @@ def _given(found: Pooled, more: Pooled, p: float) -> Pooled:
 
 def _pooled_conditional_on(units: Sequence[Posterior], acting: frozenset[str]) -> Pooled:
     """Beside effects that are ``acting`` in all sets of every unit."""
-    first = units[0].evidence
     terms = [_terms(unit.evidence) for unit in units]
     forms = [form for form in terms[0] if form[0] not in acting and all(form in of_unit for of_unit in terms)]
     bases = [_bases(unit, acting) for unit in units]
-    own: dict[str, list[float]] = defaultdict(list)
-    one: dict[str, list[float]] = defaultdict(list)
-    index: dict[str, list[int]] = defaultdict(list)
+    scores = {}
     for name in sorted({form[0] for form in forms}):
+        alike = _alike(units, terms, [form for form in forms if form[0] == name])
+        scores[name] = _Scores.of(units, bases, name, [*alike])
+    odds = units[0].evidence.odds
+    apart = float(np.log1p(-odds.pooled_effect_probability))
+    total = float(log_sum_exp([apart, *(of_name.total for of_name in scores.values())]))
+    alone = float(np.exp(apart - total))
+    none = _product(unit.effect_set_probabilities.get(frozenset(), 0.0) for unit in units)
+    found = Pooled(
+        units,
+        shared={name: float(np.exp(of_name.total - total)) for name, of_name in scores.items()},
+        independent_probability=alone,
+        probability={},
+        common={name: of_name.common_probability for name, of_name in scores.items()},
+        shapes={name: shapes_by(of_name.terms, of_name.weights) for name, of_name in scores.items()},
+        nothing=alone * none,
+    )
+    acts = {name: found.one_of((name,)) for name in found.shared}
+    return replace(found, probability=dict(sorted(acts.items(), key=lambda item: -item[1])))
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """Of one name, for each of its forms and shapes, which are the ``terms`` of
+    the first unit: logarithms of the evidence, with priors, where each unit has
+    its ``own`` values and where all have them in ``common``."""
+
+    terms: Sequence[Term]
+    own: Sequence[float]
+    common: Sequence[float]
+
+    @classmethod
+    def of(
+        cls, units: Sequence[Posterior], bases: Sequence[Sequence[_Base]], name: str, alike: Sequence[Sequence[int]]
+    ) -> _Scores:
+        """``alike`` are the terms of each unit that are of one form and shape."""
+        first = units[0].evidence
+        rescaled = float(np.log(first.odds.pooled_effect_probability / first.odds.effect_odds))
         ratios = [_ratio(unit, of_unit, name) for unit, of_unit in zip(units, bases, strict=True)]
         # All without an unmodelled part, or each with its likeliest: the
         # coefficients are one for all.
@@ -129,29 +163,28 @@ def _pooled_conditional_on(units: Sequence[Posterior], acting: frozenset[str]) -
             [_equations(unit, of_unit, name, none) for unit, of_unit in zip(units, bases, strict=True)]
             for none in (True, False)
         ]
-        for alike in _alike(units, terms, [form for form in forms if form[0] == name]):
-            prior = float(first.log_prior[alike[0]]) - np.log(2)  # common values, or each its own
-            of_own = np.sum([ratio[i] for ratio, i in zip(ratios, alike, strict=True)], axis=0)
-            of_one = [_mean(_of_common_values(units, equations, alike)) for equations in settings]
-            own[name].append(prior + _mean(of_own))
-            one[name].append(prior + float(log_sum_exp(of_one)) - np.log(len(settings)))
-            index[name].append(alike[0])
-    apart = float(np.log1p(-first.odds.effect))
-    weight = {name: float(log_sum_exp([*own[name], *one[name]])) for name in own}
-    total = float(log_sum_exp([apart, *weight.values()]))
-    shared = {name: float(np.exp(w - total)) for name, w in weight.items()}
-    of_values = {name: float(np.exp(log_sum_exp(one[name]) - weight[name])) for name in own}
-    shapes = {
-        name: shapes_by(
-            [first.terms[i] for i in index[name]], np.exp(np.logaddexp(own[name], one[name]) - weight[name])
-        )
-        for name in own
-    }
-    alone = float(np.exp(apart - total))
-    none = _product(unit.effect_set_probabilities.get(frozenset(), 0.0) for unit in units)
-    found = Pooled(units, shared, alone, {}, of_values, shapes, alone * none)
-    acts = {name: found.one_of((name,)) for name in shared}
-    return replace(found, probability=dict(sorted(acts.items(), key=lambda item: -item[1])))
+        own, common = [], []
+        for index in alike:
+            prior = float(first.log_prior[index[0]]) + rescaled - np.log(2)  # each its own values, or common ones
+            of_own = np.sum([ratio[i] for ratio, i in zip(ratios, index, strict=True)], axis=0)
+            of_common = [_mean(_of_common_values(units, equations, index)) for equations in settings]
+            own.append(prior + _mean(of_own))
+            common.append(prior + float(log_sum_exp(of_common)) - np.log(len(settings)))
+        return cls([first.terms[index[0]] for index in alike], own, common)
+
+    @property
+    def total(self) -> float:
+        return float(log_sum_exp([*self.own, *self.common]))
+
+    @property
+    def common_probability(self) -> float:
+        """That all units have the same values, if the effect acts in all."""
+        return float(np.exp(log_sum_exp(self.common) - self.total))
+
+    @property
+    def weights(self) -> Floats:
+        """The probability of each form and shape, likewise."""
+        return np.asarray(np.exp(np.logaddexp(self.own, self.common) - self.total))
 
 
 def _product(probabilities: Iterable[float]) -> float:

@@ -7,23 +7,27 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Odds:
-    """Odds and sizes before the poses were seen. A factor of 3 in any of them
-    changes little where the poses are many.
+    """Odds, probabilities and sizes before the poses were seen. A factor of 3
+    in any of them changes little where the poses are many. An odds is that of a
+    hypothesis with one more term over that without.
 
     Sizes are those of a whole effect: the rms of what it adds, over the sphere
     and over the recording's range of its covariate. They mean the same for
     every recording.
     """
 
-    effect: float = 0.3
+    effect_odds: float = 0.3
     """That some effect of the catalogue acts, shared evenly among the names
     that can; a second one likewise."""
-    outlier: float = 0.005
+    pooled_effect_probability: float = 0.3
+    """That one effect acts in every one of several units, shared likewise; else
+    each unit is for itself."""
+    outlier_odds: float = 0.005
     """That a pose is an outlier: one knock or slip in some two hundred."""
-    unmodelled: float = 0.2
+    unmodelled_probability: float = 0.2
     """That something acts that no name describes, shared evenly among its
     kinds."""
-    change_point: float = 0.005
+    change_point_odds: float = 0.005
     """That one calibration does not hold in all poses: a unit exchanged, or its
     channels, in one of two hundred."""
     largest_g: float = 30e-3
@@ -69,3 +73,8 @@ class Odds:
     window: float = 1e4
     """Sets of less probability than the best by this factor are left out
     (Occam's window; Madigan and Raftery 1994, J. Am. Stat. Assoc. 89:1535)."""
+
+    def hangs_on_one_pose(self, probability: float) -> bool:
+        """Whether a candidate of this probability would be certain, but for
+        some one pose that may be an outlier."""
+        return probability >= self.certain

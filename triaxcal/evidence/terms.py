@@ -79,7 +79,7 @@ def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequenc
     if not np.ptp(rows.t_s) > 0:  # means whose times nobody knows
         still = still | {TIME, SINCE_START}
     able = [e for e in catalogue if all(name in known and name not in still for name in e.needs)]
-    share = np.log(odds.effect / max(len(able), 1))
+    share = np.log(odds.effect_odds / max(len(able), 1))
     terms = [term for effect in able for term in _of_effect(rows, effect, share, odds, finer)]
     return [*terms, *(_outlier(rows, i, odds) for i in range(rows.n)), *_another(rows, odds)]
 
@@ -187,7 +187,7 @@ def _outlier(rows: Rows, pose: int, odds: Odds) -> Term:
     if rows.slopes:
         columns[rows.n + pose, 1] = 1 / rows.error[rows.n + pose]
     combination = np.full(columns.shape[1], 1 / np.sqrt(columns.shape[1]))
-    return Term("", f"outlier {pose}", columns * combination, combination, float(np.log(odds.outlier)), pose=pose)
+    return Term("", f"outlier {pose}", columns * combination, combination, float(np.log(odds.outlier_odds)), pose=pose)
 
 
 def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
@@ -201,5 +201,5 @@ def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
         late = np.zeros(rows.n, dtype=bool)
         late[order[cut:]] = True
         columns = rows.linear * np.resize(late, len(rows.y))[:, None] * combination
-        prior = float(np.log(odds.change_point / len(cuts)))
+        prior = float(np.log(odds.change_point_odds / len(cuts)))
         yield Term("", "another", columns, combination, prior, change_point=int(order[cut]))

@@ -83,7 +83,7 @@ def _causes(
     for finding in findings:
         yield f"{_named(finding)} acts"
     for candidate in candidates:
-        one_pose = ", but less so without some one pose" if candidate.probability >= Odds().certain else ""
+        one_pose = ", but less so without some one pose" if Odds().hangs_on_one_pose(candidate.probability) else ""
         yield f"{candidate.effect} probably acts ({chance(candidate.probability)}{one_pose})"
     if found.unexplained.significant:
         yield unexplained(found.unexplained, small)

@@ -90,7 +90,7 @@ class Finding:
     def hangs_on_a_pose(self) -> bool:
         """Whether it is likely enough to be known, and is not since some one
         pose may be an outlier."""
-        likely = self.probability is not None and self.probability >= Odds().certain
+        likely = self.probability is not None and Odds().hangs_on_one_pose(self.probability)
         return self.verdict == CANDIDATE and likely and not self.alternatives
 
     def shape(self, name: str) -> float | None:

@@ -38,8 +38,8 @@ def test_priors_of_an_effect_are_shares_of_its_odds(rows: Rows) -> None:
     odds = Odds()
     terms = [term for term in terms_of(rows, CATALOGUE, odds) if term.effect is not None]
     by_name = {name: sum(np.exp(t.log_prior) for t in terms if t.name == name) for name in {t.name for t in terms}}
-    assert sum(by_name.values()) <= odds.effect + 1e-12
-    assert max(by_name.values()) == pytest.approx(odds.effect / len(by_name), rel=1e-9)
+    assert sum(by_name.values()) <= odds.effect_odds + 1e-12
+    assert max(by_name.values()) == pytest.approx(odds.effect_odds / len(by_name), rel=1e-9)
 
 
 def test_every_pose_may_be_an_outlier(rows: Rows) -> None:
