@@ -22,27 +22,7 @@ from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.evidence.linearised_data import Rows
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import Term
-from triaxcal.evidence.unmodelled_kernels import UnmodelledCovariance, kinds_of
-
-
-@dataclass(frozen=True, eq=False)
-class UnmodelledPart:
-    """The assumption on what no term describes: nothing, or one ``kind`` of
-    size ``tau`` standard errors."""
-
-    kind: UnmodelledCovariance | None
-    tau: float
-    log_prior: float
-
-
-@dataclass(frozen=True, eq=False)
-class _EigenBasis:
-    """The projected data in the axes of one kind: ``variance`` (m,) there,
-    terms' columns (m,C), misfits (m,)."""
-
-    variance: Floats
-    columns: Floats
-    z: Floats
+from triaxcal.evidence.unmodelled_parts import ConditionalData, diagonalised, parts_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +66,12 @@ class Evidence:
         """Sizes begin at ``smallest_g``, by default at that share of the noise
         of a pose which the odds have."""
         self.rows, self.terms, self.odds = rows, terms, odds
-        self.parts = _parts(rows, odds)
+        self.parts = parts_of(rows, odds)
         self._begin_sizes(odds.smallest * rows.median_standard_error if smallest_g is None else smallest_g)
         self.log_prior = np.array([term.log_prior for term in terms])
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
         self.columns = np.concatenate([np.empty((len(rows.y), 0)), *(term.columns for term in terms)], axis=1)
-        projected = rows.complement.T @ self.columns
-        kinds = list(dict.fromkeys(part.kind for part in self.parts))
-        self._diagonal = [_diagonal(kind, projected, rows.z) for kind in kinds]
-        self._which = [kinds.index(part.kind) for part in self.parts]
-        diagonal = (self._diagonal[which] for which in self._which)
-        self._weight = [1 / (1 + part.tau**2 * t.variance) for part, t in zip(self.parts, diagonal, strict=True)]
+        self._data = diagonalised(self.parts, rows.complement.T @ self.columns, rows.z)
         ranks = np.array([term.rank for term in terms], dtype=int)
         self._by_rank: list[tuple[Ints, Ints]] = []
         for rank in np.unique(ranks):
@@ -133,33 +108,17 @@ class Evidence:
         """Logarithms (T,R) of the evidence of each term at each size beside
         ``members`` of given sizes, and that of these alone; with the priors of
         the part and of the term's size, without those of names."""
-        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
-        score, chi2, shared, log_det = self._conditional_on(part, members, sizes)
-        base = self.parts[part].log_prior + 0.5 * float(np.log(weight).sum()) - log_det
+        given = self._conditional_on(part, members, sizes)
+        base = self.parts[part].log_prior + self._data[part].half_log_weight - given.half_log_det
         out = np.empty((len(self.terms), len(self.sizes)))
         for index, places in self._by_rank:
-            information, along = self._in_own_axes(diagonal, weight, shared, places, score)
+            information, along = given.in_own_axes(places)
             squared = self._sizes_of[index][:, :, None] ** 2
             spread = 1 + squared * information[:, None, :]
             gain = np.sum(squared / spread * along[:, None, :], axis=2)
-            out[index] = self.rows.log_likelihood(chi2 - gain) - 0.5 * np.log(spread).sum(axis=2)
-        alone = float(self.rows.log_likelihood(np.array(chi2))) + base
+            out[index] = self.rows.log_likelihood(given.chi2 - gain) - 0.5 * np.log(spread).sum(axis=2)
+        alone = float(self.rows.log_likelihood(np.array(given.chi2))) + base
         return out + base - np.log(len(self.sizes)), alone
-
-    def _in_own_axes(
-        self, diagonal: _EigenBasis, weight: Floats, shared: Floats, places: Ints, score: Floats
-    ) -> tuple[Floats, Floats]:
-        """Eigenvalues (t,q) of the information of each term's coefficients, and
-        the squared scores along its axes."""
-        columns = diagonal.columns[:, places]
-        if places.shape[1] == 1:
-            information = weight @ columns[:, :, 0] ** 2 - np.sum(shared[:, places[:, 0]] ** 2, axis=0)
-            return np.maximum(information, 0.0)[:, None], score[places] ** 2
-        matrix = _squared(np.sqrt(weight)[:, None, None] * columns)
-        if len(shared):
-            matrix = matrix - _squared(shared[:, places])
-        information, axes = np.linalg.eigh(matrix)
-        return np.maximum(information, 0.0), np.einsum("tqr,tq->tr", axes, score[places]) ** 2
 
     def normal_equations(
         self, part: int, members: Sequence[int], sizes: Sequence[float], each: Sequence[int]
@@ -167,31 +126,13 @@ class Evidence:
         """Of ``each`` term the information (q,q) and score (q,) of its scaled
         coefficients beside ``members`` of these sizes, and the sum of squares
         that these leave."""
-        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
-        score, chi2, shared, _ = self._conditional_on(part, members, sizes)
-        out: dict[int, tuple[Floats, Floats]] = {}
-        for i in each:
-            own = slice(self._ends[i], self._ends[i + 1])
-            columns, taken = diagonal.columns[:, own], shared[:, own]
-            out[i] = columns.T @ (weight[:, None] * columns) - taken.T @ taken, score[own]
-        return out, chi2
+        given = self._conditional_on(part, members, sizes)
+        return {i: given.normal_equations(slice(self._ends[i], self._ends[i + 1])) for i in each}, given.chi2
 
-    def _conditional_on(
-        self, part: int, members: Sequence[int], sizes: Sequence[float]
-    ) -> tuple[Floats, float, Floats, float]:
-        """What ``members`` of these sizes leave: the score (C,) of all terms
-        and the sum of squares; (k,C) whose square is the information that they
-        take; and half the logarithm of the determinant of their precision."""
-        diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
-        index = self.places(members)
+    def _conditional_on(self, part: int, members: Sequence[int], sizes: Sequence[float]) -> ConditionalData:
+        """What ``members`` of these sizes leave under a part."""
         scale = np.repeat(np.asarray(sizes, dtype=float), [self.terms[i].rank for i in members])
-        own = diagonal.columns[:, index] * scale
-        lower = np.linalg.cholesky(np.eye(len(index)) + own.T @ (weight[:, None] * own))
-        shared = np.linalg.solve(lower, (own * weight[:, None]).T @ diagonal.columns)
-        absorbed = np.linalg.solve(lower, own.T @ (weight * diagonal.z))
-        score = diagonal.columns.T @ (weight * diagonal.z) - shared.T @ absorbed
-        chi2 = float(diagonal.z @ (weight * diagonal.z)) - float(absorbed @ absorbed)
-        return score, chi2, shared, float(np.log(np.diag(lower)).sum())
+        return self._data[part].beside(self.places(members), scale)
 
     def with_each_further(self, found: SetEvidence, row: int, cells: int) -> Floats:
         """(T,R) about the logarithm of the evidence of a set with each further
@@ -216,20 +157,13 @@ class Evidence:
         score = np.empty((len(parts), len(index)))
         chi2, base = np.empty((2, len(parts), 1))
         for row, part in enumerate(parts):
-            diagonal, weight = self._diagonal[self._which[part]], self._weight[part]
-            own = diagonal.columns[:, index]
-            weighted = (weight[:, None] * own).T
-            information[row], score[row] = weighted @ own, weighted @ diagonal.z
-            chi2[row] = diagonal.z @ (weight * diagonal.z)
-            base[row] = self.parts[part].log_prior + 0.5 * np.log(weight).sum() + prior
+            data = self._data[part]
+            information[row], score[row] = data.normal_equations(index)
+            chi2[row] = data.chi2
+            base[row] = self.parts[part].log_prior + data.half_log_weight + prior
         gain, log_det, mean = _marginalised(information, score, [self.terms[i].rank for i in members], grids)
         log = self.rows.log_likelihood(chi2 - gain) - 0.5 * log_det + base
         return SetEvidence(members, tuple(parts), sizes, log, np.einsum("ps,psq->pq", softmax(log, axis=1), mean))
-
-
-def _squared(columns: Floats) -> Floats:
-    """(t,q,q) of (m,t,q): the products of each term's columns."""
-    return np.asarray(columns.transpose(1, 2, 0) @ columns.transpose(1, 0, 2))
 
 
 def _marginalised(
@@ -267,17 +201,3 @@ def _marginalised(
     gain = gain[..., None] + more.reshape(P, R, -1)
     log_det = log_det[..., None] + more_det.reshape(P, R, -1)
     return gain.reshape(P, -1), log_det.reshape(P, -1), mean.reshape(P, -1, r + q)
-
-
-def _parts(rows: Rows, odds: Odds) -> list[UnmodelledPart]:
-    kinds = kinds_of(rows)
-    sizes = np.geomspace(odds.unmodelled_smallest, odds.unmodelled_largest, odds.unmodelled_sizes)
-    share = float(np.log(odds.unmodelled_probability / len(kinds) / len(sizes)))
-    none = UnmodelledPart(None, 0.0, float(np.log1p(-odds.unmodelled_probability)))
-    return [none, *(UnmodelledPart(kind, float(tau), share) for kind in kinds for tau in sizes)]
-
-
-def _diagonal(kind: UnmodelledCovariance | None, projected: Floats, z: Floats) -> _EigenBasis:
-    if kind is None:
-        return _EigenBasis(np.zeros(len(z)), projected, z)
-    return _EigenBasis(kind.variance, kind.axes.T @ projected, kind.axes.T @ z)
