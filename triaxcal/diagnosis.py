@@ -22,8 +22,9 @@ from triaxcal.evidence.findings import Findings, Named, findings
 from triaxcal.evidence.identifiability import NotIdentifiable, not_identifiable
 from triaxcal.evidence.information_gain import Advice, advice, decided
 from triaxcal.evidence.model_average import Refusal, average, refusal
-from triaxcal.evidence.posterior import Posterior, considered, posterior_of
+from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
+from triaxcal.evidence.refinement import considered, posterior_of
 from triaxcal.evidence.terms import faults_of
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose

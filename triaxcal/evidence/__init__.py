@@ -10,8 +10,9 @@ from triaxcal.evidence.findings import ChangePoint, Findings, Named, Unexplained
 from triaxcal.evidence.information_gain import Advice, Expected, advice
 from triaxcal.evidence.model_average import Average, Refusal, average, refusal
 from triaxcal.evidence.pooled import Pooled, pool
-from triaxcal.evidence.posterior import Posterior, posterior_of
+from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
+from triaxcal.evidence.refinement import posterior_of
 
 __all__ = [
     "Action",
