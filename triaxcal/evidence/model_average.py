@@ -12,30 +12,23 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
 
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.effects import CATALOGUE, TEMPERATURE
 from triaxcal.effects.contract import Effect
-from triaxcal.effects.plugins import EffectFault
 from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.estimate.likelihood import State, linearise_all, parameters_by_theta
+from triaxcal.evidence.average_spread import Spread
 from triaxcal.evidence.mixture_components import NEGLIGIBLE, Components, components
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.unmodelled_kernels import UnmodelledKind, reading_geometry
-from triaxcal.model.directions import cube_directions
+from triaxcal.evidence.projection import Projection
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.sensor import LINEAR, Sensor
-from triaxcal.poses.covariates import at_moment
 
 NOTICEABLE = 0.1
 """Of the standard error of a pose: a name that is unlikely and corrects less is
 not listed."""
-BIAS = slice(3, 6)
-"""Of the nine parameters as the fit has them: to one of these a bias adds as it
-is."""
-THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
 SELECTED_LEAST = 0.03
 """Of the mean square of what an unlikely name may do: a name that corrects less
 only adds coefficients that nobody knows."""
@@ -100,7 +93,7 @@ def average(posterior: Posterior, at: HoldsAt, solved: Sequence[Components] | No
 
 
 def _of_listed(posterior: Posterior, at: HoldsAt, listed: Sequence[Effect], solved: Sequence[Components]) -> Average:
-    projection = _Projection.of(posterior, at, listed)
+    projection = Projection.of(posterior, at, listed)
     mean, left = _mean(posterior, projection)
     state = _where_linearised(posterior, mean, projection)
     sensor = state.sensor(posterior.evidence.rows.problem)
@@ -128,14 +121,14 @@ def linear_alone(posterior: Posterior, at: HoldsAt, linear: Sensor, solved: Sequ
     what is handed on where no effect is corrected."""
     rows = posterior.evidence.rows
     state = State.of(rows.problem, linear)
-    projection, mean = _Projection.of(posterior, at, []), state.theta - rows.state.theta
+    projection, mean = Projection.of(posterior, at, []), state.theta - rows.state.theta
     return _with_errors(posterior, at, projection, linear, state, mean, np.zeros(3), solved)
 
 
 def _with_errors(
     posterior: Posterior,
     at: HoldsAt,
-    projection: _Projection,
+    projection: Projection,
     sensor: Sensor,
     state: State,
     mean: Floats,
@@ -143,51 +136,11 @@ def _with_errors(
     solved: Sequence[Components],
 ) -> Average:
     G = parameters_by_theta(posterior.evidence.rows.problem, state)
-    spread = _Spread.of(posterior, solved, mean, projection, process_bias, at.t_s)
+    spread = Spread.of(posterior, solved, mean, projection, process_bias, at.t_s)
     weights = {effect.name: posterior.effect_probabilities[effect.name] for effect in projection.effects}
     return Average(
         sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, process_bias
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Projection:
-    """Maps the scaled coefficients of every term to deviations of the reported
-    parameters: ``by_term`` (9+p,C), zero for outliers. ``effects`` are those
-    listed, each in the form and the shape that stands for its name, and
-    ``columns`` (N,p) theirs. An effect that is not listed is projected onto the
-    nine parameters."""
-
-    effects: tuple[Effect, ...]
-    columns: Floats
-    by_term: Floats
-
-    @classmethod
-    def of(cls, posterior: Posterior, at: HoldsAt, likeliest: Sequence[Effect]) -> _Projection:
-        evidence = posterior.evidence
-        rows = evidence.rows
-        there = _next_readings(posterior, at)
-        each = [_derivatives(posterior, effect, there) for effect in likeliest]
-        ends = np.cumsum([0, *(columns.shape[1] for columns in each)])
-        linear = np.concatenate([rows.linear, there.linear])
-        by_term = np.zeros((9 + ends[-1], evidence.columns.shape[1]))
-        of_name = {effect.name: k for k, effect in enumerate(likeliest)}
-        nothing = np.empty((len(linear), 0))
-        known: dict[int, Floats] = {}
-        for i in sorted({i for found in posterior.sets for i in found.members}):
-            term = evidence.terms[i]
-            if term.effect is None:
-                continue
-            k = of_name.get(term.name)
-            to = nothing if k is None else each[k]
-            if id(term.effect) not in known:
-                known[id(term.effect)] = _projected(linear, to, _derivatives(posterior, term.effect, there))
-            found = known[id(term.effect)][:, list(term.kept)] * term.combination
-            own = [] if k is None else [*range(9 + ends[k], 9 + ends[k + 1])]
-            by_term[np.ix_([*range(9), *own], evidence.places([i]))] = found
-        by_term[:9] /= rows.lengths[:, None]
-        columns = np.concatenate([np.empty((len(rows.y), 0)), *(c[: len(rows.y)] for c in each)], axis=1)
-        return cls(tuple(likeliest), columns, by_term)
 
 
 def _likeliest(posterior: Posterior) -> list[Effect]:
@@ -216,48 +169,7 @@ def _likeliest(posterior: Posterior) -> list[Effect]:
     ]
 
 
-def _projected(linear: Floats, to: Floats, of: Floats) -> Floats:
-    """(9+p,q): the deviation of the linear parameters, and the coefficients,
-    that come nearest to a unit of each."""
-    size = np.maximum(np.linalg.norm(to, axis=0), 1e-300)
-    found = np.linalg.lstsq(np.concatenate([linear, to / size], axis=1), of, rcond=1e-9)[0]
-    found[linear.shape[1] :] /= size[:, None]
-    return np.asarray(found)
-
-
-def _derivatives(posterior: Posterior, effect: Effect, there: _NextReadings) -> Floats:
-    """(N+M,p) derivatives by the coefficients of an effect: of the rows, and of
-    |a| in the next recording."""
-    rows = posterior.evidence.rows
-    try:
-        basis = effect.basis(there.along, there.covariates)
-        of_radius = np.einsum("ni,nip->np", there.by_bias, basis) / rows.median_standard_error
-    except EffectFault:  # of another package, which does not say what it adds there
-        of_radius = np.zeros((len(there.along), len(effect.coefficients)))
-    return np.concatenate([rows.by_coefficients(effect), of_radius])
-
-
-class _NextReadings(NamedTuple):
-    """M readings all over the sphere, as of the next recording: derivatives of
-    |a| by the ``linear`` parameters (M,9) over the error of a pose and by the
-    biases (M,3), readings ``along`` the axes (M,3), and the covariates."""
-
-    linear: Floats
-    by_bias: Floats
-    along: Floats
-    covariates: Mapping[str, Floats]
-
-
-def _next_readings(posterior: Posterior, at: HoldsAt) -> _NextReadings:
-    rows = posterior.evidence.rows
-    up = np.array([v for _, v in cube_directions()]) * rows.problem.reference
-    found = reading_geometry(rows, rows.state.sensor(rows.problem).output(up, {}))
-    reference = rows.problem.channel_reference
-    covariates = at_moment(reference, len(up), at.clocks)
-    return _NextReadings(found.linear / rows.median_standard_error, found.by_bias, found.along, covariates)
-
-
-def _mean(posterior: Posterior, projection: _Projection) -> tuple[Floats, dict[int, Floats]]:
+def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[int, Floats]]:
     """(9+p,) deviations; and by part the rows that are left, weighted by the
     inverse of their covariance."""
     evidence = posterior.evidence
@@ -283,65 +195,7 @@ def _mean(posterior: Posterior, projection: _Projection) -> tuple[Floats, dict[i
     return deviation, residuals
 
 
-@dataclass(frozen=True, eq=False)
-class _Spread:
-    """As `Average` has it, of the parameters as deviations: ``whole`` and
-    ``thermal`` (9+p,9+p), ``prior`` (p,) variances."""
-
-    whole: Floats
-    thermal: Floats
-    prior: Floats
-
-    @classmethod
-    def of(
-        cls,
-        posterior: Posterior,
-        solved: Sequence[Components],
-        mean: Floats,
-        projection: _Projection,
-        process_bias: Floats,
-        t_s: float,
-    ) -> _Spread:
-        """Within each set, part and choice of sizes, and between them. The
-        biases are those of the moment, with what a process in time adds."""
-        listed = {effect.name for effect in projection.effects}
-        whole, thermal = np.zeros((2, len(mean), len(mean)))
-        prior, total = np.zeros(len(mean) - LINEAR), 0.0
-        for cells in solved:
-            size, here = _moments(cells, posterior, mean, projection, process_bias, t_s)
-            total += float(cells.share.sum())
-            whole += here
-            prior += size
-            if cells.names & (THERMAL - listed):
-                thermal += here
-        return cls(whole / total, thermal / total, prior / total)
-
-
-def _moments(
-    cells: Components, posterior: Posterior, mean: Floats, projection: _Projection, process_bias: Floats, t_s: float
-) -> tuple[Floats, Floats]:
-    """Sums over the choices, by their share: the variances (p,) that the sizes
-    give the coefficients of an average, and the second moments (9+p,9+p) about
-    its mean."""
-    rows, assumed = posterior.evidence.rows, posterior.evidence.parts[cells.part]
-    to = np.concatenate([np.zeros((len(mean), LINEAR)), projection.by_term[:, cells.places]], axis=1)
-    size = cells.share @ (cells.sizes**2 @ (to[LINEAR:, LINEAR:] ** 2).T)
-    to[:LINEAR, :LINEAR] += np.diag(1 / rows.lengths)
-    off = cells.conditional_mean @ to.T - mean
-    off[:, BIAS] -= process_bias
-    wandering = np.zeros((3, 3))
-    if assumed.kind is not None and assumed.kind.what is UnmodelledKind.TIME:
-        there = assumed.tau**2 * assumed.kind.bias_at(rows, t_s) @ cells.inverse
-        off[:, BIAS] += cells.residuals @ there.T
-        wandering = assumed.tau**2 * (assumed.kind.scale * np.eye(3) - there @ assumed.kind.bias_at(rows, t_s).T)
-        to[BIAS] -= there @ cells.design
-    shared = cells.share * cells.noise
-    spread = to @ np.tensordot(shared, cells.conditional_covariance, axes=1) @ to.T
-    spread[BIAS, BIAS] += shared.sum() * wandering
-    return size, spread + (cells.share[:, None] * off).T @ off
-
-
-def _where_linearised(posterior: Posterior, deviation: Floats, projection: _Projection) -> State:
+def _where_linearised(posterior: Posterior, deviation: Floats, projection: Projection) -> State:
     """Adjust the nine parameters until the exact residuals are those of the
     linear model. This absorbs the higher orders of the effects."""
     rows = posterior.evidence.rows

@@ -9,7 +9,6 @@ competitor is that each unit is for itself, with its own posterior.
 
 from __future__ import annotations
 
-import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +17,13 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import log_sum_exp
-from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
+from triaxcal.evidence.base_models import NEGLIGIBLE, BaseModel, base_models, log_ratios
+from triaxcal.evidence.common_values import of_common_values, term_equations
+from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.shape_posterior import Shape, shapes_by
 from triaxcal.evidence.terms import Term
 
-LIKELY = 3
-"""Sets of a unit, the likeliest, beside which an effect is asked about."""
-NEGLIGIBLE = 14.0
-"""In the logarithm: parts that are less likely by more add nothing."""
-STEPS = 6
-"""Towards coefficients that units share: each weighs the units by the noise
-that is left in them."""
 Form = tuple[str, tuple[str, ...], tuple[int, ...]]
 """A name, the coefficients of a form, and those of them that are free."""
 
@@ -116,7 +110,7 @@ def _pooled_conditional_on(units: Sequence[Posterior], acting: frozenset[str]) -
     """Beside effects that are ``acting`` in all sets of every unit."""
     terms = [_terms(unit.evidence) for unit in units]
     forms = [form for form in terms[0] if form[0] not in acting and all(form in of_unit for of_unit in terms)]
-    bases = [_bases(unit, acting) for unit in units]
+    bases = [base_models(unit, acting) for unit in units]
     scores = {}
     for name in sorted({form[0] for form in forms}):
         alike = _alike(units, terms, [form for form in forms if form[0] == name])
@@ -151,23 +145,23 @@ class _Scores:
 
     @classmethod
     def of(
-        cls, units: Sequence[Posterior], bases: Sequence[Sequence[_Base]], name: str, alike: Sequence[Sequence[int]]
+        cls, units: Sequence[Posterior], bases: Sequence[Sequence[BaseModel]], name: str, alike: Sequence[Sequence[int]]
     ) -> _Scores:
         """``alike`` are the terms of each unit that are of one form and shape."""
         first = units[0].evidence
         rescaled = float(np.log(first.odds.pooled_effect_probability / first.odds.effect_odds))
-        ratios = [_ratio(unit, of_unit, name) for unit, of_unit in zip(units, bases, strict=True)]
+        ratios = [log_ratios(unit, of_unit, name) for unit, of_unit in zip(units, bases, strict=True)]
         # All without an unmodelled part, or each with its likeliest: the
         # coefficients are one for all.
         settings = [
-            [_equations(unit, of_unit, name, none) for unit, of_unit in zip(units, bases, strict=True)]
+            [term_equations(unit, of_unit, name, none) for unit, of_unit in zip(units, bases, strict=True)]
             for none in (True, False)
         ]
         own, common = [], []
         for index in alike:
             prior = float(first.log_prior[index[0]]) + rescaled - np.log(2)  # each its own values, or common ones
             of_own = np.sum([ratio[i] for ratio, i in zip(ratios, index, strict=True)], axis=0)
-            of_common = [_mean(_of_common_values(units, equations, index)) for equations in settings]
+            of_common = [_mean(of_common_values(units, equations, index)) for equations in settings]
             own.append(prior + _mean(of_own))
             common.append(prior + float(log_sum_exp(of_common)) - np.log(len(settings)))
         return cls([first.terms[index[0]] for index in alike], own, common)
@@ -231,138 +225,3 @@ def _alike(
 
 def _shape_of(term: Term) -> list[float]:
     return [] if term.effect is None else [value for value, _ in term.effect.shape.values()]
-
-
-@dataclass(frozen=True, eq=False)
-class _Base:
-    """A set that a further term may stand beside: ``found``, the ``names`` in
-    it, and ``with_each`` (T,R), the logarithm of its evidence with each term at
-    each size, of the sizes one by one."""
-
-    found: SetEvidence
-    names: frozenset[str]
-    with_each: Floats
-
-
-def _bases(unit: Posterior, acting: frozenset[str]) -> list[_Base]:
-    """The likeliest sets, and what is left of the likeliest without some of its
-    terms, but for effects that are ``acting``; where none is, the empty set
-    too."""
-    evidence = unit.evidence
-    best = unit.sets[0].members
-    less = [kept for k in range(len(best) + 1) for kept in itertools.combinations(best, k)]
-    some = [*less, *(found.members for found in unit.sets[:LIKELY])]
-    sets = [m for m in dict.fromkeys(some) if acting <= {evidence.terms[i].name for i in m}]
-    known = {found.members: found for found in unit.sets}
-    # Whatever part is likely beside some set: an effect may take the place of a
-    # part.
-    likely = [row for row, part in enumerate(unit.sets[0].parts) if unit.part_probabilities[part] > np.exp(-NEGLIGIBLE)]
-    out = []
-    for members in sets:
-        found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
-        rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE).tolist()}
-        whole = log_sum_exp([evidence.with_each_further(found, row, cells=1) for row in sorted(rows)], axis=0)
-        whole = whole + np.log(len(evidence.sizes))
-        out.append(_Base(found, unit.names_of(found), np.asarray(whole)))
-    return out
-
-
-def _ratio(unit: Posterior, bases: Sequence[_Base], name: str) -> Floats:
-    """(T,R) the logarithm of the evidence of the unit with each term at each
-    size, over that of the unit by itself."""
-    others = [base for base in bases if name not in base.names]
-    with_each = log_sum_exp([base.with_each for base in others], axis=0)
-    without = log_sum_exp([base.found.total for base in others])
-    return np.asarray(with_each - without + _log_without(unit, bases, name))
-
-
-def _log_without(unit: Posterior, bases: Sequence[_Base], name: str) -> float:
-    """The logarithm of the evidence of the unit without that name, over that of
-    the unit by itself."""
-    every = {found.members: found for found in (*(base.found for base in bases), *unit.sets)}.values()
-    others = [found.total for found in every if name not in unit.names_of(found)]
-    return float(log_sum_exp(others) - log_sum_exp([found.total for found in every]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Equations:
-    """Of each term of a name the information (q,q) and score (q,) of its scaled
-    coefficients, in standard errors, beside one set with one part and one
-    choice of sizes that leave ``chi2``. Its share of the unit by itself is
-    ``log_share``; ``variance`` is that of the noise where one more term
-    explains what it can."""
-
-    of_terms: Mapping[int, tuple[Floats, Floats]]
-    chi2: float
-    variance: float
-    log_share: float
-
-
-def _equations(unit: Posterior, bases: Sequence[_Base], name: str, none: bool) -> _Equations:
-    """Beside what explains most with one more term of this name; without an
-    unmodelled part, where ``none``."""
-    evidence = unit.evidence
-    mine = [i for i, term in enumerate(evidence.terms) if term.name == name]
-    others = [base for base in bases if name not in base.names]
-    found = max(others, key=lambda base: base.with_each[mine].max()).found
-    row = found.parts.index(0) if none and 0 in found.parts else int(np.argmax(found.by_part))
-    cell = int(np.argmax(found.log[row]))
-    without = float(log_sum_exp([base.found.total for base in others]))
-    share = float(found.by_part[row]) - without + _log_without(unit, bases, name)
-    of_terms, chi2 = evidence.normal_equations(found.parts[row], found.members, found.sizes[cell], mine)
-    explained = max(_explained(*equations) for equations in of_terms.values())
-    return _Equations(of_terms, chi2, evidence.rows.noise_variance_given(chi2 - explained), share)
-
-
-def _explained(information: Floats, score: Floats) -> float:
-    """By how much a term lowers the sum of squares, at most."""
-    return float(score @ np.linalg.pinv(information) @ score)
-
-
-def _of_common_values(units: Sequence[Posterior], equations: Sequence[_Equations], index: Sequence[int]) -> Floats:
-    """(R,) the same ratio, where all have the coefficients of the first: by
-    Laplace's method about the coefficients that explain most, as the noise of
-    no unit is known beforehand. Two such points are looked for, since a unit
-    may as well lack the effect and be noisy."""
-    first = units[0].evidence.terms[index[0]]
-    scaled = []
-    for unit, of_unit, i in zip(units, equations, index, strict=True):
-        scale = first.combination / unit.evidence.terms[i].combination
-        information, score = of_unit.of_terms[i]
-        scaled.append((scale[:, None] * information * scale, scale * score))
-    shared = (
-        np.array([of[0] for of in scaled]),
-        np.array([of[1] for of in scaled]),
-        np.array([of_unit.chi2 for of_unit in equations]),
-    )
-    explained = np.array([of_unit.variance for of_unit in equations])
-    noisy = np.array([u.evidence.rows.noise_variance_given(e.chi2) for u, e in zip(units, equations, strict=True)])
-    found = [_laplace_log_evidence(units, *shared, start) for start in (explained, noisy)]
-    return np.asarray(np.max(found, axis=0) + sum(of_unit.log_share for of_unit in equations))
-
-
-def _laplace_log_evidence(
-    units: Sequence[Posterior], information: Floats, score: Floats, chi2: Floats, start: Floats
-) -> Floats:
-    """(R,) the logarithm of the evidence of coefficients that U units share
-    over that of none, for each size. Of each unit ``information`` (U,q,q),
-    ``score`` (U,q) and ``chi2`` (U,) without them; ``start`` (U,) are variances
-    of the noise."""
-    size = units[0].evidence.sizes
-    prior = np.eye(score.shape[1]) / size[:, None, None] ** 2
-    variance = np.broadcast_to(start, (len(size), len(units)))
-    for _ in range(STEPS):
-        precision = prior + np.einsum("ru,uqp->rqp", 1 / variance, information)
-        values = np.linalg.solve(precision, ((1 / variance) @ score)[:, :, None])[:, :, 0]
-        squares = np.einsum("rq,uqp,rp->ru", values, information, values)
-        left = np.maximum(chi2 - 2 * values @ score.T + squares, 0.0)
-        variance = np.array(
-            [[u.evidence.rows.noise_variance_given(float(x)) for u, x in zip(units, row, strict=True)] for row in left]
-        )
-    gain = np.zeros(len(size))
-    for k, unit in enumerate(units):
-        rows = unit.evidence.rows
-        gain += rows.log_likelihood(left[:, k]) - rows.log_likelihood(chi2[k])
-    precision = prior + np.einsum("ru,uqp->rqp", 1 / variance, information)
-    log_det = np.linalg.slogdet(precision * size[:, None, None] ** 2)[1]
-    return np.asarray(gain - 0.5 * np.sum((values / size[:, None]) ** 2, axis=1) - 0.5 * log_det)

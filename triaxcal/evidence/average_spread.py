@@ -1,0 +1,82 @@
+"""The covariance of a model average: within each set, part and choice of sizes,
+and between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from triaxcal.arrays import Floats
+from triaxcal.effects import CATALOGUE, TEMPERATURE
+from triaxcal.evidence.mixture_components import Components
+from triaxcal.evidence.posterior import Posterior
+from triaxcal.evidence.projection import Projection
+from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.model.sensor import LINEAR
+
+BIAS = slice(3, 6)
+"""Of the nine parameters as the fit has them: to one of these a bias adds as it
+is."""
+THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Of the parameters as deviations: the ``whole`` covariance (9+p,9+p), of
+    which ``thermal`` is the part of sets with a thermal effect that is not
+    listed; ``prior`` (p,) are the variances of the coefficients before the
+    poses were seen."""
+
+    whole: Floats
+    thermal: Floats
+    prior: Floats
+
+    @classmethod
+    def of(
+        cls,
+        posterior: Posterior,
+        solved: Sequence[Components],
+        mean: Floats,
+        projection: Projection,
+        process_bias: Floats,
+        t_s: float,
+    ) -> Spread:
+        """Within each set, part and choice of sizes, and between them. The
+        biases are those of the moment, with what a process in time adds."""
+        listed = {effect.name for effect in projection.effects}
+        whole, thermal = np.zeros((2, len(mean), len(mean)))
+        prior, total = np.zeros(len(mean) - LINEAR), 0.0
+        for cells in solved:
+            size, here = _moments(cells, posterior, mean, projection, process_bias, t_s)
+            total += float(cells.share.sum())
+            whole += here
+            prior += size
+            if cells.names & (THERMAL - listed):
+                thermal += here
+        return cls(whole / total, thermal / total, prior / total)
+
+
+def _moments(
+    cells: Components, posterior: Posterior, mean: Floats, projection: Projection, process_bias: Floats, t_s: float
+) -> tuple[Floats, Floats]:
+    """Sums over the choices, by their share: the variances (p,) that the sizes
+    give the coefficients of an average, and the second moments (9+p,9+p) about
+    its mean."""
+    rows, assumed = posterior.evidence.rows, posterior.evidence.parts[cells.part]
+    to = np.concatenate([np.zeros((len(mean), LINEAR)), projection.by_term[:, cells.places]], axis=1)
+    size = cells.share @ (cells.sizes**2 @ (to[LINEAR:, LINEAR:] ** 2).T)
+    to[:LINEAR, :LINEAR] += np.diag(1 / rows.lengths)
+    off = cells.conditional_mean @ to.T - mean
+    off[:, BIAS] -= process_bias
+    wandering = np.zeros((3, 3))
+    if assumed.kind is not None and assumed.kind.what is UnmodelledKind.TIME:
+        there = assumed.tau**2 * assumed.kind.bias_at(rows, t_s) @ cells.inverse
+        off[:, BIAS] += cells.residuals @ there.T
+        wandering = assumed.tau**2 * (assumed.kind.scale * np.eye(3) - there @ assumed.kind.bias_at(rows, t_s).T)
+        to[BIAS] -= there @ cells.design
+    shared = cells.share * cells.noise
+    spread = to @ np.tensordot(shared, cells.conditional_covariance, axes=1) @ to.T
+    spread[BIAS, BIAS] += shared.sum() * wandering
+    return size, spread + (cells.share[:, None] * off).T @ off
