@@ -17,12 +17,12 @@ from collections.abc import Callable
 import numpy as np
 from scipy import linalg, optimize
 
+from benchmarks.noise import first_order, flicker, moving_average, white
 from triaxcal.arrays import Floats
 from triaxcal.poses.noise_spectrum import Components, first_order_windows, moving_average_windows
 from triaxcal.poses.pose import poses_of
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import WindowCutter
-from triaxcal.poses.synthetic_noise import first_order, flicker, moving_average, white
 
 RATE_HZ, POSES, MOVE_S, NOISE_G = 100, 26, 1.5, 1e-3
 NEAR = 0.5

@@ -81,7 +81,7 @@ def session(kind: str, seed: int) -> Told:
     for _ in range(UNITS):
         along = {"own": rng.standard_normal(3), "common": common, "nothing": None}[kind]
         poses = poses_of(rng, name, along)
-        units.append(posterior_of(poses, fit(poses, signs=SIGNS), signs=SIGNS, smallest_g=0.1 * NOISE_G))
+        units.append(posterior_of(poses, fit(poses, signs=SIGNS), signs=SIGNS).resized(0.1 * NOISE_G))
     found = pool(units)
     return Told(name, found.nothing <= 1 - CERTAIN, found.certain(CERTAIN), found.common.get(name, 0.0) > 0.5)
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.signal import butter, sosfilt
 
+from benchmarks.noise import first_order, flicker, moving_average, white
 from triaxcal.arrays import Floats, Ints
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.synthetic_noise import first_order, flicker, moving_average, white
 
 PAPER_UNIT = Sensor(
     np.array([-2.410618, -2.403823, -2.371761]),

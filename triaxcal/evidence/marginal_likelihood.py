@@ -62,12 +62,11 @@ class Evidence:
     all, the ``parts`` (the first is none), and the grid of ``sizes`` (R,) of
     effects in g."""
 
-    def __init__(self, rows: Rows, terms: Sequence[Term], odds: Odds, smallest_g: float | None = None) -> None:
-        """Sizes begin at ``smallest_g``, by default at that share of the noise
-        of a pose which the odds have."""
+    def __init__(self, rows: Rows, terms: Sequence[Term], odds: Odds) -> None:
+        """Sizes begin at that share of the noise of a pose which the odds have."""
         self.rows, self.terms, self.odds = rows, terms, odds
         self.parts = parts_of(rows, odds)
-        self._begin_sizes(odds.smallest * rows.median_standard_error if smallest_g is None else smallest_g)
+        self._begin_sizes(odds.smallest * rows.median_standard_error)
         self.log_prior = np.array([term.log_prior for term in terms])
         self._ends: Ints = np.cumsum([0, *(term.rank for term in terms)])
         self.columns = np.concatenate([np.empty((len(rows.y), 0)), *(term.columns for term in terms)], axis=1)

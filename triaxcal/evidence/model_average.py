@@ -53,21 +53,20 @@ class Refusal(StrEnum):
 @dataclass(frozen=True, eq=False)
 class Average:
     """``sensor`` has one entry for each likely name, by the mean of its
-    coefficients: sets without the effect count, with zero. ``covariance``
-    (9+p,9+p) is that of its scale factors, misalignments, biases and
-    coefficients, within the sets and between them, of which ``thermal`` is the
-    part of sets with a thermal effect that is not listed; ``prior_sd`` (p,) are
-    the coefficients' standard deviations before the poses were seen, as the
+    coefficients: sets without the effect count, with zero. Its biases hold what
+    a process in time adds to them at the moment for which all this holds.
+    ``covariance`` (9+p,9+p) is that of its scale factors, misalignments, biases
+    and coefficients, within the sets and between them, of which ``thermal`` is
+    the part of sets with a thermal effect that is not listed; ``prior_sd`` (p,)
+    are the coefficients' standard deviations before the poses were seen, as the
     probabilities and sizes after have them. ``weights`` has the probability of
-    each name. ``process_bias`` (3,) g, which the biases hold, is what a process
-    in time adds to them at the moment for which all this holds."""
+    each name."""
 
     sensor: Sensor
     covariance: Floats
     thermal: Floats
     prior_sd: Floats
     weights: Mapping[str, float]
-    process_bias: Floats
 
 
 def refusal(posterior: Posterior) -> Refusal | None:
@@ -138,9 +137,7 @@ def _with_errors(
     G = parameters_by_theta(posterior.evidence.rows.problem, state)
     spread = Spread.of(posterior, solved, mean, projection, process_bias, at.t_s)
     weights = {effect.name: posterior.effect_probabilities[effect.name] for effect in projection.effects}
-    return Average(
-        sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights, process_bias
-    )
+    return Average(sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights)
 
 
 def _likeliest(posterior: Posterior) -> list[Effect]:

@@ -46,8 +46,8 @@ class Posterior:
         return frozenset(pose for pose in poses if pose >= 0)
 
     def resized(self, smallest_g: float) -> Posterior:
-        """The same sets with sizes that begin elsewhere, as `posterior_of` has
-        them."""
+        """The same sets with effects of sizes that begin at ``smallest_g``:
+        several units that are compared have one grid."""
         evidence = self.evidence.resized(smallest_g)
         sets = [evidence.of_set(found.members, found.parts) for found in self.sets]
         return Posterior(evidence, sorted(sets, key=lambda found: -found.total))

@@ -45,16 +45,13 @@ def posterior_of(
     signs: Sequence[float] = (1, 1, 1),
     catalogue: Sequence[Effect] | None = None,
     odds: Odds | None = None,
-    smallest_g: float | None = None,
 ) -> Posterior:
-    """Of what acts beside the ``linear`` fit of these poses. ``smallest_g`` is
-    the least size of an effect that is asked about; several units that are
-    compared have one."""
+    """Of what acts beside the ``linear`` fit of these poses."""
     odds = odds or Odds()
     effects = considered(poses, catalogue)
     rows, finer = Rows.of(poses, linear, signs, effects), list[Finer]()
     for _ in range(ROUNDS):
-        evidence = Evidence(rows, terms_of(rows, effects, odds, finer), odds, smallest_g)
+        evidence = Evidence(rows, terms_of(rows, effects, odds, finer), odds)
         posterior = Posterior(evidence, likely_sets(evidence))
         point, split = _point_of(posterior), finer_shapes(posterior)
         if point is None and not split:

@@ -13,6 +13,6 @@ def moment(began: PoseStart) -> str:
     return f"{began.start_s:.1f} s{of}"
 
 
-def the_poses(began: Iterable[PoseStart], joined: str = " and ") -> str:
+def the_poses(began: Iterable[PoseStart]) -> str:
     """By when they began."""
-    return joined.join(f"the pose at {moment(b)}" for b in began)
+    return " and ".join(f"the pose at {moment(b)}" for b in began)

@@ -120,7 +120,7 @@ def test_a_process_in_time_says_where_the_bias_is_at_the_moment_asked_for(
     posterior = posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS, catalogue=())
     assert next(iter(posterior.unmodelled_kind_probabilities)) is UnmodelledKind.TIME
     moments = np.linspace(0, poses[-1].end_s, 7)
-    told = np.array([average(posterior, at(t)).process_bias for t in moments])
+    told = np.array([average(posterior, at(t)).sensor.bias for t in moments])
     # What is constant all along is the sensor's bias.
     told, truth = (b - b.mean(axis=0) for b in (told, np.array([bias_g(t) for t in moments])))
     assert np.sqrt(np.mean((told - truth) ** 2)) < 0.2 * np.sqrt(np.mean(truth**2))

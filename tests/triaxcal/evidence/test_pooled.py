@@ -25,7 +25,7 @@ FEW = [
 
 
 def of_units(poses: Sequence[list[Pose]]) -> list[Posterior]:
-    return [posterior_of(p, fit(p, signs=MINUS), signs=MINUS, catalogue=FEW, smallest_g=LEAST_G) for p in poses]
+    return [posterior_of(p, fit(p, signs=MINUS), signs=MINUS, catalogue=FEW).resized(LEAST_G) for p in poses]
 
 
 def test_an_effect_with_common_values_is_certain_in_all_and_in_none_alone(

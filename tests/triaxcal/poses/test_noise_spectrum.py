@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import integrate, linalg, stats
 
+from benchmarks.noise import first_order, flicker, moving_average, white
 from triaxcal.poses.noise_mixture import NoiseLevels
 from triaxcal.poses.noise_spectrum import SLOWEST, Components, Spectrum, Track, periodogram
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import WindowCutter
-from triaxcal.poses.synthetic_noise import first_order, flicker, moving_average, white
 
 WINDOW = 10
 PLACES = [np.arange(31), np.arange(32), np.delete(np.arange(40), [3, 4, 5, 20])]

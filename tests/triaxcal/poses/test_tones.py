@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from benchmarks.noise import first_order, white
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose import poses_of
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import WindowCutter
-from triaxcal.poses.synthetic_noise import first_order, white
 from triaxcal.poses.tones import without_tones
 
 NOISES = [(white, ()), (first_order, (5.0,))]

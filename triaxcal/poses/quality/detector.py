@@ -9,7 +9,7 @@ thousand for a second of spectra.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,10 +46,9 @@ class QualityDetector:
     _low: Floats = field(default_factory=lambda: np.full(3, np.inf))
     _high: Floats = field(default_factory=lambda: np.full(3, -np.inf))
 
-    def feed(self, time_ns: Ints, readings: Floats, channels: Mapping[str, Floats] | None = None) -> None:
+    def feed(self, time_ns: Ints, readings: Floats) -> None:
         """``time_ns`` (n,) strictly increasing across calls, ``readings`` (n,3)
-        finite, output units; ``channels`` are not judged.
-        """
+        finite, output units."""
         if not len(time_ns):
             return
         if self._begin_ns is None:

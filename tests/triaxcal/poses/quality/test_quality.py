@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.noise import first_order, flicker, white
 from triaxcal.arrays import Floats, Ints
 from triaxcal.poses.quality import Finding, QualityDetector
 from triaxcal.poses.quality.faults import coarse_quantization
@@ -27,7 +28,6 @@ from triaxcal.poses.quality.finding import (
 from triaxcal.poses.quality.mains import bands
 from triaxcal.poses.quality.timing import Gaps
 from triaxcal.poses.stillness.detector import StillnessDetector
-from triaxcal.poses.synthetic_noise import first_order, flicker, white
 
 NOISE = 3e-4
 HOLD_S, MOVE_S = 4.0, 1.0

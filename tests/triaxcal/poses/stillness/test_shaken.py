@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt
 
+from benchmarks.noise import first_order, white
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
-from triaxcal.poses.synthetic_noise import first_order, white
 
 Detect = Callable[..., tuple[Windows, list[Span], list[Pose]]]
 NOISE_G = 2e-4

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
+from benchmarks.noise import first_order
 from triaxcal.errors import InvalidData
 from triaxcal.model.samples import Samples
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
-from triaxcal.poses.synthetic_noise import first_order
 from triaxcal.synthetic import SyntheticUnit, Tumble
 
 Detect = Callable[..., tuple[Windows, list[Span], list[Pose]]]
