@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -501,21 +501,24 @@ def test_the_documentation_speaks_of_no_machine() -> None:
     assert not {page: found for page, found in spoken.items() if found}
 
 
+def require_made(pages: Mapping[Path, str]) -> None:
+    stale = [name_of(page) for page, text in pages.items() if page.read_text("utf-8") != text]
+    assert not stale, f"not what the code says: {', '.join(stale)}; run make docs"
+
+
 def test_the_pages_made_of_register_types_and_profile_models_are_theirs() -> None:
-    """To renew them: python docs/reference/profile.py."""
     made = runpy.run_path(str(PROJECT / "docs/reference/profile.py"))["pages"]()
     assert len(made) == 3
-    assert {p: p.read_text("utf-8") for p in made} == made
+    require_made(made)
 
 
 def test_the_page_of_the_effects_is_what_they_say_of_themselves() -> None:
-    """To renew it: python docs/reference/effects.py."""
     names = runpy.run_path(str(PROJECT / "docs/reference/effects.py"))
-    assert names["PAGE"].read_text("utf-8") == names["page"]()
+    require_made({names["PAGE"]: names["page"]()})
 
 
 def test_the_page_of_the_python_names_is_that_of_their_docstrings() -> None:
     script = PROJECT / "docs/reference/python.py"
     names = runpy.run_path(str(script))
-    assert names["PAGE"].read_text("utf-8") == names["page"]()
+    require_made({names["PAGE"]: names["page"]()})
     assert {*names["FUNCTIONS"], *names["CLASSES"], *names["ERRORS"], "__version__"} == set(tc.__all__)

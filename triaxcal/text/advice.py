@@ -3,7 +3,7 @@ effect, and what the poses cannot show."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from triaxcal.diagnosis import Loop, Recommendation, Verdict
 from triaxcal.effects.plugins import package_of
@@ -12,6 +12,7 @@ from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.figures import plain
+from triaxcal.poses.pose import Pose
 from triaxcal.poses.pose_labels import moment, the_poses
 from triaxcal.units import ErrorUnit
 
@@ -42,9 +43,11 @@ def chance(p: float) -> str:
 
 def to_do(loop: Loop, small: ErrorUnit) -> str:
     """The most urgent of `advice`, in one line."""
-    first = [*_poses_again(loop), *_apart(loop), *_next(loop, small)]
+    first = "; ".join([*_poses_again(loop), *_apart(loop), *_next(loop, small)])
     if first:
-        return "; ".join(first)
+        # What is not known for certain is in the uncertainty already.
+        optional = loop.call is Recommendation.RECORD_MORE
+        return f"optional where the limits are kept: {first}" if optional else first
     if loop.call is Recommendation.INVESTIGATE:
         return "find out what acts before the calibration is used; no further pose is expected to tell"
     known = all(f.verdict is Verdict.ADOPTED for f in loop.findings) and not loop.candidates
@@ -74,6 +77,17 @@ def advice(loop: Loop, small: ErrorUnit) -> Iterator[str]:
         yield f"these poses cannot show in full {', '.join(n for n, r in reasons.items() if r == reason)}: {reason}"
     for name, reason in loop.faulty.items():
         yield f"the effect {name} of {package_of(name)} cannot be used: {reason}"
+
+
+def of_creep(poses: Sequence[Pose]) -> str:
+    """What to do about poses that creep; empty where none does."""
+    creeping = sum(bool(p.creep.any()) for p in poses)
+    if not creeping:
+        return ""
+    held = "their standard errors contain it"
+    if 2 * creeping <= len(poses):
+        return f"{held}, nothing to do"
+    return f"{held}; as most poses creep, let the unit settle for longer before each, or keep its temperature steadier"
 
 
 def _poses_again(loop: Loop) -> Iterator[str]:
