@@ -16,6 +16,7 @@ from triaxcal import text as of_metrology
 from triaxcal.evidence.prior import Odds
 from triaxcal.rounding import number
 from triaxcal.text import diagnosis as of_diagnosis
+from triaxcal.text.advice import of_creep
 from triaxcal_drivers.extras import absent
 from triaxcald import text
 from triaxcald.cli.console import Bars, emit, micro, say, table
@@ -131,6 +132,8 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         print(f"  outside limits: {line}")
     for line in o.certified.document["result"]["data_quality"]:
         print(f"  warning: {line}")
+    if creep := of_creep([p.pose for p in loop.after.poses]):
+        print(f"  creeping poses: {creep}")
     for caution in loop.after.cautions:
         print(f"  warning: {of_metrology.caution(caution)}")
     papers = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
