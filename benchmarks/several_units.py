@@ -23,7 +23,7 @@ from benchmarks.table import Table
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.evidence import posterior_of
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.pooled import pool
 from triaxcal.model.directions import directions
 from triaxcal.model.sensor import Sensor
@@ -57,7 +57,7 @@ def poses_of(rng: np.random.Generator, name: str, along: np.ndarray | None) -> l
     if along is None:
         return made(None)
     bare = made(None)
-    rows = Rows.of(bare, fit(bare, signs=SIGNS), SIGNS)
+    rows = LinearisedData.of(bare, fit(bare, signs=SIGNS), SIGNS)
     shown = rows.complement.T @ rows.by_coefficients(effect_named(name)) @ along
     return made(along * STRENGTH / float(np.linalg.norm(shown)))
 

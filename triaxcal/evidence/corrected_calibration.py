@@ -11,7 +11,7 @@ from triaxcal.arrays import Floats
 from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
 from triaxcal.estimate.caution import BirgeRatio, ExcessVariance
 from triaxcal.estimate.likelihood import State, linearise
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.mixture_components import components
 from triaxcal.evidence.model_average import Average, average, linear_alone, refusal
 from triaxcal.evidence.posterior import Posterior
@@ -70,7 +70,7 @@ def _shape_errors(posterior: Posterior, model_average: Average) -> dict[str, flo
     return out
 
 
-def _with_residuals(c: Calibration, rows: Rows, model_average: Average) -> Calibration:
+def _with_residuals(c: Calibration, rows: LinearisedData, model_average: Average) -> Calibration:
     """In the recording's own poses, at their own times. Of poses with a fault
     that lack a channel nothing is known."""
     logged = set.intersection(*(set(p.pose.channels) for p in c.poses if p.used))
@@ -83,7 +83,9 @@ def _with_residuals(c: Calibration, rows: Rows, model_average: Average) -> Calib
     return replace(found, poses=tuple(both[i] for i in range(len(c.poses))))
 
 
-def _with_known_residuals(c: Calibration, rows: Rows, model_average: Average, places: list[int]) -> Calibration:
+def _with_known_residuals(
+    c: Calibration, rows: LinearisedData, model_average: Average, places: list[int]
+) -> Calibration:
     poses = [p.pose for p in c.poses]
     u, covariates = np.array([p.mean for p in poses]), c.covariates_of(poses)
     length, by_u = c.sensor.magnitude(u, covariates)
@@ -119,7 +121,7 @@ def _with_known_residuals(c: Calibration, rows: Rows, model_average: Average, pl
     return replace(c, residual=residual, poses=results)
 
 
-def _leverage(rows: Rows, used: list[int], model_average: Average) -> Floats:
+def _leverage(rows: LinearisedData, used: list[int], model_average: Average) -> Floats:
     """(n,) of those poses: how much each decides its own prediction, where
     coefficients are held by their sizes."""
     problem = replace(rows.problem.only(np.array(used)), slopes=None)

@@ -103,5 +103,7 @@ def _unexplained(posterior: Posterior) -> Unexplained:
 def _nothing(posterior: Posterior) -> float:
     """The empty set is always among the sets, and no unmodelled part always
     among its parts (`likely_sets`)."""
-    weight, empty = next(pair for pair in zip(posterior.weight, posterior.sets, strict=True) if not pair[1].members)
+    weight, empty = next(
+        pair for pair in zip(posterior.set_probabilities, posterior.sets, strict=True) if not pair[1].members
+    )
     return float(weight * empty.part_probabilities[empty.parts.index(0)])

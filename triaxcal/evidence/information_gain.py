@@ -18,7 +18,7 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects import TEMPERATURE
 from triaxcal.evidence.candidate_actions import LONGER, UNDECIDED_PROBABILITY, Action, ActionKind, Options
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.predictive import Hypothesis, Predictive, probabilities
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
@@ -177,7 +177,7 @@ class _CellPredictions:
     """Of the poses of ``rows``, those taken first, what every cell says beside
     what was shown; ``normal`` (S,r) are the draws, the same for all."""
 
-    def __init__(self, future: _PredictiveDraws, rows: Rows, normal: Floats) -> None:
+    def __init__(self, future: _PredictiveDraws, rows: LinearisedData, normal: Floats) -> None:
         self.future, self.rows, self.normal = future, rows, normal
         self.mean, self.covariance = future.cells.predicted(rows)
         self.taken = self._places(range(len(future.poses)))

@@ -31,7 +31,7 @@ CHI2_LOG = np.linspace(-8.0, 70.0, 12000)
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class LinearisedData:
     """N rows, first the n means, then the n slopes where the poses know theirs,
     each over its standard error.
 
@@ -62,7 +62,7 @@ class Rows:
     @classmethod
     def of(
         cls, poses: Sequence[Pose], linear: Calibration, signs: Sequence[float], effects: Sequence[Effect] = ()
-    ) -> Rows:
+    ) -> LinearisedData:
         """About the ``linear`` fit of these poses, which excludes outliers,
         with the covariates that these ``effects`` need. Poses with a fault are
         excluded. Raises as `triaxcal.estimate.initial_estimate.started_problem`
@@ -75,13 +75,13 @@ class Rows:
         problem = problem if slopes is None else replace(problem, slopes=slopes)
         return cls._about(State.of(problem, replace(linear.sensor, effects=())), poses, places, problem)
 
-    def relinearised_at(self, point: State) -> Rows:
+    def relinearised_at(self, point: State) -> LinearisedData:
         """The same rows, linearised elsewhere: coefficients count from zero
         there too."""
         return self._about(point, self.poses, self.places, self.problem)
 
     @classmethod
-    def _about(cls, point: State, poses: Sequence[Pose], places: Ints, problem: Problem) -> Rows:
+    def _about(cls, point: State, poses: Sequence[Pose], places: Ints, problem: Problem) -> LinearisedData:
         r, J, error = linearise_all(problem, point)
         r, J, n = r - J[:, LINEAR:] @ point.theta[LINEAR:], J[:, :LINEAR], len(poses)
         if len(r) <= LINEAR:
@@ -96,7 +96,7 @@ class Rows:
         run, z = np.array([p.run.index for p in poses]), complement.T @ y
         return cls(poses, places, run, problem, point, y, columns, lengths, error, complement, z, noise, likelihood)
 
-    def of_future_poses(self, poses: Sequence[Pose]) -> Rows:
+    def of_future_poses(self, poses: Sequence[Pose]) -> LinearisedData:
         """Of poses that nobody has taken, about the same point and in the same
         units: misfits are not known, and nothing is ``complement``."""
         sensor = self.state.sensor(self.problem)

@@ -19,7 +19,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp, softmax
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import Term
 from triaxcal.evidence.unmodelled_parts import ConditionalData, diagonalised, parts_of
@@ -62,7 +62,7 @@ class Evidence:
     all, the ``parts`` (the first is none), and the grid of ``sizes`` (R,) of
     effects in g."""
 
-    def __init__(self, rows: Rows, terms: Sequence[Term], odds: Odds) -> None:
+    def __init__(self, rows: LinearisedData, terms: Sequence[Term], odds: Odds) -> None:
         """Sizes begin at that share of the noise of a pose which the odds have."""
         self.rows, self.terms, self.odds = rows, terms, odds
         self.parts = parts_of(rows, odds)

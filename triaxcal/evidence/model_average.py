@@ -146,7 +146,7 @@ def _likeliest(posterior: Posterior) -> list[Effect]:
     weight: dict[int, float] = defaultdict(float)
     effects: dict[int, Effect] = {}
     corrects: dict[str, float] = defaultdict(float)
-    for w, found in zip(posterior.weight, posterior.sets, strict=True):
+    for w, found in zip(posterior.set_probabilities, posterior.sets, strict=True):
         scaled = found.coefficients
         ends = np.cumsum([0, *(posterior.evidence.terms[i].rank for i in found.members)])
         for i, first, last in zip(found.members, ends, ends[1:], strict=False):
@@ -173,7 +173,7 @@ def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[in
     rows = evidence.rows
     scaled = np.zeros(evidence.columns.shape[1])
     by_part: dict[int, Floats] = defaultdict(lambda: np.zeros(len(rows.y)))
-    for found, weight in zip(posterior.sets, posterior.weight, strict=True):
+    for found, weight in zip(posterior.sets, posterior.set_probabilities, strict=True):
         if weight < NEGLIGIBLE:
             continue
         share = found.part_probabilities * weight

@@ -31,7 +31,7 @@ class Posterior:
     sets: Sequence[SetEvidence]
 
     @cached_property
-    def weight(self) -> Floats:
+    def set_probabilities(self) -> Floats:
         """(S,) probability of each set."""
         return softmax([found.total for found in self.sets])
 
@@ -61,7 +61,7 @@ class Posterior:
         """The probability that each effect acts, whatever acts beside it, the
         likeliest first."""
         out: dict[str, float] = defaultdict(float)
-        for w, found in zip(self.weight, self.sets, strict=True):
+        for w, found in zip(self.set_probabilities, self.sets, strict=True):
             for name in self.names_of(found):
                 out[name] += float(w)
         return dict(sorted(out.items(), key=lambda item: -item[1]))
@@ -71,15 +71,15 @@ class Posterior:
         """The probability that these effects act and no other, the likeliest
         first."""
         out: dict[frozenset[str], float] = defaultdict(float)
-        for w, found in zip(self.weight, self.sets, strict=True):
+        for w, found in zip(self.set_probabilities, self.sets, strict=True):
             out[self.names_of(found)] += float(w)
         return dict(sorted(out.items(), key=lambda item: -item[1]))
 
     @cached_property
-    def of_terms(self) -> Floats:
+    def term_probabilities(self) -> Floats:
         """(T,) the probability of each term of the evidence."""
         out = np.zeros(len(self.evidence.terms))
-        for w, found in zip(self.weight, self.sets, strict=True):
+        for w, found in zip(self.set_probabilities, self.sets, strict=True):
             out[list(found.members)] += w
         return out
 
@@ -87,7 +87,7 @@ class Posterior:
     def outlier_probabilities(self) -> Floats:
         """(n,) the probability that each pose is an outlier."""
         out = np.zeros(self.evidence.rows.n)
-        for p, term in zip(self.of_terms, self.evidence.terms, strict=True):
+        for p, term in zip(self.term_probabilities, self.evidence.terms, strict=True):
             if term.pose >= 0:
                 out[term.pose] = p
         return out
@@ -97,7 +97,7 @@ class Posterior:
         """(n,) the probability that from each pose on there is another unit, or
         another mounting."""
         out = np.zeros(self.evidence.rows.n)
-        for p, term in zip(self.of_terms, self.evidence.terms, strict=True):
+        for p, term in zip(self.term_probabilities, self.evidence.terms, strict=True):
             if term.change_point >= 0:
                 out[term.change_point] = p
         return out

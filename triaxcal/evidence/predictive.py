@@ -16,7 +16,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.plugins import EffectFault
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
 from triaxcal.evidence.mixture_components import Components, components
 from triaxcal.evidence.posterior import Posterior
@@ -68,7 +68,7 @@ class Predictive:
         """(C,) one where the effect acts, else zero."""
         return np.array([float(name in h.names) for h in self.hypotheses])[self.of]
 
-    def predicted(self, rows: Rows) -> tuple[Floats, Floats]:
+    def predicted(self, rows: LinearisedData) -> tuple[Floats, Floats]:
         """Mean (C,M) and covariance (C,M,M) of M rows to come, over their
         errors."""
         evidence = self.posterior.evidence
@@ -104,7 +104,7 @@ def _unmodelled(
 def probabilities(posterior: Posterior) -> Mapping[Hypothesis, float]:
     """Of every hypothesis."""
     out: dict[Hypothesis, float] = defaultdict(float)
-    for weight, found in zip(posterior.weight, posterior.sets, strict=True):
+    for weight, found in zip(posterior.set_probabilities, posterior.sets, strict=True):
         share = weight * found.part_probabilities
         by_what: dict[UnmodelledKind | None, float] = defaultdict(float)
         for part, p in zip(found.parts, share, strict=True):
@@ -126,7 +126,7 @@ def _what(posterior: Posterior, part: int) -> UnmodelledKind | None:
     return None if kind is None or kind.what is UnmodelledKind.WITHIN_POSE else kind.what
 
 
-def _columns(evidence: Evidence, members: Sequence[int], rows: Rows) -> Floats:
+def _columns(evidence: Evidence, members: Sequence[int], rows: LinearisedData) -> Floats:
     """(M,C) of all terms in the rows to come; zero of those that are no
     ``members``, of outliers, and where an effect of another package does not
     say what it adds."""
@@ -138,7 +138,7 @@ def _columns(evidence: Evidence, members: Sequence[int], rows: Rows) -> Floats:
     return out
 
 
-def _of_term(term: Term, rows: Rows, known: dict[int, Floats]) -> Floats:
+def _of_term(term: Term, rows: LinearisedData, known: dict[int, Floats]) -> Floats:
     if term.change_point >= 0:
         return np.asarray(rows.linear * term.combination)
     if term.effect is None:

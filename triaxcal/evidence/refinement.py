@@ -15,7 +15,7 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import State, linearise_all
 from triaxcal.estimate.recordings import by_run
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.model_search import likely_sets
 from triaxcal.evidence.posterior import Posterior
@@ -49,7 +49,7 @@ def posterior_of(
     """Of what acts beside the ``linear`` fit of these poses."""
     odds = odds or Odds()
     effects = considered(poses, catalogue)
-    rows, finer = Rows.of(poses, linear, signs, effects), list[Finer]()
+    rows, finer = LinearisedData.of(poses, linear, signs, effects), list[Finer]()
     for _ in range(ROUNDS):
         evidence = Evidence(rows, terms_of(rows, effects, odds, finer), odds)
         posterior = Posterior(evidence, likely_sets(evidence))
@@ -74,7 +74,9 @@ def finer_shapes(posterior: Posterior) -> Finer:
                 key = variant_of(term.effect)
                 forms[key[1]][key].append(i)
         for of_form in forms.values():
-            shapes = [(terms[index[0]].effect, float(posterior.of_terms[index].sum())) for index in of_form.values()]
+            shapes = [
+                (terms[index[0]].effect, float(posterior.term_probabilities[index].sum())) for index in of_form.values()
+            ]
             if sum(share for _, share in shapes) >= odds.reported * posterior.effect_probabilities[name]:
                 out |= _divided([(effect, share) for effect, share in shapes if effect is not None], odds)
     return out

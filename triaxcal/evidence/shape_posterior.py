@@ -30,7 +30,7 @@ class Shape:
 def shapes_of(posterior: Posterior, name: str) -> Mapping[str, Shape]:
     """Of an effect, by the name of the shape, if that effect acts; none where
     it has none."""
-    terms, weights = posterior.evidence.terms, posterior.of_terms
+    terms, weights = posterior.evidence.terms, posterior.term_probabilities
     mine = [i for i, term in enumerate(terms) if term.effect is not None and term.name == name]
     return shapes_by([terms[i] for i in mine], weights[mine]) if weights[mine].any() else {}
 

@@ -14,7 +14,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
 from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.errors import Refused
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
 from triaxcal.model.directions import spiral
 from triaxcal.poses.covariates import static_covariates
@@ -69,7 +69,7 @@ def variant_of(effect: Effect) -> Variant:
     return effect.name, tuple(c.name for c in effect.coefficients), tuple(v for v, _ in effect.shape.values())
 
 
-def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = ()) -> list[Term]:
+def terms_of(rows: LinearisedData, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = ()) -> list[Term]:
     """Every form, shape and choice of axes of every effect that can act in
     these poses, every pose as an outlier, and every pose as the first of
     another unit or mounting. ``finer`` are divisions of shapes, one after the
@@ -84,7 +84,7 @@ def terms_of(rows: Rows, catalogue: Sequence[Effect], odds: Odds, finer: Sequenc
     return [*terms, *(_outlier(rows, i, odds) for i in range(rows.n)), *_another(rows, odds)]
 
 
-def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
+def faults_of(rows: LinearisedData, catalogue: Sequence[Effect]) -> dict[str, str]:
     """Effects of other packages that cannot be used in these poses, though they
     could be loaded: name → reason."""
     found = {}
@@ -102,7 +102,9 @@ def faults_of(rows: Rows, catalogue: Sequence[Effect]) -> dict[str, str]:
     return found
 
 
-def _of_effect(rows: Rows, effect: Effect, share: float, odds: Odds, finer: Sequence[Finer]) -> Iterator[Term]:
+def _of_effect(
+    rows: LinearisedData, effect: Effect, share: float, odds: Odds, finer: Sequence[Finer]
+) -> Iterator[Term]:
     try:
         variants = effect.variants(rows.problem.covariates)
     except (EffectFault, Refused):
@@ -158,7 +160,7 @@ def _axes(parts: Sequence[str], odds: Odds) -> Iterator[tuple[tuple[int, ...], f
             yield of(pair), two / AXES
 
 
-def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
+def _columns(rows: LinearisedData, effect: Effect) -> tuple[Floats, Floats] | None:
     """Derivatives of the rows by the coefficients (N,p), and the size of each
     (p,): the rms of what a coefficient of one adds over the sphere and over the
     poses' covariates, about its mean over these. None where it cannot be
@@ -180,7 +182,7 @@ def _columns(rows: Rows, effect: Effect) -> tuple[Floats, Floats] | None:
     return columns, np.sqrt(np.mean(np.sum(basis**2, axis=2), axis=(0, 1)))
 
 
-def _outlier(rows: Rows, pose: int, odds: Odds) -> Term:
+def _outlier(rows: LinearisedData, pose: int, odds: Odds) -> Term:
     """Its mean is off, and its slope with it."""
     columns = np.zeros((len(rows.y), 2 if rows.slopes else 1))
     columns[pose, 0] = 1 / rows.error[pose]
@@ -190,7 +192,7 @@ def _outlier(rows: Rows, pose: int, odds: Odds) -> Term:
     return Term("", f"outlier {pose}", columns * combination, combination, float(np.log(odds.outlier_odds)), pose=pose)
 
 
-def _another(rows: Rows, odds: Odds) -> Iterator[Term]:
+def _another(rows: LinearisedData, odds: Odds) -> Iterator[Term]:
     """From a pose on all nine parameters are others: another unit, channels
     that were exchanged."""
     order = np.lexsort((rows.t_s, rows.run))

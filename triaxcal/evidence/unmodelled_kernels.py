@@ -19,7 +19,7 @@ import numpy as np
 from triaxcal.arrays import Floats, Ints
 from triaxcal.effects.contract import BEFORE
 from triaxcal.estimate.likelihood import radius_by_linear
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.model.directions import spiral
 
 SPHERE = 300
@@ -58,7 +58,7 @@ class ReadingGeometry:
     """k readings: ``up`` (k,3) unit vectors, ``by_bias`` (k,3) derivatives of
     |a| by the bias of each axis, ``along`` (k,3) the readings along the
     sensitive axes in g, ``linear`` (k,9) derivatives by the nine parameters, in
-    the scale of `Rows.linear`."""
+    the scale of `LinearisedData.linear`."""
 
     up: Floats
     by_bias: Floats
@@ -82,7 +82,7 @@ class PoseInputs:
     slopes: bool
 
     @classmethod
-    def of(cls, rows: Rows) -> PoseInputs:
+    def of(cls, rows: LinearisedData) -> PoseInputs:
         covariates = rows.problem.covariates
         before = np.stack([covariates[name] for name in BEFORE], axis=1) / rows.problem.reference
         return cls(
@@ -122,7 +122,7 @@ class UnmodelledCovariance:
         """(K,L) of the rows of poses, over their errors."""
         return np.asarray(self.scale * self.between(p, q) / p.error[:, None] / q.error)
 
-    def bias_at(self, rows: Rows, t_s: float) -> Floats:
+    def bias_at(self, rows: LinearisedData, t_s: float) -> Floats:
         """(3,N) covariance of the bias at a moment of the last recording with
         the rows over their errors, of what goes with time; a length is a share
         of the recording's duration. The bias itself has the variance
@@ -135,12 +135,12 @@ class UnmodelledCovariance:
         return np.asarray(self.scale * np.concatenate([each[:, None] * by_bias for each in both]).T / rows.error)
 
 
-def duration_of(rows: Rows) -> float:
+def duration_of(rows: LinearisedData) -> float:
     """Of the longest recording."""
     return max(1e-9, *(float(np.ptp(rows.t_s[rows.run == run])) for run in np.unique(rows.run)))
 
 
-def kinds_of(rows: Rows) -> list[UnmodelledCovariance]:
+def kinds_of(rows: LinearisedData) -> list[UnmodelledCovariance]:
     found = []
     here = PoseInputs.of(rows)
     for what, length, between in _covariances(rows):
@@ -157,7 +157,7 @@ def kinds_of(rows: Rows) -> list[UnmodelledCovariance]:
     return found
 
 
-def _covariances(rows: Rows) -> Iterator[tuple[UnmodelledKind, float, _Between]]:
+def _covariances(rows: LinearisedData) -> Iterator[tuple[UnmodelledKind, float, _Between]]:
     yield UnmodelledKind.EACH_POSE, 0.0, lambda p, q: _of_means(p, q, _same(p, q))
     sphere = _Sphere.of(rows)
     for length in SMOOTH:
@@ -221,7 +221,7 @@ class _Sphere:
     fit: Floats
 
     @classmethod
-    def of(cls, rows: Rows) -> _Sphere:
+    def of(cls, rows: LinearisedData) -> _Sphere:
         sensor = rows.state.sensor(rows.problem)
         up = spiral(SPHERE) * rows.problem.reference
         everywhere = reading_geometry(rows, sensor.output(up, {}))
@@ -242,7 +242,7 @@ class _Sphere:
         return between
 
 
-def reading_geometry(rows: Rows, u: Floats) -> ReadingGeometry:
+def reading_geometry(rows: LinearisedData, u: Floats) -> ReadingGeometry:
     sensor, problem = rows.state.sensor(rows.problem), rows.problem
     radius = sensor.radius(u, {})
     linear = radius_by_linear(problem, radius, u) / rows.lengths

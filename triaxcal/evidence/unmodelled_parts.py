@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from triaxcal.arrays import Floats, Ints
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.unmodelled_kernels import UnmodelledCovariance, kinds_of
 
@@ -25,7 +25,7 @@ class UnmodelledPart:
     log_prior: float
 
 
-def parts_of(rows: Rows, odds: Odds) -> list[UnmodelledPart]:
+def parts_of(rows: LinearisedData, odds: Odds) -> list[UnmodelledPart]:
     """The first is that there is none."""
     kinds = kinds_of(rows)
     sizes = np.geomspace(odds.unmodelled_smallest, odds.unmodelled_largest, odds.unmodelled_sizes)

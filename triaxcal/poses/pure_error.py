@@ -18,10 +18,15 @@ from triaxcal.poses.noise_mixture import NoiseLevels
 from triaxcal.poses.pose import Pose
 
 LACK_OF_FIT = 0.01
-"""Residuals of less probability (`Residual.lack_of_fit_p`) are more than noise."""
+"""Residuals of less probability (`Residual.lack_of_fit_p`) contradict what was
+assumed, and it is told: a report speaks of an unexplained error, `frame` of
+units that disagree (exit code 1), and errors that were those of the noise alone
+are multiplied. One sound recording in a hundred is blamed so."""
 SIGNIFICANT = 0.05
-"""The usual level of a test that excludes nothing: below it a misfit is worth a
-warning, or a variance of its own. Chance makes one in twenty."""
+"""Residuals of less probability are reason to be careful: a warning, a variance
+of its own, a factor on the errors that is kept. It is larger than `LACK_OF_FIT`
+since the mistakes cost otherwise: to widen the intervals of one recording in
+twenty for nothing costs little, to leave them too short is not seen."""
 BEYOND_DOUBT = 0.2
 """Where residuals like these have less than this probability, the residuals
 alone say how large the noise is."""

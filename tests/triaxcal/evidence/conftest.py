@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from triaxcal.effects import effect_named
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.poses.pose import Pose
 
 SIGMA_G = 2e-5
@@ -24,5 +24,5 @@ FEW = tuple(
 """What is looked for where the subject is another: half of the time goes into the moments of a step."""
 
 
-def rows_of(poses: Sequence[Pose], signs: Sequence[float]) -> Rows:
-    return Rows.of(poses, fit(poses, signs=signs), signs)
+def rows_of(poses: Sequence[Pose], signs: Sequence[float]) -> LinearisedData:
+    return LinearisedData.of(poses, fit(poses, signs=signs), signs)

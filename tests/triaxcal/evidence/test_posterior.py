@@ -89,7 +89,7 @@ def test_what_is_in_no_catalogue_is_unmodelled(kind: str) -> None:
 
 def test_probabilities_are_those_of_a_partition(poses_with: Poses) -> None:
     posterior = found(poses_with(1, warm_up=[2e-4, 3e-4, -2e-4]))
-    assert posterior.weight.sum() == pytest.approx(1.0)
+    assert posterior.set_probabilities.sum() == pytest.approx(1.0)
     assert posterior.part_probabilities.sum() == pytest.approx(1.0)
     assert sum(posterior.effect_set_probabilities.values()) == pytest.approx(1.0)
     assert posterior.unmodelled_probability <= sum(posterior.unmodelled_kind_probabilities.values()) + 1e-12

@@ -11,7 +11,7 @@ import pytest
 from tests.triaxcal.evidence.conftest import MINUS, rows_of
 from tests.undeclared.examine import Case, still_poses
 from triaxcal.effects import CATALOGUE
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.predictive import Predictive
@@ -25,7 +25,7 @@ FLAT = 1e3
 """Standard deviation that stands for a flat prior of the nine parameters, in standard errors."""
 
 
-def recorded() -> tuple[list[Pose], Rows]:
+def recorded() -> tuple[list[Pose], LinearisedData]:
     recording = Case("none", 1, (1.0, 1.0), 26, "white").make()
     poses = still_poses(recording.samples())
     return poses, rows_of(poses, recording.signs)
@@ -74,7 +74,7 @@ def test_poses_to_come_are_predicted_as_the_joint_density_of_all_rows_says(poses
     one = replace(found, sizes=found.sizes[[cell]], log=found.log[:, [cell]])
     mean, covariance = Predictive.likeliest(Posterior(evidence, [one]), 1.0).predicted(ahead)
 
-    def design(of_rows: Rows) -> np.ndarray:
+    def design(of_rows: LinearisedData) -> np.ndarray:
         columns = []
         for i, size in zip(members, found.sizes[cell], strict=True):
             term = evidence.terms[i]

@@ -10,31 +10,31 @@ import pytest
 
 from tests.triaxcal.evidence.conftest import MINUS, rows_of
 from tests.undeclared.examine import Case, still_poses
-from triaxcal.evidence.linearised_data import Rows
+from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind, kinds_of
 from triaxcal.poses.pose import Pose
 
 
-def of_recording() -> Rows:
+def of_recording() -> LinearisedData:
     recording = Case("none", 1, (1.0, 1.0), 26, "white").make()
     return rows_of(still_poses(recording.samples()), recording.signs)
 
 
 @pytest.fixture(params=["means alone", "with slopes"])
-def rows(request: pytest.FixtureRequest, poses_with: Callable[..., list[Pose]]) -> Rows:
+def rows(request: pytest.FixtureRequest, poses_with: Callable[..., list[Pose]]) -> LinearisedData:
     rows = of_recording() if request.param == "with slopes" else rows_of(poses_with(1), MINUS)
     assert rows.slopes == (request.param == "with slopes")
     return rows
 
 
-def test_every_kind_has_a_mean_variance_of_one_in_its_own_axes(rows: Rows) -> None:
+def test_every_kind_has_a_mean_variance_of_one_in_its_own_axes(rows: LinearisedData) -> None:
     for kind in kinds_of(rows):
         assert kind.variance.mean() == pytest.approx(1.0), kind.what
         assert kind.variance.min() >= 0
         assert kind.axes @ kind.axes.T == pytest.approx(np.eye(len(rows.z)), abs=1e-9)
 
 
-def test_only_slopes_know_what_acts_inside_the_poses_alone(rows: Rows) -> None:
+def test_only_slopes_know_what_acts_inside_the_poses_alone(rows: LinearisedData) -> None:
     assert (UnmodelledKind.WITHIN_POSE in {kind.what for kind in kinds_of(rows)}) == rows.slopes
 
 
