@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from triaxcal import text, uncertainty
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, rms
 from triaxcal.diagnosis import Candidate, Finding, Recommendation
 from triaxcal.diagnosis import diagnose as diagnosed
 from triaxcal.documents import Calibration
@@ -125,11 +125,11 @@ class Verification:
 
     @property
     def rms(self) -> float:
-        return float(np.sqrt(np.mean(self.error**2)))
+        return rms(self.error)
 
     @property
     def noise_floor(self) -> float:
-        return float(np.sqrt(np.mean(self.standard_error**2)))
+        return rms(self.standard_error)
 
     @property
     def expected(self) -> float:

@@ -1,4 +1,4 @@
-"""Names of array types."""
+"""Names of array types, and the root mean square."""
 
 from __future__ import annotations
 
@@ -10,3 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+
+
+def rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))

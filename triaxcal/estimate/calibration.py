@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, rms
 from triaxcal.distributions import t_ppf
 from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.errors import InvalidData
@@ -46,11 +46,7 @@ class Residual:
     ) -> Residual:
         """Of the poses that a fit used: ``misses`` (n,) of |a| and the standard
         errors (n,) of their noise."""
-        return cls(_rms(misses), float(np.max(np.abs(misses))), cross_validated_rms_g, _rms(noise), lack_of_fit_p)
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+        return cls(rms(misses), float(np.max(np.abs(misses))), cross_validated_rms_g, rms(noise), lack_of_fit_p)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from triaxcal.arrays import Ints
+from triaxcal.arrays import Ints, rms
 from triaxcal.estimate.likelihood import Problem, State, linearise, linearise_all, solve
 
 STRAIGHT = 1e-4
@@ -41,4 +41,4 @@ def cross_validated(problem: Problem, state: State) -> float | None:
         rest: Ints = np.delete(np.arange(n), i)
         without = solve(problem.only(rest), State(state.theta + moved[i], state.effects), state.effects, steps=2)
         misses[i] = linearise(problem.only(slice(i, i + 1)), without, jacobian=False)[0][0]
-    return float(np.sqrt(np.mean(misses**2)))
+    return rms(misses)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, rms
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.creep import with_unexplained_creep
@@ -45,7 +45,7 @@ def held_out(before: Calibration, after: Calibration, check: Sequence[Pose]) -> 
         raise InvalidData(f"the check recording: {e}") from e
     more = last[0] ** 2 - first[0] ** 2
     worse = len(more) > 1 and float(more.mean()) > CLEARLY * float(more.std(ddof=1)) / np.sqrt(len(more))
-    return HoldOut(_rms(first[0]), _rms(last[0]), _rms(last[1]), len(check), bool(worse))
+    return HoldOut(rms(first[0]), rms(last[0]), rms(last[1]), len(check), bool(worse))
 
 
 def magnitude_errors(
@@ -75,7 +75,3 @@ def _errors(c: Calibration, poses: Sequence[Pose]) -> tuple[Floats, Floats]:
     return magnitude_errors(
         c.sensor, poses, channel_reference=c.channel_reference, reference=c.reference, moment=c.moment
     )
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))

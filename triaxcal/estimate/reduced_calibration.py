@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, rms
 from triaxcal.effects.contract import Effect, is_derived
 from triaxcal.estimate.calibration import Calibration, Residual
 from triaxcal.model.directions import spiral
@@ -73,7 +73,7 @@ def reduced(c: Calibration, keep: Callable[[Effect], bool], logged: Mapping[str,
         weights={name: p for name, p in c.weights.items() if name in names},
         channel_reference={name: v for name, v in c.channel_reference.items() if name in needed},
     )
-    return Reduced(_with_residual(calibration) if c.poses else calibration, float(np.sqrt(np.mean(off**2))))
+    return Reduced(_with_residual(calibration) if c.poses else calibration, rms(off))
 
 
 def _with_residual(c: Calibration) -> Calibration:
@@ -82,9 +82,8 @@ def _with_residual(c: Calibration) -> Calibration:
     used = [p for p in c.poses if p.used]
     u = np.array([p.pose.mean for p in used])
     off = c.sensor.magnitude(u, c.covariates_of([p.pose for p in used]))[0] - c.reference
-    rms, largest = float(np.sqrt(np.mean(off**2))), float(np.max(np.abs(off)))
-    floor = c.residual.noise_floor_g
-    return replace(c, residual=Residual(rms, largest, None, floor, None))
+    largest, floor = float(np.max(np.abs(off))), c.residual.noise_floor_g
+    return replace(c, residual=Residual(rms(off), largest, None, floor, None))
 
 
 def _readings(c: Calibration, logged: Mapping[str, Floats]) -> tuple[Floats, Mapping[str, Floats]]:

@@ -29,7 +29,7 @@ SAME = float(np.cos(np.radians(5.0)))
 """The cosine between directions that are one: nobody points a unit much better
 by hand."""
 POSE, MOVED, WAITED = 1.0, 5.0, 3.0
-"""The price of a pose; of one before which a channel is moved and settles,
+"""The cost of a pose; of one before which a channel is moved and settles,
 which takes minutes where a pose takes a part of one; and of one after a pause,
 which takes as long but no hands."""
 FACES = 6

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, rms
 from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
 from triaxcal.estimate.caution import BirgeRatio, ExcessVariance
 from triaxcal.estimate.likelihood import State, linearise
@@ -115,7 +115,7 @@ def _with_known_residuals(
     residual = Residual.of(
         own,
         noise,
-        cross_validated_rms_g=float(np.sqrt(np.mean((own / free[of_used]) ** 2))),
+        cross_validated_rms_g=rms(own / free[of_used]),
         lack_of_fit_p=lack_of_fit_p(float(np.sum((own / noise) ** 2)), left, pure),
     )
     return replace(c, residual=residual, poses=results)

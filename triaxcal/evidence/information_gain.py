@@ -5,7 +5,7 @@ The information of a pose is by how much it lowers the entropy of the hypotheses
 on average, over what the likely sets say that it will show. That average is
 taken over draws, as are the probabilities to expect. Poses are chosen one after
 the other, each beside those before it; the best is that with the most
-information for its price.
+information for its cost.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DRAWS = 256
 """Of what the poses may show: an expected entropy is then known to a few
 hundredths."""
 LEAST = 0.05
-"""Nats for the price of a pose: what takes two hypotheses from even odds to two
+"""Nats for the cost of a pose: what takes two hypotheses from even odds to two
 to one. Less is not worth a pose."""
 MOST = 6
 """Poses at a time: what they show then tells so much that the draws are too few
@@ -82,7 +82,7 @@ def advice(posterior: Posterior, most: int = 3) -> Advice:
         if UNDECIDED_PROBABILITY < p < 1 - UNDECIDED_PROBABILITY
     }
     expected = {name: Expected(p, future.if_it_acts(name, p)) for name, p in names.items()}
-    return Advice((*_given_poses(posterior), *future.actions), future.entropy, future.entropy_after, expected)
+    return Advice((*_beside_poses(posterior), *future.actions), future.entropy, future.entropy_after, expected)
 
 
 def decided(posterior: Posterior) -> bool:
@@ -106,7 +106,7 @@ def _influential_poses(posterior: Posterior) -> list[int]:
     return list(dict.fromkeys(out))
 
 
-def _given_poses(posterior: Posterior) -> Iterator[Action]:
+def _beside_poses(posterior: Posterior) -> Iterator[Action]:
     """What no pose tells: a channel that nobody logs, and an error that every
     pose has of its own."""
     if posterior.unmodelled_probability < posterior.evidence.odds.reported:
@@ -140,23 +140,23 @@ class _PredictiveDraws:
         self.entropy = self.entropy_after = self._entropy_of(self.weight)
 
     def take(self, options: Options, again: int | None = None) -> bool:
-        """The best action of all, if it is worth its price; or the best that
+        """The best action of all, if it is worth its cost; or the best that
         takes a pose ``repeat_of``, whatever that is worth."""
         found = options.after(self.poses)
         rows = options.rows.of_future_poses([*self.poses, *(pose for _, pose in found)])
-        chances = _CellPredictions(self, rows, self.rng.standard_normal((DRAWS, len(rows.y) // rows.n)))
+        predictions = _CellPredictions(self, rows, self.rng.standard_normal((DRAWS, len(rows.y) // rows.n)))
         gain = np.empty(len(found))
         for i in range(len(found)):
-            shown = chances.shown_with(len(self.poses) + i)
-            gain[i] = self.entropy_after - self._entropy_of(chances.weight(len(self.poses) + i, shown))
+            shown = predictions.shown_with(len(self.poses) + i)
+            gain[i] = self.entropy_after - self._entropy_of(predictions.weight(len(self.poses) + i, shown))
         rate = gain / [action.cost for action, _ in found]
         if again is not None:
             rate[[action.kind is not ActionKind.REPEAT or action.repeat_of != again for action, _ in found]] = -np.inf
         best = int(np.argmax(rate >= rate.max() - ALIKE * abs(rate.max())))
         if again is None and rate[best] < LEAST:
             return False
-        self.shown = chances.shown_with(len(self.poses) + best)
-        self.weight = chances.weight(len(self.poses) + best, self.shown)
+        self.shown = predictions.shown_with(len(self.poses) + best)
+        self.weight = predictions.weight(len(self.poses) + best, self.shown)
         action, pose = found[best]
         self.actions.append(replace(action, information=float(gain[best])))
         self.poses.append(pose)

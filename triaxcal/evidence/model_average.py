@@ -15,7 +15,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, rms
 from triaxcal.effects.contract import Effect
 from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.estimate.likelihood import State, linearise_all, parameters_by_theta
@@ -154,7 +154,7 @@ def _likeliest(posterior: Posterior) -> list[Effect]:
             if term.effect is not None:
                 weight[id(term.effect)] += float(w)
                 effects[id(term.effect)] = term.effect
-                corrects[term.name] += float(w) * float(np.sqrt(np.mean(scaled[first:last] ** 2)))
+                corrects[term.name] += float(w) * rms(scaled[first:last])
     least = NOTICEABLE * posterior.evidence.rows.median_standard_error
     out: dict[str, Effect] = {}
     for key in sorted(weight, key=lambda key: -weight[key]):

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, rms
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration, HoldsAt, PoseResult, Residual, pose_results, studentized
 from triaxcal.estimate.caution import Caution
@@ -296,7 +296,7 @@ def _solved(problem: Problem, datasheet: Datasheet, root: Floats) -> tuple[Float
 
 def _residual(r: Floats, s: Floats, leverage: Floats, p: float | None) -> Residual:
     alone = r / np.maximum(1 - leverage, 1e-9)  # of each pose under datasheet and all other poses
-    crossed = float(np.sqrt(np.mean(alone**2))) if np.all(leverage < 1 - 1e-6) else None
+    crossed = rms(alone) if np.all(leverage < 1 - 1e-6) else None
     return Residual.of(r, s, cross_validated_rms_g=crossed, lack_of_fit_p=p)
 
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from triaxcal.arrays import Bools, Floats
+from triaxcal.arrays import Bools, Floats, rms
 from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration, Residual
@@ -181,10 +181,10 @@ def fit_rotation(moments: Moments, *, signs: tuple[int, int, int] = (1, 1, 1), r
         reference=reference,
         channel_reference={},
         residual=Residual(
-            rms_g=float(np.sqrt(np.mean(r**2))),
+            rms_g=rms(r),
             max_abs_g=float(np.max(np.abs(r))),
             cross_validated_rms_g=None,
-            noise_floor_g=float(np.sqrt(np.mean(judged.noise**2))) * reference,
+            noise_floor_g=rms(judged.noise) * reference,
             lack_of_fit_p=p,
         ),
         poses=(),
