@@ -11,7 +11,7 @@ import errno
 import json
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,12 +24,13 @@ from triaxcal.errors import InvalidData, MissingChannel, Refused
 from triaxcal.estimate.calibration import Calibration as Fitted
 from triaxcal.estimate.calibration import HoldsAt, PoseResult, Residual
 from triaxcal.interchange import tables
-from triaxcal.interchange.calibration_document import LINEAR, Document, calibration_document
-from triaxcal.interchange.calibration_reading import calibration_of, calibration_part
+from triaxcal.interchange.calibration_document import Document, calibration_document
+from triaxcal.interchange.calibration_reading import calibration_of, calibration_part, uncertainty_over_error
 from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.stream_covariates import InStream, followed
 from triaxcal.uncertainty import Stated
+from triaxcal.uncertainty.readings import uncertainty_of_magnitude, uncertainty_of_readings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -222,7 +223,11 @@ class Calibration:
         if sensor.effects:
             self._require_inverse(rows, a, covariates)
         a = a.reshape(readings.shape)
-        errors = self._uncertainty(rows, covariates).reshape(readings.shape) if uncertainty else None
+        errors = (
+            uncertainty_of_readings(sensor, self._covariance(), rows, covariates).reshape(readings.shape)
+            if uncertainty
+            else None
+        )
         if table is None:
             return a if errors is None else (a, errors)
         out = dict(zip(OUT, a.T, strict=True))
@@ -349,45 +354,12 @@ class Calibration:
         c = self._fitted
         u = np.array([p.mean for p in poses])
         covariates = covariates_elsewhere(poses, c.channel_reference, self.scale_factor, self.bias, c.moment)
-        a = c.sensor.specific_force(u, covariates)
-        up = a / np.linalg.norm(a, axis=1, keepdims=True)
-        variance = np.zeros(len(u))
-        for step in self._steps(u, covariates):
-            variance += np.sum(step * up, axis=1) ** 2
-        return np.sqrt(variance)
+        return uncertainty_of_magnitude(c.sensor, self._covariance(), u, covariates)
 
-    def _uncertainty(self, u: Floats, covariates: Mapping[str, Floats]) -> Floats:
-        """(n,3)"""
-        variance = np.zeros(u.shape)
-        for step in self._steps(u, covariates):
-            variance += step**2
-        return np.sqrt(variance)
-
-    def _steps(self, u: Floats, covariates: Mapping[str, Floats]) -> Iterator[Floats]:
-        """(n,3) each: one standard error along each principal axis of the
-        parameters' covariance, and what it does."""
-        c = self._fitted
-        covariance = c.covariance * np.outer(*[self._after_the_recording(c)] * 2)
-        if not np.isfinite(covariance).all():
-            yield np.full(u.shape, np.nan)
-            return
-        size, axes = np.linalg.eigh(covariance)
-        sensor, a = c.sensor, c.sensor.specific_force(u, covariates)
-        for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
-            yield sensor.moved(step).specific_force(u, covariates) - a
-
-    def _after_the_recording(self, c: Fitted) -> Floats:
-        """(p,) standard uncertainties over standard errors: what the budget has
-        beside the fit."""
+    def _covariance(self) -> Floats:
+        """(p,p) of the parameters, with what the budget has beside the fit."""
         budget = calibration_part(self.to_dict(), where="document").get("uncertainty") or {}
-        out = []
-        for name, error in zip(c.parameters, c.standard_errors, strict=True):
-            expanded, coverage = (_of(budget, key, name) for key in ("expanded", "coverage_factor"))
-            if expanded is None or not coverage or not error > 0:
-                out.append(1.0)
-            else:
-                out.append(expanded / coverage / error)
-        return np.array(out)
+        return self._fitted.covariance * np.outer(*[uncertainty_over_error(budget, self._fitted)] * 2)
 
     def to_dict(self) -> Document:
         """The `triaxcal.calibration/1` document; as it was loaded, where it
@@ -450,16 +422,6 @@ class Calibration:
 
     def _repr_html_(self) -> str:
         return text.html(self._fitted, self.output_unit, self.reference_unit, self.warnings)
-
-
-def _of(budget: Mapping[str, Any], key: str, parameter: str) -> float | None:
-    """A figure of the budget by parameter, None where it has none."""
-    group, _, name = parameter.rpartition(".")
-    try:
-        of = budget[key]
-        return float(of[group]["xyz".index(name)] if group in LINEAR else of["effects"][group][name])
-    except (LookupError, TypeError, ValueError):
-        return None
 
 
 def read_document(path: Path) -> Mapping[str, Any]:

@@ -11,12 +11,10 @@ the magnitude still counts in full, and the fit tends to that of the ellipsoid.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import f_sf
@@ -31,6 +29,14 @@ from triaxcal.estimate.calibration import (
     studentized,
 )
 from triaxcal.estimate.caution import BirgeRatio, Caution, FewPoses
+from triaxcal.inputs.attitude_cautions import (
+    AttitudeExcluded,
+    AttitudesContradict,
+    AttitudesTied,
+    DeclaredErrorContradicted,
+    MagnitudeContradicts,
+    Row,
+)
 from triaxcal.inputs.turntable import (
     ERROR_MOST,
     TurntableData,
@@ -40,18 +46,16 @@ from triaxcal.inputs.turntable import (
     wrong_by_magnitude,
     wrong_by_residual,
 )
+from triaxcal.inputs.turntable_parameters import parameters_by_entries, second_order, sensor_and_rotation, signs_of
 from triaxcal.model.directions import most_wanted
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.pose import Pose, PoseStart
+from triaxcal.poses.pose import Pose
 from triaxcal.poses.pose_labels import the_poses
 from triaxcal.poses.pure_error import LACK_OF_FIT, pure_error_dof
 
 DILUTION_MOST = 100.0
 """Largest standard error of a combination of the twelve parameters, in errors
 of one pose: the limit that a fit to still poses has."""
-SECOND_ORDER = 0.2
-"""Share of a standard error from which on squares of the misalignments' errors
-are added to it."""
 RAISED = 1.5
 """By how much the error of the attitudes has to raise a standard error to be
 worth a word."""
@@ -76,64 +80,6 @@ class Attitude:
     up: Floats
     off_rad: float
     off: float
-
-
-@dataclass(frozen=True)
-class Row:
-    """One of the attitudes that were given, by its name, and when its pose
-    began."""
-
-    name: str
-    began: PoseStart
-
-
-@dataclass(frozen=True)
-class AttitudesTied(Caution):
-    """One of these attitudes is wrong; none is excluded."""
-
-    rows: tuple[Row, ...]
-
-
-@dataclass(frozen=True)
-class AttitudeExcluded(Caution):
-    """It is wrong by ``off_rad``; the pose was measured with ``up`` in the
-    table's frame."""
-
-    row: Row
-    off_rad: float
-    up: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class AttitudesContradict(Caution):
-    """Each other, by more than noise; ``error_rad`` by axis is estimated from
-    that."""
-
-    error_rad: float
-
-
-@dataclass(frozen=True)
-class DeclaredErrorContradicted(Caution):
-    """By the residuals, which say ``error_rad`` ± ``uncertainty_rad``;
-    ``declared_rad`` stays in force.
-
-    With it the standard errors are up to ``raised`` times what they are with
-    the estimate.
-    """
-
-    declared_rad: float
-    error_rad: float
-    uncertainty_rad: float
-    raised: float
-
-
-@dataclass(frozen=True)
-class MagnitudeContradicts(Caution):
-    """Under the fit |a| is off by ``ratio`` times its noise, most in the
-    ``worst`` row."""
-
-    ratio: float
-    worst: Row
 
 
 @dataclass(frozen=True)
@@ -285,12 +231,12 @@ def _concluded(
     names: Sequence[str],
     signs: Sequence[float] | None,
 ) -> AttitudeFit:
-    flips = _signs(s, signs)
-    sensor, C = _parts(s.P, s.c, flips)
+    flips = signs_of(s, signs)
+    sensor, C = sensor_and_rotation(s.P, s.c, flips)
     raised = max(1.0, float(np.sqrt(s.chi2 / s.left))) if s.p is not None and s.p < LACK_OF_FIT else 1.0
-    G = _by_differences(s, flips, C)
+    G = parameters_by_entries(s, flips, C)
     covariance = G @ s.covariance @ G.T * raised**2
-    covariance += np.diag(_of_second_order(covariance, sensor, data.reference) ** 2)
+    covariance += np.diag(second_order(covariance, sensor, data.reference) ** 2)
     results = _results(poses, data, s, sensor, kept)
     misses, noise = (np.array(v) for v in zip(*((p.residual_g, p.standard_error_g) for p in results), strict=True))
     information = np.linalg.inv(s.covariance)
@@ -338,63 +284,6 @@ def _results(
     off = studentized(misses, noise, leverage, least=FREE_LEAST)
     gone = {i: Exclusion.FAULT if p.fault else Exclusion.OUTLIER for i, p in enumerate(poses) if i not in kept}
     return pose_results(poses, a / length[:, None], misses, noise, off, leverage, excluded=gone)
-
-
-def _signs(s: TurntableSolution, signs: Sequence[float] | None) -> Floats:
-    """(3,) as declared, else those with which the sensor's frame lies nearest
-    to the table's."""
-    product = float(np.sign(np.linalg.det(s.P)))
-    if signs is not None:
-        flips = np.asarray(signs, dtype=float)
-        if float(np.prod(flips)) != product:
-            raise InvalidData(
-                f"the product of the signs is {np.prod(flips):+.0f}, but the attitudes say {product:+.0f}: a sign is "
-                "wrong, or the frame of the attitudes is left-handed"
-            )
-        return flips
-    choices = [np.array(f) for f in itertools.product((1.0, -1.0), repeat=3) if np.prod(f) == product]
-    return max(choices, key=lambda f: float(np.trace(_parts(s.P, s.c, f)[1])))
-
-
-def _parts(P: Floats, c: Floats, flips: Floats) -> tuple[Sensor, Floats]:
-    """The sensor, its frame such that R is upper triangular and K has the signs
-    ``flips``, and the rotation C."""
-    KR, C = scipy.linalg.rq(P)
-    turn = flips * np.sign(np.diag(KR))
-    KR, C = KR * turn, turn[:, None] * C
-    k = np.diag(KR).copy()
-    R = KR / k[:, None]
-    return Sensor(k, np.array([R[1, 2], R[0, 2], R[0, 1]]), c / k), np.asarray(C)
-
-
-def _by_differences(s: TurntableSolution, flips: Floats, C: Floats) -> Floats:
-    """(12,12) derivative of scale factor, misalignment, bias and turns of the
-    sensor's frame by P row by row and c."""
-
-    def of(p: Floats) -> Floats:
-        sensor, turned = _parts(p[:9].reshape(3, 3), p[9:], flips)
-        W = turned @ C.T
-        turns = np.array([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]]) / 2
-        return np.concatenate([sensor.scale_factor, sensor.misalignment, sensor.bias, turns])
-
-    start = np.concatenate([s.P.ravel(), s.c])
-    sizes = np.concatenate([np.repeat(np.linalg.norm(s.P, axis=1), 3), np.linalg.norm(s.P, axis=1)])
-    steps = 1e-6 * sizes
-    return np.stack([(of(start + h) - of(start - h)) / (2 * h.sum()) for h in np.diag(steps)], axis=1)
-
-
-def _of_second_order(covariance: Floats, sensor: Sensor, reference: float) -> Floats:
-    """(12,) what angles that are known so poorly do to scale factors and biases
-    by their squares, where this counts.
-
-    On six faces only attitudes tell the misalignments; an axis that is off by
-    an angle reads its cosine.
-    """
-    square = float(np.max(np.diag(covariance)[3:6]))
-    scale = np.abs(sensor.scale_factor) * square
-    if np.all(scale < SECOND_ORDER * np.sqrt(np.diag(covariance)[:3])):
-        return np.zeros(12)
-    return np.concatenate([scale, np.zeros(3), np.full(3, reference * square), np.zeros(3)])
 
 
 def _judged(

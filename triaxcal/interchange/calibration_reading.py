@@ -14,7 +14,7 @@ from triaxcal.effects import Effect, effect_of
 from triaxcal.effects.contract import covariate_of
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration, HoldsAt, Residual
-from triaxcal.interchange.calibration_document import WEIGHT
+from triaxcal.interchange.calibration_document import LINEAR, WEIGHT
 from triaxcal.interchange.error_reading import correlation_of, effect_errors_of, linear_errors_of
 from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
@@ -191,3 +191,23 @@ def _require_finite(
             raise InvalidData(f"{where}: channel_reference.{name}: expected a finite number")
     if not 0 < magnitude < math.inf:
         raise InvalidData(f"{where}: reference: expected a positive number")
+
+
+def uncertainty_over_error(budget: Mapping[str, Any], c: Calibration) -> Floats:
+    """(p,) standard uncertainties of the parameters by a document's ``budget``
+    over their standard errors; 1 where either is not known."""
+    out = []
+    for name, error in zip(c.parameters, c.standard_errors, strict=True):
+        expanded, coverage = (_in_budget(budget, key, name) for key in ("expanded", "coverage_factor"))
+        out.append(1.0 if expanded is None or not coverage or not error > 0 else expanded / coverage / error)
+    return np.array(out)
+
+
+def _in_budget(budget: Mapping[str, Any], key: str, parameter: str) -> float | None:
+    """A figure of the budget by parameter, None where it has none."""
+    group, _, name = parameter.rpartition(".")
+    try:
+        of = budget[key]
+        return float(of[group]["xyz".index(name)] if group in LINEAR else of["effects"][group][name])
+    except (LookupError, TypeError, ValueError):
+        return None

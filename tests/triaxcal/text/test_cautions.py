@@ -24,7 +24,7 @@ from triaxcal.estimate.caution import (
 )
 from triaxcal.frames.orientations import NotFlush
 from triaxcal.frames.standing import SingleOrientation
-from triaxcal.inputs.attitude import (
+from triaxcal.inputs.attitude_cautions import (
     AttitudeExcluded,
     AttitudesTied,
     DeclaredErrorContradicted,
