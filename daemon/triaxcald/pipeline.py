@@ -55,6 +55,8 @@ class DecodedStream:
         block = self._decoder.feed(batch)
         for name in ("missing", "duplicates", "incomplete", "errors"):
             self.counts[name] += getattr(block, name)
+        if block.invalid:  # older certificates have no such key, and are compared byte for byte
+            self.counts["invalid"] += block.invalid
         if len(block):
             if self._begin_ns is None:
                 self._begin_ns = int(block.time_ns[0])
@@ -149,6 +151,8 @@ class Pipeline(DecodedStream):
             found["missing_samples"] = f"the stream was interrupted {'once' if times == 1 else f'{times} times'}"
         if self.counts["duplicates"]:
             found["duplicate_samples"] = str(self.counts["duplicates"])
+        if self.counts["invalid"]:
+            found["invalid_samples"] = f"{self.counts['invalid']} that the unit says are not valid, left out"
         if self.counts["out_of_order"]:
             found["out_of_order_samples"] = f"{self.counts['out_of_order']}, left out"
         if self.counts["errors"]:

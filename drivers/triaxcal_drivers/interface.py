@@ -121,7 +121,8 @@ class SampleBlock:
     profile's output unit (for a corrected stream: g). ``channels`` the
     auxiliary ones, each (n,). The counts are of this block: samples missing by
     the counter, repeated samples dropped, samples that could not be put
-    together from their parts, records with an error flag.
+    together from their parts, records with an error flag, samples that the
+    device itself says are not valid, which are dropped.
     """
 
     time_ns: NDArray[np.int64]
@@ -132,6 +133,7 @@ class SampleBlock:
     duplicates: int = 0
     incomplete: int = 0
     errors: int = 0
+    invalid: int = 0
 
     def __len__(self) -> int:
         return len(self.time_ns)

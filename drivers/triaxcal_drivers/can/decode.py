@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from triaxcal_drivers.can.layout import NODES, Layout
 from triaxcal_drivers.can.model import READING_CHANNELS
+from triaxcal_drivers.can.together import TogetherInTime
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 
 Ints = NDArray[np.int64]
@@ -28,12 +29,14 @@ device's rate is a tenth off."""
 @dataclass(frozen=True)
 class _Parts:
     """Records that belong to the stream: host time, message number, counter,
-    the values they hold, and whether records were lost since the one before."""
+    the values they hold (those of the channels, then for each signal that says
+    whether the sample is valid, 1 where it is), and whether records were lost
+    since the one before."""
 
     time_ns: Ints
     message: Ints
     counter: Ints
-    values: NDArray[np.float64]  # (n, channels), nan where the message does not hold the channel
+    values: NDArray[np.float64]  # (n, columns), nan where the message does not hold the column
     after_gap: NDArray[np.bool_]
 
     def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _Parts:
@@ -76,21 +79,25 @@ class CanDecoder:
     **Time.** Host time of the first record, plus the periods counted since;
     host time where there is no counter.
 
+    **Together by time.** Without a counter, messages that come within half a
+    period of a sample's first one are that sample, each once; its time is that
+    of the first. One that lacks messages when the next begins is given up, and
+    counted ``incomplete``.
+
     **Samples.** One is delivered when every message of it has come and the ones
     before it are settled. One that lacks messages is given up, and counted
     ``incomplete``, once the counter is more than `LATEST` past it; one of which
     nothing came counts as ``missing``. Each message that is repeated, or comes
-    after its sample was given up, counts as one duplicate.
+    after its sample was given up, counts as one duplicate. A sample of which a
+    message says that it is not valid is left out, and counted ``invalid``.
     """
 
     def __init__(self, layout: Layout, *, rate_hz: float) -> None:
         self._layout = layout
         self._period_ns = 1e9 / rate_hz
         self._names = tuple(layout.channels)
-        self._sizes = [
-            max(s.size for s in [*(s for m, s in layout.channels.values() if m == i), *layout.counters[i : i + 1]])
-            for i in range(len(layout.messages))
-        ]
+        self._columns = (*layout.channels.values(), *layout.valid.items())  # message and signal of each
+        self._sizes = [layout.size(i) for i in range(len(layout.messages))]
         self._range = 1 << layout.counter_bits
         self._latest = min(LATEST, self._range // 8)
         self._return = min(RETURN, self._range // 4)
@@ -102,7 +109,8 @@ class CanDecoder:
         self._settled = 0  # every sample below is delivered or given up
         empty = np.zeros(0, dtype=np.int64)
         self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
-        self._held = _Parts(empty, empty, empty, np.zeros((0, len(self._names))), empty.astype(bool))
+        self._held = _Parts(empty, empty, empty, np.zeros((0, len(self._columns))), empty.astype(bool))
+        self._together = TogetherInTime(len(layout.messages), self._period_ns)
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         parts, errors = self._extract(batch)
@@ -110,7 +118,12 @@ class CanDecoder:
             return replace(self._block(parts.time_ns, parts.counter, parts.values), errors=errors)
         if not self._started:
             self._start(parts)
-        block = self._assemble(parts) if self._layout.counters else self._as_they_come(parts)
+        if self._layout.counters:
+            block = self._assemble(parts)
+        elif len(self._layout.messages) > 1:
+            block = self._by_time(parts)
+        else:
+            block = self._as_they_come(parts)
         return replace(block, errors=errors)
 
     def _start(self, parts: _Parts) -> None:
@@ -121,7 +134,8 @@ class CanDecoder:
 
     def _extract(self, batch: RawBatch) -> tuple[_Parts, int]:
         bad = (batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) != 0
-        message = self._messages(batch, ~bad & ((batch.flags & RawFlag.REMOTE) == 0))
+        remote = (batch.flags & (RawFlag.REMOTE | RawFlag.FD)) == RawFlag.REMOTE
+        message = self._messages(batch, ~bad & ~remote)
         short = (message >= 0) & (batch.length < np.array(self._sizes)[message])
         rows = np.flatnonzero((message >= 0) & ~short)
         message = message[rows]
@@ -129,13 +143,17 @@ class CanDecoder:
         starts = (np.cumsum(length) - length)[rows]
         octets = np.frombuffer(batch.payload, dtype=np.uint8)
         counter = np.zeros(len(rows), dtype=np.int64)
-        values = np.full((len(rows), len(self._names)), np.nan)
+        values = np.full((len(rows), len(self._columns)), np.nan)
         for number, size in enumerate(self._sizes):
             mine = np.flatnonzero(message == number)
             data = octets[starts[mine, None] + np.arange(size)]
-            for column, (at, signal) in enumerate(self._layout.channels.values()):
-                if at == number:
+            for column, (at, signal) in enumerate(self._columns):
+                if at != number:
+                    continue
+                if column < len(self._names):
                     values[mine, column] = signal.values(data)
+                else:
+                    values[mine, column] = np.isin(signal.raw(data).astype(np.int64), self._layout.valid_values)
             if self._layout.counters:
                 counter[mine] = self._layout.counters[number].raw(data).astype(np.int64) % self._range
         after_gap = self._after_gap(batch, rows)
@@ -174,6 +192,33 @@ class CanDecoder:
         self._settled += len(parts)
         self._last_ns = int(time_ns[-1])
         return self._block(time_ns, counter, parts.values)
+
+    def _by_time(self, parts: _Parts) -> SampleBlock:
+        """What belongs to a sample that is not whole yet is held."""
+        sample = np.concatenate(
+            [np.zeros(len(self._held), dtype=np.int64), self._together.samples_of(parts.time_ns, parts.message)]
+        )
+        parts = self._held.followed_by(parts)
+        last = int(sample[-1])
+        settled = last if self._together.open else last + 1
+        self._held = parts[sample >= settled]
+        complete = np.bincount(sample)[:settled] == len(self._layout.messages)
+        values = self._rows(parts, sample, last + 1)[:settled][complete]
+        first = parts.time_ns[np.searchsorted(sample, np.arange(settled))]
+        time_ns = np.maximum.accumulate(np.concatenate([[self._last_ns], first]))[1:]
+        counter = self._settled + np.arange(settled)
+        self._settled += settled
+        self._last_ns = int(time_ns[-1]) if settled else self._last_ns
+        block = self._block(time_ns[complete], counter[complete], values)
+        return replace(block, incomplete=settled - int(complete.sum()))
+
+    def _rows(self, parts: _Parts, row: Ints, rows: int) -> NDArray[np.float64]:
+        """The values (rows, columns) of parts that belong to samples ``row``."""
+        values = np.full((rows, len(self._columns)), np.nan)
+        for column, (number, _) in enumerate(self._columns):
+            mine = parts.message == number
+            values[row[mine], column] = parts.values[mine, column]
+        return values
 
     def _unwrap(self, parts: _Parts) -> Ints:
         before = np.concatenate([[self._last_raw], parts.counter[:-1]])
@@ -221,10 +266,7 @@ class CanDecoder:
         whole = complete[ahead:] & (samples[ahead:] == given_up + np.arange(len(samples) - ahead))
         settled = given_up + (len(whole) if whole.all() else int(np.argmin(whole)))
         new = (samples >= self._settled) & (samples < settled)
-        values = np.full((len(samples), len(self._names)), np.nan)
-        for column, (number, _) in enumerate(self._layout.channels.values()):
-            mine = parts.message == number
-            values[row[mine], column] = parts.values[mine, column]
+        values = self._rows(parts, row, len(samples))
         counter = samples[new & complete]
         time_ns = self._origin_ns + np.rint((counter - self._origin) * self._period_ns).astype(np.int64)
         block = replace(
@@ -237,6 +279,9 @@ class CanDecoder:
         return block
 
     def _block(self, time_ns: Ints, counter: Ints, values: NDArray[np.float64]) -> SampleBlock:
+        valid = (values[:, len(self._names) :] == 1).all(axis=1)
+        values = values[valid]
         columns = [self._names.index(name) for name in READING_CHANNELS]
         auxiliary = {n: values[:, i] for i, n in enumerate(self._names) if n not in READING_CHANNELS}
-        return SampleBlock(time_ns, counter, values[:, columns], auxiliary)
+        invalid = len(valid) - len(values)
+        return SampleBlock(time_ns[valid], counter[valid], values[:, columns], auxiliary, invalid=invalid)

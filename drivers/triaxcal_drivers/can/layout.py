@@ -3,8 +3,9 @@ many frames at once. No I/O."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
@@ -13,10 +14,12 @@ from numpy.typing import NDArray
 
 from triaxcal_drivers.can.model import CanStream, Scaling
 from triaxcal_drivers.errors import ProfileError
-from triaxcal_drivers.nearest import nearest
+from triaxcal_drivers.nearest import clipped, nearest
 
 NODES = 127
 SHORTEST_COUNTER = 4
+STANDARD_MOST = 0x7FF  # the highest identifier of 11 bits
+_IDENTIFIER = re.compile("0[xX]([0-9A-Fa-f]{1,8})([xX]?)")
 _FLOATS = {16: np.uint16, 32: np.uint32, 64: np.uint64}
 
 
@@ -95,15 +98,30 @@ class Message:
 @dataclass(frozen=True)
 class Layout:
     """A stream: its messages, the (message, signal) of each channel, and the
-    counter in each message."""
+    counter in each message.
+
+    ``valid`` are the signals, by message, that have to hold one of
+    ``valid_values``. Where ``by_time``, messages that come within half a period
+    are one sample.
+    """
 
     messages: tuple[Message, ...]
     channels: Mapping[str, tuple[int, Signal]]
     counters: tuple[Signal, ...]
+    valid: Mapping[int, Signal] = field(default_factory=dict)
+    valid_values: tuple[int, ...] = ()
+    by_time: bool = False
 
     @property
     def counter_bits(self) -> int:
         return self.counters[0].length if self.counters else 0
+
+    def size(self, message: int) -> int:
+        """Bytes that a message must have to hold what the stream takes of it."""
+        signals = [s for m, s in self.channels.values() if m == message]
+        signals += self.counters[message : message + 1]
+        signals += [self.valid[message]] if message in self.valid else []
+        return max(s.size for s in signals)
 
 
 def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> Layout:
@@ -114,29 +132,32 @@ def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> La
     nearest right one).
     """
     wanted = stream.wanted()
-    index = _Index(messages)
+    index = _Index(messages, getattr(stream, "base_node_id", None) or 0)
     holders = {name: index.holders(reference, where) for name, (reference, _) in wanted.items()}
     needed = {h[0][0] for h in holders.values() if len(h) == 1}
     chosen: dict[str, tuple[int, Signal]] = {}
     for name, (reference, scaling) in wanted.items():
         found = [h for h in holders[name] if len(holders[name]) == 1 or h[0] in needed]
         if len(found) != 1:
-            names = ", ".join(messages[m].name for m, _ in holders[name])
+            names = ", ".join(index.place(m) for m, _ in holders[name])
             raise ProfileError(f"{where}: '{reference}' is in several messages ({names}); name one of them")
         chosen[name] = (found[0][0], _scaled(found[0][1], scaling))
     order = sorted(needed)
     used = tuple(messages[m] for m in order)
     channels = {name: (order.index(m), signal) for name, (m, signal) in chosen.items()}
-    layout = Layout(used, channels, _counters(used, stream.counter, where))
+    by_time = stream.together == "time"
+    counters = _counters(used, stream.counter, by_time, where)
+    valid = _valid(index, order, stream.validity(), where)
     _check_identifiers(used, where)
-    return layout
+    return Layout(used, channels, counters, *valid, by_time)
 
 
 class _Index:
-    """Finds signals by name, in files of thousands of messages too."""
+    """Finds signals by name, in files of thousands of messages too. ``node_id``
+    is the one for which the identifiers of the file are written."""
 
-    def __init__(self, messages: Sequence[Message]) -> None:
-        self._messages = messages
+    def __init__(self, messages: Sequence[Message], node_id: int) -> None:
+        self._messages, self._node_id = messages, node_id
         self._of: dict[str, list[int]] = {}  # numbers of the messages of that name
         self._with: dict[str, list[int]] = {}  # of those that hold a signal of that name
         for i, m in enumerate(messages):
@@ -145,17 +166,51 @@ class _Index:
                 self._with.setdefault(name, []).append(i)
 
     def holders(self, reference: str, where: str) -> list[tuple[int, Signal]]:
-        """Which messages hold the signal: ``Signal``, or ``Message.Signal``."""
+        """Which messages hold the signal: ``Signal``, ``Message.Signal``, or
+        ``Message@0x19.Signal`` where several have that name."""
         within, _, name = reference.rpartition(".")
-        if within and within not in self._of:
-            raise ProfileError(f"{where}: no message '{within}'{nearest(within, self._of)}")
-        inside = self._of.get(within, range(len(self._messages)))
+        inside = self._named(within, where) if within else range(len(self._messages))
         found = [(i, self._messages[i].signals[name]) for i in self._with.get(name, []) if i in inside]
         if not found:
             at = f" in message '{within}'" if within else ""
             known = (s for i in inside for s in self._messages[i].signals)
             raise ProfileError(f"{where}: no signal '{name}'{at}{nearest(name, known)}")
         return found
+
+    def _named(self, within: str, where: str) -> Sequence[int]:
+        """The messages ``Message`` or ``Message@0x19``."""
+        name, at, identifier = within.partition("@")
+        if name not in self._of:
+            raise ProfileError(f"{where}: no message '{name}'{nearest(name, self._of)}")
+        found = self._of[name]
+        if not at:
+            return found
+        if not (wanted := _IDENTIFIER.fullmatch(identifier)):
+            raise ProfileError(f"{where}: '{clipped(within)}': expected an identifier as in {name}@0x19")
+        value, extended = int(wanted[1], 16), bool(wanted[2])
+        held = [
+            i
+            for i in found
+            if self._identifier(i) == value and (value > STANDARD_MOST or self._messages[i].extended == extended)
+        ]
+        if not held:
+            places = ", ".join(map(self.place, found))
+            raise ProfileError(f"{where}: no message '{clipped(within)}'; known: {places}")
+        return held
+
+    def _identifier(self, i: int) -> int:
+        """As the file has it."""
+        m = self._messages[i]
+        return m.identifier + (self._node_id if m.per_node else 0)
+
+    def place(self, i: int) -> str:
+        """The message's name as a profile has to give it."""
+        name = self._messages[i].name
+        if len(self._of[name]) == 1:
+            return name
+        identifier = self._identifier(i)
+        short = self._messages[i].extended and identifier <= STANDARD_MOST  # an x tells it from a standard one
+        return f"{name}@0x{identifier:X}{'x' if short else ''}"
 
 
 def _scaled(signal: Signal, scaling: Scaling) -> Signal:
@@ -171,11 +226,31 @@ def _scaled(signal: Signal, scaling: Scaling) -> Signal:
     )
 
 
-def _counters(used: Sequence[Message], counter: str | None, where: str) -> tuple[Signal, ...]:
+def _valid(
+    index: _Index, order: Sequence[int], validity: tuple[str, tuple[int, ...]] | None, where: str
+) -> tuple[dict[int, Signal], tuple[int, ...]]:
+    """The signals that say whether a sample is valid, by their message's place
+    in ``order``."""
+    if validity is None:
+        return {}, ()
+    name, values = validity
+    found = {order.index(m): signal for m, signal in index.holders(name, where) if m in order}
+    if not found:
+        names = ", ".join(map(index.place, order))
+        raise ProfileError(f"{where}: valid: '{name}' is in no message of the sample ({names})")
+    for signal in found.values():
+        if signal.is_float:
+            raise ProfileError(f"{where}: valid: '{name}' is a float, expected a whole number")
+    return found, values
+
+
+def _counters(used: Sequence[Message], counter: str | None, by_time: bool, where: str) -> tuple[Signal, ...]:
     if counter is None:
-        if len(used) > 1:
+        if len(used) > 1 and not by_time:
             names = ", ".join(m.name for m in used)
-            raise ProfileError(f"{where}: a sample made of several messages ({names}) needs a counter")
+            raise ProfileError(
+                f'{where}: a sample made of several messages ({names}) needs a counter, or together = "time"'
+            )
         return ()
     for message in used:
         if counter not in message.signals:

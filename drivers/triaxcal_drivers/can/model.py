@@ -13,6 +13,7 @@ from triaxcal_drivers.claim import Claim
 from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
 
 READING_CHANNELS = tuple("u" + axis for axis in AXES)
+VALUES_MOST = 256  # of a signal that says what is valid; such a signal has a byte at most
 
 ObjectName = Annotated[
     str,
@@ -41,15 +42,37 @@ class Scaling(Strict):
 
 
 class DbcChannel(Scaling):
-    signal: Annotated[str, Field(description="name of the signal, or Message.Signal")]
+    signal: Annotated[str, Field(description="name of the signal, Message.Signal, or Message@0x19.Signal")]
 
 
 class PdoChannel(Scaling):
     object: ObjectName
 
 
-def _named(key: str, channel: type[Scaling]) -> BeforeValidator:
-    """A channel may be given by its name in the file alone."""
+class _Validity(Strict):
+    """A sample whose signal holds another number than these is not valid."""
+
+    values: Annotated[
+        tuple[int, ...],
+        Field(
+            strict=False,  # a list, which it is once a short form has been looked for
+            min_length=1,
+            max_length=VALUES_MOST,
+            description="unscaled numbers of a valid sample",
+        ),
+    ] = (1,)
+
+
+class DbcValidity(_Validity):
+    signal: Annotated[str, Field(description="name of the signal, or Message.Signal")]
+
+
+class PdoValidity(_Validity):
+    object: ObjectName
+
+
+def _named(key: str, channel: type[Strict]) -> BeforeValidator:
+    """What may be given by its name in the file alone."""
     return BeforeValidator(
         lambda given: {key: given} if isinstance(given, str) else given, json_schema_input_type=str | channel
     )
@@ -61,48 +84,63 @@ def _has_readings(channels: Mapping[str, object]) -> None:
             raise ValueError(f"channels.{name} is missing")
 
 
-class DbcStream(Strict):
+Together = Annotated[
+    Literal["time"] | None,
+    Field(description="without a counter: messages that come within half a period of each other are one sample"),
+]
+
+
+class _Stream(Strict):
+    counter: str | None = None
+    together: Together = None
+    channels: Mapping[str, Scaling]
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        _has_readings(self.channels)
+        if self.counter is not None and self.together is not None:
+            raise ValueError("together is for messages without a counter, and there is one")
+        return self
+
+
+class DbcStream(_Stream):
     """A stream whose messages a DBC file describes.
 
     The sample is made of the messages that hold its channels; ``counter`` names
-    a signal that each of them holds. ``base_node_id`` is the node for which the
-    DBC's identifiers are written: given it, a unit at another node sends them
-    shifted by the difference.
+    a signal that each of them holds, ``valid`` one that says whether the sample
+    is to be used. ``base_node_id`` is the node for which the DBC's identifiers
+    are written: given it, a unit at another node sends them shifted by the
+    difference.
     """
 
     layout: Literal["dbc"]
     file: str
     base_node_id: Annotated[int | None, Field(ge=1, le=127)] = None
-    counter: str | None = None
+    valid: Annotated[DbcValidity | None, _named("signal", DbcValidity)] = None
     channels: Annotated[
         Mapping[str, Annotated[DbcChannel, _named("signal", DbcChannel)]], Field(max_length=CHANNELS_MOST)
     ]
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        _has_readings(self.channels)
-        return self
 
     def wanted(self) -> dict[str, tuple[str, Scaling]]:
         """The name in the file, and the scaling, of each channel."""
         return {name: (channel.signal, channel) for name, channel in self.channels.items()}
 
+    def validity(self) -> tuple[str, tuple[int, ...]] | None:
+        """The name in the file, and the unscaled numbers of valid samples."""
+        return (self.valid.signal, self.valid.values) if self.valid else None
 
-class PdoStream(Strict):
+
+class PdoStream(_Stream):
     """A stream whose messages are the TPDOs that an EDS file maps; channels are
     the mapped objects."""
 
     layout: Literal["pdo"]
     eds: str
     counter: ObjectName | None = None
+    valid: Annotated[PdoValidity | None, _named("object", PdoValidity)] = None
     channels: Annotated[
         Mapping[str, Annotated[PdoChannel, _named("object", PdoChannel)]], Field(max_length=CHANNELS_MOST)
     ]
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        _has_readings(self.channels)
-        return self
 
     @property
     def file(self) -> str:
@@ -111,6 +149,10 @@ class PdoStream(Strict):
     def wanted(self) -> dict[str, tuple[str, Scaling]]:
         """The object's name, and the scaling, of each channel."""
         return {name: (channel.object, channel) for name, channel in self.channels.items()}
+
+    def validity(self) -> tuple[str, tuple[int, ...]] | None:
+        """The object's name, and the unscaled numbers of valid samples."""
+        return (self.valid.object, self.valid.values) if self.valid else None
 
 
 CanStream = Annotated[DbcStream | PdoStream, Field(discriminator="layout")]

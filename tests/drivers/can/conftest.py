@@ -74,7 +74,7 @@ def joined(blocks: Sequence[SampleBlock]) -> dict[str, Any]:
         "counter": np.concatenate([b.counter for b in blocks]).tolist(),
         "readings": np.concatenate([b.readings for b in blocks]).tolist(),
         **channels,
-        **{n: sum(getattr(b, n) for b in blocks) for n in ("missing", "duplicates", "incomplete", "errors")},
+        **{n: sum(getattr(b, n) for b in blocks) for n in ("missing", "duplicates", "incomplete", "errors", "invalid")},
     }
 
 

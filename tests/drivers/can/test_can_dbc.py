@@ -98,6 +98,14 @@ def test_signals_of_no_message_are_passed_over() -> None:
     assert [m.name for m in read(HEAD + loose + "\nBO_ 1 M: 8 A\n")] == ["M"]
 
 
+def test_lines_of_other_tools_that_cantools_refuses_are_passed_over() -> None:
+    text = HEAD.replace("BS_:", "BS_: 1000000 : 0,0") + 'BO_ 100 M: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] "" A\n\n'
+    text += 'BA_DEF_ BO_ "x" ENUM "false","true";\nBA_DEF_DEF_ "x" true;\n'
+    with pytest.raises(cantools.database.UnsupportedDatabaseFormatError):
+        cantools.database.load_string(text, "dbc", strict=False)
+    assert [(m.name, [*m.signals]) for m in read(text)] == [("M", ["S"])]
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -58,7 +58,28 @@ def test_a_counter_of_differing_width_is_refused(edited: Edited) -> None:
 
 def test_a_sample_of_several_messages_needs_a_counter(edited: Edited) -> None:
     message = refusal(opened(edited(('counter = "Counter"\n', ""))))
-    assert "a sample made of several messages (ReadingsXY, ReadingsZ) needs a counter" in message
+    assert message.endswith(
+        'a sample made of several messages (ReadingsXY, ReadingsZ) needs a counter, or together = "time"'
+    )
+
+
+def test_a_counter_and_time_do_not_both_say_what_is_one_sample(edited: Edited) -> None:
+    message = refusal(lambda: edited(('counter = "Counter"\n', 'counter = "Counter"\ntogether = "time"\n')))
+    assert "together is for messages without a counter, and there is one" in message
+
+
+@pytest.mark.parametrize(
+    ("valid", "words"),
+    [
+        ('"Stat"', "no signal 'Stat'; did you mean 'Status'?"),
+        ('"CorrectedZ.Status"', "valid: 'CorrectedZ.Status' is in no message of the sample (ReadingsXY, ReadingsZ)"),
+        ('{ signal = "Status", values = [] }', "values"),
+    ],
+)
+def test_a_signal_of_validity_belongs_to_the_sample(edited: Edited, valid: str, words: str) -> None:
+    assert words in refusal(
+        lambda: opened(edited(('counter = "Counter"\n', f'counter = "Counter"\nvalid = {valid}\n')))()
+    )
 
 
 def test_a_signal_in_several_messages_must_be_told_apart(edited: Edited) -> None:
@@ -68,6 +89,24 @@ def test_a_signal_in_several_messages_must_be_told_apart(edited: Edited) -> None
     assert "'Temperature' is in several messages (ReadingsZ, CorrectedZ); name one of them" in message
     qualified = edited(*[(old, new.replace('"T', '"CorrectedZ.T')) for old, new in signals], *rest)
     assert opened(qualified)()
+
+
+TWICE = [("BO_ 901 CorrectedXY", "BO_ 901 ReadingsXY")]
+
+
+def test_a_message_whose_name_is_given_twice_goes_by_its_identifier_too(edited: Edited) -> None:
+    signals = [(f'{u} = "{s}"', f'{u} = "ReadingsXY{{at}}.{s}"') for u, s in (("ux", "Ux"), ("uy", "Uy"))]
+
+    def named(at: str) -> Callable[[], object]:
+        return opened(edited(*((old, new.format(at=at)) for old, new in signals), dbc=TWICE))
+
+    assert named("@0x185")()
+    assert "no signal 'Ux' in message 'ReadingsXY@0x385'" in refusal(named("@0x385"))
+    assert "no message 'ReadingsXY@0x186'; known: ReadingsXY@0x185, ReadingsXY@0x385" in refusal(named("@0x186"))
+    assert "'ReadingsXY@185': expected an identifier as in ReadingsXY@0x19" in refusal(named("@185"))
+    both = [("BO_ 901 CorrectedXY", "BO_ 901 ReadingsXY"), (" SG_ Ax ", " SG_ Ux "), (" SG_ Ay ", " SG_ Uy ")]
+    message = refusal(opened(edited(dbc=both)))
+    assert "'Ux' is in several messages (ReadingsXY@0x185, ReadingsXY@0x385); name one of them" in message
 
 
 def test_identifiers_too_close_to_shift_with_the_node_are_refused(edited: Edited) -> None:
