@@ -162,6 +162,8 @@ def test_the_commands_of_a_page_that_are_marked_as_runnable_run(
     monkeypatch.chdir(tmp_path)
     ran = 0
     for block in blocks(page):
+        if block.file:
+            (tmp_path / block.file).write_text(block.text, "utf-8")
         if block.note.startswith("run"):
             for command in block.commands:
                 assert run(command) == int(block.note.partition("exit")[2] or 0), command

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Iterable
 
 from triaxcal.errors import InvalidData, Refused, TriaxcalError
-from triaxcal_drivers.errors import DriverError, DriverMissing, ProfileError, RegisterValueError
+from triaxcal_drivers.errors import DriverError, DriverMissing, LogError, ProfileError, RegisterValueError
 from triaxcald.errors import DaemonError
 
 DONE, OUTSIDE, BAD_INPUT, REFUSED, DEVICE, DISK, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
@@ -24,7 +24,7 @@ def exit_code_of(e: BaseException) -> int:
     match e:
         case Refused() | RegisterValueError():
             return REFUSED
-        case InvalidData() | ProfileError() | DriverMissing():
+        case InvalidData() | ProfileError() | DriverMissing() | LogError():
             return BAD_INPUT
         case DaemonError():
             return e.exit_code

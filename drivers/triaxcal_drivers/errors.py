@@ -54,3 +54,7 @@ class DeviceBusy(RegisterRefused):
 
 class RegisterValueError(DriverError):
     """A value does not fit the register's type or limits; nothing was sent."""
+
+
+class LogError(DriverError):
+    """A log that others recorded cannot be read."""

@@ -12,6 +12,8 @@ EXTRAS = {
     "pymodbus": "modbus",
     "serial": "modbus",
     "msgpack": "station",
+    "asammdf": "logs",
+    "rosbags": "logs",
 }
 """By the name that is imported."""
 CALLED = {"can": "python-can", "serial": "pyserial"}

@@ -20,6 +20,7 @@ LAST_THREADS_S = 1.0
 def entry() -> NoReturn:
     """Console script. Says what is not installed in one line."""
     heed_stop_signals()
+    _keep_from_python_can()
     try:
         from triaxcald.cli.commands import main
 
@@ -29,6 +30,15 @@ def entry() -> NoReturn:
         code = 2
     _leave_nothing_unsaid()
     _end(code)
+
+
+def _keep_from_python_can() -> None:
+    """python-can imports asammdf, and all that this brings, wherever it is
+    installed: seconds before each command on a bus, none of which needs it.
+
+    `triaxcal_drivers.logs.mf4` takes the mark away again.
+    """
+    sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
 
 
 def _end(code: int) -> NoReturn:

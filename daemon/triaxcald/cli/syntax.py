@@ -309,8 +309,8 @@ def _audits(commands: Any) -> None:
     )  # fmt: skip
     p.add_argument("recordings", metavar="REC|FOLDER|GLOB", nargs="+", type=Path)
     add_json(p)
-    log = commands.add_parser("log", help="a recording's contents; mend one; write CSV")
-    parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export")
+    log = commands.add_parser("log", help="a recording's contents; mend one; write CSV; take over other logs")
+    parts = log.add_subparsers(dest="part", required=True, metavar="info|recover|export|import")
     p = _command(parts, "info", "recordings:info_command", "what a recording holds", "", "log info rec.mcap")
     p.add_argument("recording", metavar="REC", type=Path)
     add_json(p)
@@ -328,3 +328,16 @@ def _audits(commands: Any) -> None:
     p.add_argument("-o", "--output", type=Path, help="default: standard output")
     p.add_argument("--stream", default=READINGS)
     p.add_argument("--phase", default=PHASES[0], choices=PHASES)
+    p = _command(
+        parts, "import", "importing:import_command", "make a recording of a log that others recorded",
+        "BLF, ASC, candump, TRC, MF4, pcap and pcapng of SocketCAN, told by the file's first bytes; packed with gzip "
+        "or not.", "log import drive.blf --profile imu.toml -o rec.mcap",
+    )  # fmt: skip
+    p.add_argument("log", metavar="LOG", type=Path)
+    p.add_argument("--profile", metavar="P", type=Path, required=True, help="of the device whose frames are in it")
+    p.add_argument("-o", "--output", metavar="REC.mcap", type=Path, required=True)
+    p.add_argument("--channel", metavar="NAME", help="the bus, where the log has the unit's frames on several")
+    p.add_argument(
+        "--node", type=count, metavar="N", help="the unit's, where identifiers shift with it and several nodes send"
+    )
+    add_json(p)

@@ -30,6 +30,7 @@ def describe(path: Path) -> dict[str, Any]:
             "duration_s": (max(ends) - min(starts)) / 1e9 if starts else 0.0,
             "topics": topics,
             "raw": _phases(recording),
+            **_imported(recording),
             "metadata": recording.metadata,
             "attachments": {
                 name: {
@@ -49,6 +50,12 @@ def _detail(event: schema.Event) -> Any:
         return event.detail
     except (ValueError, RecursionError):
         return event.text
+
+
+def _imported(recording: Recording) -> dict[str, Any]:
+    """From which log the recording was made, where it was."""
+    details = [_detail(event) for event in recording.events() if event.kind == schema.IMPORTED]
+    return {"imported": details[0]} if details else {}
 
 
 def _topics(recording: Recording) -> dict[str, dict[str, int]]:

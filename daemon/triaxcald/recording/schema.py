@@ -28,6 +28,7 @@ FORMAT_RECORD = "recording"  # the metadata record that holds FORMAT, and ENDS_W
 ENDS_WITH = "ends_with"  # the key there that says in which document a whole recording ends
 RAW_RECORD = "raw"  # the metadata record with count and digest, written at the end
 END_RECORD = "end"  # the metadata record with the digest of the document that the recording ends with
+IMPORTED = "imported"  # the kind of the event that says of which log a recording was made
 RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
 PROFILE = "triaxcal"  # in the header of the MCAP file
 

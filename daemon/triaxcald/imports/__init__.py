@@ -1,0 +1,1 @@
+"""Logs that others recorded, as recordings of ours."""

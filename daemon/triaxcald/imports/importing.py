@@ -1,0 +1,172 @@
+"""From a log that others recorded to a recording of ours."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from triaxcal_drivers.catalogue import driver_named
+from triaxcal_drivers.interface import Decoder, RawBatch
+from triaxcal_drivers.profile import READINGS, Bundle
+from triaxcald.certificate import software
+from triaxcald.errors import InputError, RecordingError
+from triaxcald.files import new_beside
+from triaxcald.inputs import CALIBRATION, PROFILE, preview_channels
+from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic
+from triaxcald.recording.writer import RecordingWriter
+
+BATCH = 4096  # records; a quarter of an hour of a slow unit, 4 s of a fast one
+DRAINED_EACH = 32  # batches; the writer's queue has room for 256, and drops what comes beyond
+COUNTED = ("missing", "duplicates", "incomplete", "errors", "invalid")
+
+Record = tuple[int, int, int, bytes]
+"""Time, source, flags and bytes of a raw record."""
+
+
+Describe = Callable[[dict[str, int]], dict[str, Any]]
+"""What the event has to say, of the counts of the readings' samples."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What came of it. ``document`` is the event in the recording; ``seconds``
+    from the first sample to the last."""
+
+    output: Path
+    document: Mapping[str, Any]
+    seconds: float
+
+
+class Importing:
+    """One recording being made of a log's records."""
+
+    def __init__(self, bundle: Bundle, writer: RecordingWriter) -> None:
+        driver = driver_named(bundle.profile.driver)
+        self.counts = dict.fromkeys(("samples", *COUNTED), 0)
+        self._first_ns = self._last_ns = 0
+        self._writer = writer
+        self._decoders: dict[str, Decoder] = {name: driver.decoder(bundle, name) for name in bundle.profile.streams}
+        self._batches = 0
+
+    def take(self, records: Sequence[Record]) -> None:
+        """Raises RecordingError."""
+        batch = RawBatch.of(records)
+        self._batches += 1
+        if self._batches % DRAINED_EACH == 0:
+            self._writer.drain()
+        self._writer.raw(CALIBRATION, batch)
+        for name, decoder in self._decoders.items():
+            block = decoder.feed(batch)
+            if topic := _topic(name):
+                self._writer.preview(topic, block)
+            if name != READINGS:
+                continue
+            for what in COUNTED:
+                self.counts[what] += getattr(block, what)
+            if len(block):
+                if not self.counts["samples"]:
+                    self._first_ns = int(block.time_ns[0])
+                self._last_ns = int(block.time_ns[-1])
+                self.counts["samples"] += len(block)
+
+    @property
+    def seconds(self) -> float:
+        return (self._last_ns - self._first_ns) / 1e9
+
+
+def _topic(stream: str) -> PreviewTopic | None:
+    return next((topic for topic in PREVIEWS if topic.endswith(f"/{stream}")), None)
+
+
+@dataclass
+class _LogClock:
+    """The writer's clock, at the log's time, so that a recording does not
+    stretch from the log's day to today."""
+
+    now_ns: int = 0
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+def write_recording(
+    out: Path, bundle: Bundle, records: Iterator[Record], source: Path, describe: Describe
+) -> tuple[dict[str, Any], float]:
+    """Makes the recording ``out`` of all the records; its `imported` event, and
+    the seconds that the samples cover.
+
+    ``describe`` is called once all have been taken, with the counts of the
+    readings' samples: it gives what the event has to say besides, or raises
+    InputError where the log is not one unit's. Nothing is left then. Raises
+    InputError, RecordingError, LogError.
+    """
+    if os.path.lexists(out):
+        raise RecordingError(f"{out}: exists already; a recording is never overwritten")
+    try:
+        with new_beside(out) as temporary:
+            temporary.unlink()
+            return _write(temporary, out, bundle, records, source, describe)
+    except OSError as e:
+        raise InputError(f"{out}: cannot be written: {e.strerror}") from e
+
+
+def _write(
+    temporary: Path, out: Path, bundle: Bundle, records: Iterator[Record], source: Path, describe: Describe
+) -> tuple[dict[str, Any], float]:
+    batches = in_batches(records)
+    first = next(batches, [])
+    clock = _LogClock(max(0, first[0][0]) if first else 0)
+    signs = bundle.profile.output.signs
+    unit = {"name": bundle.profile.name, "serial": "", "signs": ",".join(map(str, signs)) if signs else ""}
+    with RecordingWriter(
+        temporary,
+        metadata={"unit": unit, "software": software(), "import": {"file": source.name}},
+        preview_channels=preview_channels(bundle.profile),
+        preview_unit=bundle.profile.output.unit,
+        clock_ns=clock,
+    ) as writer:
+        writer.path = out  # what messages name
+        writer.attach(PROFILE, "application/toml", bundle.text)
+        for name, data in bundle.files.items():
+            writer.attach(f"profile/{name}", "application/octet-stream", data)
+        importing = Importing(bundle, writer)
+        if first:
+            importing.take(first)
+        for batch in batches:
+            importing.take(batch)
+            clock.now_ns = max(clock.now_ns, batch[-1][0])
+        detail = {
+            **file_told(source),
+            **describe(importing.counts),
+            "samples": importing.counts,
+            "imported": datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="seconds"),
+        }
+        writer.event(IMPORTED, detail)
+    return detail, importing.seconds
+
+
+def in_batches(records: Iterable[Record]) -> Iterator[list[Record]]:
+    batch: list[Record] = []
+    for record in records:
+        batch.append(record)
+        if len(batch) == BATCH:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
+
+
+def file_told(path: Path) -> dict[str, Any]:
+    """Raises InputError."""
+    try:
+        with open(path, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+            return {"file": path.name, "bytes": os.fstat(file.fileno()).st_size, "sha256": digest}
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read: {e.strerror}") from e

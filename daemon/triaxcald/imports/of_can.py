@@ -1,0 +1,82 @@
+"""Logs of a CAN bus, through a profile of the driver ``can``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+from triaxcal_drivers.can.description import stream_layout
+from triaxcal_drivers.can.model import CanProfile
+from triaxcal_drivers.logs.frames import Account, LoggedFrame, Remark
+from triaxcal_drivers.logs.kinds import Kind, Log
+from triaxcal_drivers.profile import Bundle
+from triaxcald.errors import InputError
+from triaxcald.imports.importing import Imported, Record, write_recording
+from triaxcald.imports.selection import Selection
+from triaxcald.imports.times import LONGEST_NS, Ticks, Times
+
+
+def import_can(log: Log, bundle: Bundle, out: Path, *, node: int | None, channel: str | None) -> Imported:
+    """Raises InputError, RecordingError, LogError, ProfileError."""
+    profile = cast(CanProfile, bundle.profile)
+    assert isinstance(log.kind, Kind)
+    layouts = {
+        name: stream_layout(stream, bundle.files, where=f"profile {profile.name}, streams.{name}")
+        for name, stream in profile.streams.items()
+    }
+    period_ns = 1e9 / profile.sampling.rate_hz
+    work = _Work(Selection(layouts, node, channel), Account(), Times(period_ns), Ticks(period_ns))
+
+    def describe(counts: dict[str, int]) -> dict[str, Any]:
+        return work.described(log, counts)
+
+    detail, seconds = write_recording(out, bundle, work.records(log), Path(log.name), describe)
+    return Imported(out, detail, seconds)
+
+
+class _Work:
+    """What is counted on the way."""
+
+    def __init__(self, selection: Selection, account: Account, times: Times, ticks: Ticks) -> None:
+        self._selection, self._account, self._times, self._ticks = selection, account, times, ticks
+
+    def records(self, log: Log) -> Iterator[Record]:
+        for frame in log.frames(self._account):
+            if not self._selection.takes(frame):
+                continue
+            time_ns = self._time_ns(frame)
+            if not 0 <= time_ns < LONGEST_NS:
+                self._account.note(f"frame {self._selection.frames}", f"a time of {time_ns} ns")
+                continue
+            self._times.note(time_ns)
+            yield time_ns, frame.source, frame.flags, frame.data
+
+    def _time_ns(self, frame: LoggedFrame) -> int:
+        if Remark.NO_TIMES in self._account.remarks:  # where a few lines lack theirs, the others' are of no use either
+            return self._ticks.of((frame.source, frame.flags))
+        return -1 if frame.time_ns is None else frame.time_ns
+
+    def described(self, log: Log, counts: dict[str, int]) -> dict[str, Any]:
+        """Raises InputError."""
+        chosen, account = self._selection, self._account
+        chosen.settle(log.name)
+        if not counts["samples"]:
+            why = ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "no sample is whole"
+            raise InputError(f"{log.name}: no sample in its {chosen.taken} frames of the profile: {why}")
+        assert isinstance(log.kind, Kind)
+        return {
+            "kind": log.kind.name,
+            "channels": chosen.from_channels,
+            "node": chosen.node,
+            "frames": chosen.frames,
+            "taken": chosen.taken,
+            "error_frames": chosen.error_frames,
+            "elsewhere": chosen.elsewhere,
+            "other_frames": sum(chosen.others.values()),
+            "other_records": dict(account.others),
+            "damaged": account.damaged,
+            "damage": account.damage,
+            "remarks": sorted(account.remarks),
+            "times": self._times.document(),
+        }

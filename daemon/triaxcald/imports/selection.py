@@ -1,0 +1,127 @@
+"""Which frames of a log are those of one unit: by the identifiers of its
+profile, its node and its bus."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from triaxcal_drivers.can.layout import NODES, Layout, Message
+from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.logs.frames import LoggedFrame
+from triaxcal_drivers.nearest import clipped
+from triaxcald.errors import InputError
+
+_EXTENDED, _ERROR = int(RawFlag.EXTENDED_ID), int(RawFlag.ERROR)
+SHOWN = 8  # identifiers or channels in a message
+
+Key = tuple[int, int]
+"""An identifier, and `RawFlag.EXTENDED_ID` where it is one."""
+
+
+@dataclass
+class Selection:
+    """Takes the frames of one unit and counts the rest. ``node`` and
+    ``channel`` are what the user asked for; ``layouts`` are those of all
+    streams, ``readings`` among them."""
+
+    layouts: Mapping[str, Layout]
+    node: int | None = None
+    channel: str | None = None
+    frames: int = 0
+    taken: int = 0
+    error_frames: int = 0
+    elsewhere: int = 0  # of the unit's identifiers, on another channel or of another node
+    others: Counter[Key] = field(default_factory=Counter)
+    channels: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self._nodes: dict[Key, int | None] = {}  # by identifier; None where it does not shift
+        for layout in self.layouts.values():
+            for message in layout.messages:
+                self._nodes |= _identifiers(message)
+        self._seen: Counter[tuple[Key, str]] = Counter()
+
+    def takes(self, frame: LoggedFrame) -> bool:
+        self.frames += 1
+        self.channels[frame.channel] += 1
+        if self.channel is not None and frame.channel != self.channel:
+            self.elsewhere += 1
+            return False
+        if frame.flags & _ERROR:
+            self.error_frames += 1
+            return True
+        key = frame.source, frame.flags & _EXTENDED
+        if key not in self._nodes:
+            self.others[key] += 1
+            return False
+        node = self._nodes[key]
+        if self.node is not None and node is not None and node != self.node:
+            self._seen[key, frame.channel] += 1
+            self.elsewhere += 1
+            return False
+        self._seen[key, frame.channel] += 1
+        self.taken += 1
+        return True
+
+    def settle(self, name: str) -> None:
+        """The node and the channels that the frames came by, once all have been
+        seen. Raises InputError where that is not one unit's, or none."""
+        if self.channel is not None and self.channel not in self.channels:
+            raise InputError(f"--channel {self.channel}: {name} has {_listed(self.channels)}")
+        nodes: Counter[int] = Counter()
+        for (key, _), count in self._seen.items():
+            if (node := self._nodes[key]) is not None:
+                nodes[node] += count
+        if self.node is not None and nodes and self.node not in nodes:
+            raise InputError(f"--node {self.node}: {name} has frames of {_listed(nodes)}")
+        if self.node is None and len(nodes) > 1:
+            raise InputError(f"{name}: frames of the nodes {_listed(nodes)}; --node says which is the unit's")
+        if self.node is None and nodes:
+            self.node = next(iter(nodes))
+        self._require_one_channel(name)
+        if not self.taken:
+            there = _identifiers_shown(key for key, _ in self.others.most_common(SHOWN)) or "no frame"
+            wanted = ", ".join(self._wanted()[:SHOWN])
+            raise InputError(f"{name}: none of the profile's identifiers ({wanted}) is in it; there is {there}")
+
+    def _require_one_channel(self, name: str) -> None:
+        places: dict[Key, Counter[str]] = {}
+        for (key, channel), count in self._seen.items():
+            places.setdefault(key, Counter())[channel] += count
+        for key, found in places.items():
+            if len(found) > 1:
+                shown = _identifiers_shown([key])
+                raise InputError(f"{name}: {shown} comes on {_listed(found)}; --channel says which is the unit's")
+
+    def _wanted(self) -> list[str]:
+        shown = []
+        for message in (m for layout in self.layouts.values() for m in layout.messages):
+            key = message.identifier_of(self.node or 0), _EXTENDED if message.extended else 0
+            shifts = message.per_node and self.node is None
+            shown.append(_identifiers_shown([key]) + (" + node" if shifts else ""))
+        return list(dict.fromkeys(shown))
+
+    @property
+    def from_channels(self) -> list[str]:
+        """Those that the unit's frames came on."""
+        return sorted({channel for _, channel in self._seen})
+
+
+def _identifiers(message: Message) -> dict[Key, int | None]:
+    flag = _EXTENDED if message.extended else 0
+    if not message.per_node:
+        return {(message.identifier, flag): None}
+    return {(message.identifier + node, flag): node for node in range(1, NODES + 1)}
+
+
+def _identifiers_shown(keys: Iterable[Key]) -> str:
+    shown = [f"0x{source:X}{'x' if extended else ''}" for source, extended in keys]
+    return ", ".join(shown[:SHOWN]) + (", …" if len(shown) > SHOWN else "")
+
+
+def _listed(counted: Mapping[Any, int]) -> str:
+    shown = [f"{clipped(what)} ({count} frames)" for what, count in counted.items()]
+    return ", ".join(shown[:SHOWN]) + (", …" if len(shown) > SHOWN else "")

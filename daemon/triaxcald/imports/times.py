@@ -1,0 +1,62 @@
+"""What is said of the times of a log, which stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+
+LONGEST_NS = 2**62  # a hundred and forty-six years since the epoch; later ones are damage
+PAUSE_S = 1.0
+PERIODS = 10
+"""A pause is longer than this many periods, and than `PAUSE_S`."""
+
+
+@dataclass
+class Times:
+    """Of the frames that were taken, in their order."""
+
+    period_ns: float
+    first_ns: int | None = None
+    latest_ns: int = 0
+    back: int = 0  # frames whose time is before that of one that came earlier
+    furthest_back_ns: int = 0
+    pauses: int = 0
+    longest_pause_ns: int = 0
+
+    def note(self, time_ns: int) -> None:
+        if self.first_ns is None:
+            self.first_ns = self.latest_ns = time_ns
+        step_ns = time_ns - self.latest_ns
+        if step_ns < 0:
+            self.back += 1
+            self.furthest_back_ns = max(self.furthest_back_ns, -step_ns)
+            return
+        if step_ns > max(PERIODS * self.period_ns, PAUSE_S * 1e9):
+            self.pauses += 1
+            self.longest_pause_ns = max(self.longest_pause_ns, step_ns)
+        self.latest_ns = time_ns
+
+    def document(self) -> dict[str, float | int]:
+        return {
+            "back": self.back,
+            "furthest_back_s": self.furthest_back_ns / 1e9,
+            "pauses": self.pauses,
+            "longest_pause_s": self.longest_pause_ns / 1e9,
+        }
+
+
+class Ticks:
+    """Times for a log that tells none: a period later each time the message
+    that came first comes again."""
+
+    def __init__(self, period_ns: float) -> None:
+        self._period_ns = period_ns
+        self._lead: Hashable = None
+        self._ticks = 0
+
+    def of(self, key: Hashable) -> int:
+        if self._lead is None:
+            self._lead = key
+        elif key == self._lead:
+            self._ticks += 1
+        return round(self._ticks * self._period_ns)

@@ -1,0 +1,139 @@
+"""What can-utils' candump writes: the log of ``-l`` and ``-L``, and what it
+shows, with times or without.
+
+python-can reads the log alone, and ends with the first damaged line.
+"""
+
+from __future__ import annotations
+
+import calendar
+import re
+from collections.abc import Iterator
+from itertools import chain, islice, pairwise
+from typing import BinaryIO
+
+from triaxcal_drivers.logs.frames import (
+    CLASSIC_MOST,
+    ERROR,
+    EXTENDED,
+    EXTENDED_MOST,
+    FD,
+    FD_MOST,
+    REMOTE,
+    SENT,
+    SWITCHED,
+    Account,
+    LoggedFrame,
+    Remark,
+)
+from triaxcal_drivers.logs.lines import nanoseconds, numbered
+
+LOG = re.compile(
+    rb"\((\d{1,12})\.(\d{1,9})\)\s+(\S{1,64})\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
+    rb"(?:(R)(\d?)\w{0,2}|#([0-9A-Fa-f])((?:[0-9A-Fa-f]{2}){0,64})|((?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?)"
+    rb"(?:\s+([RrTt]))?$"
+)
+SHOWN = re.compile(
+    rb"(?:\(([-0-9 :]*?)(\d{1,12})\.(\d{1,9})\)\s+)?(\S{1,64})\s+(?:(RX|TX)\s+([B-])\s+([E-])\s+)?"
+    rb"([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})\s+(?:\[(\d\d?)\]|\{\w\})\s*"
+    rb"(?:(remote request)|((?:[0-9A-Fa-f]{2}(?:\s+|$)){0,64}))(?:\s*ERRORFRAME|\s*'.*)?$"
+)
+_DAY = re.compile(rb"(\d{4})-(\d\d)-(\d\d) (\d\d):(\d\d):$")
+_ERROR_BIT = 0x20000000
+_BRS, _ESI = 1, 2  # bits of the digit behind ##
+EPOCH_FROM_NS = 10**17  # a time since the epoch is later, in 1973, and one since the start is earlier
+LOOKED_AT = 1000  # lines by which times since the start are told from times since the line before
+
+
+def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
+    found = _frames(stream, account)
+    head = list(islice(found, LOOKED_AT))
+    times = [f.time_ns for f in head if f.time_ns is not None]
+    if len(times) < len(head):
+        account.remarks.add(Remark.NO_TIMES)
+    elif times and times[0] < EPOCH_FROM_NS:
+        account.remarks.add(Remark.NO_DATE)
+        if any(b < a for a, b in pairwise(times)):
+            account.remarks.add(Remark.TIMES_ADDED_UP)
+            yield from _added_up(chain(head, found))
+            return
+    yield from head
+    yield from found
+
+
+def _added_up(found: Iterator[LoggedFrame]) -> Iterator[LoggedFrame]:
+    time_ns = 0
+    for frame in found:
+        time_ns += frame.time_ns or 0
+        yield frame._replace(time_ns=time_ns)
+
+
+def _frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
+    for number, line in numbered(stream, account):
+        if not line:
+            continue
+        frame = _logged(LOG.match(line)) or _shown(SHOWN.match(line), account)
+        if frame is not None:
+            yield frame
+        else:
+            account.note(f"line {number}", "expected a frame as candump writes it")
+
+
+_Match = re.Match[bytes] | None
+
+
+def _logged(m: _Match) -> LoggedFrame | None:
+    if m is None:
+        return None
+    seconds, fraction, channel, identifier, remote, asked, bits, fd, data, direction = m.groups()
+    flags = SENT if direction in (b"T", b"t") else 0
+    octets = bytes.fromhex((fd if bits else data or b"").decode())
+    if bits:
+        flags |= FD | _fd_flags(int(bits, 16))
+    elif remote:
+        flags |= REMOTE
+        octets = bytes(min(int(asked or 0), CLASSIC_MOST))
+    return _frame(nanoseconds(seconds, fraction), identifier, flags, octets, channel)
+
+
+def _shown(m: _Match, account: Account) -> LoggedFrame | None:
+    if m is None:
+        return None
+    day, seconds, fraction, channel, direction, switched, passive, identifier, length, remote, data = m.groups()
+    octets = bytes.fromhex((data or b"").decode())
+    flags = SENT if direction == b"TX" else 0
+    if length is None or (not remote and int(length) != len(octets)):
+        return None
+    if int(length) > CLASSIC_MOST or len(length) == 2:  # candump gives the length of an FD frame two digits
+        flags |= FD | (SWITCHED if switched == b"B" else 0) | (REMOTE if passive == b"E" else 0)
+        if len(octets) > FD_MOST:
+            return None
+    elif remote:
+        flags |= REMOTE
+        octets = bytes(int(length))
+    time_ns = _time_ns(day, seconds, fraction, account) if seconds else None
+    return _frame(time_ns, identifier, flags, octets, channel)
+
+
+def _time_ns(day: bytes, seconds: bytes, fraction: bytes, account: Account) -> int:
+    time_ns = nanoseconds(seconds, fraction)
+    if found := _DAY.match(day):
+        account.remarks.add(Remark.DATE_WITHOUT_ZONE)
+        year, month, date, hour, minute = map(int, found.groups())
+        time_ns += calendar.timegm((year, max(1, min(month, 12)), date, hour, minute, 0)) * 1_000_000_000
+    return time_ns
+
+
+def _fd_flags(bits: int) -> int:
+    return (SWITCHED if bits & _BRS else 0) | (REMOTE if bits & _ESI else 0)
+
+
+def _frame(time_ns: int | None, identifier: bytes, flags: int, octets: bytes, channel: bytes) -> LoggedFrame:
+    source = int(identifier, 16)
+    if len(identifier) == 8:
+        flags = ERROR if source & _ERROR_BIT else flags | EXTENDED
+    return LoggedFrame(time_ns, source & EXTENDED_MOST, flags, octets, channel.decode("utf-8", "replace"))
+
+
+def recognises(line: bytes) -> bool:
+    return bool(LOG.match(line) or SHOWN.match(line))

@@ -1,0 +1,156 @@
+"""Which kind of log a file is, by its first bytes, and its frames."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import shutil
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, cast
+
+from triaxcal_drivers.errors import LogError
+from triaxcal_drivers.files import open_file
+from triaxcal_drivers.logs import asc, blf, candump, mf4, pcap, trc
+from triaxcal_drivers.logs.frames import Account, LoggedFrame
+
+HEAD = 8192  # bytes by which the kind is told
+GZIP = b"\x1f\x8b"
+MCAP = b"\x89MCAP0\r\n"
+EXPANSION_MOST, ROOM = 64, 16 * 2**20
+"""So many times its size, and so many bytes more, a packed file may unpack
+to."""
+LINES_LOOKED_AT = 20  # of a text, for one that tells its kind
+
+
+@dataclass(frozen=True)
+class Kind:
+    """``name`` for messages. ``seeks`` where the reader does not go through the
+    file from its start to its end."""
+
+    name: str
+    frames: Callable[[BinaryIO, Account], Iterator[LoggedFrame]]
+    seeks: bool = False
+
+
+BLF = Kind("BLF", blf.frames)
+ASC = Kind("ASC", asc.frames)
+CANDUMP = Kind("candump", candump.frames)
+TRC = Kind("TRC", trc.frames)
+MF4 = Kind("MF4", mf4.frames, seeks=True)
+PCAP = Kind("pcap", pcap.frames)
+MCAP_KIND = "MCAP"
+NAMES = "BLF, ASC, candump, TRC, MF4, pcap, pcapng or MCAP"
+
+
+def kind_of(head: bytes) -> Kind | str | None:
+    """By a file's first bytes; `MCAP_KIND` for a file that holds no frames of a
+    bus, but messages."""
+    if head.startswith(blf.MAGIC):
+        return BLF
+    if head.startswith(mf4.MAGICS):
+        return MF4
+    if head.startswith(pcap.MAGICS):
+        return PCAP
+    if head.startswith(MCAP):
+        return MCAP_KIND
+    return _of_text(head)
+
+
+def _of_text(head: bytes) -> Kind | None:
+    lines = [line.strip() for line in head.split(b"\n")[:LINES_LOOKED_AT] if line.strip()]
+    if len(head) == HEAD and len(lines) > 1:
+        lines = lines[:-1]  # cut off
+    if any(trc.HEAD.match(line) for line in lines):
+        return TRC
+    if any(asc.HEAD.match(line) for line in lines):
+        return ASC
+    if any(candump.recognises(line) for line in lines):
+        return CANDUMP
+    return TRC if any(trc.LINE.match(line) and b")" in line for line in lines) else None
+
+
+@dataclass
+class Log:
+    """An opened log."""
+
+    name: str
+    kind: Kind | str
+    stream: BinaryIO
+
+    def frames(self, account: Account) -> Iterator[LoggedFrame]:
+        """Raises LogError, in one line with the file's name."""
+        assert isinstance(self.kind, Kind)
+        try:
+            yield from self.kind.frames(self.stream, account)
+        except LogError as e:
+            raise LogError(f"{self.name}: {e}") from e
+        except (EOFError, gzip.BadGzipFile, zlib.error) as e:
+            account.note("the gzip file", str(e) or "damaged")
+        except OSError as e:
+            raise LogError(f"{self.name}: cannot be read: {e.strerror or e}") from e
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Log]:
+    """Packed with gzip or not. Raises LogError."""
+    try:
+        file = open_file(path)
+    except OSError as e:
+        raise LogError(f"{path}: cannot be read: {e.strerror}") from e
+    with file:
+        stream = file
+        try:
+            if _head(file, len(GZIP)) == GZIP:
+                stream = cast(BinaryIO, _unpacked(file, path))
+            head = _head(stream, HEAD)
+        except (OSError, EOFError, zlib.error) as e:
+            raise LogError(f"{path}: cannot be read: {e}") from e
+        kind = kind_of(head)
+        if kind is None:
+            empty = "; the file is empty" if not head else ""
+            raise LogError(f"{path}: no log of a known kind, expected {NAMES}{empty}")
+        seeks = kind.seeks if isinstance(kind, Kind) else True
+        if stream is not file and seeks:
+            with tempfile.TemporaryFile() as whole:
+                try:
+                    shutil.copyfileobj(stream, whole)
+                except (OSError, EOFError, zlib.error) as e:
+                    raise LogError(f"{path}: cannot be unpacked: {e}") from e
+                whole.seek(0)
+                yield Log(str(path), kind, cast(BinaryIO, whole))
+        else:
+            yield Log(str(path), kind, stream)
+
+
+def _head(stream: BinaryIO, count: int) -> bytes:
+    """The first bytes, which stay unread."""
+    return cast(io.BufferedReader, stream).peek(count)[:count]
+
+
+def _unpacked(file: BinaryIO, path: Path) -> io.BufferedReader:
+    most = EXPANSION_MOST * path.stat().st_size + ROOM
+    return io.BufferedReader(_Bounded(gzip.GzipFile(fileobj=file, mode="rb"), most, str(path)))
+
+
+class _Bounded(io.RawIOBase):
+    """Raises LogError where a file unpacks to more than ``most`` bytes."""
+
+    def __init__(self, source: gzip.GzipFile, most: int, name: str) -> None:
+        self._source, self._left, self._name = source, most, name
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: object) -> int:
+        view = memoryview(buffer)  # type: ignore[arg-type]
+        data = self._source.read(len(view))
+        self._left -= len(data)
+        if self._left < 0:
+            raise LogError(f"{self._name}: unpacks to more than {EXPANSION_MOST} times the file")
+        view[: len(data)] = data
+        return len(data)

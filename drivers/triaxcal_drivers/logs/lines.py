@@ -1,0 +1,61 @@
+"""Lines of a log that is text, and the dates in them."""
+
+from __future__ import annotations
+
+import calendar
+import re
+from collections.abc import Iterator
+from typing import BinaryIO
+
+from triaxcal_drivers.logs.frames import Account
+
+LINE_MOST = 4096  # bytes; a CAN FD frame of Vector's has some 400
+
+_MONTHS = {
+    name: number
+    for names in (
+        "jan feb mar apr may jun jul aug sep oct nov dec",
+        "jan feb mär apr mai jun jul aug sep okt nov dez",
+    )
+    for number, name in enumerate(names.split(), 1)
+}
+_DATE = re.compile(
+    r"(?:\w+\.?\s+)?(\w{3})\w*\.?\s+(\d{1,2})\s+(\d{1,2}):(\d\d):(\d\d)(?:\.(\d{1,9}))?\s*(am|pm)?\s+(\d{4})", re.I
+)
+
+
+def numbered(stream: BinaryIO, account: Account) -> Iterator[tuple[int, bytes]]:
+    """Each line with its number from 1, without blanks at its ends. One that is
+    too long is damage, and a last one without its end: nobody can tell what is
+    missing from it."""
+    number = 0
+    while line := stream.readline(LINE_MOST):
+        number += 1
+        if len(line) == LINE_MOST and not line.endswith(b"\n"):
+            account.note(f"line {number}", f"more than {LINE_MOST} bytes")
+            while (more := stream.readline(LINE_MOST)) and not more.endswith(b"\n"):
+                pass
+            continue
+        if not line.endswith(b"\n"):
+            account.note(f"line {number}", "the file ends in the line")
+            return
+        yield number, line.strip()
+
+
+def nanoseconds(seconds: bytes, fraction: bytes) -> int:
+    """Of a decimal number's two parts."""
+    return int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, b"0") or 0)
+
+
+def date_ns(text: str) -> int | None:
+    """Nanoseconds since the epoch of "Wed Nov 25 04:38:43.125 pm 2026", taken
+    for UTC."""
+    match = _DATE.search(text)
+    month = _MONTHS.get(match[1].lower()) if match else None
+    if match is None or month is None:
+        return None
+    hour = int(match[3])
+    if match[7]:
+        hour = hour % 12 + (12 if match[7].lower() == "pm" else 0)
+    seconds = calendar.timegm((int(match[8]), month, int(match[2]), hour, int(match[4]), int(match[5])))
+    return seconds * 1_000_000_000 + int((match[6] or "0").ljust(9, "0"))

@@ -1,0 +1,107 @@
+"""PEAK's TRC, versions 1.0 to 2.1: text, a line for each message.
+
+Ours, and not python-can's: that one ends with the first damaged line, and reads
+no error frames and no version 1.2.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from decimal import Decimal, InvalidOperation
+from typing import BinaryIO
+
+from triaxcal_drivers.logs.frames import (
+    CLASSIC_MOST,
+    ERROR,
+    EXTENDED,
+    EXTENDED_MOST,
+    FD,
+    FD_LENGTHS,
+    FD_MOST,
+    REMOTE,
+    SENT,
+    STANDARD_MOST,
+    SWITCHED,
+    Account,
+    LoggedFrame,
+    Remark,
+)
+from triaxcal_drivers.logs.lines import numbered
+
+LINE = re.compile(rb"\s*\d+\)?\s+\d+(?:\.\d+)?\s+\S+\s+\S+")
+HEAD = re.compile(rb";(?:\$FILEVERSION\s*=|\$STARTTIME\s*=|#{40})")
+_DAY_ZERO = 25569  # days from TRC's, 1899-12-30, to the epoch
+_DAY_NS = 86_400_000_000_000
+_COLUMNS: Mapping[str, str] = {
+    "1.0": "NOIlD",
+    "1.1": "NOdIlD",
+    "1.2": "NOBdIlD",
+    "1.3": "NOBdIRlD",
+}
+"""By the letters of ``$COLUMNS``, which files before 2.0 do not have. In 1.x the
+direction may be ``Warng`` or ``Error``."""
+_TYPES = {
+    "DT": 0,
+    "FD": FD,
+    "FB": FD | SWITCHED,
+    "FE": FD | SWITCHED | REMOTE,
+    "BI": FD | REMOTE,
+    "RR": REMOTE,
+    "ER": ERROR,
+}
+
+
+def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
+    columns, start_ns = _COLUMNS["1.0"], None
+    for number, line in numbered(stream, account):
+        if line.startswith(b";"):
+            text = line.decode("cp1252", "replace")
+            if text.startswith(";$FILEVERSION"):
+                columns = _COLUMNS.get(text.partition("=")[2].strip(), columns)
+            elif text.startswith(";$STARTTIME"):
+                start_ns = _start_ns(text.partition("=")[2])
+            elif text.startswith(";$COLUMNS"):
+                columns = text.partition("=")[2].replace(",", "").strip()
+        elif line:
+            try:
+                frame = _frame(line.decode("ascii"), columns, start_ns or 0, account)
+            except (ValueError, KeyError, IndexError, InvalidOperation):
+                account.note(f"line {number}", f"expected a message of the columns {','.join(columns)}")
+                continue
+            if frame is not None:
+                yield frame
+    account.remarks.add(Remark.NO_DATE if start_ns is None else Remark.DATE_WITHOUT_ZONE)
+
+
+def _start_ns(text: str) -> int | None:
+    try:
+        days = Decimal(text.strip())
+    except InvalidOperation:
+        return None
+    return int((days - _DAY_ZERO) * _DAY_NS) if _DAY_ZERO <= days < 150_000 else None
+
+
+def _frame(line: str, columns: str, start_ns: int, account: Account) -> LoggedFrame | None:
+    """Raises ValueError, KeyError, IndexError, InvalidOperation."""
+    words = line.split(None, len(columns) - 1)
+    at = dict(zip(columns, words, strict=False))
+    kind, direction = at.get("T", "DT"), at.get("d", "Rx")
+    if kind not in _TYPES or direction not in ("Rx", "Tx") or at["I"] == "FFFFFFFF":
+        account.others[kind if kind != "DT" else "status"] += 1
+        return None
+    flags = _TYPES[kind] | (SENT if direction == "Tx" else 0)
+    time_ns = start_ns + int(Decimal(at["O"]) * 1_000_000)
+    channel = at.get("B", "1")
+    if flags & ERROR:
+        return LoggedFrame(time_ns, 0, ERROR, b"", channel)
+    source = int(at["I"], 16)
+    flags |= EXTENDED if len(at["I"]) > 4 else 0
+    length = FD_LENGTHS[int(at["L"])] if "L" in at else int(at["l"])
+    data = at.get("D", "")
+    if flags & (REMOTE | FD) == REMOTE or data.startswith("RTR"):
+        return LoggedFrame(time_ns, source, flags | REMOTE, bytes(min(length, CLASSIC_MOST)), channel)
+    octets = bytes.fromhex("".join(data.split()[:length]))
+    if len(octets) != length or length > FD_MOST or source > (EXTENDED_MOST if flags & EXTENDED else STANDARD_MOST):
+        raise ValueError(line)
+    return LoggedFrame(time_ns, source, flags, octets, channel)

@@ -1,0 +1,64 @@
+"""Which frames of a log are the unit's."""
+
+from __future__ import annotations
+
+import pytest
+
+from triaxcal_drivers.can.layout import Layout, Message, Signal
+from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.logs.frames import LoggedFrame
+from triaxcald.errors import InputError
+from triaxcald.imports.selection import Selection
+
+UX = Signal("ux", 0, 8)
+
+
+def layout(*, per_node: bool = False, extended: bool = False) -> Layout:
+    return Layout((Message("M", 0x180, {"ux": UX}, extended, per_node),), {"ux": (0, UX)}, ())
+
+
+def frame(source: int, channel: str = "1", flags: int = 0) -> LoggedFrame:
+    return LoggedFrame(0, source, flags, b"\0", channel)
+
+
+def test_an_identifier_is_standard_or_extended() -> None:
+    extended = int(RawFlag.EXTENDED_ID)
+    for own, other in ((0, extended), (extended, 0)):
+        chosen = Selection({"readings": layout(extended=bool(own))})
+        assert chosen.takes(frame(0x180, flags=own))
+        assert not chosen.takes(frame(0x180, flags=other))
+        assert (chosen.frames, chosen.taken, chosen.others) == (2, 1, {(0x180, other): 1})
+
+
+def test_the_node_that_is_there_is_the_units() -> None:
+    chosen = Selection({"readings": layout(per_node=True)})
+    assert [chosen.takes(frame(s)) for s in (0x180, 0x181, 0x181 + 126, 0x180 + 128)] == [False, True, True, False]
+    with pytest.raises(InputError, match=r"frames of the nodes 1 \(1 frames\), 127 \(1 frames\); --node says"):
+        chosen.settle("log")
+    chosen = Selection({"readings": layout(per_node=True)}, node=127)
+    assert [chosen.takes(frame(s)) for s in (0x181, 0x181 + 126)] == [False, True]
+    chosen.settle("log")
+    assert (chosen.node, chosen.elsewhere) == (127, 1)
+
+
+def test_messages_may_come_by_a_bus_each_but_none_by_two() -> None:
+    layouts = {"readings": layout(), "corrected": Layout((Message("N", 0x200, {"ux": UX}),), {"ux": (0, UX)}, ())}
+    chosen = Selection(layouts)
+    assert chosen.takes(frame(0x180, "a"))
+    assert chosen.takes(frame(0x200, "b"))
+    chosen.settle("log")
+    assert chosen.from_channels == ["a", "b"]
+    assert chosen.takes(frame(0x180, "b"))
+    with pytest.raises(InputError, match=r"0x180 comes on a \(1 frames\), b \(1 frames\); --channel says"):
+        chosen.settle("log")
+    chosen = Selection(layouts, channel="b")
+    assert not chosen.takes(frame(0x180, "a"))
+    assert chosen.takes(frame(0x180, "b"))
+    chosen.settle("log")
+
+
+def test_error_frames_come_along_but_are_none_of_the_units() -> None:
+    chosen = Selection({"readings": layout()})
+    assert chosen.takes(frame(4, flags=int(RawFlag.ERROR)))
+    with pytest.raises(InputError, match=r"none of the profile's identifiers \(0x180\) is in it; there is no frame"):
+        chosen.settle("log")

@@ -1,0 +1,88 @@
+"""Lines of Vector's ASC, as CANoe and CANalyzer write them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.logs.asc import frames
+from triaxcal_drivers.logs.frames import LoggedFrame, Remark
+
+Read = Callable[..., tuple[list[LoggedFrame], Any]]
+HEAD = "date Sat Sep 30 10:06:13.191 pm 2017\nbase hex  timestamps absolute\ninternal events logged\n// version 9.0.0\n"
+START_NS = 1_506_809_173_191_000_000
+FD = RawFlag.FD
+
+
+@pytest.mark.parametrize(
+    ("line", "source", "flags", "data"),
+    [
+        ("   2.500000 1  12D             Rx   d 8 01 02 03 04 05 06 07 08", 0x12D, 0, "0102030405060708"),
+        ("   2.500000 1  12D             Tx   d 2 01 02  Length = 107000 BitCount = 56 ID = 301", 0x12D,
+         RawFlag.SENT, "0102"),
+        ("   2.500000 1  18EBFF00x       Rx   d 1 ff", 0x18EBFF00, RawFlag.EXTENDED_ID, "ff"),
+        ("   2.500000 1  Engine_State    Rx   d 1 ff Length = 0 BitCount = 0 ID = 301", 301, 0, "ff"),
+        ("   2.500000 1  EngineStateLong Rx   d 1 ff ID = 217997090x", 217997090, RawFlag.EXTENDED_ID, "ff"),
+        ("   2.500000 1  300             Rx   r 8", 0x300, RawFlag.REMOTE, "00" * 8),
+        ("   2.500000 1  300             TxRq r", 0x300, RawFlag.REMOTE | RawFlag.SENT, ""),
+        ("   2.500000 1  ErrorFrame      ECC: 10100010", 0, RawFlag.ERROR, ""),
+        ("   2.500000 CANFD 1 Rx  115  1 1 8 8 06 ff fc ff fc ff 00 00 95000 135 3000 0 0 0 0 0", 0x115,
+         FD | RawFlag.BIT_RATE_SWITCH | RawFlag.REMOTE, "06fffcfffcff0000"),
+        ("   2.500000 CANFD 1 Tx  18EBFF00x  Symbol_1  0 0 9 12 " + "0a " * 12 + " 130 0 1000 0 0 0 0 0", 0x18EBFF00,
+         FD | RawFlag.SENT | RawFlag.EXTENDED_ID, "0a" * 12),
+        ("   2.500000 CANFD 1 Rx  115  0 0 2 2 06 ff 95000 135 0 0 0 0 0 0", 0x115, 0, "06ff"),
+        ("   2.500000 CANFD 1 Rx  ErrorFrame  Not Acknowledge error", 0, RawFlag.ERROR, ""),
+    ],
+)  # fmt: skip
+def test_a_line_is_a_frame(read: Read, line: str, source: int, flags: int, data: str) -> None:
+    (frame,), account = read(frames, f"{HEAD}{line}\n".encode())
+    assert frame == LoggedFrame(START_NS + 2_500_000_000, source, int(flags), bytes.fromhex(data), "1")
+    assert (account.damaged, account.others) == (0, {})
+    assert account.remarks == {Remark.DATE_WITHOUT_ZONE}
+
+
+def test_numbers_may_be_decimal(read: Read) -> None:
+    head = HEAD.replace("base hex", "base dec")
+    (frame,), _ = read(frames, f"{head}  0.0100 2  301  Rx   d 3 10 255 7\n".encode())
+    assert (frame.source, frame.data, frame.channel) == (301, bytes([10, 255, 7]), "2")
+
+
+def test_relative_times_are_added_up_over_all_events(read: Read) -> None:
+    head = HEAD.replace("absolute", "relative")
+    lines = "  0.010 1  12D  Rx d 0\n  0.020 1  Statistic: D 1 R 0\n  0.005 1  12D  Rx d 0\n"
+    found, account = read(frames, (head + lines).encode())
+    assert [(f.time_ns or 0) - START_NS for f in found] == [10_000_000, 35_000_000]
+    assert Remark.TIMES_ADDED_UP in account.remarks
+    assert account.others == {"event": 1}
+
+
+def test_without_a_date_times_count_from_zero(read: Read) -> None:
+    (frame,), account = read(frames, b"base hex  timestamps absolute\n  1.000000 1  12D  Rx d 1 ff\n")
+    assert frame.time_ns == 1_000_000_000
+    assert account.remarks == {Remark.NO_DATE}
+
+
+def test_a_german_date_is_one(read: Read) -> None:
+    (frame,), _ = read(frames, "date Die M\xe4r 10 15:00:00 2020\n 0.5 1 1 Rx d 0\n".encode("cp1252"))
+    assert frame.time_ns == 1_583_852_400_500_000_000
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "  1.0 1  12D  Rx d 8 01 02",
+        "  1.0 1  12G  Rx d 1 01",
+        "  1.0 1  800  Rx d 1 01",
+        "  1.0 CANFD 1 Rx 115",
+        "garbage",
+    ],
+)
+def test_a_damaged_line_is_counted_with_its_place(read: Read, line: str) -> None:
+    good = "  1.0 1  12D  Rx d 1 01\n"
+    found, account = read(frames, f"{HEAD}{good}{line}\n{good}".encode())
+    assert len(found) == 2
+    assert account.damaged == 1
+    assert account.damage.startswith("line 6: ")
