@@ -41,6 +41,16 @@ def waits(trouble: str) -> str:
     return f"waiting for the unit: {trouble}"
 
 
+def metrics_at(port: int) -> str:
+    return f"http://127.0.0.1:{port}/metrics has the numbers, http://127.0.0.1:{port}/health says how it stands"
+
+
+def units_recorded(units: int, lost: Sequence[str], records: int) -> str:
+    """How recordings stand, in a line."""
+    missing = f", waiting for {', '.join(lost)}" if lost else ""
+    return f"{units - len(lost)} of {units} units recorded, {records} records{missing}"
+
+
 def switch_supply(off_s: float) -> str:
     """What the operator is to do."""
     return f"switch the supply of the unit off for at least {math.ceil(off_s)} s, then on"

@@ -35,6 +35,9 @@ class Told:
     def stage(self, unit: str, text: str) -> None:
         self.said.append((unit, text))
 
+    def lost(self, unit: str, trouble: str) -> None:
+        self.said.append((unit, f"lost: {trouble}"))
+
     def poses(self, unit: str, phase: str, guide: Any) -> None:
         self.said.append((unit, f"{guide.found} poses"))
 
@@ -126,7 +129,7 @@ def test_all_but_the_dead_one_are_calibrated(ran: Any) -> None:
 def test_the_dead_one_is_told_at_once_and_given_up_when_the_others_are_done(ran: Any) -> None:
     _, told, _, ended = ran
     assert ended[-1] == DIES
-    waits = next(i for i, (unit, text) in enumerate(told.said) if unit == DIES and text.startswith("waiting for"))
+    waits = next(i for i, (unit, text) in enumerate(told.said) if unit == DIES and text.startswith("lost: "))
     assert waits < max(i for i, (unit, _) in enumerate(told.said) if unit != DIES)
 
 

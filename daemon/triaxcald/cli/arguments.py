@@ -82,6 +82,12 @@ def not_negative(text: str) -> float:
     return within(text, 0.0, sys.float_info.max, "a number of at least 0")
 
 
+def port(text: str) -> int:
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"expected a port between 0 and 65535, 0 for any, not '{text}'")
+    return int(text)
+
+
 def latitude(text: str) -> float:
     return within(text, -90.0, 90.0, "degrees between -90 and 90")
 

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from triaxcald.abort import add_action, discard_action, tell
+from triaxcald.text import waits
 
 LINE_MOST = 4000  # characters of a line; the longest of ours list a thousand poses' labels
 
@@ -117,9 +118,12 @@ class Bars:
             self._tasks[unit] = self._progress.add_task("", total=1, unit=unit)
         return self._tasks[unit]
 
-    def stage(self, unit: str, text: str) -> None:
-        self._show(unit, description=text)
-        self._plain(unit, text)
+    def stage(self, unit: str, what: str) -> None:
+        self._show(unit, description=what)
+        self._plain(unit, what)
+
+    def lost(self, unit: str, trouble: str) -> None:
+        self.stage(unit, waits(trouble))
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         what = "check poses" if phase == "verification" else "poses"

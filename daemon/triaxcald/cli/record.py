@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from triaxcald import text
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import Bars, say
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import warn_of_a_journal
+from triaxcald.cli.json_lines import JsonLines
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import severest
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.station.config import Place, Station, check_lines, load_station
 
 if TYPE_CHECKING:  # matplotlib and all come once the file is known to be good
-    from triaxcald.run.recording import Kept
+    from triaxcald.run.recording import Kept, UnitStatus
     from triaxcald.run.session import UnitSession
 
 
@@ -28,10 +31,21 @@ def record_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
     places = _places(station, a.unit, a.output, folder)
     check_lines(places, where=str(station.path))
-    from triaxcald.run.recording import UnitRecording, record_units
+    with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
+        kept = run_interruptible(_record(a, station, places, progress))
+    return severest(k.exit_code for k in kept)
+
+
+async def _record(
+    a: argparse.Namespace, station: Station, places: Sequence[Place], progress: Bars | JsonLines
+) -> list[Kept]:
+    from triaxcald.run.recording import State, UnitRecording, record_units
     from triaxcald.run.session import UnitSession
+    from triaxcald.service.supervisor import Supervisor
     from triaxcald.station.coming_back import Patience
     from triaxcald.station.serials import SerialsSeen
+
+    folder = a.output.is_dir()
 
     def path_of(session: UnitSession) -> Callable[[IdentityRead], Path]:
         if not folder:
@@ -42,12 +56,26 @@ def record_command(a: argparse.Namespace) -> int:
         warn_of_a_journal(session.station, session.name, identity.serial)
 
     serials = SerialsSeen()
-    with Bars() as bars:
-        sessions = [UnitSession(station, place, bars, serials=serials) for place in places]
-        recordings = [UnitRecording(session, path_of(session), identified) for session in sessions]
+    sessions = [UnitSession(station, place, progress, serials=serials) for place in places]
+    recordings = [UnitRecording(session, path_of(session), identified) for session in sessions]
+
+    def statuses() -> list[UnitStatus]:
+        return [recording.status for recording in recordings]
+
+    def in_a_line() -> str:
+        units = statuses()
+        lost = [u.unit for u in units if u.state is State.WAITING]
+        return text.units_recorded(len(units), lost, sum(u.records for u in units))
+
+    async with AsyncExitStack() as stack:
+        if a.metrics is not None:
+            from triaxcald.service.metrics import served
+
+            port = stack.enter_context(served(a.metrics, statuses, a.output if folder else a.output.parent))
+            progress.stage("record", text.metrics_at(port))
+        await stack.enter_async_context(Supervisor().kept_informed(in_a_line))
         patience = Patience(most_s=a.give_up_after)
-        kept = run_interruptible(record_units(recordings, a.seconds, patience, _ended))
-    return severest(k.exit_code for k in kept)
+        return await record_units(recordings, a.seconds, patience, lambda kept: _ended(kept, progress))
 
 
 def _places(station: Station, unit: str | None, output: Path, folder: bool) -> Sequence[Place]:
@@ -62,7 +90,13 @@ def _places(station: Station, unit: str | None, output: Path, folder: bool) -> S
     return station.places
 
 
-def _ended(kept: Kept) -> None:
+def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
+    if isinstance(progress, JsonLines):
+        counts = {name: n for name, n in kept.counts.items() if n}
+        path = str(kept.path) if kept.path else None
+        level = "info" if kept.error is None else "error"
+        progress.say(level, "ended", unit=kept.unit, recording=path, message=kept.error, **counts, lost=kept.lost)
+        return
     if kept.path is not None:
         say(_summary(kept))
     if kept.error is not None:

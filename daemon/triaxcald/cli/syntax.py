@@ -22,6 +22,7 @@ from triaxcald.cli.arguments import (
     count,
     moment,
     not_negative,
+    port,
     positive,
     seed,
     within,
@@ -86,6 +87,10 @@ def _line(commands: Any) -> None:
     p.add_argument("--seconds", type=positive, metavar="S", help="of the samples' time; default: until interrupted")
     p.add_argument("--unit", help="where the station has more than one; default, with a FOLDER: all of them")
     p.add_argument("--give-up-after", type=not_negative, metavar="S", help="of waiting for a unit; default: never")
+    p.add_argument(
+        "--metrics", type=port, metavar="PORT", help="numbers for Prometheus and a health page on the loopback"
+    )
+    p.add_argument("--log-format", choices=("text", "json"), default="text", help="of progress; json: an object a line")
 
 
 def _on_recordings(commands: Any) -> None:

@@ -4,9 +4,10 @@ may be lost meanwhile, and come back."""
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 from triaxcal_drivers.interface import Device
@@ -38,6 +39,29 @@ class Kept:
     error: str | None = None
 
 
+class State(Enum):
+    WAITING, RECORDING, ENDED = "waiting", "recording", "ended"
+
+
+@dataclass(frozen=True)
+class UnitStatus:
+    """How a unit's recording stands. ``trouble`` is what is the matter with one
+    that is waited for; ``last_ns`` host time of the last record, ``latest`` the
+    last values of its other channels; the rest as in `Kept`."""
+
+    unit: str
+    state: State
+    trouble: str | None
+    path: Path | None
+    records: int
+    counts: Mapping[str, int]
+    gaps: int
+    gaps_s: float
+    lost: int
+    last_ns: int | None
+    latest: Mapping[str, float]
+
+
 class UnitRecording:
     """One unit's recording, at ``path_of`` its identity; ``identified`` is told
     who it is, once it is there."""
@@ -51,7 +75,36 @@ class UnitRecording:
         self._session, self._path_of, self._identified = session, path_of, identified
         self._recorded = Recorded(CALIBRATION, session.place.bundle, session.place.address)
         self._path: Path | None = None
+        self._writer: RecordingWriter | None = None
         self._lost = 0
+        self._state = State.WAITING
+        self._trouble: str | None = None
+
+    @property
+    def status(self) -> UnitStatus:
+        """From any thread."""
+        recorded, writer = self._recorded, self._writer
+        return UnitStatus(
+            self._session.name,
+            self._state,
+            self._trouble,
+            self._path,
+            recorded.digest.records,
+            dict(recorded.streams[READINGS].counts),
+            recorded.gaps,
+            recorded.gaps_s,
+            sum(writer.losses.values()) if writer is not None else self._lost,
+            recorded.last_ns,
+            dict(recorded.latest),
+        )
+
+    def _waits(self, trouble: Exception) -> None:
+        self._is_lost(str(trouble))
+        self._session.waits(trouble)
+
+    def _is_lost(self, trouble: str | None) -> None:
+        self._state = State.RECORDING if trouble is None else State.WAITING
+        self._trouble = trouble
 
     async def run(self, seconds: float | None, patience: Patience) -> Kept:
         """Until there are so many ``seconds`` of samples, for ever where None,
@@ -59,7 +112,7 @@ class UnitRecording:
         cancelled."""
         session = self._session
         try:
-            async with session.place.opened(patience, session.waits) as device:
+            async with session.place.opened(patience, self._waits) as device:
                 identity = await session.identify(device)
                 self._identified(session, identity)
                 self._path = self._path_of(identity)
@@ -67,7 +120,10 @@ class UnitRecording:
                     await self._record(device, identity, writer, seconds, patience)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
             return self._kept(e)
-        return self._kept(None)
+        else:
+            return self._kept(None)
+        finally:
+            self._state = State.ENDED
 
     async def _record(
         self,
@@ -78,14 +134,17 @@ class UnitRecording:
         patience: Patience,
     ) -> None:
         session, because = self._session, "the recording is complete"
+        self._writer = writer
         try:
             session.progress.stage(session.name, "recording")
-            await self._recorded.for_seconds(session.returning(device, identity, patience), writer, seconds)
+            self._is_lost(None)
+            returning = session.returning(device, identity, patience, self._is_lost)
+            await self._recorded.for_seconds(returning, writer, seconds)
         except (Exception, asyncio.CancelledError) as e:
             because = aborted(e, None).reason
             raise
         finally:
-            self._lost = sum(writer.losses.values())
+            self._lost, self._writer = sum(writer.losses.values()), None
             with suppress(RecordingError):  # the disk has failed, which is on its way already
                 writer.event("ended", {"because": because})
 

@@ -42,18 +42,29 @@ class UnitSession:
 
     def waits(self, trouble: Exception) -> None:
         """The unit is not there, for now."""
-        self.progress.stage(self.name, text.waits(str(trouble)))
+        self.progress.lost(self.name, str(trouble))
 
-    def returning(self, device: Device, identity: IdentityRead, patience: Patience) -> Returning:
+    def returning(
+        self,
+        device: Device,
+        identity: IdentityRead,
+        patience: Patience,
+        lost: Callable[[str | None], None] = lambda _: None,
+    ) -> Returning:
         """The device, waited for where it is lost; it is this unit that has to
-        come back."""
+        come back. ``lost`` is told what is the matter, and None when it is
+        over."""
 
         async def identify() -> None:
             where, expected = self.place.address, identity.serial or self.place.unit.serial
             await check_identity(device, self.place.bundle, expected, where=where)
 
         def tell(trouble: str | None) -> None:
-            self.progress.stage(self.name, text.IS_BACK if trouble is None else text.waits(trouble))
+            lost(trouble)
+            if trouble is None:
+                self.progress.stage(self.name, text.IS_BACK)
+            else:
+                self.progress.lost(self.name, trouble)
 
         return Returning(device, identify, patience, tell)
 

@@ -39,6 +39,7 @@ class Progress(Protocol):
     """Who shows the operator how it goes."""
 
     def stage(self, unit: str, text: str) -> None: ...
+    def lost(self, unit: str, trouble: str) -> None: ...
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
 
 
@@ -51,7 +52,9 @@ class Recorded:
     readings, and the corrected output where the device has one.
 
     ``where`` says where the unit is, for messages; ``ends_with`` is what the
-    recording ends with. ``gaps_s`` is how long the device was lost, all in all.
+    recording ends with. ``gaps_s`` is how long the device was lost, all in all;
+    ``last_ns`` host time of the last record, ``latest`` the last values of the
+    readings' other channels.
     """
 
     phase: Phase
@@ -59,7 +62,10 @@ class Recorded:
     where: str
     ends_with: str = ""
     digest: RawDigest = field(init=False)
+    gaps: int = 0
     gaps_s: float = 0.0
+    last_ns: int | None = None
+    latest: dict[str, float] = field(default_factory=dict)
     clock: SteadyClock = HOST
 
     def __post_init__(self) -> None:
@@ -96,8 +102,12 @@ class Recorded:
                     self._note(writer, unwritten)
                     unwritten = None
                 self.digest.update(self.phase, batch)
+                if len(batch):
+                    self.last_ns = int(batch.time_ns[-1])
                 for name, decoded in self.streams.items():
                     block = decoded.feed(batch)
+                    if len(block) and name == READINGS:
+                        self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
                     if writer is not None and len(block):
                         writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
                 yield batch
@@ -107,6 +117,7 @@ class Recorded:
             return
         detail: dict[str, Any] = {"from_ns": gap.from_ns, "cause": gap.cause}
         if gap.to_ns is not None:
+            self.gaps += 1
             self.gaps_s += (gap.to_ns - gap.from_ns) * 1e-9
             detail |= {"to_ns": gap.to_ns, "lost": gap.lost}
         if writer is not None:

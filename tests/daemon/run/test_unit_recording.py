@@ -30,6 +30,9 @@ class Told:
     def stage(self, unit: str, text: str) -> None:
         self.stages.setdefault(unit, []).append(text)
 
+    def lost(self, unit: str, trouble: str) -> None:
+        self.stage(unit, f"lost: {trouble}")
+
     def poses(self, *_: object) -> None: ...
 
     async def until(self, unit: str, done: Callable[[str], bool]) -> None:
@@ -95,7 +98,7 @@ async def test_a_unit_that_goes_and_comes_back_is_in_one_recording_with_the_gap(
     await told.until("unit0", lambda text: text == "recording")
     await asyncio.sleep(0.7)
     await bench.take(0)
-    await told.until("unit0", lambda text: text.startswith("waiting for the unit: "))
+    await told.until("unit0", lambda text: text.startswith("lost: "))
     await bench.put(0)
     (kept,) = await work
     await bench.take(0)
@@ -143,7 +146,7 @@ async def test_a_unit_that_is_not_there_keeps_nobody_waiting_and_is_recorded_onc
     )
     station = load_station(workshop.station(*units))
     work = recorded(station, workshop.folder, told, seconds=1.0, patience=Patience())
-    await told.until("unit1", lambda text: text.startswith("waiting for the unit: nothing answers at node 9"))
+    await told.until("unit1", lambda text: text.startswith("lost: nothing answers at node 9"))
     await told.until("unit0", lambda text: text == "recording")
     await bench.put(1)
     kept: list[Kept] = await work

@@ -1,0 +1,160 @@
+"""Numbers for Prometheus and a page for people, on the loopback: how recordings
+stand."""
+
+from __future__ import annotations
+
+import html
+import json
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
+from prometheus_client.registry import Collector
+
+from triaxcald.errors import InputError
+from triaxcald.run.recording import State, UnitStatus
+
+Statuses = Callable[[], Sequence[UnitStatus]]
+
+_COUNTED = {
+    "samples": "Samples of the readings",
+    "missing": "Samples missing by the unit's own count",
+    "duplicates": "Samples that came twice",
+    "incomplete": "Samples of which a part was missing",
+    "errors": "Error frames and failed requests",
+}
+
+
+class UnitMetrics(Collector):
+    """``folder`` is where recordings go: its file system's free space is told."""
+
+    def __init__(self, statuses: Statuses, folder: Path) -> None:
+        self._statuses, self._folder = statuses, folder
+
+    def collect(self) -> Iterator[Metric]:
+        units = self._statuses()
+        recording = GaugeMetricFamily("triaxcal_unit_recording", "1 while the unit is there", labels=["unit"])
+        records = CounterMetricFamily("triaxcal_records", "Raw records taken from the bus", labels=["unit"])
+        lost = CounterMetricFamily("triaxcal_lost_records", "Records lost between bus and disk", labels=["unit"])
+        gaps = CounterMetricFamily("triaxcal_gaps", "Interruptions and losses on the bus", labels=["unit"])
+        gaps_s = CounterMetricFamily("triaxcal_gap_seconds", "Time in which the unit was lost", labels=["unit"])
+        last = GaugeMetricFamily(
+            "triaxcal_last_record_timestamp_seconds", "Host time of the last record", labels=["unit"]
+        )
+        size = GaugeMetricFamily("triaxcal_recording_bytes", "Size of the recording's file", labels=["unit"])
+        channel = GaugeMetricFamily(
+            "triaxcal_channel", "Last value of another channel, the temperature among them", labels=["unit", "channel"]
+        )
+        counted = {
+            name: CounterMetricFamily(f"triaxcal_{name}", text, labels=["unit"]) for name, text in _COUNTED.items()
+        }
+        for u in units:
+            recording.add_metric([u.unit], float(u.state is State.RECORDING))
+            records.add_metric([u.unit], u.records)
+            lost.add_metric([u.unit], u.lost)
+            gaps.add_metric([u.unit], u.gaps)
+            gaps_s.add_metric([u.unit], u.gaps_s)
+            if u.last_ns is not None:
+                last.add_metric([u.unit], u.last_ns / 1e9)
+            if u.path is not None and u.path.exists():
+                size.add_metric([u.unit], u.path.stat().st_size)
+            for name, value in u.latest.items():
+                channel.add_metric([u.unit, name], value)
+            for name, family in counted.items():
+                family.add_metric([u.unit], u.counts.get(name, 0))
+        yield from (recording, records, lost, gaps, gaps_s, last, size, channel, *counted.values())
+        free = GaugeMetricFamily("triaxcal_disk_free_bytes", "Where recordings go")
+        free.add_metric([], shutil.disk_usage(self._folder).free)
+        yield free
+
+
+def health(units: Sequence[UnitStatus]) -> dict[str, Any]:
+    """``healthy`` where every unit is there and is recorded."""
+    return {
+        "format": "triaxcal.health/1",
+        "healthy": all(u.state is State.RECORDING for u in units),
+        "units": [
+            {
+                "unit": u.unit,
+                "state": u.state.value,
+                "trouble": u.trouble,
+                "recording": str(u.path) if u.path else None,
+                "records": u.records,
+                "gaps": u.gaps,
+                "lost": u.lost,
+            }
+            for u in units
+        ],
+    }
+
+
+@contextmanager
+def served(port: int, statuses: Statuses, folder: Path) -> Iterator[int]:
+    """``/metrics``, ``/health`` (503 where a unit is lost) and ``/`` on the
+    loopback; the port, which the system chooses where ``port`` is 0. Raises
+    InputError where it is taken."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(UnitMetrics(statuses, folder))
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            path = self.path.partition("?")[0]
+            if path == "/metrics":
+                self._answer(200, CONTENT_TYPE_LATEST, generate_latest(registry))
+            elif path == "/health":
+                document = health(statuses())
+                body = json.dumps(document, indent=2).encode()
+                self._answer(200 if document["healthy"] else 503, "application/json", body)
+            elif path == "/":
+                self._answer(200, "text/html; charset=utf-8", _page(statuses()).encode())
+            else:
+                self._answer(404, "text/plain", b"/, /health and /metrics are here\n")
+
+        def _answer(self, code: int, kind: str, body: bytes) -> None:
+            self.send_response(code)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Nothing: standard error is the recording's."""
+
+    try:
+        server = ThreadingHTTPServer(("127.0.0.1", port), Page)
+    except OSError as e:
+        raise InputError(f"--metrics {port}: cannot listen on 127.0.0.1: {e.strerror}") from e
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, name="metrics", daemon=True).start()
+    try:
+        yield server.server_address[1]
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def _page(units: Sequence[UnitStatus]) -> str:
+    rows = "".join(
+        "<tr>"
+        + "".join(
+            f"<td>{html.escape(str(cell))}</td>"
+            for cell in (u.unit, u.state.value, u.records, u.gaps, u.lost, u.path or "", u.trouble or "")
+        )
+        + "</tr>"
+        for u in units
+    )
+    heads = "".join(
+        f"<th>{name}</th>" for name in ("unit", "state", "records", "gaps", "lost records", "recording", "trouble")
+    )
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="5">'
+        "<title>triaxcal record</title><style>body{font-family:sans-serif}td,th{padding:.2em 1em;text-align:left}"
+        f"</style><h1>triaxcal record</h1><table><tr>{heads}</tr>{rows}</table></html>\n"
+    )

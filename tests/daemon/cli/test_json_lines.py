@@ -1,0 +1,32 @@
+"""Progress as JSON, a line each."""
+
+from __future__ import annotations
+
+import io
+import json
+from datetime import UTC, datetime
+
+from triaxcald.cli.json_lines import JsonLines
+
+NOW = datetime(2026, 3, 1, 12, 0, 0, 250_000, UTC)
+
+
+def test_each_line_is_an_object_with_time_level_and_event() -> None:
+    out = io.StringIO()
+    lines = JsonLines(out, lambda: NOW)
+    lines.stage("unit0", "recording")
+    lines.lost("unit0", "nothing answers\nat node 5")
+    lines.say("error", "ended", unit="unit0", lost=3)
+    assert [json.loads(line) for line in out.getvalue().splitlines()] == [
+        {"time": "2026-03-01T12:00:00.250+00:00", "level": "info", "event": "stage", "unit": "unit0",
+         "message": "recording"},
+        {"time": "2026-03-01T12:00:00.250+00:00", "level": "warning", "event": "lost", "unit": "unit0",
+         "message": "nothing answers\nat node 5"},
+        {"time": "2026-03-01T12:00:00.250+00:00", "level": "error", "event": "ended", "unit": "unit0", "lost": 3},
+    ]  # fmt: skip
+
+
+def test_nobody_who_reads_is_no_failure() -> None:
+    out = io.StringIO()
+    out.close()
+    JsonLines(out).stage("unit0", "recording")
