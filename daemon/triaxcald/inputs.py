@@ -29,6 +29,7 @@ from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline, creeping, together
+from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import RECOVERY_RECORD, Phase
 from triaxcald.station.config import parse_station
@@ -220,6 +221,7 @@ def losses_of(recording: Recording) -> list[str]:
 
 def bundle_of(recording: Recording) -> Bundle:
     """The profile that a recording carries. Raises RecordingError."""
+    require_of_unit(recording)
     try:
         text = recording.attachments[PROFILE]
     except KeyError:

@@ -32,6 +32,7 @@ from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, REFUSED
 from triaxcald.inputs import losses_of, parse_document
 from triaxcald.outcome import ATTACHMENT, FORMAT, Verdict, digest_of
 from triaxcald.provision.state import DeviceState, Held
+from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_RECORD
 from triaxcald.recording.survey import Survey, survey
@@ -84,6 +85,7 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
     """Raises RecordingError where the file cannot be read, or holds no result.
     ``compute`` makes the results again."""
     with Recording.open(path) as recording:
+        require_of_unit(recording)
         if recording.ends_with not in ("", FORMAT):
             raise RecordingError(f"{path}: ends with {recording.ends_with}, which this version does not know")
         return _Audit(path, recording, compute).run()

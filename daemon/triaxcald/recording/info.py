@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from triaxcald.recording import schema
+from triaxcald.recording.bus import describe_bus, is_of_bus
 from triaxcald.recording.reader import Recording
 
 
@@ -31,6 +32,7 @@ def describe(path: Path) -> dict[str, Any]:
             "topics": topics,
             "raw": _phases(recording),
             **_imported(recording),
+            **({"bus": describe_bus(recording)} if is_of_bus(recording) else {}),
             "metadata": recording.metadata,
             "attachments": {
                 name: {

@@ -4,18 +4,17 @@ nothing that fails its CRC."""
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO, NamedTuple, Self, TypeVar
+from typing import BinaryIO
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Header, Message, Metadata, Schema
 
 from triaxcal_drivers.files import open_file
-from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
+from triaxcald.recording.contents import Contents, TopicMessage
 from triaxcald.recording.frames import (
     MAGIC,
     CutShort,
@@ -32,17 +31,8 @@ from triaxcald.recording.frames import (
     walk,
 )
 
-T = TypeVar("T")
 METADATA_MOST = 2**20  # bytes; ours has some hundred
 ATTACHMENTS_MOST = 1000  # a run leaves a dozen
-JOINED = 1 << 15
-"""Raw records that are decoded at once: so many that the cost of a call no
-longer counts, and less than a MiB."""
-
-
-class TopicMessage(NamedTuple):
-    topic: str
-    message: Message
 
 
 class Attachments(Mapping[str, bytes]):
@@ -71,8 +61,8 @@ class Attachments(Mapping[str, bytes]):
         return len(self._offsets)
 
 
-class Recording:
-    """One unit's recording, opened; a context manager.
+class Recording(Contents):
+    """One recording's file, opened.
 
     Opening reads the whole file once and checks it: every byte of a finished
     recording is under a CRC. ``unfinished`` also takes one that is still being
@@ -84,7 +74,7 @@ class Recording:
         self.name = name
         self.finished = True
         self.metadata: dict[str, dict[str, str]] = {}
-        self.attachments = Attachments(self)
+        self.attachments: Attachments = Attachments(self)
         self._stream = stream
         self._chunks: list[int] = []
         self._topics: dict[int, str] = {}
@@ -118,66 +108,11 @@ class Recording:
     def close(self) -> None:
         self._stream.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     @property
     def chunks(self) -> int:
         return len(self._chunks)
 
-    def phases(self) -> list[str]:
-        """In the order in which they began."""
-        return list(dict.fromkeys(phase for phase, _ in self.raw_batches()))
-
-    def raw(self, phase: schema.Phase) -> Iterator[RawBatch]:
-        """The phase's raw records in the order in which they came, some
-        `JOINED` at a time: a live bus hands out few."""
-        waiting: list[RawBatch] = []
-        records = 0
-        for found, batch in self.raw_batches():
-            if found == phase:
-                waiting.append(batch)
-                records += len(batch)
-                if records >= JOINED:
-                    yield RawBatch.joined(waiting)
-                    waiting, records = [], 0
-        if waiting:
-            yield RawBatch.joined(waiting)
-
-    def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
-        """All raw records with their phase."""
-        return ((phase, batch) for _, phase, batch in self._decoded(schema.RAW, schema.decode_raw))
-
-    @property
-    def ends_with(self) -> str:
-        """The format of the document that the whole recording ends with; empty
-        where it ends with none."""
-        return self.metadata[schema.FORMAT_RECORD].get(schema.ENDS_WITH, "")
-
-    def raw_digest(self) -> schema.RawDigest:
-        """Of all raw records; the metadata record ``raw`` says what it was when
-        they were written."""
-        digest = schema.RawDigest(self.ends_with)
-        for phase, batch in self.raw_batches():
-            digest.update(phase, batch)
-        return digest
-
-    def register_accesses(self) -> Iterator[schema.RegisterAccess]:
-        return self._decoded(schema.REGISTERS, schema.decode_register_access)
-
-    def events(self) -> Iterator[schema.Event]:
-        return self._decoded(schema.EVENTS, schema.decode_event)
-
-    def losses(self) -> Iterator[schema.Loss]:
-        return self._decoded(schema.LOSS, schema.decode_loss)
-
     def messages(self) -> Iterator[TopicMessage]:
-        """Every message with its topic, undecoded, in the order of the file."""
         topics = dict(self._topics)
         unpacked = Unpacked(self.name, self.size)
         for offset in self._chunks:
@@ -207,14 +142,6 @@ class Recording:
             return frame_at(self._stream, self.name, offset, self.size)
         except OSError as e:
             raise RecordingError(f"{self.name}: reading failed at byte {offset}: {e.strerror}") from e
-
-    def _decoded(self, topic: str, decode: Callable[[bytes], T]) -> Iterator[T]:
-        for found, message in self.messages():
-            if found == topic:
-                try:
-                    yield decode(message.data)
-                except ValueError as e:
-                    raise RecordingError(f"{self.name}: {topic} at {message.log_time} ns: {e}") from e
 
     def _survey(self) -> None:
         """Notes where everything is and checks the two CRCs that together cover

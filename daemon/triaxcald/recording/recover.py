@@ -32,6 +32,7 @@ from triaxcald.recording.frames import (
     unpack,
     unpack_part,
 )
+from triaxcald.recording.raw_batch import decode_raw
 
 
 @dataclass
@@ -105,7 +106,8 @@ class _Mending:
         self._recovery = Recovery(cut_short=True)
         self._channel_ids: dict[int, int] = {}  # of the damaged file -> of the new one
         self._digest = schema.RawDigest()
-        self._raw_end = 0  # running index after the last record known of
+        self._first = 0  # running index of the first record
+        self._raw_end = 0  # and after the last record known of
         self._written: dict[str, str] = {}  # the metadata record `raw`, where the writer came to its end
         self._located = False  # damage has been met
         self._unpacked = Unpacked(damaged.name, damaged.size)
@@ -153,6 +155,7 @@ class _Mending:
             self._mcap.add_metadata(record.name, record.metadata)
         elif record.metadata.get(schema.ENDS_WITH):
             self._digest.ends_with = record.metadata[schema.ENDS_WITH]
+        self._first = self._first or schema.first_index({record.name: record.metadata})
 
     def _stretch(self, stretch: Stretch) -> None:
         """Keeps what a chunk of the wrong length or one that was cut off still
@@ -229,7 +232,7 @@ class _Mending:
     def _count(self, topic: str, data: bytes) -> None:
         """Raises ValueError where ``data`` is not what the topic holds."""
         if topic == schema.RAW:
-            first, phase, batch = schema.decode_raw(data)
+            first, phase, batch = decode_raw(data)
             self._digest.update(phase, batch)
             self._raw_end = max(self._raw_end, first + len(batch))
         elif topic == schema.LOSS:
@@ -248,7 +251,7 @@ class _Mending:
     def _count_missing(self) -> None:
         recovery = self._recovery
         recovery.raw_records = self._digest.records
-        by_index = self._raw_end - recovery.raw_records - recovery.raw_dropped
+        by_index = self._raw_end - self._first - recovery.raw_records - recovery.raw_dropped
         written = self._written.get("records", "")
         # No CRC but the whole's vouches for metadata.
         believed = int(written) if written.isdecimal() and not recovery.unlocated_damage else 0

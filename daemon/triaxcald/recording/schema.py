@@ -30,15 +30,19 @@ RAW_RECORD = "raw"  # the metadata record with count and digest, written at the 
 END_RECORD = "end"  # the metadata record with the digest of the document that the recording ends with
 IMPORTED = "imported"  # the kind of the event that says of which log a recording was made
 RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
+BUS_RECORD = "bus"  # the metadata record that takes the place of `unit` where all frames of a bus were recorded
+SEGMENT_RECORD = "segment"  # the metadata record that says which part of a longer recording this is
 PROFILE = "triaxcal"  # in the header of the MCAP file
 
 Phase = Literal["calibration", "verification"]
+BUS_PHASE = "bus/"  # begins the phases of a bus recording, one for each channel
 PreviewTopic = Literal["/preview/readings", "/preview/corrected"]
 Operation = Literal["read", "write"]
 
 RAW, REGISTERS, EVENTS, LOSS = "/raw", "/registers", "/events", "/loss"
 PREVIEWS: tuple[PreviewTopic, PreviewTopic] = ("/preview/readings", "/preview/corrected")
 PREVIEW_HZ = 20.0  # enough to see a pose by, and little beside the raw records
+_U64_DIGITS = 20
 MAX_RECORDS = 8192  # raw records in one message; a longer batch is cut, so that reading needs little memory
 
 _PACKAGE = "triaxcal.recording.v1"
@@ -54,6 +58,8 @@ _MESSAGES: Mapping[str, Sequence[_Field]] = {
         ("flags", _F.TYPE_BYTES, False),
         ("length", _F.TYPE_FIXED32, True),
         ("payload", _F.TYPE_BYTES, False),
+        ("start_ns", _F.TYPE_FIXED64, False),
+        ("step_ns", _F.TYPE_SFIXED32, True),
     ),
     "RegisterAccess": (
         ("time_ns", _F.TYPE_FIXED64, False),
@@ -180,66 +186,32 @@ def preview_fields(channels: Sequence[str]) -> list[str]:
     return fields
 
 
-def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
-    """``first`` is the running index of the batch's first record among all that
-    were offered."""
-    message = SCHEMAS["RawBatch"].message(
-        first=first,
-        phase=phase,
-        time_ns=batch.time_ns.tolist(),
-        source=batch.source.tolist(),
-        flags=batch.flags.tobytes(),
-        length=batch.length.tolist(),
-        payload=batch.payload,
-    )
-    return bytes(message.SerializeToString())
-
-
-def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
-    """(running index of the first record, phase, batch). Raises ValueError
-    where ``data`` is none."""
-    message = _parse("RawBatch", data)
-    if len(message.time_ns) > MAX_RECORDS:
-        raise ValueError(f"{len(message.time_ns)} records in one message, expected at most {MAX_RECORDS}")
-    length = np.array(message.length, dtype=np.uint32)
-    if np.any(length > np.iinfo(np.uint16).max):
-        raise ValueError(f"a record of {length.max()} bytes, expected at most {np.iinfo(np.uint16).max}")
-    batch = RawBatch(
-        np.array(message.time_ns, dtype=np.uint64).astype(np.int64),
-        np.array(message.source, dtype=np.uint32),
-        np.frombuffer(message.flags, dtype=np.uint8),
-        length.astype(np.uint16),
-        message.payload,
-    )
-    return int(message.first), str(message.phase), batch
-
-
 def encode(value: RegisterAccess | Event | Loss) -> bytes:
     message = SCHEMAS[type(value).__name__].message(**vars(value))
     return bytes(message.SerializeToString())
 
 
 def decode_register_access(data: bytes) -> RegisterAccess:
-    m = _parse("RegisterAccess", data)
+    m = parse("RegisterAccess", data)
     return RegisterAccess(m.time_ns, m.register, m.operation, m.raw, m.error, m.unanswered)
 
 
 def decode_event(data: bytes) -> Event:
-    m = _parse("Event", data)
+    m = parse("Event", data)
     return Event(m.time_ns, m.kind, m.text)
 
 
 def decode_loss(data: bytes) -> Loss:
-    m = _parse("Loss", data)
+    m = parse("Loss", data)
     return Loss(m.time_ns, m.where, m.first, m.records, m.reason)
 
 
 def decode_time(data: bytes) -> int:
     """The time of any message but a raw batch. Raises ValueError."""
-    return int(_parse("Timed", data).time_ns)
+    return int(parse("Timed", data).time_ns)
 
 
-def _parse(name: str, data: bytes) -> Any:
+def parse(name: str, data: bytes) -> Any:
     """Raises ValueError where ``data`` is no message ``name``."""
     try:
         return SCHEMAS[name].message.FromString(data)
@@ -304,6 +276,13 @@ class RawDigest:
             columns, payloads = self._phases[phase]
             whole.update(hashlib.sha256(phase.encode()).digest() + columns.digest() + payloads.digest())
         return whole.hexdigest()
+
+
+def first_index(metadata: Mapping[str, Mapping[str, str]]) -> int:
+    """The running index of a recording's first raw record; a segment begins
+    where the one before it ended."""
+    told = metadata.get(SEGMENT_RECORD, {}).get("first", "")
+    return int(told) if told.isdecimal() and len(told) < _U64_DIGITS else 0
 
 
 class PreviewEncoder:

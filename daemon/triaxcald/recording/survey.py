@@ -27,6 +27,7 @@ from mcap.records import (
 from triaxcald.recording import schema
 from triaxcald.recording.frames import HEAD, Frame, chunk_data, chunk_records, parse, whole_chunk_head
 from triaxcald.recording.inventory import Inventory
+from triaxcald.recording.raw_batch import decode_raw
 from triaxcald.recording.reader import Recording
 
 Kind = Literal["twice", "times", "sequence", "running_index", "topic", "undecodable", "index"]
@@ -79,7 +80,7 @@ class _Surveying:
         self._channels: dict[int, Channel] = {}
         self._messages: Counter[int] = Counter()
         self._times_ns: tuple[int, int] | None = None
-        self._raw_end = 0
+        self._raw_end = schema.first_index(recording.metadata)
         self._gaps: list[tuple[int, int]] = []  # of running indices of raw records, first and end
         self._lost: list[tuple[int, int]] = []  # and what is noted as lost
         self._indices: list[Any] = []  # that the summary has to have
@@ -198,7 +199,7 @@ class _Surveying:
 
     def _raw(self, message: Message) -> int:
         """Its own time, which is that of its last record."""
-        first, _, batch = schema.decode_raw(message.data)
+        first, _, batch = decode_raw(message.data)
         if first != self._raw_end:
             self._gaps.append((self._raw_end, first))
         self._raw_end = first + len(batch)

@@ -1,31 +1,25 @@
-"""Writes one unit's recording, on a thread of its own so that no disk ever
-holds up a bus."""
+"""Writes a recording, on a thread of its own so that no disk ever holds up a
+bus."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
-
-from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import Writer as McapWriter
+from typing import Any, Self
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.abort import Left, add_action, discard_action
-from triaxcald.errors import DiskError, RecordingError
-from triaxcald.recording import schema
-from triaxcald.recording.inventory import Document, Inventory
-
-CHUNK_NS = 1_000_000_000  # no record waits longer than this for the operating system to have it
+from triaxcald.errors import RecordingError
+from triaxcald.recording import disk, schema
+from triaxcald.recording.ending import ENDED, EndedBecause
+from triaxcald.recording.file import CHUNK_NS, SYNC_S, Head, RecordingFile
+from triaxcald.recording.inventory import Document
 
 
 class RecordingWriter:
@@ -33,14 +27,20 @@ class RecordingWriter:
     returns at once.
 
     ``metadata`` are named records of strings (run, station, unit, software).
-    ``clock_ns`` is the host's time since the epoch; chunks close by it. At most
-    ``queue_batches`` raw batches and preview blocks wait for the disk; what
-    comes when the queue is full is dropped, counted in `losses` and noted in
-    the file. Registers, events and attachments are few and never dropped.
-    ``ends_with`` is the format of the document that `seal` will be given.
+    ``preview_channels`` is None where there are to be no previews. ``clock_ns``
+    is the host's time since the epoch; chunks close by it, and at least every
+    ``sync_s`` they are forced to the disk. At most ``queue_batches`` raw
+    batches and preview blocks wait for the disk; what comes when the queue is
+    full is dropped, counted in `losses` and noted in the file, unless the
+    caller ``waits`` for room. Registers, events and attachments are few and
+    never dropped. ``ends_with`` is the format of the document that `seal` will
+    be given.
+
+    Where the disk has hardly room left, the file is ended while there is room
+    for its end.
 
     Raises RecordingError, here and from every method: the file exists already
-    or the disk has failed.
+    or the disk has failed (DiskError).
     """
 
     def __init__(
@@ -48,47 +48,39 @@ class RecordingWriter:
         path: Path,
         *,
         metadata: Mapping[str, Mapping[str, str]],
-        preview_channels: Sequence[str] = (),
+        preview_channels: Sequence[str] | None = (),
         preview_unit: str = "",
         preview_hz: float = schema.PREVIEW_HZ,
         clock_ns: Callable[[], int] = time.time_ns,
         queue_batches: int = 256,
         ends_with: str = "",
+        sync_s: float = SYNC_S,
+        waits: bool = False,
     ) -> None:
         self.path = path
         self.losses: dict[str, int] = {}
-        self._clock_ns = clock_ns
-        self._preview = schema.PreviewEncoder(preview_channels)
-        self._decimators = {topic: schema.Decimator(preview_hz) for topic in schema.PREVIEWS}
         self.ends_with = ends_with
-        self._digest = schema.RawDigest(ends_with)
-        self._end: dict[str, str] = {}
-        self._inventory = Inventory()
-        self._offered = 0
+        self._clock_ns, self._sync_s, self._waits = clock_ns, sync_s, waits
+        self._decimators = {topic: schema.Decimator(preview_hz) for topic in schema.PREVIEWS}
         self._attached: set[str] = set()
         self._unreported: list[tuple[str, int, int]] = []  # topic, first, records
         self._failure: RecordingError | None = None
-        self._closed = False
-        self._flushed_ns: int | None = None  # when the oldest record not yet flushed was written
+        self._closed = self._finished = False
         self._order = threading.Lock()
         self._room = threading.Semaphore(queue_batches)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        head = {name: dict(record) for name, record in metadata.items()}
-        try:
-            self._file = _create(path)
-            self._mcap = McapWriter(self._file, enable_data_crcs=True)
-            self._write_head(head, preview_unit)
-        except FileExistsError:
-            raise RecordingError(f"{path}: exists already; a recording is never overwritten") from None
-        except OSError as e:
-            raise RecordingError(f"{path}: cannot be created: {e.strerror}") from e
+        self._file = self._begin(Head(metadata, preview_channels, preview_unit, ends_with))
+        self._offered = self._file.raw_end
         # A caller that dies without closing must not be kept alive by it; `log
         # recover` finishes the file.
         self._thread = threading.Thread(target=self._run, name=f"recording {path.name}", daemon=True)
         self._thread.start()
         add_action(self, self._finish_at_abort)
 
-    def raw(self, phase: schema.Phase, batch: RawBatch) -> bool:
+    def _begin(self, head: Head) -> RecordingFile:
+        return RecordingFile(self.path, head, clock_ns=self._clock_ns, sync_s=self._sync_s)
+
+    def raw(self, phase: str, batch: RawBatch) -> bool:
         """Whether there was room for the batch."""
         self._check()
         with self._order:
@@ -134,9 +126,7 @@ class RecordingWriter:
 
         def write() -> None:
             self._report_losses()
-            data = make(self._inventory.document())
-            self._write_attachment(time_ns, name, media_type, data)
-            self._end = {"name": name, "sha256": hashlib.sha256(data).hexdigest()}
+            self._file.seal(time_ns, name, media_type, make)
 
         self._jobs.put(write)
         self.close()
@@ -154,11 +144,23 @@ class RecordingWriter:
     def raw_sha256(self) -> str:
         """Digest of the raw records in the file; complete after `drain` or
         `close`."""
-        return self._digest.hexdigest()
+        return self._file.digest.hexdigest()
 
-    def close(self) -> None:
-        """Writes what is waiting, the indexes and the end of the file."""
+    @property
+    def size(self) -> int:
+        """Bytes that are in the file."""
+        return self._file.size
+
+    @property
+    def closed(self) -> bool:
+        return self._closed
+
+    def close(self, because: EndedBecause | None = None) -> None:
+        """Writes what is waiting, the indexes and the end of the file, and
+        before them the event that says why, where that is given."""
         if not self._closed:
+            if because is not None and self._failure is None:
+                self.event(ENDED, {"reason": because})
             self._closed = True
             self._jobs.put(None)
         self._thread.join()
@@ -171,8 +173,8 @@ class RecordingWriter:
         self._jobs.put(None)
         self._thread.join(max(0.0, until_s - time.monotonic()))
         if self._thread.is_alive():
-            return Left(f"{self.path} is not finished; triaxcal log recover mends it")
-        return Left(str(self._failure) if self._failure else f"{self.path} is finished")
+            return Left(f"{self._file.path} is not finished; triaxcal log recover mends it")
+        return Left(str(self._failure) if self._failure else f"{self._file.path} is finished")
 
     def __enter__(self) -> Self:
         return self
@@ -181,11 +183,16 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self.close()
+            self.close(None if self._closed else self._left_with(value))
         except RecordingError as e:
             if value is None:
                 raise
             value.add_note(str(e))  # what is on its way already weighs more
+
+    def _left_with(self, error: BaseException | None) -> EndedBecause | None:
+        """What to say of why it ended; None where whoever writes it says so
+        himself."""
+        return None
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -194,7 +201,7 @@ class RecordingWriter:
             raise RecordingError(f"{self.path}: the recording is closed")
 
     def _offer(self, topic: str, first: int, records: int, job: Callable[[], None]) -> bool:
-        if self._room.acquire(blocking=False):
+        if self._room.acquire(blocking=False) or (self._waits and self._wait_for_room()):
             self._jobs.put(partial(self._make_room, job))
             return True
         self.losses[topic] = self.losses.get(topic, 0) + records
@@ -205,31 +212,51 @@ class RecordingWriter:
         self._unreported.append((topic, first, records))
         return False
 
-    # What follows runs on the writer's thread, but for the head.
+    def _wait_for_room(self) -> bool:
+        while not self._room.acquire(timeout=0.05):
+            self._check()
+        return True
+
+    # What follows runs on the writer's thread.
 
     def _run(self) -> None:
-        ended = False
         try:
             while (job := self._next_job()) is not None:
                 job()
                 self._report_losses()
-                self._flush_when_due()
-            self._write_end()
-            ended = True
+                self._look_after()
+            self._report_losses()
+            self._finish()
         except OSError as e:
-            self._failure = DiskError(f"{self.path}: writing failed: {e.strerror or e}")
+            self._failure = disk.not_written(self._file.path, e, self._file.sound_ns)
+        except RecordingError as e:
+            self._failure = e
         finally:
-            if not ended and self._failure is None:
+            if self._failure is None and not self._finished:
                 self._failure = RecordingError(f"{self.path}: the writer stopped on a fault of its own")
-            with suppress(OSError):  # the disk's failure is known by now
-                self._file.close()
+            self._file.abandon()
+
+    def _finish(self) -> None:
+        self._file.finish()
+        self._finished = True
 
     def _next_job(self) -> Callable[[], None] | None:
         while True:
             try:
-                return self._jobs.get(timeout=CHUNK_NS / 1e9 if self._flushed_ns is not None else None)
+                return self._jobs.get(timeout=CHUNK_NS / 1e9 if self._file.waits else None)
             except queue.Empty:
-                self._flush_when_due()
+                self._look_after()
+
+    def _look_after(self) -> None:
+        if self._file.flush_when_due() and (free := self._file.lacks_room()) is not None:
+            self._end_for_lack_of_room(free)
+
+    def _end_for_lack_of_room(self, free: int) -> None:
+        """Raises DiskError."""
+        detail = json.dumps({"reason": "disk", "free_bytes": free}, sort_keys=True)
+        self._file.write(schema.EVENTS, schema.Event(self._clock_ns(), ENDED, detail))
+        self._finish()
+        raise disk.ended_early(self._file.path, free, self._file.sound_ns)
 
     def _make_room(self, job: Callable[[], None]) -> None:
         job()
@@ -244,79 +271,17 @@ class RecordingWriter:
             loss = schema.Loss(self._clock_ns(), topic, first, records, "the queue to the disk was full")
             self._write(schema.LOSS, loss)
 
-    def _flush_when_due(self) -> None:
-        now_ns = self._clock_ns()
-        # A clock set back counts as due.
-        if self._flushed_ns is not None and not 0 <= now_ns - self._flushed_ns < CHUNK_NS:
-            self._flush()
-
     def _flush(self) -> None:
-        self._mcap.flush()  # type: ignore[no-untyped-call]
-        self._flushed_ns = None
-
-    def _write_head(self, metadata: Mapping[str, dict[str, str]], unit: str) -> None:
-        self._mcap.start(profile=schema.PROFILE)
-        own = {"format": schema.FORMAT} | ({schema.ENDS_WITH: self.ends_with} if self.ends_with else {})
-        for name, record in {schema.FORMAT_RECORD: own, **metadata}.items():
-            self._inventory.metadata(name, record)
-            self._mcap.add_metadata(name, record)
-        self._channel_ids = _declare(self._mcap, self._inventory, self._preview.kind, unit)
-        self._write(schema.EVENTS, schema.Event(self._clock_ns(), "recording_started", "{}"))
-        self._flush()  # schemas and channels are in the first chunk: have it on disk at once
+        self._file.flush()
 
     def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:
-        for piece in schema.cut(batch):
-            time_ns = int(piece.time_ns[-1]) if len(piece) else self._clock_ns()
-            self._add(schema.RAW, time_ns, schema.encode_raw(first, phase, piece))
-            self._digest.update(phase, piece)
-            first += len(piece)
+        self._file.raw(phase, first, batch)
 
     def _write_preview(self, topic: str, block: SampleBlock, picked: Sequence[int]) -> None:
-        for i in picked:
-            self._add(topic, int(block.time_ns[i]), self._preview.encode(block, i))
+        self._file.preview(topic, block, picked)
 
     def _write(self, topic: str, value: schema.RegisterAccess | schema.Event | schema.Loss) -> None:
-        self._add(topic, value.time_ns, schema.encode(value))
+        self._file.write(topic, value)
 
     def _write_attachment(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
-        self._inventory.attachment(name, media_type, time_ns, data)
-        self._mcap.add_attachment(time_ns, time_ns, name, media_type, data)
-        self._flush()
-
-    def _add(self, topic: str, time_ns: int, data: bytes) -> None:
-        if self._flushed_ns is None:
-            self._flushed_ns = self._clock_ns()
-        self._inventory.message(topic, time_ns, time_ns, data)
-        self._mcap.add_message(self._channel_ids[topic], time_ns, data, time_ns)
-
-    def _write_end(self) -> None:
-        self._report_losses()
-        raw = {"records": str(self._digest.records), "sha256": self._digest.hexdigest()}
-        self._mcap.add_metadata(schema.RAW_RECORD, raw)
-        if self._end:
-            self._mcap.add_metadata(schema.END_RECORD, self._end)
-        self._mcap.finish()  # type: ignore[no-untyped-call]
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
-
-def _create(path: Path) -> BinaryIO:
-    return open(path, "xb")
-
-
-def _declare(mcap: McapWriter, inventory: Inventory, preview: schema.Schema, unit: str) -> dict[str, int]:
-    """Registers schemas and channels in the order that fixes their ids; the
-    channels' ids by topic."""
-    ids = {}
-
-    def channel(topic: str, kind: schema.Schema, schema_id: int, said: dict[str, str]) -> None:
-        ids[topic] = mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id, said)
-        inventory.channel(topic, MessageEncoding.Protobuf, said, (kind.name, SchemaEncoding.Protobuf, kind.data))
-
-    for topic, name in schema.CHANNELS:
-        kind = schema.SCHEMAS[name]
-        channel(topic, kind, mcap.register_schema(kind.name, SchemaEncoding.Protobuf, kind.data), {})
-    schema_id = mcap.register_schema(preview.name, SchemaEncoding.Protobuf, preview.data)
-    for topic, topic_unit in zip(schema.PREVIEWS, (unit, "g"), strict=True):
-        channel(topic, preview, schema_id, {"unit": topic_unit})
-    return ids
+        self._file.attach(time_ns, name, media_type, data)

@@ -13,6 +13,7 @@ from triaxcal_drivers.interface import RawBatch
 from triaxcald.audit import audit, text
 from triaxcald.audit.differences import differing
 from triaxcald.recording import schema
+from triaxcald.recording.raw_batch import decode_raw, encode_raw
 
 CERTIFICATE, VERIFICATION, AFTER = "certificate.json", "verification.json", "registers-after.json"
 CHECKED = ("outcome.json", CERTIFICATE, "report.html", VERIFICATION, "registers-before.json", AFTER)
@@ -45,11 +46,11 @@ class _Once:
     def __call__(self, topic: str, data: bytes) -> bytes:
         if topic != schema.RAW or self.changed:
             return data
-        first, phase, batch = schema.decode_raw(data)
+        first, phase, batch = decode_raw(data)
         if phase != self.phase or not len(batch):
             return data
         self.changed += 1
-        return schema.encode_raw(first, phase, self.change(batch))
+        return encode_raw(first, phase, self.change(batch))
 
 
 def _other_byte(batch: RawBatch) -> RawBatch:

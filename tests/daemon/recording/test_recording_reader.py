@@ -51,7 +51,7 @@ def test_records_of_a_phase_come_many_at_a_time_however_few_a_message_has(
     with Recording.open(recording) as rec:
         single = [batch for phase, batch in rec.raw_batches() if phase == "calibration"]
         (joined,) = rec.raw("calibration")
-        monkeypatch.setattr("triaxcald.recording.reader.JOINED", len(single[0]) + 1)
+        monkeypatch.setattr("triaxcald.recording.contents.JOINED", len(single[0]) + 1)
         parts = list(rec.raw("calibration"))
     assert len(single) == 4
     assert [len(p) for p in parts] == [len(single[0]) + len(single[1]), len(single[2]) + len(single[3])]

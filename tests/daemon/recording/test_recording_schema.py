@@ -4,7 +4,6 @@ import hashlib
 import struct
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,34 +11,6 @@ from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.recording import schema
 
 TWO = RawBatch.of([(256, 0x181, 0, b"\x01\x02"), (512, 0x281, 16, b"\xff")])
-
-
-def test_a_raw_batch_is_packed_fixed_width_columns_on_the_wire() -> None:
-    expected = (
-        "09 0700000000000000"  # 1: first = 7, fixed64
-        "12 0b 63616c6962726174696f6e"  # 2: phase = "calibration"
-        "1a 10 0001000000000000 0002000000000000"  # 3: time_ns, packed fixed64
-        "22 08 81010000 81020000"  # 4: source, packed fixed32
-        "2a 02 00 10"  # 5: flags
-        "32 08 02000000 01000000"  # 6: length, packed fixed32
-        "3a 03 01 02 ff"  # 7: payload
-    )
-    assert schema.encode_raw(7, "calibration", TWO) == bytes.fromhex(expected)
-
-
-def test_a_raw_batch_reads_back_as_it_was() -> None:
-    first, phase, batch = schema.decode_raw(schema.encode_raw(7, "verification", TWO))
-    assert (first, phase, batch.payload) == (7, "verification", TWO.payload)
-    for column in ("time_ns", "source", "flags", "length"):
-        got, put = getattr(batch, column), getattr(TWO, column)
-        assert got.dtype == put.dtype
-        np.testing.assert_array_equal(got, put)
-
-
-@pytest.mark.parametrize("data", [b"\x09\x01", b"\xff\xff\xff", bytes.fromhex("3a03ffffff")])
-def test_bytes_that_are_no_raw_batch_are_a_value_error(data: bytes) -> None:
-    with pytest.raises(ValueError):
-        schema.decode_raw(data)
 
 
 def test_the_raw_digest_is_sha256_of_columns_and_payloads_by_phase() -> None:

@@ -14,8 +14,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcald.errors import RecordingError
+from triaxcald.recording import file as file_module
 from triaxcald.recording import schema
-from triaxcald.recording import writer as writer_module
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 
@@ -51,7 +51,7 @@ def disks(monkeypatch: pytest.MonkeyPatch) -> list[Disk]:
         made.append(Disk(path))
         return io.BufferedWriter(made[-1])
 
-    monkeypatch.setattr(writer_module, "_create", create)
+    monkeypatch.setattr(file_module, "_create", create)
     return made
 
 
@@ -197,7 +197,7 @@ def test_a_disk_that_fails_reaches_the_caller_in_one_line(
     writer.drain()
     disks[0].error = OSError(code, "no more of this")
     writer.raw("calibration", batch_of(0, 10))
-    message = f"{tmp_path / 'rec.mcap'}: writing failed: no more of this"
+    message = f"{tmp_path / 'rec.mcap'}: writing failed: no more of this; sound up to 2023-11-14T22:13:20Z"
     with pytest.raises(RecordingError) as drained:
         writer.drain()
     with pytest.raises(RecordingError) as next_one:
@@ -221,7 +221,8 @@ def test_a_disk_that_fails_on_closing_does_not_hide_what_is_graver(
     with pytest.raises(type(graver)) as raised:
         leave()
     assert raised.value is graver
-    assert graver.__notes__ == [f"{tmp_path / 'rec.mcap'}: writing failed: No space left on device"]
+    [note] = graver.__notes__
+    assert note.startswith(f"{tmp_path / 'rec.mcap'}: writing failed: No space left on device; sound up to ")
 
 
 def test_a_disk_that_fails_on_closing_is_told_where_all_else_went_well(

@@ -1,0 +1,105 @@
+"""What a recording holds, be it one file or many."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from types import TracebackType
+from typing import NamedTuple, Self, TypeVar
+
+from mcap.records import Message
+
+from triaxcal_drivers.interface import RawBatch
+from triaxcald.errors import RecordingError
+from triaxcald.recording import schema
+from triaxcald.recording.raw_batch import decode_raw
+
+T = TypeVar("T")
+JOINED = 1 << 15
+"""Raw records that are decoded at once: so many that the cost of a call no
+longer counts, and less than a MiB."""
+
+
+class TopicMessage(NamedTuple):
+    topic: str
+    message: Message
+
+
+class Contents(ABC):
+    """A context manager. ``metadata`` by record, ``attachments`` by name.
+
+    Every iterator raises RecordingError.
+    """
+
+    name: str
+    metadata: dict[str, dict[str, str]]
+    attachments: Mapping[str, bytes]
+
+    @abstractmethod
+    def messages(self) -> Iterator[TopicMessage]:
+        """Every message with its topic, undecoded, in the order of the file."""
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def phases(self) -> list[str]:
+        """In the order in which they began."""
+        return list(dict.fromkeys(phase for phase, _ in self.raw_batches()))
+
+    def raw(self, phase: str) -> Iterator[RawBatch]:
+        """The phase's raw records in the order in which they came, some
+        `JOINED` at a time: a live bus hands out few."""
+        waiting: list[RawBatch] = []
+        records = 0
+        for found, batch in self.raw_batches():
+            if found == phase:
+                waiting.append(batch)
+                records += len(batch)
+                if records >= JOINED:
+                    yield RawBatch.joined(waiting)
+                    waiting, records = [], 0
+        if waiting:
+            yield RawBatch.joined(waiting)
+
+    def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
+        """All raw records with their phase."""
+        return ((phase, batch) for _, phase, batch in self._decoded(schema.RAW, decode_raw))
+
+    @property
+    def ends_with(self) -> str:
+        """The format of the document that the whole recording ends with; empty
+        where it ends with none."""
+        return self.metadata[schema.FORMAT_RECORD].get(schema.ENDS_WITH, "")
+
+    def raw_digest(self) -> schema.RawDigest:
+        """Of all raw records; the metadata record ``raw`` says what it was when
+        they were written."""
+        digest = schema.RawDigest(self.ends_with)
+        for phase, batch in self.raw_batches():
+            digest.update(phase, batch)
+        return digest
+
+    def register_accesses(self) -> Iterator[schema.RegisterAccess]:
+        return self._decoded(schema.REGISTERS, schema.decode_register_access)
+
+    def events(self) -> Iterator[schema.Event]:
+        return self._decoded(schema.EVENTS, schema.decode_event)
+
+    def losses(self) -> Iterator[schema.Loss]:
+        return self._decoded(schema.LOSS, schema.decode_loss)
+
+    def _decoded(self, topic: str, decode: Callable[[bytes], T]) -> Iterator[T]:
+        for found, message in self.messages():
+            if found == topic:
+                try:
+                    yield decode(message.data)
+                except ValueError as e:
+                    raise RecordingError(f"{self.name}: {topic} at {message.log_time} ns: {e}") from e

@@ -1,0 +1,56 @@
+"""What a recording asks of the disk it is written to, and what is said where
+the disk fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+
+from triaxcald.errors import DiskError, RecordingError
+
+END_BYTES, CHUNK_BYTES = 4 * 2**20, 256
+"""So much room the end of a file takes at most, and more for each of its chunks:
+the last chunk is of a mebibyte or two, and each has its index."""
+_OF_THE_DISK = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS))
+
+
+def free_bytes(path: Path | int) -> int | None:
+    """What may still be written where ``path``, or an open descriptor, is; None
+    where the system does not say."""
+    if not hasattr(os, "statvfs"):
+        return None
+    try:
+        found = os.statvfs(path)
+    except OSError:
+        return None
+    # What is kept back for the superuser is there for him.
+    blocks = found.f_bfree if os.geteuid() == 0 else found.f_bavail
+    return blocks * found.f_frsize if found.f_blocks else None
+
+
+def require_there(descriptor: int) -> None:
+    """Raises OSError where the open file has no name any more: what is written
+    to it is lost when it is closed."""
+    if os.fstat(descriptor).st_nlink == 0:
+        raise FileNotFoundError(errno.ENOENT, "the file, or its folder, was removed")
+
+
+def not_created(path: Path, e: OSError) -> RecordingError:
+    kind = DiskError if e.errno in _OF_THE_DISK else RecordingError
+    return kind(f"{path}: cannot be created: {e.strerror}")
+
+
+def not_written(path: Path, e: OSError, sound_ns: int) -> DiskError:
+    """``sound_ns`` is the host's time up to which everything is in the file."""
+    return DiskError(f"{path}: writing failed: {e.strerror or e}; sound up to {_utc(sound_ns)}")
+
+
+def ended_early(path: Path, free: int, sound_ns: int) -> DiskError:
+    """The file was ended while there was room for its end."""
+    return DiskError(f"{path}: ended, as {free} bytes are free on the disk; whole up to {_utc(sound_ns)}")
+
+
+def _utc(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%dT%H:%M:%SZ}"

@@ -1,0 +1,179 @@
+"""A batch of raw records as a message, column by column.
+
+Through protobuf's own classes every number becomes a Python object first, which
+takes longer than all else that is done to a record; so its wire format is
+written and read here.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triaxcal_drivers.interface import RawBatch
+from triaxcald.recording import schema
+
+_FIXED64, _LENGTH = 1, 2  # wire types
+_U64 = struct.Struct("<Q")
+_STEP_MOST_NS = 2**31 - 1
+
+
+class Fields(NamedTuple):
+    """What a raw batch has by field, its columns still as bytes; empty where it
+    has none of a field."""
+
+    first: int = 0
+    phase: bytes = b""
+    time_ns: bytes = b""
+    source: bytes = b""
+    flags: bytes = b""
+    length: bytes = b""
+    payload: bytes = b""
+    start_ns: int = 0
+    step_ns: bytes = b""
+
+
+_NAMES = dict(enumerate(Fields._fields, start=1))
+_WORDS = frozenset(("first", "start_ns"))
+_WIDTHS: Mapping[str, int] = {"time_ns": 8, "source": 4, "length": 4, "step_ns": 4}
+
+
+def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
+    """``first`` is the running index of the batch's first record among all that
+    were offered.
+
+    Frames of a bus have the first time and the steps from each to the next,
+    which take a quarter of the room, where all steps are below 2.1 s; records
+    of a unit have their times as they are, as they always had.
+    """
+    start_ns, time_ns, step_ns = 0, b"", b""
+    step = np.diff(batch.time_ns) if phase.startswith(schema.BUS_PHASE) else None
+    if step is not None and len(batch) and batch.time_ns[0] > 0 and np.all(np.abs(step) <= _STEP_MOST_NS):
+        start_ns, step_ns = int(batch.time_ns[0]), step.astype("<i4").tobytes()
+    else:
+        time_ns = batch.time_ns.astype("<u8").tobytes()
+    return pack(
+        Fields(
+            first=first,
+            phase=phase.encode(),
+            time_ns=time_ns,
+            source=batch.source.astype("<u4").tobytes(),
+            flags=batch.flags.tobytes(),
+            length=batch.length.astype("<u4").tobytes(),
+            payload=batch.payload,
+            start_ns=start_ns,
+            step_ns=step_ns,
+        )
+    )
+
+
+def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
+    """(running index of the first record, phase, batch). Raises ValueError
+    where ``data`` is none."""
+    fields = unpack(data) or _by_protobuf(data)
+    time_ns = _times_ns(fields)
+    if len(time_ns) > schema.MAX_RECORDS:
+        raise ValueError(f"{len(time_ns)} records in one message, expected at most {schema.MAX_RECORDS}")
+    length = np.frombuffer(fields.length, dtype="<u4")
+    if np.any(length > np.iinfo(np.uint16).max):
+        raise ValueError(f"a record of {length.max()} bytes, expected at most {np.iinfo(np.uint16).max}")
+    batch = RawBatch(
+        time_ns,
+        np.frombuffer(fields.source, dtype="<u4").astype(np.uint32),
+        np.frombuffer(fields.flags, dtype=np.uint8),
+        length.astype(np.uint16),
+        fields.payload,
+    )
+    return fields.first, fields.phase.decode(), batch
+
+
+def _times_ns(fields: Fields) -> NDArray[np.int64]:
+    if not fields.start_ns:
+        return np.frombuffer(fields.time_ns, dtype="<u8").astype(np.int64)
+    if fields.time_ns:
+        raise ValueError("times in two ways, expected one of them")
+    steps = np.frombuffer(fields.step_ns, dtype="<i4").astype(np.int64)
+    # A start beyond int64 wraps, as such a time in the column does.
+    start = np.array([fields.start_ns], dtype=np.uint64).astype(np.int64)
+    return np.cumsum(np.concatenate((start, steps)))
+
+
+def _by_protobuf(data: bytes) -> Fields:
+    """By protobuf's own reader, of a message that another writer made. Raises
+    ValueError."""
+    message = schema.parse("RawBatch", data)
+    widths = {"time_ns": "<u8", "source": "<u4", "length": "<u4", "step_ns": "<i4"}
+    columns = {name: np.array(getattr(message, name), dtype=kind).tobytes() for name, kind in widths.items()}
+    return Fields(
+        first=message.first,
+        phase=message.phase.encode(),
+        flags=message.flags,
+        payload=message.payload,
+        start_ns=message.start_ns,
+        **columns,
+    )
+
+
+def pack(fields: Fields) -> bytes:
+    """As protobuf writes it: in the order of the fields, without those that are
+    empty."""
+    parts: list[bytes] = []
+    for number, name in _NAMES.items():
+        value: int | bytes = getattr(fields, name)
+        if not value:
+            continue
+        if isinstance(value, int):
+            parts += bytes([number << 3 | _FIXED64]), _U64.pack(value)
+        else:
+            parts += bytes([number << 3 | _LENGTH]), _varint(len(value)), value
+    return b"".join(parts)
+
+
+def unpack(data: bytes) -> Fields | None:
+    """None where ``data`` is written in another way than `pack` does it; it may
+    be a message all the same."""
+    found: dict[str, int | bytes] = {}
+    at, end = 0, len(data)
+    while at < end:
+        tag, at = data[at], at + 1
+        name = _NAMES.get(tag >> 3)
+        if name is None or name in found or tag & 7 != (_FIXED64 if name in _WORDS else _LENGTH):
+            return None
+        if name in _WORDS:
+            if at + _U64.size > end:
+                return None
+            (found[name],) = _U64.unpack_from(data, at)
+            at += _U64.size
+            continue
+        length, at = _length(data, at)
+        if length < 0 or at + length > end or length % _WIDTHS.get(name, 1):
+            return None
+        found[name] = data[at : at + length]
+        at += length
+    return Fields(**found)  # type: ignore[arg-type]  # which of them are numbers is known by name
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _length(data: bytes, at: int) -> tuple[int, int]:
+    """A varint of at most 5 bytes, and where it ends; -1 where there is none."""
+    value = 0
+    for shift in range(0, 35, 7):
+        if at >= len(data):
+            break
+        octet, at = data[at], at + 1
+        value |= (octet & 0x7F) << shift
+        if octet < 0x80:
+            return value, at
+    return -1, at

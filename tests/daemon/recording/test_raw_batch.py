@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from triaxcal_drivers.interface import RawBatch
+from triaxcald.recording import schema
+from triaxcald.recording.raw_batch import decode_raw, encode_raw
+
+TWO = RawBatch.of([(256, 0x181, 0, b"\x01\x02"), (512, 0x281, 16, b"\xff")])
+
+
+def by_protobuf(**fields: object) -> bytes:
+    return bytes(schema.SCHEMAS["RawBatch"].message(**fields).SerializeToString())
+
+
+def test_records_of_a_unit_are_packed_fixed_width_columns_on_the_wire() -> None:
+    expected = (
+        "09 0700000000000000"  # 1: first = 7, fixed64
+        "12 0b 63616c6962726174696f6e"  # 2: phase = "calibration"
+        "1a 10 0001000000000000 0002000000000000"  # 3: time_ns, packed fixed64
+        "22 08 81010000 81020000"  # 4: source, packed fixed32
+        "2a 02 00 10"  # 5: flags
+        "32 08 02000000 01000000"  # 6: length, packed fixed32
+        "3a 03 01 02 ff"  # 7: payload
+    )
+    assert encode_raw(7, "calibration", TWO) == bytes.fromhex(expected)
+
+
+def test_frames_of_a_bus_have_the_first_time_and_the_steps() -> None:
+    three = RawBatch.of([(256, 0x181, 0, b"\x01"), (512, 0x181, 0, b"\x02"), (511, 0x181, 0, b"\x03")])
+    expected = (
+        "12 05 6275732f30"  # 2: phase = "bus/0"; first = 0 is not written
+        "22 0c 81010000 81010000 81010000"
+        "2a 03 00 00 00"
+        "32 0c 01000000 01000000 01000000"
+        "3a 03 01 02 03"
+        "41 0001000000000000"  # 8: start_ns, fixed64
+        "4a 08 00010000 ffffffff"  # 9: step_ns, packed sfixed32
+    )
+    assert encode_raw(0, "bus/0", three) == bytes.fromhex(expected)
+    assert decode_raw(bytes.fromhex(expected))[2].time_ns.tolist() == [256, 512, 511]
+
+
+@pytest.mark.parametrize("step_ns", [2**31, -(2**31)])
+def test_frames_of_a_bus_that_lie_far_apart_have_their_times_as_they_are(step_ns: int) -> None:
+    far = RawBatch.of([(2**32, 1, 0, b""), (2**32 + step_ns, 1, 0, b"")])
+    data = encode_raw(0, "bus/0", far)
+    assert schema.SCHEMAS["RawBatch"].message.FromString(data).time_ns == [2**32, 2**32 + step_ns]
+    assert decode_raw(data)[2].time_ns.tolist() == far.time_ns.tolist()
+
+
+rows = st.lists(
+    st.tuples(st.integers(0, 2**62), st.integers(0, 2**32 - 1), st.integers(0, 255), st.binary(max_size=64)),
+    max_size=40,
+)
+
+
+@given(st.integers(0, 2**63), st.sampled_from(["calibration", "bus/vcan0", "bus/Fahrgestell ä"]), rows)
+def test_a_raw_batch_reads_back_as_it_was_and_is_what_protobuf_would_write(
+    first: int, phase: str, records: list[tuple[int, int, int, bytes]]
+) -> None:
+    put = RawBatch.of(records)
+    data = encode_raw(first, phase, put)
+    assert schema.SCHEMAS["RawBatch"].message.FromString(data).SerializeToString() == data
+    got_first, got_phase, got = decode_raw(data)
+    assert (got_first, got_phase, got.payload) == (first, phase, put.payload)
+    for column in ("time_ns", "source", "flags", "length"):
+        assert getattr(got, column).dtype == getattr(put, column).dtype
+        np.testing.assert_array_equal(getattr(got, column), getattr(put, column))
+
+
+def test_a_message_in_another_order_or_with_a_field_of_a_later_version_is_read_too() -> None:
+    data = encode_raw(7, "calibration", TWO)
+    for other in (data[9:] + data[:9], data + b"\x52\x01x"):
+        first, phase, batch = decode_raw(other)
+        assert (first, phase, batch.payload) == (7, "calibration", TWO.payload)
+        assert batch.time_ns.tolist() == [256, 512]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x09\x01",
+        b"\xff\xff\xff",
+        bytes.fromhex("3a03ffffff"),  # a payload without its records
+        bytes.fromhex("1a07 00000000000000"),  # seven bytes of times
+        bytes.fromhex("1a08 0100000000000000 4101000000000000"),  # times in two ways
+        bytes.fromhex("3affffffffffffffffff01"),
+    ],
+)
+def test_bytes_that_are_no_raw_batch_are_a_value_error(data: bytes) -> None:
+    with pytest.raises(ValueError):
+        decode_raw(data)
+
+
+def test_more_records_than_one_message_may_have_are_a_value_error() -> None:
+    n = schema.MAX_RECORDS + 1
+    with pytest.raises(ValueError, match=f"{n} records in one message, expected at most {schema.MAX_RECORDS}"):
+        decode_raw(by_protobuf(time_ns=[1] * n, source=[0] * n, flags=bytes(n), length=[0] * n))
+
+
+def test_a_record_longer_than_any_is_a_value_error() -> None:
+    with pytest.raises(ValueError, match="a record of 65536 bytes, expected at most 65535"):
+        decode_raw(by_protobuf(time_ns=[1], source=[0], flags=b"\0", length=[65536], payload=bytes(65536)))
