@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import coverage, efficiency, frame, outliers, peers, raw_rotation, speed, stillness, undeclared, ways_in
+from benchmarks import (
+    coverage,
+    efficiency,
+    frame,
+    outliers,
+    peers,
+    raw_rotation,
+    recorder,
+    speed,
+    stillness,
+    undeclared,
+    ways_in,
+)
 from benchmarks.table import chosen
 
 
 def main(arguments: list[str] | None = None) -> int:
     quick = chosen(__doc__, arguments)
-    for module in (efficiency, coverage, outliers, peers, raw_rotation, speed, ways_in):
+    for module in (efficiency, coverage, outliers, peers, raw_rotation, speed, ways_in, recorder):
         module.main(["--quick"] if quick else [])
         sys.stdout.flush()
     print("\n### The frame of the mounting faces\n")
