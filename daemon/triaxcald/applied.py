@@ -18,8 +18,8 @@ from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.export import Rows
-from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import Phase
+from triaxcald.recording.series import is_recording, open_recording
 from triaxcald.tables.samples import Reading, read_table
 
 BLOCK = 65536
@@ -61,7 +61,7 @@ def applied(
     """
     found = Applied(iter(()), None)
     beside: Mapping[str, Any] = {}
-    if name.endswith(".mcap"):
+    if is_recording(name):
         blocks = _of_recording(Path(name), phase)
         whole = _of_recording(Path(name), phase)
         pieces: Iterator[tuple[Any, Mapping[str, Any]]] = ((b.time_ns * 1e-9, b.channels) for b in whole if len(b))
@@ -132,7 +132,7 @@ def _of_another_unit(calibration: Calibration, name: str, lengths: list[float]) 
 
 
 def _of_recording(path: Path, phase: Phase) -> Iterator[SampleBlock]:
-    with Recording.open(path) as recording:
+    with open_recording(path) as recording:
         pipeline = Pipeline(bundle_of(recording), READINGS)
         for batch in recording.raw(phase):
             yield pipeline.feed(batch)

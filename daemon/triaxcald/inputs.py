@@ -30,8 +30,9 @@ from triaxcal_drivers.profile import READINGS, Bundle, Profile
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import Pipeline, creeping, together
 from triaxcald.recording.bus import require_of_unit
-from triaxcald.recording.reader import Recording
+from triaxcald.recording.contents import Contents
 from triaxcald.recording.schema import RECOVERY_RECORD, Phase
+from triaxcald.recording.series import is_recording, open_recording
 from triaxcald.station.config import parse_station
 from triaxcald.tables.naming import ERRORS
 from triaxcald.tables.samples import Reading, Table, read_table
@@ -81,17 +82,17 @@ def measure(
     reading: Reading | None = None,
     turn_s: float | None = None,
 ) -> Measured:
-    """``name`` is a path to an `.mcap`, a text table or a Parquet file, or `-`;
-    ``reading`` says how a table is to be read. Raises InputError,
-    RecordingError.
+    """``name`` is a path to an `.mcap`, to the manifest of a recording in
+    segments, to a text table or a Parquet file, or `-`; ``reading`` says how a
+    table is to be read. Raises InputError, RecordingError.
 
     ``moments`` are fed all raw samples and their temperature on the way, block
     by block: of a unit that turns, where what turns slowly enough would pass
     for a pose that creeps. ``turn_s``: the unit may turn in place, as for
     `find_spans`.
     """
-    if name.endswith(".mcap"):
-        with Recording.open(Path(name)) as recording:
+    if is_recording(name):
+        with open_recording(Path(name)) as recording:
             return _measure_recording(recording, phase, stream, moments, turn_s)
     table = read_table(name, reading)
     samples = table.samples
@@ -149,7 +150,7 @@ def _of_means(name: str, table: Table) -> Measured:
 
 
 def _measure_recording(
-    recording: Recording, phase: Phase, stream: str, moments: Moments | None, turn_s: float | None
+    recording: Contents, phase: Phase, stream: str, moments: Moments | None, turn_s: float | None
 ) -> Measured:
     bundle = bundle_of(recording)
     pipeline = Pipeline(bundle, stream, turn_s=turn_s)
@@ -189,7 +190,7 @@ def require_unit(document: Mapping[str, Any], measured: Measured, *, where: str)
         raise InputError(f"{where}: unit.serial is {theirs}; {measured.name} is of {ours}")
 
 
-def signs_of(recording: Recording) -> tuple[int, int, int] | None:
+def signs_of(recording: Contents) -> tuple[int, int, int] | None:
     """Of the scale factors, as the station that made the recording had them."""
     parts = recording.metadata.get("unit", {}).get("signs", "").split(",")
     if len(parts) != 3 or any(p not in ("1", "-1") for p in parts):
@@ -206,7 +207,7 @@ def preview_channels(profile: Profile) -> list[str]:
     return list(names)
 
 
-def losses_of(recording: Recording) -> list[str]:
+def losses_of(recording: Contents) -> list[str]:
     """What did not get into the recording, or was lost from it since, one line
     each."""
     lost = sum(loss.records for loss in recording.losses())
@@ -219,7 +220,7 @@ def losses_of(recording: Recording) -> list[str]:
     return found
 
 
-def bundle_of(recording: Recording) -> Bundle:
+def bundle_of(recording: Contents) -> Bundle:
     """The profile that a recording carries. Raises RecordingError."""
     require_of_unit(recording)
     try:

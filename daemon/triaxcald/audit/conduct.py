@@ -33,6 +33,7 @@ from triaxcald.inputs import losses_of, parse_document
 from triaxcald.outcome import ATTACHMENT, FORMAT, Verdict, digest_of
 from triaxcald.provision.state import DeviceState, Held
 from triaxcald.recording.bus import require_of_unit
+from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_RECORD
 from triaxcald.recording.survey import Survey, survey
@@ -84,6 +85,8 @@ class Audit:
 def audit(path: Path, *, compute: Compute = compute) -> Audit:
     """Raises RecordingError where the file cannot be read, or holds no result.
     ``compute`` makes the results again."""
+    if is_manifest(path):
+        raise RecordingError(f"{path}: a recording in segments, which holds no result to audit")
     with Recording.open(path) as recording:
         require_of_unit(recording)
         if recording.ends_with not in ("", FORMAT):

@@ -15,7 +15,7 @@ from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.tables.naming import TIME_UNITS, parse_columns
 
-RECORDING = ".mcap, a table (.csv, .csv.gz, .txt, .parquet) or - for text on standard input"
+RECORDING = ".mcap or .segments.json, a table (.csv, .csv.gz, .txt, .parquet) or - for text on standard input"
 
 
 class OneLineParser(argparse.ArgumentParser):

@@ -77,7 +77,7 @@ def _known(name: str) -> bool:
 
 
 def _looks_like_recording(word: str) -> bool:
-    return word == "-" or word.endswith((".mcap", ".csv", ".csv.gz"))
+    return word == "-" or word.endswith((".mcap", ".segments.json", ".csv", ".csv.gz"))
 
 
 # Without a recording

@@ -15,8 +15,8 @@ from triaxcald.inputs import bundle_of
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
-from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
+from triaxcald.recording.series import open_recording
 
 
 def audit_command(a: argparse.Namespace) -> int:
@@ -71,7 +71,7 @@ def recover_command(a: argparse.Namespace) -> int:
 
 
 def export_command(a: argparse.Namespace) -> int:
-    with Recording.open(a.recording) as recording:
+    with open_recording(a.recording) as recording:
         bundle = bundle_of(recording)
         if a.stream not in bundle.profile.streams:
             raise InputError(f"--stream {a.stream}: the recording has {', '.join(bundle.profile.streams)}")

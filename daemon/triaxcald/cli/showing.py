@@ -19,6 +19,7 @@ from triaxcal.units import ErrorUnit, reference_unit_of
 from triaxcald.cli.console import say, table
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, measure, require_same_outputs
+from triaxcald.recording.series import is_recording
 from triaxcald.tables.samples import Reading
 
 
@@ -63,7 +64,7 @@ def reading_of(a: argparse.Namespace, name: str, of: Calibration | None = None) 
     """How a table is to be read, where ``of`` is the calibration that needs its
     channels. Raises InputError where the recording is none."""
     said = Reading(a.columns or {}, a.time_unit, a.rate, a.skip_bad, dict(a.where or ()), a.pose_means)
-    if name.endswith(".mcap") and said != Reading():
+    if is_recording(name) and said != Reading():
         raise InputError(f"{name}: --columns, --time-unit, --rate, --skip-bad, --where and --pose-means are for tables")
     return said if of is None else replace(said, wanted=frozenset(map(channel_of, of.fitted.channel_reference)))
 

@@ -8,7 +8,10 @@ from typing import Any
 
 from triaxcald.recording import schema
 from triaxcald.recording.bus import describe_bus, is_of_bus
+from triaxcald.recording.contents import Contents
+from triaxcald.recording.ending import ENDED
 from triaxcald.recording.reader import Recording
+from triaxcald.recording.series import Series, open_recording
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -17,7 +20,7 @@ def describe(path: Path) -> dict[str, Any]:
 
     Raises RecordingError.
     """
-    with Recording.open(path, unfinished=True) as recording:
+    with open_recording(path, unfinished=True) as recording:
         topics = _topics(recording)
         starts = [topic["start_ns"] for topic in topics.values()]
         ends = [topic["end_ns"] for topic in topics.values()]
@@ -25,13 +28,12 @@ def describe(path: Path) -> dict[str, Any]:
             "format": schema.FORMAT,
             "file": str(path),
             "bytes": recording.size,
-            "finished": recording.finished,
-            "recovered": schema.RECOVERY_RECORD in recording.metadata,
-            "chunks": recording.chunks,
+            **(_segments(recording) if isinstance(recording, Series) else _file(recording)),
             "duration_s": (max(ends) - min(starts)) / 1e9 if starts else 0.0,
             "topics": topics,
             "raw": _phases(recording),
             **_imported(recording),
+            "ended": next((_detail(e) for e in reversed(list(recording.events())) if e.kind == ENDED), None),
             **({"bus": describe_bus(recording)} if is_of_bus(recording) else {}),
             "metadata": recording.metadata,
             "attachments": {
@@ -54,13 +56,29 @@ def _detail(event: schema.Event) -> Any:
         return event.text
 
 
-def _imported(recording: Recording) -> dict[str, Any]:
+def _imported(recording: Contents) -> dict[str, Any]:
     """From which log the recording was made, where it was."""
     details = [_detail(event) for event in recording.events() if event.kind == schema.IMPORTED]
     return {"imported": details[0]} if details else {}
 
 
-def _topics(recording: Recording) -> dict[str, dict[str, int]]:
+def _file(recording: Recording) -> dict[str, Any]:
+    return {
+        "finished": recording.finished,
+        "recovered": schema.RECOVERY_RECORD in recording.metadata,
+        "chunks": recording.chunks,
+    }
+
+
+def _segments(series: Series) -> dict[str, Any]:
+    return {
+        "finished": all(s.state == "closed" for s in series.manifest.segments),
+        "segments": [asdict(s) for s in series.manifest.segments],
+        "deleted": series.manifest.deleted,
+    }
+
+
+def _topics(recording: Contents) -> dict[str, dict[str, int]]:
     topics: dict[str, dict[str, int]] = {}
     for topic, message in recording.messages():
         time_ns = message.log_time
@@ -71,7 +89,7 @@ def _topics(recording: Recording) -> dict[str, dict[str, int]]:
     return topics
 
 
-def _phases(recording: Recording) -> dict[str, dict[str, Any]]:
+def _phases(recording: Contents) -> dict[str, dict[str, Any]]:
     """Of each phase: records, their bytes, and the time from the first to the
     last."""
     phases: dict[str, dict[str, Any]] = {}

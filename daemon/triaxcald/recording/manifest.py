@@ -1,0 +1,145 @@
+"""The manifest of a recording in segments (`triaxcal.segments/1`): which files
+it consists of, in order."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from triaxcal_drivers.files import read_whole
+from triaxcald.errors import RecordingError
+from triaxcald.files import write_durably
+
+FORMAT = "triaxcal.segments/1"
+SUFFIX = ".segments.json"
+MANIFEST_MOST = 32 * 2**20  # bytes; an entry has some 400, and there are 8760 hours in a year
+State = Literal["open", "closed", "cut_short"]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One file. Running indices of raw records from ``first`` to before ``end``
+    are its own, of which ``records`` are in it; ``start_ns`` and ``end_ns`` are
+    host times of the first and the last, None where there are none. ``bytes``
+    and ``sha256`` are of the whole file, ``raw_sha256`` is the digest of its
+    raw records. ``open``: it is being written, or was when the power failed;
+    ``cut_short``: it was not finished."""
+
+    file: str
+    number: int
+    first: int
+    state: State = "open"
+    end: int = 0
+    records: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+    bytes: int = 0
+    sha256: str = ""
+    raw_sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """``segments`` in order. ``deleted`` counts those that retention has taken
+    away, which are in it no more, by reason."""
+
+    path: Path
+    segments: tuple[Segment, ...] = ()
+    deleted: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def next_number(self) -> int:
+        return max([sum(self.deleted.values()), *(s.number for s in self.segments)]) + 1
+
+    def path_of(self, segment: Segment) -> Path:
+        return self.path.with_name(segment.file)
+
+    def file_name(self, number: int) -> str:
+        return f"{self.path.name.removesuffix(SUFFIX)}-{number:06d}.mcap"
+
+    def with_last(self, segment: Segment) -> Manifest:
+        """``segment`` in the place of the last one where that has its number,
+        else behind it."""
+        known = self.segments[:-1] if self.segments and self.segments[-1].number == segment.number else self.segments
+        return replace(self, segments=(*known, segment))
+
+    def without(self, taken: list[tuple[Segment, str]]) -> Manifest:
+        """Of which some were deleted, each for a reason."""
+        gone = {segment.number for segment, _ in taken}
+        counts = Counter(self.deleted) + Counter(reason for _, reason in taken)
+        return replace(self, segments=tuple(s for s in self.segments if s.number not in gone), deleted=dict(counts))
+
+    def save(self) -> None:
+        """Whole or not at all. Raises OSError."""
+        document = {"format": FORMAT, "segments": [asdict(s) for s in self.segments], "deleted": self.deleted}
+        write_durably(self.path, json.dumps(document, indent=1) + "\n")
+
+
+def manifest_path(path: Path) -> Path:
+    """Of the recording that is asked for as ``path``, an `.mcap` or the manifest
+    itself."""
+    return path if is_manifest(path) else path.with_name(path.name.removesuffix(".mcap") + SUFFIX)
+
+
+def is_manifest(path: Path | str) -> bool:
+    return str(path).endswith(SUFFIX)
+
+
+def load_manifest(path: Path) -> Manifest:
+    """Raises RecordingError."""
+    try:
+        document = json.loads(read_whole(path, MANIFEST_MOST))
+    except OSError as e:
+        raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
+    except (ValueError, RecursionError) as e:
+        raise RecordingError(f"{path}: not JSON, expected a {FORMAT} document") from e
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        said = document.get("format") if isinstance(document, dict) else None
+        raise RecordingError(f"{path}: format {json.dumps(said)[:40]}, expected '{FORMAT}'")
+    listed, deleted = document.get("segments"), document.get("deleted", {})
+    if not isinstance(listed, list) or not isinstance(deleted, dict):
+        raise RecordingError(f"{path}: segments: expected a list, and deleted an object")
+    segments = tuple(_segment(entry, f"{path}: segments[{i}]") for i, entry in enumerate(listed))
+    if any(later.number <= earlier.number for earlier, later in pairwise(segments)):
+        raise RecordingError(f"{path}: segments: expected numbers that rise")
+    counts = {str(reason): _count(n, f"{path}: deleted") for reason, n in deleted.items()}
+    return Manifest(path, segments, counts)
+
+
+_KINDS: dict[str, Any] = {f.name: f.type for f in fields(Segment)}
+
+
+def _segment(entry: Any, where: str) -> Segment:
+    if not isinstance(entry, dict):
+        raise RecordingError(f"{where}: expected an object")
+    held: dict[str, Any] = {}
+    for name, kind in _KINDS.items():
+        value = entry.get(name)
+        if kind == "str":
+            held[name] = _text(value, f"{where}: {name}")
+        elif name == "state":
+            if value not in get_args(State):
+                raise RecordingError(f"{where}: {name}: expected one of {', '.join(get_args(State))}")
+            held[name] = value
+        elif not (value is None and kind == "int | None"):
+            held[name] = _count(value, f"{where}: {name}")
+    file = held["file"]
+    if Path(file).name != file or not file.endswith(".mcap"):
+        raise RecordingError(f"{where}: file: expected the name of an .mcap beside it")
+    return Segment(**held)
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str) or len(value) > 255:
+        raise RecordingError(f"{where}: expected a text")
+    return value
+
+
+def _count(value: Any, where: str) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**63:
+        raise RecordingError(f"{where}: expected a number from 0 on")
+    return value

@@ -1,0 +1,88 @@
+"""Which segments of a recording are kept, and which make room."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from triaxcal_drivers.files import read_whole
+from triaxcald.recording.manifest import Manifest, Segment
+
+EVIDENCE = ("*.outcome.json", "*.certificate.json")
+"""Documents that may rest on a recording."""
+EVIDENCE_MOST = 4 * 2**20  # bytes of one, as for any document
+Reason = Literal["age", "disk"]
+
+
+@dataclass(frozen=True)
+class Retention:
+    """Segments that end more than ``keep_s`` ago go (None: no age is too much);
+    and the oldest go while less than ``free_bytes`` of the disk are free."""
+
+    keep_s: float | None = None
+    free_bytes: int = 0
+
+
+class Surplus(NamedTuple):
+    segment: Segment
+    reason: Reason
+
+
+def surplus(
+    segments: Sequence[Segment], retention: Retention, *, now_ns: int, free_bytes: int | None, kept: Collection[str]
+) -> list[Surplus]:
+    """What has to go, the oldest first. The one that is being written stays,
+    and so do the files ``kept``. ``free_bytes`` of the disk, None where that is
+    not known."""
+    found: list[Surplus] = []
+    free = retention.free_bytes if free_bytes is None else free_bytes
+    for segment in segments:
+        if segment.state == "open" or segment.file in kept:
+            continue
+        if _too_old(segment, retention.keep_s, now_ns):
+            found.append(Surplus(segment, "age"))
+        elif free < retention.free_bytes:
+            found.append(Surplus(segment, "disk"))
+        else:
+            continue
+        free += segment.bytes
+    return found
+
+
+def _too_old(segment: Segment, keep_s: float | None, now_ns: int) -> bool:
+    """One without a record is as old as any."""
+    return keep_s is not None and (segment.end_ns is None or now_ns - segment.end_ns > keep_s * 1e9)
+
+
+def evidence(manifest: Manifest) -> frozenset[str]:
+    """The files that an outcome or a certificate beside the manifest names, by
+    name or by digest; all, where such a document cannot be read."""
+    texts = []
+    for pattern in EVIDENCE:
+        for path in manifest.path.parent.glob(pattern):
+            try:
+                texts.append((path.name, read_whole(path, EVIDENCE_MOST).decode("utf-8", "replace")))
+            except OSError:
+                return frozenset(s.file for s in manifest.segments)
+    return frozenset(s.file for s in manifest.segments if _is_named(s, texts))
+
+
+def _is_named(segment: Segment, texts: Iterable[tuple[str, str]]) -> bool:
+    stem = Path(segment.file).stem
+    told = [name for name in (segment.file, segment.sha256, segment.raw_sha256) if name]
+    return any(name.startswith(f"{stem}.") or any(t in text for t in told) for name, text in texts)
+
+
+def delete(manifest: Manifest, chosen: Iterable[Surplus]) -> list[Surplus]:
+    """Those that are gone; one that cannot be removed stays, and the next may
+    go. What is still in the manifest, and not on the disk, is gone too."""
+    gone = []
+    for one in chosen:
+        try:
+            manifest.path_of(one.segment).unlink(missing_ok=True)
+        except OSError:
+            continue
+        gone.append(one)
+    return gone

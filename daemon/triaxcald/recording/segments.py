@@ -1,0 +1,188 @@
+"""Writes a recording in segments, each of which can be read alone."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from triaxcal_drivers.interface import RawBatch
+from triaxcald.errors import RecordingError
+from triaxcald.recording import disk, schema
+from triaxcald.recording.ending import EndedBecause, ended_because
+from triaxcald.recording.file import Head, RecordingFile
+from triaxcald.recording.inventory import Document
+from triaxcald.recording.manifest import Manifest, Segment, State, load_manifest, manifest_path
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.retention import Retention, Surplus, delete, evidence, surplus
+from triaxcald.recording.series import digest_of
+from triaxcald.recording.writer import RecordingWriter
+
+SEGMENT_BYTES, SEGMENT_S = 256 * 2**20, 3600.0
+"""What damage to one file costs at most, and the least that retention takes: an
+hour of a busy bus is some hundred MiB."""
+
+
+class SegmentedWriter(RecordingWriter):
+    """As `RecordingWriter`, into one file after the other: a new one begins when
+    the last has ``size_bytes`` or is ``time_s`` old. ``manifest`` is the file
+    that names them; where it is there already, the recording goes on behind
+    what it names. ``path`` is the manifest, or an `.mcap` of that name.
+
+    Attachments that come before the first raw record are in every segment.
+    ``retention`` takes the oldest segments away; ``deleted`` are those, and
+    events of the current segment say it too. Left as a context manager it says
+    by an event why it ended.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        metadata: Mapping[str, Mapping[str, str]],
+        size_bytes: int = SEGMENT_BYTES,
+        time_s: float = SEGMENT_S,
+        retention: Retention | None = None,
+        **options: Any,
+    ) -> None:
+        self.manifest = manifest_path(path)
+        self.deleted: list[Surplus] = []
+        self._size_bytes, self._time_ns, self._retention = size_bytes, round(time_s * 1e9), retention
+        self._kept: list[tuple[int, str, str, bytes]] = []
+        self._recorded = self._told_low = False
+        super().__init__(self.manifest, metadata=metadata, **options)
+
+    def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
+        raise RecordingError(f"{self.manifest}: a recording in segments ends with no document")
+
+    def _left_with(self, error: BaseException | None) -> EndedBecause | None:
+        return ended_because(error)
+
+    def _begin(self, head: Head) -> RecordingFile:
+        self._head = replace(head, metadata={name: dict(record) for name, record in head.metadata.items()})
+        self._segments = load_manifest(self.manifest) if self.manifest.exists() else Manifest(self.manifest)
+        try:
+            self._segments = _settled(self._segments)
+            return self._next()
+        except OSError as e:
+            raise disk.not_created(self.manifest, e) from e
+
+    # What follows runs on the writer's thread, but for the first segment.
+
+    def _next(self) -> RecordingFile:
+        """Raises OSError, RecordingError."""
+        known, number = self._segments.segments, self._segments.next_number
+        first = known[-1].end if known else 0
+        told = {"number": str(number), "first": str(first), "of": self.manifest.name}
+        if known:
+            told |= {"previous": known[-1].file, "previous_sha256": known[-1].sha256}
+        head = replace(self._head, metadata={**self._head.metadata, schema.SEGMENT_RECORD: told})
+        segment = Segment(self._segments.file_name(number), number, first)
+        path = self._segments.path_of(segment)
+        if os.path.lexists(path):
+            raise RecordingError(f"{path}: exists already; a recording is never overwritten")
+        # Before the file is: one that no manifest names would be in the way for ever.
+        self._segments = self._segments.with_last(segment)
+        self._segments.save()
+        file = RecordingFile(path, head, clock_ns=self._clock_ns, sync_s=self._sync_s, first=first)
+        self._begun_ns = self._clock_ns()
+        for attachment in self._kept:
+            file.attach(*attachment)
+        return file
+
+    def _look_after(self) -> None:
+        super()._look_after()
+        old = not 0 <= self._clock_ns() - self._begun_ns < self._time_ns
+        if (old and self._file.digest.records) or self._file.size >= self._size_bytes:
+            self._finish()
+            self._finished = False
+            self._file = self._next()
+            self._told_low = False
+            self._retain()
+        if self._lacks() and not self._told_low and not self._retain():
+            self._told_low = True
+            self._say("disk_low", {"wanted_bytes": self._retention.free_bytes if self._retention else 0})
+
+    def _finish(self) -> None:
+        super()._finish()
+        file, last = self._file, self._segments.segments[-1]
+        start_ns, end_ns = file.span_ns or (None, None)
+        closed = replace(
+            last, state="closed", end=file.raw_end, records=file.digest.records, start_ns=start_ns, end_ns=end_ns,
+            bytes=file.size, sha256=digest_of(file.path), raw_sha256=file.digest.hexdigest(),
+        )  # fmt: skip
+        self._segments = self._segments.with_last(closed)
+        self._segments.save()
+
+    def _end_for_lack_of_room(self, free: int) -> None:
+        """Unless older segments make room. Raises DiskError."""
+        if not self._retain():
+            super()._end_for_lack_of_room(free)
+
+    def _lacks(self) -> bool:
+        """Whether less of the disk is free than is to be."""
+        free = disk.free_bytes(self.manifest.parent)
+        return self._retention is not None and free is not None and free < self._retention.free_bytes
+
+    def _retain(self) -> list[Surplus]:
+        """What it has taken away, also said in the file."""
+        if self._retention is None:
+            return []
+        chosen = surplus(
+            self._segments.segments, self._retention, now_ns=self._clock_ns(),
+            free_bytes=disk.free_bytes(self.manifest.parent), kept=evidence(self._segments),
+        )  # fmt: skip
+        gone = delete(self._segments, chosen)
+        if gone:
+            self._segments = self._segments.without([(one.segment, one.reason) for one in gone])
+            self._segments.save()
+            self.deleted += gone
+            self._say("deleted", {"segments": [_told(one) for one in gone]})
+        return gone
+
+    def _say(self, kind: str, detail: Mapping[str, Any]) -> None:
+        self._write(schema.EVENTS, schema.Event(self._clock_ns(), kind, json.dumps(detail, sort_keys=True)))
+
+    def _write_attachment(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
+        if not self._recorded:
+            self._kept.append((time_ns, name, media_type, data))
+        super()._write_attachment(time_ns, name, media_type, data)
+
+    def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:
+        self._recorded = True
+        super()._write_raw(phase, first, batch)
+
+
+def _told(one: Surplus) -> dict[str, Any]:
+    s = one.segment
+    return {"file": s.file, "because": one.reason, "bytes": s.bytes, "start_ns": s.start_ns, "end_ns": s.end_ns}
+
+
+def _settled(manifest: Manifest) -> Manifest:
+    """Its last segment as it lies on the disk, where it was not closed. Raises
+    OSError, RecordingError."""
+    if not manifest.segments or manifest.segments[-1].state != "open":
+        return manifest
+    last = manifest.segments[-1]
+    path = manifest.path_of(last)
+    if not os.path.lexists(path):
+        return replace(manifest, segments=manifest.segments[:-1])
+    with Recording.open(path, unfinished=True) as recording:
+        digest, span = schema.RawDigest(), list[int]()
+        for phase, batch in recording.raw_batches():
+            digest.update(phase, batch)
+            if len(batch):
+                span = [min([*span, int(batch.time_ns.min())]), max([*span, int(batch.time_ns.max())])]
+        lost = sum(loss.records for loss in recording.losses() if loss.where == schema.RAW)
+        state: State = "closed" if recording.finished else "cut_short"
+        size = recording.size
+    return manifest.with_last(
+        replace(
+            last, state=state, end=last.first + digest.records + lost, records=digest.records,
+            start_ns=span[0] if span else None, end_ns=span[1] if span else None,
+            bytes=size, sha256=digest_of(path), raw_sha256=digest.hexdigest(),
+        )
+    )  # fmt: skip

@@ -1,0 +1,89 @@
+"""A recording in segments, read as one."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from triaxcal_drivers.files import open_file
+from triaxcald.errors import RecordingError
+from triaxcald.recording import schema
+from triaxcald.recording.contents import Contents, TopicMessage
+from triaxcald.recording.manifest import Manifest, Segment, is_manifest, load_manifest
+from triaxcald.recording.reader import Attachments, Recording
+
+_BLOCK = 2**20
+
+
+class Series(Contents):
+    """All segments that are there, one open at a time. Metadata and attachments
+    are those of the first.
+
+    Each segment is compared with the manifest when it is read. Raises
+    RecordingError: one is missing, or is not as it was.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self.manifest: Manifest = load_manifest(path)
+        if not self.manifest.segments:
+            raise RecordingError(f"{path}: no segment is left of this recording")
+        for segment in self.manifest.segments:
+            self._require_there(segment)
+        self._first = self._opened(self.manifest.segments[0])
+        own = (schema.SEGMENT_RECORD, schema.RAW_RECORD)
+        self.metadata = {name: record for name, record in self._first.metadata.items() if name not in own}
+        self.attachments: Attachments = self._first.attachments
+
+    def close(self) -> None:
+        self._first.close()
+
+    @property
+    def size(self) -> int:
+        return sum(segment.bytes for segment in self.manifest.segments)
+
+    def messages(self) -> Iterator[TopicMessage]:
+        yield from self._first.messages()
+        for segment in self.manifest.segments[1:]:
+            with self._opened(segment) as recording:
+                yield from recording.messages()
+
+    def _require_there(self, segment: Segment) -> None:
+        path = self.manifest.path_of(segment)
+        try:
+            size = path.stat().st_size
+        except OSError as e:
+            raise RecordingError(f"{self.name}: segment {segment.file}: {e.strerror}") from e
+        if segment.state != "open" and size != segment.bytes:
+            raise RecordingError(
+                f"{self.name}: segment {segment.file}: {size} bytes, expected {segment.bytes}; it was changed since"
+            )
+
+    def _opened(self, segment: Segment) -> Recording:
+        path = self.manifest.path_of(segment)
+        if segment.state != "open" and digest_of(path) != segment.sha256:
+            raise RecordingError(f"{self.name}: segment {segment.file}: was changed since it was recorded")
+        return Recording.open(path, unfinished=segment.state != "closed")
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of the whole file. Raises RecordingError."""
+    try:
+        digest = hashlib.sha256()
+        with open_file(path) as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
+        return digest.hexdigest()
+    except OSError as e:
+        raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
+
+
+def open_recording(path: Path, *, unfinished: bool = False) -> Recording | Series:
+    """One file, or all that a manifest names. Raises RecordingError."""
+    return Series(path) if is_manifest(path) else Recording.open(path, unfinished=unfinished)
+
+
+def is_recording(name: str) -> bool:
+    """Whether a file of that name is a recording of ours, and not a table."""
+    return name.endswith(".mcap") or is_manifest(name)

@@ -1,0 +1,397 @@
+"""A recording in segments: written one after the other, read as one."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from triaxcal_drivers.errors import DeviceSilent
+from triaxcal_drivers.interface import RawBatch
+from triaxcald.audit import audit_each
+from triaxcald.errors import RecordingError
+from triaxcald.recording import disk, schema
+from triaxcald.recording.manifest import load_manifest
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.recover import recover
+from triaxcald.recording.retention import Retention
+from triaxcald.recording.segments import SegmentedWriter
+from triaxcald.recording.series import Series, digest_of
+from triaxcald.recording.survey import survey
+
+T0_NS = 1_700_000_000_000_000_000
+S = 1_000_000_000
+GOLDEN = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"
+METADATA = {"station": {"name": "bench"}, "unit": {"serial": "42"}}
+BatchOf = Callable[..., RawBatch]
+NewWriter = Callable[..., SegmentedWriter]
+
+
+@pytest.fixture
+def new(tmp_path: Path, clock: Any) -> Iterator[NewWriter]:
+    writers: list[SegmentedWriter] = []
+
+    def make(**options: Any) -> SegmentedWriter:
+        settings = {"metadata": METADATA, "clock_ns": clock, "time_s": 60.0}
+        writers.append(SegmentedWriter(tmp_path / "rec.mcap", **{**settings, **options}))
+        return writers[-1]
+
+    yield make
+    for writer in writers:
+        if not writer.closed:
+            writer.close()
+
+
+@pytest.fixture
+def minutes(clock: Any, batch_of: BatchOf) -> Callable[..., None]:
+    """Records a batch of ten in each of so many minutes, which are a segment each."""
+
+    def record(writer: SegmentedWriter, count: int, first: int = 0) -> None:
+        for i in range(count):
+            writer.raw("calibration", batch_of(first + 10 * i, 10))
+            writer.drain()
+            clock.now_ns += 60 * S
+            writer.event("minute")
+            writer.drain()
+
+    return record
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.glob("*.mcap"))
+
+
+def kinds(path: Path, *, unfinished: bool = False) -> list[str]:
+    with Recording.open(path, unfinished=unfinished) as recording:
+        return [e.kind for e in recording.events()]
+
+
+def test_a_segment_begins_when_the_last_is_old_enough(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None]
+) -> None:
+    with new() as writer:
+        writer.attach("station.toml", "application/toml", b"name = 'bench'\n")
+        minutes(writer, 3)
+    assert files(tmp_path) == ["rec-000001.mcap", "rec-000002.mcap", "rec-000003.mcap", "rec-000004.mcap"]
+    listed = load_manifest(tmp_path / "rec.segments.json").segments
+    assert [(s.first, s.end, s.records, s.state) for s in listed] == [
+        (0, 10, 10, "closed"), (10, 20, 10, "closed"), (20, 30, 10, "closed"), (30, 30, 0, "closed"),
+    ]  # fmt: skip
+    assert (listed[1].start_ns, listed[1].end_ns) == (T0_NS + 10_000_000, T0_NS + 19_000_000)
+    for segment in listed:
+        path = tmp_path / segment.file
+        assert (path.stat().st_size, digest_of(path)) == (segment.bytes, segment.sha256)
+
+
+def test_a_segment_begins_when_the_last_is_large_enough(tmp_path: Path, new: NewWriter, batch_of: BatchOf) -> None:
+    with new(size_bytes=200_000, time_s=1e6) as writer:
+        for i in range(20):
+            writer.raw("calibration", batch_of(3000 * i, 3000))
+            writer.drain()
+    sizes = [s.bytes for s in load_manifest(tmp_path / "rec.segments.json").segments]
+    assert len(sizes) > 2
+    assert all(200_000 <= size < 300_000 for size in sizes[:-1])
+
+
+def test_each_segment_is_a_whole_recording_that_can_be_read_alone(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], batch_of: BatchOf
+) -> None:
+    with new() as writer:
+        writer.attach("station.toml", "application/toml", b"name = 'bench'\n")
+        minutes(writer, 2)
+        writer.attach("note.txt", "text/plain", b"later")
+    with Recording.open(tmp_path / "rec-000002.mcap") as recording:
+        assert recording.metadata["unit"] == {"serial": "42"}
+        assert dict(recording.attachments) == {"station.toml": b"name = 'bench'\n"}
+        assert [b.time_ns.tolist() for b in recording.raw("calibration")] == [batch_of(10, 10).time_ns.tolist()]
+        assert recording.metadata["segment"] == {
+            "number": "2", "first": "10", "of": "rec.segments.json",
+            "previous": "rec-000001.mcap", "previous_sha256": digest_of(tmp_path / "rec-000001.mcap"),
+        }  # fmt: skip
+        assert survey(recording, "none").faults == []
+    assert kinds(tmp_path / "rec-000002.mcap") == ["recording_started", "minute"]
+
+
+def test_a_segment_is_mended_without_what_is_in_the_others_counting_as_missing(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None]
+) -> None:
+    with new() as writer:
+        minutes(writer, 2)
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "rec-000002.mcap").read_bytes()[:-200])
+    recovery = recover(tmp_path / "cut.mcap", tmp_path / "mended.mcap")
+    assert (recovery.raw_records, recovery.raw_missing) == (10, 0)
+
+
+def test_the_segments_are_read_as_one_stream(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], batch_of: BatchOf
+) -> None:
+    with new() as writer:
+        writer.attach("station.toml", "application/toml", b"name = 'bench'\n")
+        minutes(writer, 3)
+    whole = schema.RawDigest()
+    whole.update("calibration", batch_of(0, 30))
+    with Series(tmp_path / "rec.segments.json") as series:
+        assert series.raw_digest().hexdigest() == whole.hexdigest()
+        assert series.phases() == ["calibration"]
+        assert (series.metadata["unit"], "segment" in series.metadata) == ({"serial": "42"}, False)
+        assert dict(series.attachments) == {"station.toml": b"name = 'bench'\n"}
+        assert [e.kind for e in series.events()].count("minute") == 3
+
+
+def test_a_recording_goes_on_behind_the_manifest_that_is_there(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], batch_of: BatchOf
+) -> None:
+    with new() as writer:
+        minutes(writer, 1)
+    with new() as writer:
+        minutes(writer, 1, first=10)
+    listed = load_manifest(tmp_path / "rec.segments.json").segments
+    assert [s.number for s in listed] == [1, 2, 3, 4]
+    assert [(s.first, s.records) for s in listed] == [(0, 10), (10, 0), (10, 10), (20, 0)]
+    with Series(tmp_path / "rec.segments.json") as series:
+        times = [t for batch in series.raw("calibration") for t in batch.time_ns.tolist()]
+    assert times == batch_of(0, 20).time_ns.tolist()
+
+
+def test_after_a_kill_the_segment_that_was_being_written_is_taken_as_it_lies(
+    tmp_path: Path, new: NewWriter, batch_of: BatchOf, clock: Any
+) -> None:
+    killed = new()
+    killed.raw("calibration", batch_of(0, 10))
+    killed.drain()
+    before = (tmp_path / "rec-000001.mcap").read_bytes(), (tmp_path / "rec.segments.json").read_text()
+    killed.close()
+    (tmp_path / "rec-000001.mcap").write_bytes(before[0])  # as a kill would have left them
+    (tmp_path / "rec.segments.json").write_text(before[1])
+    with Series(tmp_path / "rec.segments.json") as series:
+        assert series.raw_digest().records == 10
+    with new() as writer:
+        writer.raw("calibration", batch_of(10, 10))
+    first, second = load_manifest(tmp_path / "rec.segments.json").segments
+    assert (first.state, first.first, first.end, first.records) == ("cut_short", 0, 10, 10)
+    assert (second.state, second.first, second.end) == ("closed", 10, 20)
+    with Series(tmp_path / "rec.segments.json") as series:
+        assert series.raw_digest().records == 20
+
+
+def test_what_the_queue_had_no_room_for_has_its_running_index_in_the_series(
+    tmp_path: Path, new: NewWriter, batch_of: BatchOf, clock: Any
+) -> None:
+    with new(queue_batches=1) as writer:
+        writer.drain()
+        writer._room.acquire()  # as if a batch were on its way to a slow disk
+        assert not writer.raw("calibration", batch_of(0, 10))
+        writer._room.release()
+        writer.drain()
+        assert writer.raw("calibration", batch_of(10, 10))
+        assert writer.losses == {"/raw": 10}
+    [segment] = load_manifest(tmp_path / "rec.segments.json").segments
+    assert (segment.end, segment.records) == (20, 10)
+
+
+# Retention
+
+
+def test_segments_older_than_they_are_kept_go_and_that_is_said(tmp_path: Path, new: NewWriter, clock: Any) -> None:
+    with new(retention=Retention(keep_s=150.0)) as writer:
+        for _ in range(5):
+            writer.raw("calibration", RawBatch.of([(clock.now_ns, 0x181, 0, b"")]))
+            writer.drain()
+            clock.now_ns += 60 * S
+            writer.event("minute")
+            writer.drain()
+    gone = [one.segment.file for one in writer.deleted]
+    assert gone == ["rec-000001.mcap", "rec-000002.mcap", "rec-000003.mcap"]
+    assert files(tmp_path) == ["rec-000004.mcap", "rec-000005.mcap", "rec-000006.mcap"]
+    manifest = load_manifest(tmp_path / "rec.segments.json")
+    assert ([s.number for s in manifest.segments], manifest.deleted) == ([4, 5, 6], {"age": 3})
+    with Series(tmp_path / "rec.segments.json") as series:
+        told = [s["file"] for e in series.events() if e.kind == "deleted" for s in e.detail["segments"]]
+    assert told == gone
+
+
+def test_the_oldest_make_room_where_too_little_of_the_disk_is_free(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def free(path: Path | int) -> int:
+        return 100_000_000 - sum(p.stat().st_size for p in tmp_path.glob("*.mcap"))
+
+    monkeypatch.setattr(disk, "free_bytes", free)
+    with new() as writer:
+        minutes(writer, 1)
+    room = 4 * (tmp_path / "rec-000001.mcap").stat().st_size
+    with new(retention=Retention(free_bytes=100_000_000 - room)) as writer:
+        minutes(writer, 6)
+    assert {one.reason for one in writer.deleted} == {"disk"}
+    assert files(tmp_path)[0] > "rec-000003.mcap"
+    assert sum(p.stat().st_size for p in tmp_path.glob("*.mcap")) < 2 * room
+
+
+def test_no_segment_goes_that_an_outcome_names(tmp_path: Path, new: NewWriter, minutes: Callable[..., None]) -> None:
+    with new() as writer:
+        minutes(writer, 3)
+    first, second, third, _ = load_manifest(tmp_path / "rec.segments.json").segments
+    (tmp_path / "left-4711.outcome.json").write_text(json.dumps({"recording": first.file}))
+    (tmp_path / "left-4711.certificate.json").write_text(json.dumps({"raw": {"sha256": second.raw_sha256}}))
+    with new(retention=Retention(keep_s=1.0)) as writer:
+        minutes(writer, 2, first=30)
+    assert [one.segment.number for one in writer.deleted][:1] == [third.number]
+    assert files(tmp_path)[:2] == [first.file, second.file]
+
+
+def test_where_nothing_can_go_the_lack_of_room_is_said_once(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None]
+) -> None:
+    with new(retention=Retention(free_bytes=2**62), time_s=1e6) as writer:
+        minutes(writer, 3)
+    assert (writer.deleted, kinds(tmp_path / "rec-000001.mcap").count("disk_low")) == ([], 1)
+
+
+# Its end
+
+
+@pytest.mark.parametrize(
+    ("error", "said"), [(None, "asked"), (KeyboardInterrupt(), "signal"), (DeviceSilent("a"), "unit gave up")]
+)
+def test_the_last_event_says_why_it_ended(
+    tmp_path: Path, new: NewWriter, batch_of: BatchOf, error: BaseException | None, said: str
+) -> None:
+    def record() -> None:
+        with new() as writer:
+            writer.raw("calibration", batch_of(0, 10))
+            if error is not None:
+                raise error
+
+    if error is None:
+        record()
+    else:
+        with pytest.raises(type(error)):
+            record()
+    with Recording.open(tmp_path / "rec-000001.mcap") as recording:
+        last = list(recording.events())[-1]
+    assert (last.kind, last.detail) == ("ended", {"reason": said})
+
+
+def test_a_recording_in_segments_ends_with_no_document(new: NewWriter) -> None:
+    with new() as writer, pytest.raises(RecordingError, match="ends with no document"):
+        writer.seal("outcome.json", "application/json", lambda contents: b"{}")
+
+
+# Read by commands
+
+
+def test_info_tells_the_segments_and_what_is_in_them(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], triaxcal: Callable[..., Any]
+) -> None:
+    with new() as writer:
+        minutes(writer, 2)
+    done = triaxcal("log", "info", tmp_path / "rec.segments.json", "--json")
+    assert done.code == 0
+    assert (done.json["finished"], done.json["ended"], done.json["deleted"]) == (True, {"reason": "asked"}, {})
+    assert [s["file"] for s in done.json["segments"]] == files(tmp_path)
+    assert done.json["raw"]["calibration"]["records"] == 20
+
+
+def test_poses_of_a_recording_in_segments_are_those_of_the_same_in_one_file(
+    tmp_path: Path, triaxcal: Callable[..., Any]
+) -> None:
+    with Recording.open(GOLDEN) as whole:
+        with SegmentedWriter(tmp_path / "rec.mcap", metadata=whole.metadata, size_bytes=50_000) as writer:
+            for name in ("station.toml", "profile.toml", "profile/triax-ref-can.dbc"):
+                writer.attach(name, "application/octet-stream", whole.attachments[name])
+            for phase, batch in whole.raw_batches():
+                assert writer.raw(phase, batch)
+                writer.drain()
+        names = files(tmp_path)
+    assert len(names) > 3
+    in_segments, in_one = (triaxcal("poses", p, "--json") for p in (tmp_path / "rec.segments.json", GOLDEN))
+    assert (in_segments.code, in_segments.json["poses"]) == (0, in_one.json["poses"])
+
+
+def spoilt(folder: Path, how: str) -> None:
+    path = folder / "rec-000002.mcap"
+    if how == "missing":
+        path.unlink()
+    elif how == "longer":
+        path.write_bytes(path.read_bytes() + b"x")
+    else:
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [("missing", "segment rec-000002.mcap: No such file or directory"),
+     ("longer", "bytes, expected"), ("other", "segment rec-000002.mcap: was changed since it was recorded")],
+)  # fmt: skip
+def test_a_segment_that_is_missing_or_changed_is_one_line(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], triaxcal: Callable[..., Any], how: str, said: str
+) -> None:
+    with new() as writer:
+        minutes(writer, 3)
+    spoilt(tmp_path, how)
+    done = triaxcal("log", "info", tmp_path / "rec.segments.json")
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert said in done.err
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[]", "format null, expected 'triaxcal.segments/1'"),
+        ("{", "not JSON, expected a triaxcal.segments/1 document"),
+        ('{"format": "triaxcal.segments/1"}', "segments: expected a list"),
+        ('{"format": "triaxcal.segments/1", "segments": []}', "no segment is left of this recording"),
+        ('{"format": "triaxcal.segments/1", "segments": [{}]}', "segments[0]: file: expected a text"),
+        ("[" * 100_000, "not JSON"),
+    ],
+)
+def test_what_is_no_manifest_is_one_line(tmp_path: Path, triaxcal: Callable[..., Any], text: str, said: str) -> None:
+    (tmp_path / "x.segments.json").write_text(text)
+    done = triaxcal("poses", tmp_path / "x.segments.json")
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert said in done.err
+
+
+def test_a_manifest_names_files_beside_it_alone(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], triaxcal: Callable[..., Any]
+) -> None:
+    with new() as writer:
+        minutes(writer, 1)
+    text = (tmp_path / "rec.segments.json").read_text()
+    (tmp_path / "rec.segments.json").write_text(text.replace("rec-000001", "../rec-000001"))
+    done = triaxcal("poses", tmp_path / "rec.segments.json")
+    assert done.code == 2
+    assert "segments[0]: file: expected the name of an .mcap beside it" in done.err
+
+
+def test_no_result_of_a_recording_in_segments_is_audited(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None]
+) -> None:
+    with new() as writer:
+        minutes(writer, 1)
+    [audited] = audit_each([tmp_path / "rec.segments.json"])
+    assert audited.exit_code == 2
+    assert "a recording in segments, which holds no result to audit" in str(audited.error)
+
+
+def test_the_manifest_is_whole_at_any_moment(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever reads it while it is replaced has the old one or the new one."""
+    replace, seen = os.replace, []
+
+    def watched(source: Any, target: Any) -> None:
+        if str(target).endswith(".segments.json") and Path(target).exists():
+            seen.append(len(load_manifest(Path(target)).segments))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", watched)
+    with new() as writer:
+        minutes(writer, 2)
+    assert seen == [1, 1, 2, 2, 3]
