@@ -82,6 +82,26 @@ def not_negative(text: str) -> float:
     return within(text, 0.0, sys.float_info.max, "a number of at least 0")
 
 
+def duration(text: str) -> float:
+    """Seconds; a letter says which unit it is in: s, m, h, d."""
+    seconds = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+    number, unit = (text[:-1], text[-1]) if text[-1:] in seconds else (text, "s")
+    try:
+        return positive(number) * seconds[unit]
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"expected a time as 90s, 15m, 12h or 30d, not '{text}'") from None
+
+
+def size(text: str) -> int:
+    """Bytes; a letter says which unit they are in: k, M, G (powers of 1024)."""
+    factors = {"k": 2**10, "M": 2**20, "G": 2**30}
+    number, factor = (text[:-1], factors[text[-1]]) if text[-1:] in factors else (text, 1)
+    try:
+        return round(positive(number) * factor)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"expected a size as 500k, 256M or 2G, not '{text}'") from None
+
+
 def port(text: str) -> int:
     if not text.isdecimal() or int(text) > 65535:
         raise argparse.ArgumentTypeError(f"expected a port between 0 and 65535, 0 for any, not '{text}'")

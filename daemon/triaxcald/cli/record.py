@@ -17,11 +17,12 @@ from triaxcald.cli.json_lines import JsonLines
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import severest
 from triaxcald.provision.identity import IdentityRead
+from triaxcald.recording.manifest import SUFFIX
 from triaxcald.station.config import Place, Station, check_lines, load_station
 
 if TYPE_CHECKING:  # matplotlib and all come once the file is known to be good
     from triaxcald.run.recording import Kept, UnitStatus
-    from triaxcald.run.session import UnitSession
+    from triaxcald.run.session import Segments, UnitSession
 
 
 def record_command(a: argparse.Namespace) -> int:
@@ -50,14 +51,17 @@ async def _record(
     def path_of(session: UnitSession) -> Callable[[IdentityRead], Path]:
         if not folder:
             return lambda _: Path(a.output)
+        if segments is not None:  # the next start goes on behind it
+            return lambda identity: Path(a.output) / f"{session.name}-{identity.serial or 'unknown'}{SUFFIX}"
         return lambda identity: Path(a.output) / session.recording_name(identity)
 
     def identified(session: UnitSession, identity: IdentityRead) -> None:
         warn_of_a_journal(session.station, session.name, identity.serial)
 
+    segments = _segments(a)
     serials = SerialsSeen()
     sessions = [UnitSession(station, place, progress, serials=serials) for place in places]
-    recordings = [UnitRecording(session, path_of(session), identified) for session in sessions]
+    recordings = [UnitRecording(session, path_of(session), identified, segments) for session in sessions]
 
     def statuses() -> list[UnitStatus]:
         return [recording.status for recording in recordings]
@@ -76,6 +80,18 @@ async def _record(
         await stack.enter_async_context(Supervisor().kept_informed(in_a_line))
         patience = Patience(most_s=a.give_up_after)
         return await record_units(recordings, a.seconds, patience, lambda kept: _ended(kept, progress))
+
+
+def _segments(a: argparse.Namespace) -> Segments | None:
+    """Where anything about them was said."""
+    from triaxcald.recording.retention import Retention
+    from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S
+    from triaxcald.run.session import Segments
+
+    if all(given is None for given in (a.segment_size, a.segment_time, a.keep, a.keep_free)):
+        return None
+    retention = None if a.keep is a.keep_free is None else Retention(a.keep, a.keep_free or 0)
+    return Segments(a.segment_size or SEGMENT_BYTES, a.segment_time or SEGMENT_S, retention)
 
 
 def _places(station: Station, unit: str | None, output: Path, folder: bool) -> Sequence[Place]:

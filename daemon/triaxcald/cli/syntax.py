@@ -20,11 +20,13 @@ from triaxcald.cli.arguments import (
     add_table,
     add_uncertainty,
     count,
+    duration,
     moment,
     not_negative,
     port,
     positive,
     seed,
+    size,
     within,
 )
 
@@ -87,6 +89,12 @@ def _line(commands: Any) -> None:
     p.add_argument("--seconds", type=positive, metavar="S", help="of the samples' time; default: until interrupted")
     p.add_argument("--unit", help="where the station has more than one; default, with a FOLDER: all of them")
     p.add_argument("--give-up-after", type=not_negative, metavar="S", help="of waiting for a unit; default: never")
+    p.add_argument(
+        "--segment-size", type=size, metavar="SIZE", help="a new file after so much, as 256M, with a manifest"
+    )
+    p.add_argument("--segment-time", type=duration, metavar="TIME", help="a new file after so long, as 1h")
+    p.add_argument("--keep", type=duration, metavar="TIME", help="delete segments older than this, as 30d")
+    p.add_argument("--keep-free", type=size, metavar="SIZE", help="delete the oldest while less of the disk is free")
     p.add_argument(
         "--metrics", type=port, metavar="PORT", help="numbers for Prometheus and a health page on the loopback"
     )

@@ -16,9 +16,10 @@ from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import DONE, exit_code_of
 from triaxcald.inputs import CALIBRATION
 from triaxcald.provision.identity import IdentityRead
+from triaxcald.recording.ending import ended_because
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.endings import aborted
-from triaxcald.run.session import UnitSession
+from triaxcald.run.session import Segments, UnitSession
 from triaxcald.station.collection import Recorded
 from triaxcald.station.coming_back import Patience
 
@@ -63,16 +64,17 @@ class UnitStatus:
 
 
 class UnitRecording:
-    """One unit's recording, at ``path_of`` its identity; ``identified`` is told
-    who it is, once it is there."""
+    """One unit's recording, at ``path_of`` its identity, in ``segments`` where
+    they are given; ``identified`` is told who it is, once it is there."""
 
     def __init__(
         self,
         session: UnitSession,
         path_of: Callable[[IdentityRead], Path],
         identified: Callable[[UnitSession, IdentityRead], None] = lambda *_: None,
+        segments: Segments | None = None,
     ) -> None:
-        self._session, self._path_of, self._identified = session, path_of, identified
+        self._session, self._path_of, self._identified, self._segments = session, path_of, identified, segments
         self._recorded = Recorded(CALIBRATION, session.place.bundle, session.place.address)
         self._path: Path | None = None
         self._writer: RecordingWriter | None = None
@@ -116,7 +118,7 @@ class UnitRecording:
                 identity = await session.identify(device)
                 self._identified(session, identity)
                 self._path = self._path_of(identity)
-                with session.writer(self._path, identity, ends_with="") as writer:
+                with session.writer(self._path, identity, segments=self._segments) as writer:
                     await self._record(device, identity, writer, seconds, patience)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
             return self._kept(e)
@@ -133,20 +135,27 @@ class UnitRecording:
         seconds: float | None,
         patience: Patience,
     ) -> None:
-        session, because = self._session, "the recording is complete"
-        self._writer = writer
+        session, self._writer = self._session, writer
         try:
             session.progress.stage(session.name, "recording")
             self._is_lost(None)
             returning = session.returning(device, identity, patience, self._is_lost)
             await self._recorded.for_seconds(returning, writer, seconds)
         except (Exception, asyncio.CancelledError) as e:
-            because = aborted(e, None).reason
+            self._end(writer, e)
             raise
+        else:
+            writer.close("asked")
         finally:
             self._lost, self._writer = sum(writer.losses.values()), None
-            with suppress(RecordingError):  # the disk has failed, which is on its way already
-                writer.event("ended", {"because": because})
+
+    def _end(self, writer: RecordingWriter, e: BaseException) -> None:
+        """Says why, and finishes the file; where the disk has failed, that is
+        on its way already."""
+        with suppress(RecordingError):
+            if not isinstance(e, asyncio.CancelledError):
+                writer.event("failed", {"error": aborted(e, None).reason})
+            writer.close(ended_because(e))
 
     def _kept(self, e: BaseException | None) -> Kept:
         readings, unit = self._recorded.streams[READINGS], self._session.name

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from triaxcal_drivers.interface import Device
 from triaxcald import text
@@ -14,12 +16,24 @@ from triaxcald.errors import InputError
 from triaxcald.inputs import PROFILE, STATION_FILE, preview_channels
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
+from triaxcald.recording.retention import Retention
+from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.unit import drawn_with
 from triaxcald.station.collection import Progress
 from triaxcald.station.coming_back import Patience, Returning
 from triaxcald.station.config import Place, Station
 from triaxcald.station.serials import SerialsSeen
+
+
+@dataclass(frozen=True)
+class Segments:
+    """A recording in segments of so many bytes and seconds, of which
+    ``retention`` takes the oldest away."""
+
+    size_bytes: int = SEGMENT_BYTES
+    time_s: float = SEGMENT_S
+    retention: Retention | None = None
 
 
 class UnitSession:
@@ -87,20 +101,25 @@ class UnitSession:
             raise InputError(f"{folder}: no folder for recordings: {e.strerror}") from e
         return folder / self.recording_name(identity)
 
-    def writer(self, path: Path, identity: IdentityRead, *, ends_with: str) -> RecordingWriter:
+    def writer(
+        self, path: Path, identity: IdentityRead, *, ends_with: str = "", segments: Segments | None = None
+    ) -> RecordingWriter:
+        """With station file and profile in it. Raises RecordingError."""
         unit = {"name": self.name, "serial": identity.serial or "", "signs": ",".join(map(str, self.place.signs))}
-        writer = RecordingWriter(
-            path,
-            metadata={
+        settings: dict[str, Any] = {
+            "metadata": {
                 "station": {"name": self.station.file.name},
                 "unit": unit,
                 "software": {**software(), **drawn_with()},
             },
-            preview_channels=preview_channels(self.profile),
-            preview_unit=self.profile.output.unit,
-            clock_ns=self.clock_ns,
-            ends_with=ends_with,
-        )
+            "preview_channels": preview_channels(self.profile),
+            "preview_unit": self.profile.output.unit,
+            "clock_ns": self.clock_ns,
+        }
+        if segments is None:
+            writer = RecordingWriter(path, **settings, ends_with=ends_with)
+        else:
+            writer = SegmentedWriter(path, **settings, **vars(segments))
         writer.attach(STATION_FILE, "application/toml", self.station.text)
         writer.attach(PROFILE, "application/toml", self.place.bundle.text)
         for name, data in self.place.bundle.files.items():

@@ -263,6 +263,52 @@ def test_all_units_of_a_station_are_recorded_at_once_into_a_folder(workshop: Any
         assert info["events"][-1]["kind"] == "ended"
 
 
+def test_a_recording_in_segments_goes_on_with_the_next_start_and_is_read_by_its_manifest(
+    workshop: Any, triaxcal: Run
+) -> None:
+    folder = workshop.folder / "recordings"
+    folder.mkdir()
+    with workshop.serve(workshop.device()) as served:
+        station = workshop.station({"bus": served.bus})
+        recording = ["record", station, "-o", folder, "--seconds", "10", "--segment-size", "40k"]
+        for _ in range(2):
+            assert triaxcal(*recording).code == 0
+    manifest = folder / "unit0-4711.segments.json"
+    info = triaxcal("log", "info", manifest, "--json").json
+    assert info["finished"] is True
+    assert len(info["segments"]) >= 4
+    assert [e["detail"] for e in info["events"] if e["kind"] == "ended"] == [{"reason": "asked"}] * 2
+    poses = triaxcal("poses", manifest, "--json").json["poses"]
+    assert len(poses) >= 6
+    for segment in info["segments"]:
+        assert triaxcal("log", "info", folder / segment["file"], "--json").json["finished"] is True
+
+
+def test_progress_may_be_json_and_the_numbers_are_served(workshop: Any, triaxcal: Run) -> None:
+    rec = workshop.folder / "rec.mcap"
+    with workshop.serve(workshop.device()) as served:
+        station = workshop.station({"bus": served.bus})
+        done = triaxcal("record", station, "-o", rec, "--seconds", "5", "--log-format", "json", "--metrics", "0")
+    assert done.code == 0
+    lines = [json.loads(line) for line in done.err.splitlines()]
+    assert "http://127.0.0.1:" in lines[0]["message"]
+    assert (lines[-1]["event"], lines[-1]["level"], lines[-1]["recording"]) == ("ended", "info", str(rec))
+    assert lines[-1]["samples"] >= 500
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--keep", "30 days", "expected a time as 90s, 15m, 12h or 30d, not '30 days'"),
+        ("--segment-time", "0h", "expected a time as 90s"),
+        ("--segment-size", "1T", "expected a size as 500k, 256M or 2G, not '1T'"),
+        ("--metrics", "70000", "expected a port between 0 and 65535"),
+    ],
+)
+def test_options_of_a_recording_say_what_they_take(triaxcal: Run, option: str, value: str, words: str) -> None:
+    triaxcal("record", "station.toml", "-o", "rec.mcap", option, value).failed(2, option, words)
+
+
 def test_a_unit_that_stops_in_the_middle_of_a_recording_leaves_a_finished_file(workshop: Any, triaxcal: Run) -> None:
     rec = workshop.folder / "rec.mcap"
     with workshop.serve(workshop.device(speed=10.0), Faults(die_at_s=22.0)) as served:

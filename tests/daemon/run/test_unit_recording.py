@@ -130,8 +130,9 @@ async def test_another_unit_that_is_put_in_its_place_is_not_recorded_as_the_same
     assert kept.error is not None
     assert "is serial 0013, expected 4711" in kept.error
     with Recording.open(workshop.folder / "unit0.mcap") as recording:
-        *_, last = recording.events()
-    assert (last.kind, "is serial 0013" in last.text) == ("ended", True)
+        *_, failed, ended = recording.events()
+    assert (failed.kind, "is serial 0013" in failed.text) == ("failed", True)
+    assert (ended.kind, ended.detail) == ("ended", {"reason": "unit gave up"})
 
 
 async def test_a_unit_that_is_not_there_keeps_nobody_waiting_and_is_recorded_once_it_is(
@@ -167,5 +168,5 @@ async def test_a_recording_that_is_cancelled_is_whole_and_says_so(workshop: Any)
     await bench.take(0)
     assert (kept.exit_code, kept.error) == (130, "unit unit0: interrupted")
     events, decoded, _ = told_by(workshop.folder / "unit0.mcap")
-    assert events == [("ended", {"because": "interrupted"})]
+    assert events == [("ended", {"reason": "signal"})]
     assert decoded.counts["samples"] == kept.counts["samples"] > 0

@@ -1,0 +1,56 @@
+"""The files in deploy/ start the command that this project has, with options that it takes."""
+
+from __future__ import annotations
+
+import configparser
+import json
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from triaxcald.cli.commands import parser
+
+DEPLOY = Path(__file__).parents[1] / "deploy"
+UNIT = DEPLOY / "triaxcal-record.service"
+
+
+@pytest.fixture(scope="module")
+def unit() -> configparser.ConfigParser:
+    read = configparser.ConfigParser(interpolation=None, strict=True)
+    read.optionxform = str  # type: ignore[assignment, method-assign]
+    read.read(UNIT)
+    return read
+
+
+def test_the_service_starts_a_command_that_there_is(unit: configparser.ConfigParser) -> None:
+    program, *command = shlex.split(unit["Service"]["ExecStart"])
+    assert Path(program).name == "triaxcal"
+    chosen = parser().parse_args(command)
+    assert (chosen.command, chosen.metrics, chosen.log_format) == ("record", 9464, "json")
+
+
+def test_the_container_starts_the_same_command(unit: configparser.ConfigParser) -> None:
+    lines = (DEPLOY / "Dockerfile").read_text().splitlines()
+    (command,) = (json.loads(line.removeprefix("CMD ")) for line in lines if line.startswith("CMD "))
+    assert command == shlex.split(unit["Service"]["ExecStart"])[1:]
+
+
+def test_bad_files_are_not_started_again_and_an_interruption_is_no_failure(unit: configparser.ConfigParser) -> None:
+    service = unit["Service"]
+    assert (service["RestartPreventExitStatus"], service["SuccessExitStatus"]) == ("2", "130")
+    assert service["Type"] == "notify"
+    assert float(service["WatchdogSec"]) > 0
+
+
+def test_systemd_takes_the_unit(tmp_path: Path) -> None:
+    systemd = shutil.which("systemd-analyze")
+    if systemd is None:
+        pytest.skip("this machine has no systemd-analyze")
+    text = UNIT.read_text().replace("/opt/triaxcal/bin/triaxcal", "/bin/true").replace("User=triaxcal", "User=root")
+    (tmp_path / UNIT.name).write_text(text)
+    done = subprocess.run([systemd, "verify", str(tmp_path / UNIT.name)], capture_output=True, text=True, timeout=60)
+    about_it = [line for line in done.stderr.splitlines() if UNIT.name in line]
+    assert about_it == []
