@@ -10,7 +10,9 @@ from pydantic import BeforeValidator, Field, model_validator
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.can.claim import claim_on_can
 from triaxcal_drivers.claim import Claim
+from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
+from triaxcal_drivers.validation import validate
 
 READING_CHANNELS = tuple("u" + axis for axis in AXES)
 VALUES_MOST = 256  # of a signal that says what is valid; such a signal has a byte at most
@@ -194,12 +196,37 @@ class CanProfile(Profile):
         return codec.decode(self.registers[name], raw, order="little", name=name)
 
 
+class SocketCanOptions(Strict):
+    """Options of interface "socketcan". ``fd`` is CAN FD, by default where the
+    interface has it; the names that python-can has mean what they mean there.
+
+    ``listen_only`` refuses to send; ``receive_buffer`` is in bytes, by default
+    `triaxcal_drivers.can.raw_socket.BUFFER_S` seconds of a full bus;
+    ``hardware_timestamps`` takes the adapter's own where it gives any.
+    """
+
+    fd: bool | None = None
+    receive_own_messages: bool = False
+    local_loopback: bool = True
+    listen_only: bool = False
+    receive_buffer: Annotated[int | None, Field(gt=0, lt=1 << 30)] = None
+    hardware_timestamps: bool = False
+
+    @classmethod
+    def of(cls, options: Mapping[str, object]) -> Self:
+        """Raises ValueError with one line."""
+        try:
+            return validate(cls, options, b"", where="options of socketcan")
+        except ProfileError as e:
+            raise ValueError(str(e)) from e
+
+
 class CanBus(Strict):
     """Where a unit is: a python-can interface and channel, and its node on that
     bus.
 
-    ``options`` are passed on to python-can as they are; its configuration files
-    are not read.
+    ``options`` are passed on to python-can as they are, except those of
+    "socketcan", which is ours; its configuration files are not read.
     """
 
     interface: Annotated[str, Field(description='a python-can interface: "socketcan", "udp_multicast"…')]
@@ -207,6 +234,12 @@ class CanBus(Strict):
     node_id: Annotated[int, Field(ge=1, le=127)]
     bitrate: Annotated[int | None, Field(gt=0, description="bit/s")] = None
     options: Mapping[str, str | int | bool] = {}
+
+    @model_validator(mode="after")
+    def _known_options(self) -> Self:
+        if self.interface == "socketcan":
+            SocketCanOptions.of(self.options)
+        return self
 
     def __str__(self) -> str:
         return f"node {self.node_id} on {self.interface} {self.channel}"
