@@ -1,0 +1,80 @@
+"""Interfaces to test on, and what judges them."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.guest.inside.controller import Controller
+from tests.guest.inside.witness import Candump, Sender
+from triaxcal_drivers.can.socketcan import SocketCan, open_socketcan
+
+STAMPED, STAMP_NS = 1, 35  # SO_TIMESTAMPNS
+numbers = itertools.count()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _stamping() -> Iterator[None]:
+    """The kernel begins to stamp what comes some time after the first socket that wants it, and until then stamps what
+    is read: with this one it never has to begin."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.setsockopt(socket.SOL_SOCKET, STAMP_NS, STAMPED)
+        yield
+
+
+def ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
+
+
+@pytest.fixture
+def vcan() -> Iterator[str]:
+    """A virtual interface with CAN FD, up."""
+    name = f"vcan{next(numbers)}"
+    ip("link", "add", "dev", name, "mtu", "72", "up", "type", "vcan")
+    yield name
+    subprocess.run(["ip", "link", "del", name], capture_output=True)
+
+
+@pytest.fixture
+def opened() -> Iterator[Callable[..., SocketCan]]:
+    """Our receiver on an interface, closed when the test ends."""
+    made: list[SocketCan] = []
+
+    def open_(name: str, bitrate: int | None = None, **options: Any) -> SocketCan:
+        made.append(open_socketcan(name, options, bitrate))
+        return made[-1]
+
+    yield open_
+    for adapter in made:
+        adapter.close()
+
+
+@pytest.fixture
+def sender(vcan: str) -> Iterator[Sender]:
+    made = Sender(vcan)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def candump() -> Callable[[str, int], Candump]:
+    return Candump
+
+
+@pytest.fixture
+def controller() -> Iterator[Controller]:
+    """An interface with a controller: the kernel's slcan on a pseudo-terminal."""
+    try:
+        made = Controller.attached()
+    except OSError as e:
+        if os.environ.get("TRIAXCAL_GUEST") == "inside":
+            raise
+        pytest.skip(f"this kernel has no slcan: {e.strerror}")
+    yield made
+    made.end()
