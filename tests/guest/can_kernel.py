@@ -40,21 +40,23 @@ def why_not_the_host() -> str | None:
         return f"this kernel has no CAN: {e.strerror}"
     if not shutil.which("candump"):
         return "no can-utils on this machine"
-    made = subprocess.run([*APART, "ip", "link", "add", "type", "vcan"], capture_output=True, text=True)
+    made = subprocess.run([*apart(), "ip", "link", "add", "type", "vcan"], capture_output=True, text=True)
     return f"no vcan here: {made.stderr.strip()}" if made.returncode else None
 
 
-APART = ("unshare", "--map-root-user", "--net")
-"""Runs a command where it may make network interfaces that nobody else sees."""
+def apart() -> list[str]:
+    """Runs a command where it may make network interfaces, which nobody else sees."""
+    return ["unshare", "--net", *([] if os.geteuid() == 0 else ["--map-root-user"])]
 
 
 def run_on_the_host(command: list[str], environment: dict[str, str], timeout_s: float) -> str:
     """What it printed. Raises RuntimeError where it does not end."""
-    return _finished([*APART, *command], {**os.environ, **environment}, timeout_s)
+    return _finished([*apart(), *command], {**os.environ, **environment}, timeout_s)
 
 
 def run_in_the_guest(command: list[str], shared: Path, environment: dict[str, str], timeout_s: float) -> str:
-    """Likewise. ``shared`` is the folder that the command can write, at the same path plus nothing else."""
+    """What its kernel printed; what the command did is in the file ``said`` of ``shared``, the folder that it can
+    write. Raises RuntimeError likewise."""
     init = shared / "init"
     init.write_text(_init_script(command, shared, environment))
     init.chmod(0o755)

@@ -16,8 +16,8 @@ collect_ignore = [str(INSIDE)]
 @pytest.fixture(scope="session")
 def ended(once: Callable[[str, Callable[[Path], None]], Path]) -> dict[str, Inner]:
     """How each test ended, by file and name."""
-    no_guest, no_host = why_not_the_guest(), why_not_the_host()
-    if no_guest and no_host:
+    no_guest = why_not_the_guest()
+    if no_guest and (no_host := why_not_the_host()):
         no_kernel(f"{no_guest}; {no_host}")
     folder = once("guest", on_the_host if no_guest else inside_the_guest)
     results = folder / "results.xml"

@@ -9,11 +9,9 @@ import socket
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 from triaxcal_drivers.can.error_frame import ControllerState
 
-_NETWORKS = Path("/sys/class/net")
 _CAN_TYPE = 280  # ARPHRD_CAN
 _FD_BYTES = 72  # a frame's, and so the interface's mtu with CAN FD
 _UP = 1
@@ -108,4 +106,11 @@ def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def can_interfaces() -> list[str]:
     """Names of the CAN interfaces that there are."""
-    return sorted(path.parent.name for path in _NETWORKS.glob("*/type") if path.read_text().strip() == str(_CAN_TYPE))
+    return sorted(name for _, name in socket.if_nameindex() if _is_can(name))
+
+
+def _is_can(name: str) -> bool:
+    try:
+        return read_link(name).can
+    except OSError:  # gone meanwhile
+        return False

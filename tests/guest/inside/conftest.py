@@ -69,12 +69,10 @@ def candump() -> Callable[[str, int], Candump]:
 
 @pytest.fixture
 def controller() -> Iterator[Controller]:
-    """An interface with a controller: the kernel's slcan on a pseudo-terminal."""
-    try:
-        made = Controller.attached()
-    except OSError as e:
-        if os.environ.get("TRIAXCAL_GUEST") == "inside":
-            raise
-        pytest.skip(f"this kernel has no slcan: {e.strerror}")
+    """An interface with a controller: the kernel's slcan on a pseudo-terminal. It appears in the machine's own network,
+    whoever makes it, and so not on a host."""
+    if os.environ.get("TRIAXCAL_GUEST") != "inside":
+        pytest.skip("slcan is tested in a guest alone")
+    made = Controller.attached()
     yield made
     made.end()

@@ -6,17 +6,20 @@ import fcntl
 import os
 import pty
 import select
+import socket
 import struct
 import subprocess
 import threading
 import tty
 from contextlib import suppress
-from pathlib import Path
 
 from tests.guest.inside.witness import wait_until
 
 SET_DISCIPLINE, SLCAN = 0x5423, 17  # TIOCSETD, N_SLCAN
-NETWORKS = Path("/sys/class/net")
+
+
+def interfaces() -> set[str]:
+    return {name for _, name in socket.if_nameindex()}
 
 
 class Controller:
@@ -35,18 +38,13 @@ class Controller:
 
     @classmethod
     def attached(cls) -> Controller:
-        before = set(NETWORKS.iterdir())
+        before = interfaces()
         adapter, line = pty.openpty()
         tty.setraw(line)
         tty.setraw(adapter)
-        try:
-            fcntl.ioctl(line, SET_DISCIPLINE, struct.pack("i", SLCAN))
-        except OSError:
-            os.close(adapter)
-            os.close(line)
-            raise
-        (interface,) = set(NETWORKS.iterdir()) - before
-        made = cls(adapter, line, interface.name)
+        fcntl.ioctl(line, SET_DISCIPLINE, struct.pack("i", SLCAN))
+        (name,) = interfaces() - before
+        made = cls(adapter, line, name)
         made.ip("type", "can", "bitrate", "500000")
         made.ip("up")
         return made
@@ -73,4 +71,4 @@ class Controller:
         for end in (self._adapter, self._line):
             with suppress(OSError):  # unplugged before
                 os.close(end)
-        wait_until(lambda: not (NETWORKS / self.name).exists())
+        wait_until(lambda: self.name not in interfaces())

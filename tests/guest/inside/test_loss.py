@@ -10,6 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.guest.inside.witness import Sender, listeners, number, received, wait_until
 from triaxcal_drivers.can.socketcan import open_socketcan
 from triaxcal_drivers.interface import RawFlag
@@ -62,8 +64,12 @@ def test_as_many_frames_may_wait_as_the_buffer_is_said_to_hold(
     assert 0 <= len(received(adapter, count)) - count <= 1  # the kernel takes the one that exceeds it
 
 
-def test_a_stopped_process_loses_nothing_and_stamps_are_of_arrival(vcan: str, sender: Sender) -> None:
+def test_a_stopped_process_loses_nothing_and_stamps_are_of_arrival(
+    vcan: str, sender: Sender, opened: Callable[..., Any]
+) -> None:
     """Stopped while 3,000 frames come, eleven times what the kernel keeps by default."""
+    if (room := opened(vcan).buffer_frames) < 3000 and os.environ.get("TRIAXCAL_GUEST") != "inside":
+        pytest.skip(f"this system lets an ordinary user keep {room} frames")
     before = listeners(vcan)
     reads, writes = os.pipe()
     child = os.fork()
