@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
 from collections.abc import Callable
 from typing import TypeVar
@@ -15,7 +16,12 @@ T = TypeVar("T")
 
 
 def open_bus(settings: CanBus) -> Adapter:
-    """Blocking. Raises BusError."""
+    """Blocking; SocketCAN by a socket of our own, all else by python-can.
+    Raises BusError."""
+    if settings.interface == "socketcan" and sys.platform == "linux":
+        from triaxcal_drivers.can.socketcan import open_socketcan  # what it imports is Linux' own
+
+        return open_socketcan(str(settings.channel), settings.options, settings.bitrate)
     return PythonCan(settings)
 
 
