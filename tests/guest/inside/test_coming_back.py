@@ -1,0 +1,181 @@
+"""Recordings over faults of a real CAN interface: what is lost is counted where it is, and the recording goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import struct
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.guest.inside.conftest import ip
+from tests.guest.inside.test_line import started
+from tests.guest.inside.witness import Sender, listeners, wait_until
+from triaxcal_drivers.can.receive import OVERFLOW
+from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.loading import BUILT_IN
+from triaxcal_drivers.profile import READINGS
+from triaxcald.inputs import CALIBRATION, bundle_of
+from triaxcald.pipeline import DecodedStream
+from triaxcald.recording.reader import Recording
+from triaxcald.run.recording import State, UnitRecording
+from triaxcald.run.session import UnitSession
+from triaxcald.station.coming_back import Patience
+from triaxcald.station.config import load_station
+from triaxcald.station.lock import FOLDER_VARIABLE
+
+STATION = """\
+format = "triaxcal.station/1"
+name = "bench"
+[[units]]
+name = "unit"
+profile = "lonely.toml"
+bus = {{ interface = "socketcan", channel = "{0}", node_id = 5, options = {{ {1} }} }}
+"""
+
+
+def station_file(folder: Path, vcan: str, options: str = "") -> Path:
+    """Of a unit that streams, and has no registers: the test sends its frames."""
+    text = (BUILT_IN / "triax-ref-can.toml").read_text()
+    lonely = text[: text.index("[registers]")]
+    lonely = "\n".join(li for li in lonely.splitlines() if not li.startswith(("serial_register", "expect")))
+    (folder / "lonely.toml").write_text(lonely)
+    (folder / "triax-ref-can.dbc").write_bytes((BUILT_IN / "triax-ref-can.dbc").read_bytes())
+    (folder / "station.toml").write_text(STATION.format(vcan, options))
+    return folder / "station.toml"
+
+
+def send(sender: Sender, counters: Iterable[int]) -> None:
+    for counter in counters:
+        sender.send(0x185, bytes(6) + struct.pack("<H", counter))
+        sender.send(0x285, bytes(3) + struct.pack("<hH", 2500, counter) + bytes(1))
+
+
+class Told:
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def stage(self, unit: str, text: str) -> None:
+        self.said.append(text)
+
+    def lost(self, unit: str, trouble: str) -> None:
+        self.said.append(f"lost: {trouble}")
+
+    def poses(self, *_: object) -> None: ...
+
+
+async def until(true: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 60.0
+    while not true():
+        assert time.monotonic() < deadline_s, "it did not happen"
+        await asyncio.sleep(0.01)
+
+
+def events_of(path: Path) -> list[tuple[str, Any]]:
+    with Recording.open(path) as recording:
+        return [(e.kind, e.detail) for e in recording.events() if e.kind != "recording_started"]
+
+
+def decoded(path: Path) -> tuple[DecodedStream, np.ndarray]:
+    with Recording.open(path) as recording:
+        stream = DecodedStream(bundle_of(recording), READINGS)
+        return stream, np.concatenate([stream.feed(batch).counter for batch in recording.raw(CALIBRATION)])
+
+
+def test_a_link_that_goes_down_and_up_leaves_a_gap_in_one_recording(
+    vcan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    cause = over_a_fault(vcan, tmp_path, ["set", vcan, "down"], ["set", vcan, "up"])
+    assert "the link is down" in cause
+
+
+def test_an_interface_that_is_removed_and_added_leaves_a_gap_in_one_recording(
+    vcan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    over_a_fault(vcan, tmp_path, ["del", vcan], ["add", "dev", vcan, "up", "type", "vcan"])
+
+
+def over_a_fault(vcan: str, tmp_path: Path, breaks: list[str], mends: list[str]) -> str:
+    """What the recording says of its cause."""
+    station, told, path = load_station(station_file(tmp_path, vcan)), Told(), tmp_path / "rec.mcap"
+    recording = UnitRecording(UnitSession(station, station.places[0], told), lambda _: path)
+
+    async def work() -> None:
+        running = asyncio.ensure_future(recording.run(None, Patience()))
+        await until(lambda: recording.status.state is State.RECORDING and listeners(vcan) > 0)
+        sender = Sender(vcan)
+        send(sender, range(50))
+        await until(lambda: recording.status.records == 100)
+        ip("link", *breaks)
+        await until(lambda: recording.status.state is State.WAITING)
+        sender.close()
+        await until(lambda: any(said.startswith("lost: cannot open socketcan") for said in told.said))
+        ip("link", *mends)
+        sender, counter = Sender(vcan), 200
+        while recording.status.state is State.WAITING:
+            send(sender, [counter])
+            counter += 1
+            await asyncio.sleep(0.01)
+        send(sender, range(counter, counter + 20))
+        await until(lambda: recording.status.records >= 130)
+        sender.close()
+        running.cancel()
+        await running
+
+    asyncio.run(work())
+    kinds = [kind for kind, _ in events_of(path)]
+    assert kinds == ["interrupted", "gap", "ended"]
+    stream, counters = decoded(path)
+    assert counters[:42].tolist() == list(range(42)), "the last of them wait for those after them"
+    assert stream.counts["receiver_overflows"] == 1
+    assert (np.diff(counters) >= 1).all()
+    return str(events_of(path)[0][1]["cause"])
+
+
+def test_what_a_stopped_process_does_not_fetch_is_counted_with_its_place(
+    vcan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    station = station_file(tmp_path, vcan, "receive_buffer = 65536")
+    path, said = tmp_path / "rec.mcap", tmp_path / "station"
+    process = started(said, "record", station, "-o", path)
+    wait_until(lambda: "recording" in said.read_text() and listeners(vcan) > 0)
+    sender = Sender(vcan)
+    for counter in range(100):
+        send(sender, [counter])
+        time.sleep(0.01)
+    os.kill(process, signal.SIGSTOP)
+    send(sender, range(100, 2100))
+    time.sleep(3.0)  # longer than the unit may be silent
+    os.kill(process, signal.SIGCONT)
+    for counter in range(2100, 2300):
+        send(sender, [counter])
+        time.sleep(0.002)
+    time.sleep(1.0)
+    os.kill(process, signal.SIGINT)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 130, said.read_text()
+    events = events_of(path)
+    gaps = [detail for kind, detail in events if kind == "gap"]
+    assert "interrupted" not in [kind for kind, _ in events], "the unit was not silent"
+    assert {gap["cause"] for gap in gaps} == {OVERFLOW}
+    with Recording.open(path) as recording:
+        batches = [batch for _, batch in recording.raw_batches()]
+    lost = sum(gap["lost"] for gap in gaps)
+    assert lost > 0
+    first = int.from_bytes(batches[0].payload[6:8], "little")  # before it the stream was not open yet
+    assert first < 100
+    assert sum(map(len, batches)) + lost == 2 * (2300 - first)
+    marked = sum(int(np.count_nonzero(batch.flags & RawFlag.LOST_BEFORE)) for batch in batches)
+    assert marked == len(gaps)
+    stream, counters = decoded(path)
+    assert stream.counts["missing"] + stream.counts["incomplete"] >= lost // 2
+    assert counters[-1] >= 2290
+    sender.close()
