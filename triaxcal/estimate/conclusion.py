@@ -80,7 +80,7 @@ def concluded(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
             r,
             noise,
             cross_validated_rms_g=cross_validated(problem, state),
-            lack_of_fit_p=lack_of_fit_p(found.chi2, found.left, pure_error_dof(poses)),
+            lack_of_fit_p=lack_of_fit_p(found.chi2, found.dof, pure_error_dof(poses)),
         ),
         poses=pose_results(poses, up, r, noise, studentized(r, s, leverage), leverage, total=s * birge_ratio),
         condition=_condition(weighted),
@@ -97,18 +97,18 @@ def concluded(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
 @dataclass(frozen=True)
 class _ResidualChi2:
     """``chi2``, in units of the noise inside the poses, that a fit leaves in
-    ``left`` degrees of freedom; ``with_doubtful`` the same with excluded poses
-    whose residuals tell how well all come back, and what these show ``excess``
-    noise."""
+    ``dof`` degrees of freedom; ``with_doubtful`` both with excluded poses whose
+    residuals tell how well all come back, and the ``excess`` over the noise
+    that these show."""
 
     chi2: float
-    left: int
+    dof: int
     with_doubtful: tuple[float, int]
     excess: Excess
 
     @classmethod
     def of(
-        cls, everything_left: Linearised, problem: Problem, state: State, judged: Problem | None, pure: float
+        cls, linearised: Linearised, problem: Problem, state: State, judged: Problem | None, pure: float
     ) -> _ResidualChi2:
         """``judged`` are the means of all those poses where they are more;
         ``pure`` the degrees of freedom of the noise inside them."""
@@ -117,14 +117,14 @@ class _ResidualChi2:
         # of the Jacobian stands for it.
         spent = len(state.theta) + sum(len(e.shape) for e in state.effects)
         by_means = problem.slopes is None or n > spent
-        r, J, s = everything_left
-        own = (r[:n], J[:n], s[:n]) if by_means else everything_left
-        chi2, left = residual_chi2(own), len(own[0]) - spent
+        r, J, s = linearised
+        own = (r[:n], J[:n], s[:n]) if by_means else linearised
+        chi2, dof = residual_chi2(own), len(own[0]) - spent
         if judged is None or not by_means:
-            return cls(chi2, left, (chi2, left), Excess.estimated(own, n, left, pure))
+            return cls(chi2, dof, (chi2, dof), Excess.estimated(own, n, dof, pure))
         others = linearise(judged, State.of(judged, state.sensor(problem)))
-        with_doubtful = residual_chi2(others), left + len(judged.u) - n
-        return cls(chi2, left, with_doubtful, Excess.estimated(others, len(judged.u), with_doubtful[1], pure))
+        with_doubtful = residual_chi2(others), dof + len(judged.u) - n
+        return cls(chi2, dof, with_doubtful, Excess.estimated(others, len(judged.u), with_doubtful[1], pure))
 
 
 def _linearised(problem: Problem, state: State) -> Linearised:

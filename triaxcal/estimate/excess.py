@@ -42,9 +42,9 @@ class Excess:
     excess_g: float = 0.0
 
     @classmethod
-    def estimated(cls, left_by: Linearised, n: int, left: int, pure_dof: float) -> Excess:
-        """That with which the sum of squares that a fit leaves is its ``left``
-        degrees of freedom, in linear reckoning from residuals, derivatives and
+    def estimated(cls, linearised: Linearised, n: int, residual_dof: int, pure_dof: float) -> Excess:
+        """That with which the sum of squares that a fit leaves is its
+        ``residual_dof``, in linear reckoning from residuals, derivatives and
         errors near its minimum, of which the first ``n`` are the means of the
         poses. ``pure_dof`` are the degrees of freedom of the noise inside the
         poses.
@@ -54,19 +54,19 @@ class Excess:
         Rev. 40:207), at least 1 unless no pose knows its noise. Raises Refused
         where the fit ran away.
         """
-        r, J, s = left_by
+        r, J, s = linearised
 
         def ratio(excess: float) -> float:
             error = s * np.tile(_widened(s[:n], excess), len(s) // n)
-            return residual_chi2((r, J, error)) / left
+            return residual_chi2((r, J, error)) / residual_dof
 
-        whole = ratio(0.0) if left > 0 else 1.0
+        whole = ratio(0.0) if residual_dof > 0 else 1.0
         if not np.isfinite(whole):
             raise NotStill("the fit ran away")
-        p = lack_of_fit_p(whole * left, left, pure_dof)
+        p = lack_of_fit_p(whole * residual_dof, residual_dof, pure_dof)
         if p is None or p >= NO_CHANCE:
             return cls(float(np.sqrt(whole if pure_dof < 1 else max(whole, 1.0))))
-        high = float(np.linalg.norm(r[:n])) / np.sqrt(left) + float(np.max(s[:n]))
+        high = float(np.linalg.norm(r[:n])) / np.sqrt(residual_dof) + float(np.max(s[:n]))
         while ratio(high) > 1:
             high *= 2
         return cls(excess_g=float(scipy.optimize.brentq(lambda e: ratio(e) - 1, 0.0, high, xtol=EXACT * high)))

@@ -37,7 +37,7 @@ class Spread:
     def of(
         cls,
         posterior: Posterior,
-        solved: Sequence[Components],
+        mixture: Sequence[Components],
         mean: Floats,
         projection: Projection,
         process_bias: Floats,
@@ -48,7 +48,7 @@ class Spread:
         listed = {effect.name for effect in projection.effects}
         whole, thermal = np.zeros((2, len(mean), len(mean)))
         prior, total = np.zeros(len(mean) - LINEAR), 0.0
-        for cells in solved:
+        for cells in mixture:
             size, here = _moments(cells, posterior, mean, projection, process_bias, t_s)
             total += float(cells.share.sum())
             whole += here

@@ -26,10 +26,10 @@ def corrected(before: Calibration, posterior: Posterior, at: HoldsAt) -> Calibra
     linear calibration of all poses that were given: where no effect is to be
     corrected (`refusal`), it stays, with the errors that all likely sets make
     of it."""
-    solved = components(posterior)
-    model_average = None if refusal(posterior) else average(posterior, at, solved)
+    mixture = components(posterior)
+    model_average = None if refusal(posterior) else average(posterior, at, mixture)
     if model_average is None or not model_average.sensor.effects:
-        model_average = linear_alone(posterior, at, before.sensor, solved)
+        model_average = linear_alone(posterior, at, before.sensor, mixture)
     rows = posterior.evidence.rows
     needed = dict.fromkeys(name for effect, _ in model_average.sensor.effects for name in effect.needs)
     after = replace(

@@ -1,5 +1,5 @@
-"""The likeliest sets solved: coefficients and their covariance, for one part of
-the evidence and choice of sizes."""
+"""The posterior of all parameters as a mixture of normal distributions: one for
+each likely set, part of the evidence and choice of sizes."""
 
 from __future__ import annotations
 

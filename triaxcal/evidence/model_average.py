@@ -81,24 +81,24 @@ def refusal(posterior: Posterior) -> Refusal | None:
     return None
 
 
-def average(posterior: Posterior, at: HoldsAt, solved: Sequence[Components] | None = None) -> Average:
+def average(posterior: Posterior, at: HoldsAt, mixture: Sequence[Components] | None = None) -> Average:
     """Over all sets, sizes and parts; it holds for another recording as at a
-    moment of this one. ``solved`` are the likeliest sets (`components`), where
+    moment of this one. ``mixture`` are the likeliest sets (`components`), where
     they are known."""
-    listed, solved = _likeliest(posterior), components(posterior) if solved is None else solved
-    made = _of_listed(posterior, at, listed, solved)
+    listed, mixture = _likeliest(posterior), components(posterior) if mixture is None else mixture
+    made = _of_listed(posterior, at, listed, mixture)
     kept = [effect for effect in listed if _selected(posterior, made, effect)]
-    return made if len(kept) == len(listed) else _of_listed(posterior, at, kept, solved)
+    return made if len(kept) == len(listed) else _of_listed(posterior, at, kept, mixture)
 
 
-def _of_listed(posterior: Posterior, at: HoldsAt, listed: Sequence[Effect], solved: Sequence[Components]) -> Average:
+def _of_listed(posterior: Posterior, at: HoldsAt, listed: Sequence[Effect], mixture: Sequence[Components]) -> Average:
     projection = Projection.of(posterior, at, listed)
     mean, left = _mean(posterior, projection)
     state = _where_linearised(posterior, mean, projection)
     sensor = state.sensor(posterior.evidence.rows.problem)
     process_bias = _process_bias(posterior, left, at.t_s)
     moved = Sensor(sensor.scale_factor, sensor.misalignment, sensor.bias + process_bias, sensor.effects)
-    return _with_errors(posterior, at, projection, moved, state, mean, process_bias, solved)
+    return _with_errors(posterior, at, projection, moved, state, mean, process_bias, mixture)
 
 
 def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
@@ -115,13 +115,13 @@ def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
     return corrects >= SELECTED_LEAST * (corrects + float(np.sum(np.diag(made.covariance)[own] / size**2)))
 
 
-def linear_alone(posterior: Posterior, at: HoldsAt, linear: Sensor, solved: Sequence[Components]) -> Average:
+def linear_alone(posterior: Posterior, at: HoldsAt, linear: Sensor, mixture: Sequence[Components]) -> Average:
     """The ``linear`` sensor with the errors that all likely sets make of it:
     what is handed on where no effect is corrected."""
     rows = posterior.evidence.rows
     state = State.of(rows.problem, linear)
     projection, mean = Projection.of(posterior, at, []), state.theta - rows.state.theta
-    return _with_errors(posterior, at, projection, linear, state, mean, np.zeros(3), solved)
+    return _with_errors(posterior, at, projection, linear, state, mean, np.zeros(3), mixture)
 
 
 def _with_errors(
@@ -132,10 +132,10 @@ def _with_errors(
     state: State,
     mean: Floats,
     process_bias: Floats,
-    solved: Sequence[Components],
+    mixture: Sequence[Components],
 ) -> Average:
     G = parameters_by_theta(posterior.evidence.rows.problem, state)
-    spread = Spread.of(posterior, solved, mean, projection, process_bias, at.t_s)
+    spread = Spread.of(posterior, mixture, mean, projection, process_bias, at.t_s)
     weights = {effect.name: posterior.effect_probabilities[effect.name] for effect in projection.effects}
     return Average(sensor, G @ spread.whole @ G.T, G @ spread.thermal @ G.T, np.sqrt(spread.prior), weights)
 

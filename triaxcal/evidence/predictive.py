@@ -45,7 +45,7 @@ class Predictive:
     ``hypotheses``."""
 
     posterior: Posterior
-    solved: Sequence[Components]
+    mixture: Sequence[Components]
     weight: Floats
     hypotheses: Sequence[Hypothesis]
     of: Ints
@@ -54,15 +54,15 @@ class Predictive:
     def likeliest(cls, posterior: Posterior, share: float) -> Predictive:
         """Those that hold this share of the probability, or as many as there
         are."""
-        solved = components(posterior, share)
-        each = [_hypothesis(posterior, cells.found, cells.part) for cells in solved]
+        mixture = components(posterior, share)
+        each = [_hypothesis(posterior, cells.found, cells.part) for cells in mixture]
         hypotheses = list(dict.fromkeys(each))
-        of = np.repeat([hypotheses.index(h) for h in each], [len(cells.share) for cells in solved])
-        weight = np.concatenate([cells.share for cells in solved])
+        of = np.repeat([hypotheses.index(h) for h in each], [len(cells.share) for cells in mixture])
+        weight = np.concatenate([cells.share for cells in mixture])
         whole = probabilities(posterior)
         wanted = np.array([whole[h] for h in hypotheses])
         weight = weight * (wanted / np.bincount(of, weight))[of]
-        return cls(posterior, solved, weight / weight.sum(), hypotheses, of)
+        return cls(posterior, mixture, weight / weight.sum(), hypotheses, of)
 
     def with_name(self, name: str) -> Floats:
         """(C,) one where the effect acts, else zero."""
@@ -72,11 +72,11 @@ class Predictive:
         """Mean (C,M) and covariance (C,M,M) of M rows to come, over their
         errors."""
         evidence = self.posterior.evidence
-        columns = _columns(evidence, sorted({i for cells in self.solved for i in cells.found.members}), rows)
+        columns = _columns(evidence, sorted({i for cells in self.mixture for i in cells.found.members}), rows)
         here, there = PoseInputs.of(evidence.rows), PoseInputs.of(rows)
         of_parts: dict[int, tuple[Floats, Floats]] = {}
         mean, covariance = [], []
-        for cells in self.solved:
+        for cells in self.mixture:
             kind, tau = evidence.parts[cells.part].kind, evidence.parts[cells.part].tau
             if cells.part not in of_parts:
                 of_parts[cells.part] = _unmodelled(kind, tau, here, there, cells.inverse)
