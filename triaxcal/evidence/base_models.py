@@ -48,7 +48,7 @@ def base_models(unit: Posterior, acting: frozenset[str]) -> list[BaseModel]:
     for members in sets:
         found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
         rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE).tolist()}
-        whole = log_sum_exp([evidence.with_each_further(found, row, cells=1) for row in sorted(rows)], axis=0)
+        whole = log_sum_exp([evidence.with_each_further(found, row) for row in sorted(rows)], axis=0)
         whole = whole + np.log(len(evidence.sizes))
         out.append(BaseModel(found, unit.names_of(found), np.asarray(whole)))
     return out

@@ -133,17 +133,13 @@ class Evidence:
         scale = np.repeat(np.asarray(sizes, dtype=float), [self.terms[i].rank for i in members])
         return self._data[part].beside(self.places(members), scale)
 
-    def with_each_further(self, found: SetEvidence, row: int, cells: int) -> Floats:
+    def with_each_further(self, found: SetEvidence, row: int) -> Floats:
         """(T,R) about the logarithm of the evidence of a set with each further
-        term at each size, under the part in this ``row`` of it: at those
-        ``cells`` of the members' sizes that are best without the term."""
-        best = np.argsort(-found.log[row])[:cells]
-        share = found.by_part[row] - log_sum_exp(found.log[row][best])
-        each = []
-        for cell in best:
-            with_each, without = self.log_evidence_with_each(found.parts[row], found.members, found.sizes[cell])
-            each.append(found.log[row][cell] + share + with_each - without)
-        return np.asarray(log_sum_exp(each, axis=0))
+        term at each size, under the part in this ``row`` of it: by the ratio at
+        those sizes of the members that are best without the term."""
+        best = found.sizes[int(np.argmax(found.log[row]))]
+        with_each, without = self.log_evidence_with_each(found.parts[row], found.members, best)
+        return np.asarray(found.by_part[row] + with_each - without)
 
     def of_set(self, members: tuple[int, ...], parts: Sequence[int]) -> SetEvidence:
         """Sizes of three and more terms go by every second step of the grid."""

@@ -78,7 +78,7 @@ def _scores_with_each_term(evidence: Evidence, members: tuple[int, ...]) -> Floa
     alone = evidence.of_set(members, range(len(evidence.parts)))
     likely = np.argsort(-alone.by_part)[:3]
     rows = dict.fromkeys([0, *map(int, likely)])
-    each = [log_sum_exp(evidence.with_each_further(alone, row, cells=1), axis=1) for row in rows]
+    each = [log_sum_exp(evidence.with_each_further(alone, row), axis=1) for row in rows]
     return np.asarray(log_sum_exp(each, axis=0) + evidence.log_prior)
 
 

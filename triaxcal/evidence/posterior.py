@@ -196,9 +196,7 @@ class Posterior:
             members = tuple(sorted((*rest, i)))
             base = evidence.of_set(members, parts)
             others = [other.kind not in {evidence.terms[k].kind for k in members} for other in evidence.terms]
-            each = log_sum_exp(
-                [evidence.with_each_further(base, row, cells=1) for row in range(len(parts))], axis=(0, 2)
-            )
+            each = log_sum_exp([evidence.with_each_further(base, row) for row in range(len(parts))], axis=(0, 2))
             each = np.where(others, each + evidence.log_prior, -np.inf)
             acts, none = log_sum_exp(each[mine]), log_sum_exp([base.total, *each[~mine]])
             out[term.pose] = np.exp(acts - np.logaddexp(acts, none))
