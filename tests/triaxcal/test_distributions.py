@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from triaxcal import distributions as d
 
@@ -38,3 +38,10 @@ def test_degrees_of_freedom_may_be_an_array() -> None:
     dof = np.array(DOF)[:, None]
     assert np.array_equal(d.chi2_isf(Q, dof), stats.chi2.isf(Q, dof), equal_nan=True)
     assert np.array_equal(d.f_sf(X, dof, 7), stats.f.sf(X, dof, 7), equal_nan=True)
+
+
+def test_softmax_is_that_of_scipy_along_any_axis_and_for_terms_that_are_impossible() -> None:
+    log = np.random.default_rng(1).normal(-500.0, 30.0, (4, 9))
+    log[1, 3] = -np.inf
+    for axis in (None, 0, 1):
+        assert d.softmax(log, axis) == pytest.approx(special.softmax(log, axis=axis), rel=1e-12)

@@ -8,7 +8,7 @@ from typing import Any
 
 from triaxcal import text
 from triaxcal.arrays import Floats
-from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt, Residual
+from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt, PoseResult, Residual
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import (
     UNCERTAINTY_DIGITS,
@@ -94,22 +94,18 @@ def calibration_document(
     can tell. ``budgeted``: with the budget, which is that of a fit to still
     poses."""
     errors = dict(zip(c.parameters, c.standard_errors, strict=True))
-    unit = output_unit or "output"
     evaluated = budget(c, stated) if budgeted else None
 
     def group(name: str) -> list[Any]:
         return numbers([errors[f"{name}.{axis}"] for axis in "xyz"], UNCERTAINTY_DIGITS)
 
+    def linear_only(of: Calibration) -> Document:
+        return calibration_document(of, output_unit=output_unit, reference_unit=reference_unit, stated=stated)
+
     return {
         "format": "triaxcal.calibration/1",
         "terms": list(c.terms),
-        "units": {
-            "output": output_unit,
-            "reference": reference_unit,
-            "scale_factor": f"{unit}/{grouped(reference_unit)}",
-            "misalignment": "rad",
-            "bias": reference_unit,
-        },
+        "units": _units(output_unit, reference_unit),
         "reference": number(c.reference),
         "channel_reference": {name: number(v) for name, v in c.channel_reference.items()},
         "holds_at": _holds_at(c.holds_at),
@@ -131,38 +127,41 @@ def calibration_document(
         **({"uncertainty": budget_document(c, evaluated, reference_unit)} if evaluated else {}),
         "next_recording": None if evaluated is None else next_recording_document(next_recording(c, evaluated)),
         "residual": residual_document(c.residual, c.reference),
-        "poses": [
-            {
-                "start_s": number(p.pose.start_s),
-                "end_s": number(p.pose.end_s),
-                "mean": numbers(p.pose.mean),
-                "direction": direction(p.direction),
-                "residual_g": error(p.residual_g, c.reference),
-                "standard_error_g": uncertainty(p.standard_error_g),
-                "studentized": uncertainty(p.studentized),
-                "leverage": uncertainty(p.leverage),
-                "used": p.used,
-                "excluded": p.excluded,
-                **({} if p.outlier_probability is None else {"outlier_probability": chance(p.outlier_probability)}),
-                **({"left_out": _LEFT_OUT.get(p.excluded, p.pose.fault)} if p.excluded else {}),
-                "channels": {name: number(v) for name, v in p.pose.channels.items()},
-            }
-            for p in c.poses
-        ],
+        "poses": [_pose_result(p, c.reference) for p in c.poses],
         "trends": c.slopes,
         "condition": uncertainty(c.condition),
         "dilution": uncertainty(c.dilution),
         "blind_to": list(c.blind_to),
         "warnings": [text.caution(caution) for caution in c.cautions],
-        **(
-            {
-                "linear_only": calibration_document(
-                    c.linear_only, output_unit=output_unit, reference_unit=reference_unit, stated=stated
-                )
-            }
-            if c.linear_only is not None
-            else {}
-        ),
+        **({} if c.linear_only is None else {"linear_only": linear_only(c.linear_only)}),
+    }
+
+
+def _units(output_unit: str, reference_unit: str) -> Document:
+    return {
+        "output": output_unit,
+        "reference": reference_unit,
+        "scale_factor": f"{output_unit or 'output'}/{grouped(reference_unit)}",
+        "misalignment": "rad",
+        "bias": reference_unit,
+    }
+
+
+def _pose_result(p: PoseResult, reference: float) -> Document:
+    return {
+        "start_s": number(p.pose.start_s),
+        "end_s": number(p.pose.end_s),
+        "mean": numbers(p.pose.mean),
+        "direction": direction(p.direction),
+        "residual_g": error(p.residual_g, reference),
+        "standard_error_g": uncertainty(p.standard_error_g),
+        "studentized": uncertainty(p.studentized),
+        "leverage": uncertainty(p.leverage),
+        "used": p.used,
+        "excluded": p.excluded,
+        **({} if p.outlier_probability is None else {"outlier_probability": chance(p.outlier_probability)}),
+        **({"left_out": _LEFT_OUT.get(p.excluded, p.pose.fault)} if p.excluded else {}),
+        "channels": {name: number(v) for name, v in p.pose.channels.items()},
     }
 
 

@@ -94,6 +94,22 @@ def test_the_magnitude_s_gradient_is_its_central_difference(with_effects: Callab
         assert gradient[:, axis] == pytest.approx(difference, abs=1e-8)
 
 
+def test_derivatives_by_every_parameter_are_their_central_differences(with_effects: Callable[..., Sensor]) -> None:
+    sensor = with_effects(**EVERYTHING)
+    rng = np.random.default_rng(2)
+    held = covariates(15, rng)
+    u = sensor.output(rng.standard_normal((15, 3)), held)
+    of_radius = sensor.radius_by_parameters(u, held)
+    a, _, of_force = sensor.specific_force_and_derivatives(u, held)
+    assert a == pytest.approx(sensor.specific_force(u, held), abs=1e-12)
+    sizes = np.maximum(1.0, np.abs(of_force).max(axis=(0, 1)))  # by a coefficient of kelvins squared it is hundreds
+    for k, step in enumerate(np.diag(1e-6 / sizes)):
+        more, less = (sensor.moved(s).specific_force(u, held) for s in (step, -step))
+        by_difference = np.linalg.norm(more, axis=1) - np.linalg.norm(less, axis=1)
+        assert of_force[:, :, k] / sizes[k] == pytest.approx((more - less) / 2e-6, abs=1e-6)
+        assert of_radius[:, k] / sizes[k] == pytest.approx(by_difference / 2e-6, abs=1e-6)
+
+
 def test_a_reading_at_which_the_model_turns_back_is_refused_in_one_line() -> None:
     """s + q s² has no slope at s = −1/2q, where Newton's method begins."""
     bent = effect_named("second_order_nonlinearity"), np.array([0.25, 0.0, 0.0])
