@@ -41,10 +41,10 @@ class TemperatureLag(Effect):
     θ depends on what it was before. A pose does not know that by itself, so θ −
     T is a covariate of the poses, derived from all of a recording for certain
     time constants (`triaxcal.effects.contract.lag_of`,
-    `triaxcal.poses.covariates.behind`): the temperature goes straight from the
-    middle of one pose to that of the next, and stood still before the first.
-    What it did there, nobody knows; that goes out by exp(−t/τ), as a `WarmUp`
-    of the same time constant would. In use, where no lag is given, the
+    `triaxcal.poses.covariates.lag_deviation`): the temperature goes straight
+    from the middle of one pose to that of the next, and stood still before the
+    first. What it did there, nobody knows; that goes out by exp(−t/τ), as a
+    `WarmUp` of the same time constant would. In use, where no lag is given, the
     temperature counts as settled: θ = T.
 
     A time constant between two of those known has the mean of theirs, weighted
