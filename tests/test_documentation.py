@@ -510,7 +510,7 @@ def require_made(pages: Mapping[Path, str]) -> None:
 
 def test_the_pages_made_of_register_types_and_profile_models_are_theirs() -> None:
     made = runpy.run_path(str(PROJECT / "docs/reference/profile.py"))["pages"]()
-    assert len(made) == 3
+    assert len(made) == 4
     require_made(made)
 
 

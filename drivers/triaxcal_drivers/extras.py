@@ -14,6 +14,7 @@ EXTRAS = {
     "msgpack": "station",
     "asammdf": "logs",
     "rosbags": "logs",
+    "lz4": "logs",
 }
 """By the name that is imported."""
 CALLED = {"can": "python-can", "serial": "pyserial"}

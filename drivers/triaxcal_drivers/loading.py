@@ -34,7 +34,11 @@ def parse_bundle(text: bytes, files: Mapping[str, bytes] | None, *, where: str, 
         raise ProfileError(f'{where}: driver: expected the name of a driver, as in driver = "can"')
     model = driver_named(name, where=where).profile_model
     profile = validate(model, data, text, where=where)
-    return Bundle(profile, text, {file: _held(file, files, folder, where) for file in profile.files()})
+    held = {file: _held(file, files, folder, where) for file in profile.files()}
+    for file in profile.optional_files():
+        if file in files if files is not None else folder is not None and os.path.exists(folder / file):
+            held[file] = _held(file, files, folder, where)
+    return Bundle(profile, text, held)
 
 
 def _held(file: str, files: Mapping[str, bytes] | None, folder: Path | None, where: str) -> bytes:

@@ -192,6 +192,10 @@ class Profile(Strict):
         """Names of the files this profile refers to (DBC, EDS), relative to it."""
         return ()
 
+    def optional_files(self) -> tuple[str, ...]:
+        """Names of files that belong to it where they are there."""
+        return ()
+
     def by_role(self, role: str) -> str | None:
         """The name of the register with that role."""
         return next((name for name, r in self.registers.items() if r.role == role), None)

@@ -71,7 +71,7 @@ def test_a_driver_installed_by_somebody_else_is_found(elsewhere):
         )
     )
     assert ["their-serial", "their_drivers:SerialDriver", "their_drivers", None] in found
-    assert [d[0] for d in found] == sorted(["can", "modbus", "their-serial"])
+    assert [d[0] for d in found] == sorted(["can", "mcap", "modbus", "their-serial"])
 
 
 def test_a_profile_for_it_is_read_by_it(elsewhere):
@@ -134,6 +134,7 @@ def test_asking_for_one_driver_imports_no_other(elsewhere):
 def test_our_drivers_are_listed():
     assert {d.name: d.target for d in listed() if d.distribution == "triaxcal"} == {
         "can": "triaxcal_drivers.can.driver:CanDriver",
+        "mcap": "triaxcal_drivers.mcap.driver:McapDriver",
         "modbus": "triaxcal_drivers.modbus.driver:ModbusDriver",
     }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from triaxcal_drivers.loading import load_bundle
-from triaxcal_drivers.logs.kinds import NAMES, Kind, opened
+from triaxcal_drivers.logs.kinds import Kind, opened
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
@@ -16,14 +16,21 @@ def import_command(a: argparse.Namespace) -> int:
     writable(a.output)
     bundle = load_bundle(a.profile)
     driver = bundle.profile.driver
-    if driver != "can":
-        raise InputError(f"{a.profile}: driver '{driver}' has no logs that can be imported, expected can")
+    if driver not in ("can", "mcap"):
+        raise InputError(f"{a.profile}: driver '{driver}' has no logs that can be imported, expected can or mcap")
     with opened(a.log) as log:
-        if not isinstance(log.kind, Kind):
-            raise InputError(f"{a.log}: an {log.kind} file, which holds no frames of a bus; expected {NAMES}")
-        from triaxcald.imports.of_can import import_can  # numpy and what writes recordings
+        if isinstance(log.kind, Kind) != (driver == "can"):
+            name = log.kind.name if isinstance(log.kind, Kind) else log.kind
+            held = "frames of CAN" if driver == "can" else "messages"
+            raise InputError(f"{a.log}: {name}, which holds no {held}; the profile's driver is '{driver}'")
+        if driver == "can":
+            from triaxcald.imports.of_can import import_can  # each with what it needs alone
 
-        made = import_can(log, bundle, a.output, node=a.node, channel=a.channel)
+            made = import_can(log, bundle, a.output, node=a.node, channel=a.channel)
+        else:
+            from triaxcald.imports.of_mcap import import_mcap
+
+            made = import_mcap(log, bundle, a.output)
     for line in (text.left_out(made.document), *text.remarks(made.document)):
         if line:
             say(line)

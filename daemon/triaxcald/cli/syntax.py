@@ -343,8 +343,9 @@ def _audits(commands: Any) -> None:
     p.add_argument("--phase", default=PHASES[0], choices=PHASES)
     p = _command(
         parts, "import", "importing:import_command", "make a recording of a log that others recorded",
-        "BLF, ASC, candump, TRC, MF4, pcap and pcapng of SocketCAN, told by the file's first bytes; packed with gzip "
-        "or not.", "log import drive.blf --profile imu.toml -o rec.mcap",
+        "BLF, ASC, candump, TRC, MF4, pcap and pcapng of SocketCAN, or MCAP with messages of ROS 2, JSON or protobuf, "
+        "told by the file's first bytes; packed with gzip or not.",
+        "log import drive.blf --profile imu.toml -o rec.mcap",
     )  # fmt: skip
     p.add_argument("log", metavar="LOG", type=Path)
     p.add_argument("--profile", metavar="P", type=Path, required=True, help="of the device whose frames are in it")

@@ -22,6 +22,7 @@ from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic
 from triaxcald.recording.writer import RecordingWriter
 
 BATCH = 4096  # records; a quarter of an hour of a slow unit, 4 s of a fast one
+BATCH_BYTES = 2**20  # of their data; a chunk of a recording may have 16 MiB
 DRAINED_EACH = 32  # batches; the writer's queue has room for 256, and drops what comes beyond
 COUNTED = ("missing", "duplicates", "incomplete", "errors", "invalid")
 
@@ -153,11 +154,13 @@ def _write(
 
 def in_batches(records: Iterable[Record]) -> Iterator[list[Record]]:
     batch: list[Record] = []
+    count = 0
     for record in records:
         batch.append(record)
-        if len(batch) == BATCH:
+        count += len(record[3])
+        if len(batch) == BATCH or count >= BATCH_BYTES:
             yield batch
-            batch = []
+            batch, count = [], 0
     if batch:
         yield batch
 

@@ -31,16 +31,17 @@ def summary(output: object, detail: Mapping[str, Any], seconds: float) -> str:
 
 def left_out(detail: Mapping[str, Any]) -> str:
     """What of the log is not in the recording; empty where all is."""
-    whole, elsewhere = detail.get("other_frames", 0), detail.get("elsewhere", 0)
-    parts = [f"{whole} frames of other identifiers"] if whole else []
+    whole, elsewhere = detail["other_frames"], detail["elsewhere"]
+    what = "messages of other topics" if detail["kind"] == "MCAP" else "frames of other identifiers"
+    parts = [f"{whole} {what}"] if whole else []
     parts += [f"{elsewhere} of other channels or nodes"] if elsewhere else []
-    parts += [f"{count} of kind '{kind}'" for kind, count in detail.get("other_records", {}).items()]
+    parts += [f"{count} of kind '{kind}'" for kind, count in detail["other_records"].items()]
     return f"left out: {', '.join(parts)}" if parts else ""
 
 
 def remarks(detail: Mapping[str, Any]) -> list[str]:
     """What a reader of the recording ought to know, a line each."""
-    lines = [_REMARKS[name] for name in detail.get("remarks", ())]
+    lines = [_REMARKS[name] for name in detail["remarks"]]
     times = detail["times"]
     if times["back"]:
         lines.append(

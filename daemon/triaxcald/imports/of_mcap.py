@@ -1,0 +1,154 @@
+"""MCAP files that others recorded, through a profile of the driver ``mcap``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+from triaxcal_drivers.errors import LogError
+from triaxcal_drivers.logs.frames import Account
+from triaxcal_drivers.logs.kinds import MCAP_KIND, Log
+from triaxcal_drivers.mcap.container import Channel, LoggedMessage, McapFile
+from triaxcal_drivers.mcap.driver import stream_reader
+from triaxcal_drivers.mcap.model import McapProfile, schema_file
+from triaxcal_drivers.mcap.schema import MessageSchema
+from triaxcal_drivers.nearest import clipped, nearest
+from triaxcal_drivers.profile import Bundle
+from triaxcald.errors import InputError
+from triaxcald.imports.importing import Imported, Record, write_recording
+from triaxcald.imports.times import LONGEST_NS, Times
+
+MESSAGE_MOST = 65535  # bytes of a raw record
+STAMPS_LOOKED_AT = 10_000  # messages by whose stamps it is told whether they move
+SHOWN = 12  # topics in a message
+
+
+def import_mcap(log: Log, bundle: Bundle, out: Path) -> Imported:
+    """Raises InputError, RecordingError, LogError, ProfileError."""
+    profile = cast(McapProfile, bundle.profile)
+    schemas = _schemas(log, profile)
+    files = {schema_file(name): schema.to_bytes() for name, schema in schemas.items()}
+    whole = replace(bundle, files={**bundle.files, **files})
+    work = _Work(profile, log)
+    still = any(schema.stamp_stands_still for schema in schemas.values())
+
+    def describe(counts: dict[str, int]) -> dict[str, Any]:
+        return work.described(counts, still)
+
+    detail, seconds = write_recording(out, whole, work.records(), Path(log.name), describe)
+    return Imported(out, detail, seconds)
+
+
+def _schemas(log: Log, profile: McapProfile) -> dict[str, MessageSchema]:
+    """Of each stream whose topic is there, from the log's first messages.
+    Raises InputError."""
+    file = McapFile(log.stream, Account())
+    first: dict[str, LoggedMessage] = {}
+    heads: dict[str, list[bytes]] = {}
+    topics = {stream.topic for stream in profile.streams.values()}
+    for message in file.messages():
+        topic = message.channel.topic
+        if topic not in topics:
+            continue
+        first.setdefault(topic, message)
+        heads.setdefault(topic, [])
+        if len(heads[topic]) < STAMPS_LOOKED_AT and len(message.data) <= MESSAGE_MOST:
+            heads[topic].append(message.data)
+        if len(heads) == len(topics) and all(len(head) == STAMPS_LOOKED_AT for head in heads.values()):
+            break
+    found = {}
+    for name, stream in profile.streams.items():
+        if stream.topic in first:
+            schema = _schema(first[stream.topic].channel, log.name)
+            found[name] = replace(schema, stamp_stands_still=_stands_still(profile, name, schema, heads[stream.topic]))
+        elif name == "readings":
+            there = list(file.topics)
+            shown = ", ".join(map(clipped, there[:SHOWN])) or "none"
+            hint = nearest(stream.topic, there) or f"; there are {shown}"
+            raise InputError(f"{log.name}: no message on topic '{stream.topic}'{hint}")
+    return found
+
+
+def _schema(channel: Channel, name: str) -> MessageSchema:
+    schema = channel.schema
+    if schema is None and channel.encoding != "json":
+        raise InputError(
+            f"{name}: topic '{clipped(channel.topic)}' has no schema, and is encoded as {channel.encoding}"
+        )
+    if schema is None:
+        return MessageSchema("", channel.encoding, "", b"")
+    return MessageSchema(schema.name, channel.encoding, schema.encoding, schema.data)
+
+
+def _stands_still(profile: McapProfile, name: str, schema: MessageSchema, head: list[bytes]) -> bool:
+    """Raises ProfileError where the messages do not hold what the profile
+    names."""
+    read = stream_reader(profile, name, schema)
+    if profile.streams[name].time is None:
+        return False
+    stamps = set()
+    for data in head:
+        try:
+            stamps.add(read(data)[1])
+        except ValueError:
+            continue
+        if len(stamps) > 1:
+            return False
+    return len(head) > 1
+
+
+class _Work:
+    """What is counted on the way."""
+
+    def __init__(self, profile: McapProfile, log: Log) -> None:
+        self._profile, self._log = profile, log
+        self._account = Account()
+        self._times = Times(1e9 / profile.sampling.rate_hz)
+        self._numbers = {stream.topic: i for i, stream in enumerate(profile.streams.values())}
+        self._schemas: dict[str, Any] = {}
+        self._messages = self._taken = self._others = 0
+
+    def records(self) -> Iterator[Record]:
+        """Raises LogError."""
+        for message in McapFile(self._log.stream, self._account).messages():
+            self._messages += 1
+            topic = message.channel.topic
+            if topic not in self._numbers:
+                self._others += 1
+                continue
+            if self._schemas.setdefault(topic, message.channel.schema) != message.channel.schema:
+                raise LogError(f"{self._log.name}: topic '{clipped(topic)}' has messages of two definitions")
+            where = f"message {self._messages}"
+            if len(message.data) > MESSAGE_MOST:
+                self._account.note(where, f"{len(message.data)} bytes, expected at most {MESSAGE_MOST}")
+            elif message.log_time_ns >= LONGEST_NS:
+                self._account.note(where, f"a time of {message.log_time_ns} ns")
+            else:
+                self._taken += 1
+                self._times.note(message.log_time_ns)
+                yield message.log_time_ns, self._numbers[topic], 0, message.data
+
+    def described(self, counts: dict[str, int], still: bool) -> dict[str, Any]:
+        """Raises InputError."""
+        if not counts["samples"]:
+            raise InputError(
+                f"{self._log.name}: no sample in its {self._taken} messages of the profile: {counts['errors']} are not"
+                " as they are defined"
+            )
+        return {
+            "kind": MCAP_KIND,
+            "channels": list(self._numbers),
+            "node": None,
+            "frames": self._messages,
+            "taken": self._taken,
+            "error_frames": 0,
+            "elsewhere": 0,
+            "other_frames": self._others,
+            "other_records": dict(self._account.others),
+            "damaged": self._account.damaged,
+            "damage": self._account.damage,
+            "remarks": ["stamp_stands_still"] if still else [],
+            "times": self._times.document(),
+        }

@@ -1,0 +1,2 @@
+"""Messages of other people's MCAP files: what ROS 2 recorded, JSON and
+protobuf."""
