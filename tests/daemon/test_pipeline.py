@@ -12,7 +12,7 @@ from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import Finding, QualityDetector
 from triaxcal.poses.quality.finding import MissingSamples, StuckOutput
 from triaxcal_drivers.interface import RawBatch
-from triaxcal_drivers.loading import load_bundle
+from triaxcal_drivers.loading import load_bundle, parse_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald.pipeline import Pipeline, together
 from triaxcald.recording.schema import cut
@@ -177,3 +177,19 @@ def test_an_interruption_of_the_stream_is_counted_and_said(records: list[tuple[i
     pipeline = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(flagged)])
     assert pipeline.counts["receiver_overflows"] == 1
     assert pipeline.data_quality() == ["missing_samples: the stream was interrupted once"]
+
+
+def test_samples_that_are_not_valid_are_left_out_and_said(records: list[tuple[int, int, int, bytes]]) -> None:
+    """By a status of which the third bit, over-range, is set in three samples."""
+    text = BUNDLE.text.replace(
+        b'counter = "Counter"', b'counter = "Counter"\nvalid = { signal = "Status", values = [0] }'
+    )
+    bundle = parse_bundle(text, BUNDLE.files, where="test")
+    spoiled = [
+        (t, source, flags, data[:7] + b"\x04" if source == 0x285 and i // 4 in (101, 203, 305) else data)
+        for i, (t, source, flags, data) in enumerate(records)
+    ]
+    pipeline = Pipeline(bundle, READINGS).feed_all([RawBatch.of(spoiled)])
+    assert (pipeline.counts["samples"], pipeline.counts["invalid"], pipeline.counts["missing"]) == (1998, 3, 0)
+    assert "invalid_samples: 3 that the unit says are not valid, left out" in pipeline.data_quality()
+    assert "invalid" not in Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(records)]).counts

@@ -6,6 +6,8 @@ import gzip
 import json
 import os
 import shutil
+import struct
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -261,6 +263,50 @@ DOCUMENTS = [
         ["fit", str(RECORDING), "--attitudes", "a.csv"])[1], 2, "expected at most 10000"),
 ]  # fmt: skip
 
+# Logs of others
+
+
+def log(content: bytes, profile: str = "triax-ref-can") -> Callable[[Path], list[str]]:
+    def make(folder: Path) -> list[str]:
+        put(content)(folder / "a.log")
+        return ["log", "import", "a.log", "--profile", profile, "-o", "r.mcap"]
+
+    return make
+
+
+def mdf(*blocks: bytes) -> bytes:
+    return b"MDF     4.11    " + bytes(12) + struct.pack("<H", 411) + bytes(34) + b"".join(blocks)
+
+
+def mdf_block(kind: bytes, link: int, body: bytes = b"") -> bytes:
+    return b"##" + kind + bytes(4) + struct.pack("<QQQ", 32 + len(body), 1, link) + body
+
+
+def blf(container: bytes, size: int) -> bytes:
+    body = struct.pack("<H6xI4x", 2, size) + container
+    return (
+        b"LOGG" + struct.pack("<I", 144) + bytes(136) + b"LOBJ" + struct.pack("<HHII", 16, 1, 16 + len(body), 10) + body
+    )
+
+
+FRAME = b"(1436509052.249713) can0 7FF#00\n"
+NOTHING = "none of the profile's identifiers"
+LOGS = [
+    Row("a foreign file for a log", log(SECRET.encode()), 2, "no log of a known kind"),
+    Row("a gzip bomb of frames", log(gzip.compress(FRAME + b"\n" * 2**26)), 2, "unpacks to more than 64 times"),
+    Row("a line of 50 MB in a log", log(FRAME + b"(" * 50_000_000 + b"\n" + FRAME), 2, NOTHING),
+    Row("times beyond all clocks", log(b"(999999999999.9) can0 185#0011223344556677\n" * 99), 2, "no sample in its 99"),
+    Row("identifiers at random", log(b"".join(b"(1.0) c%d %08X#\n" % (i, i) for i in range(60_000))), 2, NOTHING),
+    Row("a BLF container of 4 GiB", log(blf(zlib.compress(bytes(2**20)), 2**32 - 1)), 2, "of 4294967295 bytes"),
+    Row("a BLF container of nothing", log(blf(zlib.compress(bytes(2**24)), 2**24)), 2, NOTHING),
+    Row("a pcap packet of 4 GiB", log(struct.pack("<IHHiIIIIIII", 0xA1B2C3D4, 2, 4, 0, 0, 0, 227, 0, 0, 2**32 - 1, 0)),
+        2, NOTHING),
+    Row("an MF4 that leads back to itself", log(mdf(mdf_block(b"HD", 96), mdf_block(b"DG", 96))), 2,
+        "byte 96: blocks that lead back to themselves"),
+    Row("an MF4 group of 10^12 records", log(mdf(mdf_block(b"HD", 96), mdf_block(b"CG", 0,
+        struct.pack("<QQHHIII", 0, 10**12, 0, 0, 0, 22, 0)))), 2, "byte 96: a group of 22000000000000 bytes"),
+]  # fmt: skip
+
 # Text tables
 
 
@@ -386,4 +432,4 @@ WRITTEN = [
     Row("a link for an EEPROM", lambda f: (linked("nothing", [])(f), device('eeprom = "out"')(f))[1], 2,
         "a symbolic link"),
 ]  # fmt: skip
-ROWS = [*TOML, *PATHS, *DESCRIPTIONS, *DOCUMENTS, *TABLES, *RECORDINGS, *WRITTEN]
+ROWS = [*TOML, *PATHS, *DESCRIPTIONS, *DOCUMENTS, *LOGS, *TABLES, *RECORDINGS, *WRITTEN]

@@ -60,10 +60,13 @@ class _Work:
     def described(self, log: Log, counts: dict[str, int]) -> dict[str, Any]:
         """Raises InputError."""
         chosen, account = self._selection, self._account
-        chosen.settle(log.name)
-        if not counts["samples"]:
-            why = ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "no sample is whole"
-            raise InputError(f"{log.name}: no sample in its {chosen.taken} frames of the profile: {why}")
+        try:
+            chosen.settle(log.name)
+            if not counts["samples"]:
+                why = ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "no sample is whole"
+                raise InputError(f"{log.name}: no sample in its {chosen.taken} frames of the profile: {why}")
+        except InputError as e:
+            raise InputError(f"{e}; damaged: {account.damage}" if account.damaged else str(e)) from e
         assert isinstance(log.kind, Kind)
         return {
             "kind": log.kind.name,

@@ -17,8 +17,16 @@ from triaxcald.errors import InputError
 _EXTENDED, _ERROR = int(RawFlag.EXTENDED_ID), int(RawFlag.ERROR)
 SHOWN = 8  # identifiers or channels in a message
 
+KEPT_APART = 4096
+"""Identifiers, and channels, that are counted each by itself: a bus has no more,
+and a file of random ones shall take no memory."""
+_OTHER_CHANNELS = "others"
+
 Key = tuple[int, int]
 """An identifier, and `RawFlag.EXTENDED_ID` where it is one."""
+
+
+_FURTHER: Key = (0, -1)  # none that there is
 
 
 @dataclass
@@ -46,7 +54,8 @@ class Selection:
 
     def takes(self, frame: LoggedFrame) -> bool:
         self.frames += 1
-        self.channels[frame.channel] += 1
+        name = frame.channel
+        self.channels[name if name in self.channels or len(self.channels) < KEPT_APART else _OTHER_CHANNELS] += 1
         if self.channel is not None and frame.channel != self.channel:
             self.elsewhere += 1
             return False
@@ -55,7 +64,7 @@ class Selection:
             return True
         key = frame.source, frame.flags & _EXTENDED
         if key not in self._nodes:
-            self.others[key] += 1
+            self.others[key if key in self.others or len(self.others) < KEPT_APART else _FURTHER] += 1
             return False
         node = self._nodes[key]
         if self.node is not None and node is not None and node != self.node:
@@ -83,7 +92,9 @@ class Selection:
             self.node = next(iter(nodes))
         self._require_one_channel(name)
         if not self.taken:
-            there = _identifiers_shown(key for key, _ in self.others.most_common(SHOWN)) or "no frame"
+            there = (
+                _identifiers_shown(key for key, _ in self.others.most_common(SHOWN) if key != _FURTHER) or "no frame"
+            )
             wanted = ", ".join(self._wanted()[:SHOWN])
             raise InputError(f"{name}: none of the profile's identifiers ({wanted}) is in it; there is {there}")
 

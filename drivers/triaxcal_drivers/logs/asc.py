@@ -44,7 +44,7 @@ _ALMOST = re.compile(rb"\d{1,3}\s+\S+\s+(?:Rx|Tx)\b|CANFD\b", re.I)
 _IDENTIFIER = re.compile(rb"([0-9A-Fa-f]+)(x?)$", re.I)
 _DECLARED = re.compile(rb"\bID\s*=\s*(\d{1,10})(x?)", re.I)
 _PASSED_OVER = re.compile(
-    rb"(?://|;|date\b|base\b|(?:no\s+)?internal\s+events|begin\b|end\b|previous\s+log|$)", re.I
+    rb"(?://|;|date\b|base\b|(?:no\s+)?internal\s+events|begin\b|end\b|previous\s+log)", re.I
 )  # the head of a file, and what stands between events
 
 
@@ -99,7 +99,7 @@ class _Reader:
         if _ALMOST.match(what):
             self.account.note(where, "a frame that cannot be read")
         elif what != b"Start of measurement":
-            self.account.others["event"] += 1
+            self.account.other("event")
         return None
 
     def _classic(self, m: re.Match[bytes], where: str) -> LoggedFrame | None:

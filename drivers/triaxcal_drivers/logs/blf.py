@@ -153,7 +153,7 @@ class _Objects:
     def _frame(self, data: bytes, at: int, version: int, kind: int, where: str) -> LoggedFrame | None:
         make = _MAKERS.get(kind)
         if make is None or version not in (1, 2):
-            self._account.others[f"BLF object {kind}"] += 1
+            self._account.other(f"BLF object {kind}")
             return None
         try:
             unit, stamp = _STAMP.unpack_from(data, _OBJECT.size)

@@ -70,8 +70,6 @@ def _added_up(found: Iterator[LoggedFrame]) -> Iterator[LoggedFrame]:
 
 def _frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
     for number, line in numbered(stream, account):
-        if not line:
-            continue
         frame = _logged(LOG.match(line)) or _shown(SHOWN.match(line), account)
         if frame is not None:
             yield frame

@@ -24,6 +24,7 @@ EXTENDED, REMOTE, ERROR, FD, SWITCHED, SENT = (
 """Whole numbers: a reader joins them for every frame."""
 STANDARD_MOST, EXTENDED_MOST = 0x7FF, 0x1FFFFFFF
 CLASSIC_MOST, FD_MOST = 8, 64  # bytes of a frame
+OTHERS_MOST = 64  # kinds of records that are counted apart; ours have a handful
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """Bytes by the data length code (ISO 11898-1)."""
 
@@ -61,6 +62,10 @@ class Account:
     damage: str = ""
     others: Counter[str] = field(default_factory=Counter)
     remarks: set[Remark] = field(default_factory=set)
+
+    def other(self, what: str, count: int = 1) -> None:
+        """A record of which no frame is made."""
+        self.others[what if what in self.others or len(self.others) < OTHERS_MOST else "further kinds"] += count
 
     def note(self, where: str, what: str) -> None:
         """A damaged place."""

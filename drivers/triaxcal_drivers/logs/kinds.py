@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import io
 import shutil
@@ -21,7 +22,7 @@ from triaxcal_drivers.logs.frames import Account, LoggedFrame
 HEAD = 8192  # bytes by which the kind is told
 GZIP = b"\x1f\x8b"
 MCAP = b"\x89MCAP0\r\n"
-EXPANSION_MOST, ROOM = 64, 16 * 2**20
+EXPANSION_MOST, ROOM = 64, 2**20
 """So many times its size, and so many bytes more, a packed file may unpack
 to."""
 LINES_LOOKED_AT = 20  # of a text, for one that tells its kind
@@ -109,7 +110,7 @@ def opened(path: Path) -> Iterator[Log]:
                 stream = cast(BinaryIO, _unpacked(file, path))
             head = _head(stream, HEAD)
         except (OSError, EOFError, zlib.error) as e:
-            raise LogError(f"{path}: cannot be read: {e}") from e
+            raise LogError(f"{path}: cannot be read: {_reason(e)}") from e
         kind = kind_of(head)
         if kind is None:
             empty = "; the file is empty" if not head else ""
@@ -120,11 +121,15 @@ def opened(path: Path) -> Iterator[Log]:
                 try:
                     shutil.copyfileobj(stream, whole)
                 except (OSError, EOFError, zlib.error) as e:
-                    raise LogError(f"{path}: cannot be unpacked: {e}") from e
+                    raise LogError(f"{path}: cannot be read: {_reason(e)}") from e
                 whole.seek(0)
                 yield Log(str(path), kind, cast(BinaryIO, whole))
         else:
             yield Log(str(path), kind, stream)
+
+
+def _reason(e: Exception) -> str:
+    return (e.strerror if isinstance(e, OSError) else None) or str(e)
 
 
 def _head(stream: BinaryIO, count: int) -> bytes:
@@ -134,14 +139,14 @@ def _head(stream: BinaryIO, count: int) -> bytes:
 
 def _unpacked(file: BinaryIO, path: Path) -> io.BufferedReader:
     most = EXPANSION_MOST * path.stat().st_size + ROOM
-    return io.BufferedReader(_Bounded(gzip.GzipFile(fileobj=file, mode="rb"), most, str(path)))
+    return io.BufferedReader(_Bounded(gzip.GzipFile(fileobj=file, mode="rb"), most))
 
 
 class _Bounded(io.RawIOBase):
-    """Raises LogError where a file unpacks to more than ``most`` bytes."""
+    """Raises OSError where a file unpacks to more than ``most`` bytes."""
 
-    def __init__(self, source: gzip.GzipFile, most: int, name: str) -> None:
-        self._source, self._left, self._name = source, most, name
+    def __init__(self, source: gzip.GzipFile, most: int) -> None:
+        self._source, self._left = source, most
 
     def readable(self) -> bool:
         return True
@@ -151,6 +156,6 @@ class _Bounded(io.RawIOBase):
         data = self._source.read(len(view))
         self._left -= len(data)
         if self._left < 0:
-            raise LogError(f"{self._name}: unpacks to more than {EXPANSION_MOST} times the file")
+            raise OSError(errno.EFBIG, f"unpacks to more than {EXPANSION_MOST} times the file")
         view[: len(data)] = data
         return len(data)

@@ -9,6 +9,7 @@ from typing import BinaryIO
 
 from triaxcal_drivers.logs.frames import Account
 
+BLOCK = 2**16  # bytes that are read at once
 LINE_MOST = 4096  # bytes; a CAN FD frame of Vector's has some 400
 
 _MONTHS = {
@@ -25,21 +26,24 @@ _DATE = re.compile(
 
 
 def numbered(stream: BinaryIO, account: Account) -> Iterator[tuple[int, bytes]]:
-    """Each line with its number from 1, without blanks at its ends. One that is
-    too long is damage, and a last one without its end: nobody can tell what is
-    missing from it."""
-    number = 0
-    while line := stream.readline(LINE_MOST):
-        number += 1
-        if len(line) == LINE_MOST and not line.endswith(b"\n"):
-            account.note(f"line {number}", f"more than {LINE_MOST} bytes")
-            while (more := stream.readline(LINE_MOST)) and not more.endswith(b"\n"):
-                pass
-            continue
-        if not line.endswith(b"\n"):
-            account.note(f"line {number}", "the file ends in the line")
-            return
-        yield number, line.strip()
+    """Each line that is not empty with its number from 1, without blanks at its
+    ends. One that is too long is damage, and a last one without its end: nobody
+    can tell what is missing from it."""
+    number, rest, overlong = 0, b"", False
+    while block := stream.read(BLOCK):
+        lines = (rest + block).split(b"\n")
+        rest = lines.pop()
+        for line in lines:
+            number += 1
+            if overlong or len(line) > LINE_MOST:
+                account.note(f"line {number}", f"more than {LINE_MOST} bytes")
+                overlong = False
+            elif bare := line.strip():
+                yield number, bare
+        if len(rest) > LINE_MOST:
+            rest, overlong = b"", True
+    if rest or overlong:
+        account.note(f"line {number + 1}", "the file ends in the line")
 
 
 def nanoseconds(seconds: bytes, fraction: bytes) -> int:

@@ -106,7 +106,7 @@ def _bus_groups(mdf: Any, account: Account) -> Iterator[tuple[int, str]]:
         names = {channel.name for channel in group.channels}
         found = next((n for n in ("CAN_DataFrame", "CAN_RemoteFrame", "CAN_ErrorFrame") if n in names), None)
         if found is None:
-            account.others["record of an MF4 group without CAN frames"] += int(group.channel_group.cycles_nr)
+            account.other("record of an MF4 group without CAN frames", int(group.channel_group.cycles_nr))
         else:
             yield number, found
 

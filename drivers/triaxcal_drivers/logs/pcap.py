@@ -211,10 +211,10 @@ def _inner(packet: _Packet, account: Account) -> _Inner | None:
         protocol, index = struct.unpack(">HxxI", data[:8])
         sent, inner, channel = data[10] == _SENT_BY_US, data[20:], f"if{index}"
     else:
-        account.others[f"packet of link type {packet.link}"] += 1
+        account.other(f"packet of link type {packet.link}")
         return None
     if protocol not in (_CAN, _CANFD):
-        account.others[f"packet of protocol 0x{protocol:04X}"] += 1
+        account.other(f"packet of protocol 0x{protocol:04X}")
         return None
     return _Inner(inner, protocol, sent, channel, packet.order)
 

@@ -63,7 +63,7 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
                 start_ns = _start_ns(text.partition("=")[2])
             elif text.startswith(";$COLUMNS"):
                 columns = text.partition("=")[2].replace(",", "").strip()
-        elif line:
+        else:
             try:
                 frame = _frame(line.decode("ascii"), columns, start_ns or 0, account)
             except (ValueError, KeyError, IndexError, InvalidOperation):
@@ -88,7 +88,7 @@ def _frame(line: str, columns: str, start_ns: int, account: Account) -> LoggedFr
     at = dict(zip(columns, words, strict=False))
     kind, direction = at.get("T", "DT"), at.get("d", "Rx")
     if kind not in _TYPES or direction not in ("Rx", "Tx") or at["I"] == "FFFFFFFF":
-        account.others[kind if kind != "DT" else "status"] += 1
+        account.other(kind[:8] if kind != "DT" else "status")
         return None
     flags = _TYPES[kind] | (SENT if direction == "Tx" else 0)
     time_ns = start_ns + int(Decimal(at["O"]) * 1_000_000)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from typing import BinaryIO, NamedTuple
 
@@ -17,11 +17,11 @@ import zstandard
 from triaxcal_drivers.logs.frames import Account
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD_MOST = 128 * 2**20
+RECORD_MOST = 64 * 2**20
 """Bytes of a record; a chunk holds 4 MiB by most writers' settings, and one
 image more where it is larger."""
-UNPACKED_MOST = 128 * 2**20  # of a chunk
-EXPANSION_MOST, ROOM = 64, 256 * 2**20
+UNPACKED_MOST = 64 * 2**20  # of a chunk
+EXPANSION_MOST, ROOM = 64, 64 * 2**20
 """So many times its size, and so many bytes more, a file may unpack to."""
 NAMED_MOST = 10_000  # schemas and channels, each; a robot has some hundred topics
 
@@ -88,16 +88,19 @@ class McapFile:
                 yield from self._record(code, self.stream.read(length), where)
         self.account.note(f"byte {at}", "the file ends without its end")
 
-    def _record(self, code: int, body: bytes, where: str) -> Iterator[LoggedMessage]:
+    def _record(self, code: int, body: bytes, where: str) -> Generator[LoggedMessage, None, bool]:
+        """One record of the file, or, with its chunk's place, of a chunk;
+        whether it is what it should be."""
         try:
             if code == _CHUNK_CODE:
                 yield from self._chunk(body, where)
-            elif code == _MESSAGE_CODE:
-                yield from self._message(body, where)
-            else:
-                self._declare(code, body, where)
+                return True
+            if code == _MESSAGE_CODE:
+                return (yield from self._message(body, where))
+            return self._declare(code, body, where)
         except (struct.error, UnicodeDecodeError, IndexError):
             self.account.note(where, "a record that is too short")
+            return False
 
     def _chunk(self, body: bytes, where: str) -> Iterator[LoggedMessage]:
         _, _, size, crc, length = _CHUNK.unpack_from(body)
@@ -114,26 +117,27 @@ class McapFile:
         while at + _HEAD.size <= len(data):
             code, count = _HEAD.unpack_from(data, at)
             at += _HEAD.size
-            if at + count > len(data):
-                self.account.note(where, "a chunk that ends in a record")
+            if at + count > len(data) or code not in (_SCHEMA, _CHANNEL, _MESSAGE_CODE):
+                self.account.note(where, "a chunk with a record that is none")
                 return
-            if code in (_SCHEMA, _CHANNEL, _MESSAGE_CODE):
-                yield from self._record(code, data[at : at + count], where)
+            if not (yield from self._record(code, data[at : at + count], where)):
+                return  # so that a chunk of a million bad records is one of them
             at += count
 
-    def _message(self, body: bytes, where: str) -> Iterator[LoggedMessage]:
+    def _message(self, body: bytes, where: str) -> Generator[LoggedMessage, None, bool]:
         number, _, log_time_ns, _ = _MESSAGE.unpack_from(body)
         if number not in self._channels:
             self.account.note(where, f"a message of channel {number}, which is not declared")
-            return
+            return False
         yield LoggedMessage(self._channels[number], log_time_ns, body[_MESSAGE.size :])
+        return True
 
-    def _declare(self, code: int, body: bytes, where: str) -> None:
+    def _declare(self, code: int, body: bytes, where: str) -> bool:
         """Raises struct.error, UnicodeDecodeError."""
         known: dict[int, Schema] | dict[int, Channel] = self._schemas if code == _SCHEMA else self._channels
         if len(known) >= NAMED_MOST:
             self.account.note(where, f"more than {NAMED_MOST} schemas or channels")
-            return
+            return False
         (number,) = struct.unpack_from("<H", body)
         if code == _SCHEMA:
             name, at = _text(body, 2)
@@ -146,6 +150,7 @@ class McapFile:
             encoding, _ = _text(body, at)
             self._channels[number] = Channel(self._schemas.get(schema), topic, encoding)
             self.topics[topic] = None
+        return True
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
