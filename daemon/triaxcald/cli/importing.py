@@ -18,6 +18,8 @@ def import_command(a: argparse.Namespace) -> int:
     driver = bundle.profile.driver
     if driver not in ("can", "mcap"):
         raise InputError(f"{a.profile}: driver '{driver}' has no logs that can be imported, expected can or mcap")
+    if driver == "mcap" and (a.node is not None or a.channel is not None):
+        raise InputError(f"--{'channel' if a.channel else 'node'}: of a CAN bus; the profile's driver is 'mcap'")
     with opened(a.log) as log:
         if isinstance(log.kind, Kind) != (driver == "can"):
             name = log.kind.name if isinstance(log.kind, Kind) else log.kind

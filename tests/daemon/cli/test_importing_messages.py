@@ -229,6 +229,7 @@ def test_a_profile_and_a_log_of_unlike_kinds_are_refused(tmp_path: Path, triaxca
     triaxcal("log", "import", log, "--profile", "triax-ref-can", "-o", tmp_path / "r.mcap").failed(
         2, f"{log}: MCAP, which holds no frames of CAN; the profile's driver is 'can'"
     )
+    imported(log, profile(tmp_path), "--channel", "can0").failed(2, "--channel: of a CAN bus; the profile's driver is")
     frames = tmp_path / "a.log"
     frames.write_text("(1436509052.249713) vcan0 044#2A366C2B\n")
     imported(frames, profile(tmp_path)).failed(2, "candump, which holds no messages; the profile's driver is 'mcap'")
