@@ -67,6 +67,18 @@ def bus_frames(recording: Contents) -> Iterator[tuple[Channel, RawBatch]]:
     return ((channel_of(phase), batch) for phase, batch in recording.raw_batches() if phase.startswith(BUS_PHASE))
 
 
+def frame_rows(recording: Contents) -> Iterator[tuple[int, int, int, bytes, str]]:
+    """The same frame by frame: time in ns, source, flags, data, and the name of
+    the channel. Raises RecordingError."""
+    for channel, batch in bus_frames(recording):
+        ends = np.cumsum(batch.length, dtype=np.int64).tolist()
+        begin, name = 0, "" if channel is None else str(channel)
+        columns = (batch.time_ns.tolist(), batch.source.tolist(), batch.flags.tolist())
+        for time_ns, source, flags, end in zip(*columns, ends, strict=True):
+            yield time_ns, source, flags, batch.payload[begin:end], name
+            begin = end
+
+
 def require_of_unit(recording: Contents) -> None:
     """Raises RecordingError where it holds the frames of a bus."""
     if is_of_bus(recording):

@@ -58,6 +58,10 @@ class SegmentedWriter(RecordingWriter):
     def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
         raise RecordingError(f"{self.manifest}: a recording in segments ends with no document")
 
+    @property
+    def _told(self) -> Path:
+        return self._file.path
+
     def _left_with(self, error: BaseException | None) -> EndedBecause | None:
         return ended_because(error)
 

@@ -173,8 +173,8 @@ class RecordingWriter:
         self._jobs.put(None)
         self._thread.join(max(0.0, until_s - time.monotonic()))
         if self._thread.is_alive():
-            return Left(f"{self._file.path} is not finished; triaxcal log recover mends it")
-        return Left(str(self._failure) if self._failure else f"{self._file.path} is finished")
+            return Left(f"{self._told} is not finished; triaxcal log recover mends it")
+        return Left(str(self._failure) if self._failure else f"{self._told} is finished")
 
     def __enter__(self) -> Self:
         return self
@@ -188,6 +188,11 @@ class RecordingWriter:
             if value is None:
                 raise
             value.add_note(str(e))  # what is on its way already weighs more
+
+    @property
+    def _told(self) -> Path:
+        """The file that messages name."""
+        return self.path
 
     def _left_with(self, error: BaseException | None) -> EndedBecause | None:
         """What to say of why it ended; None where whoever writes it says so
@@ -228,7 +233,7 @@ class RecordingWriter:
             self._report_losses()
             self._finish()
         except OSError as e:
-            self._failure = disk.not_written(self._file.path, e, self._file.sound_ns)
+            self._failure = disk.not_written(self._told, e, self._file.sound_ns)
         except RecordingError as e:
             self._failure = e
         finally:
@@ -256,7 +261,7 @@ class RecordingWriter:
         detail = json.dumps({"reason": "disk", "free_bytes": free}, sort_keys=True)
         self._file.write(schema.EVENTS, schema.Event(self._clock_ns(), ENDED, detail))
         self._finish()
-        raise disk.ended_early(self._file.path, free, self._file.sound_ns)
+        raise disk.ended_early(self._told, free, self._file.sound_ns)
 
     def _make_room(self, job: Callable[[], None]) -> None:
         job()

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcald.recording import schema
-from triaxcald.recording.bus import Channel, bus_frames, bus_record, channel_of, phase_of
+from triaxcald.recording.bus import Channel, bus_frames, bus_record, channel_of, frame_rows, phase_of
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
 from triaxcald.recording.writer import RecordingWriter
@@ -60,6 +60,17 @@ def test_its_frames_come_by_channel_in_the_order_of_the_file(bus_recording: Path
     assert batch.time_ns.tolist() == CHASSIS.time_ns.tolist()
     assert batch.flags.tolist() == CHASSIS.flags.tolist()
     assert batch.payload == CHASSIS.payload
+
+
+def test_its_frames_come_one_by_one_for_whoever_imports_them(bus_recording: Path) -> None:
+    with Recording.open(bus_recording) as recording:
+        rows = list(frame_rows(recording))
+    assert rows[:3] == [
+        (T0_NS, 0x123, 0, b"\x01\x02", "chassis"),
+        (T0_NS + 1_000, 0x123, RawFlag.EXTENDED_ID, b"\x03", "chassis"),
+        (T0_NS + 2_000, 0x124, REMOTE, bytes(4), "chassis"),
+    ]
+    assert rows[5] == (T0_NS + 2_500_000_000, 0x7FF, RawFlag.LOST_BEFORE, b"", "1")
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import signal
+import socket
 import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from subprocess import DEVNULL
 from typing import Any
 
 import can
@@ -126,13 +129,9 @@ def test_a_message_that_its_sender_changes_afterwards_is_recorded_as_it_was(tmp_
 def test_a_message_does_not_wait_for_others_to_come(
     tmp_path: Path, wait_until: Callable[[Callable[[], bool]], None]
 ) -> None:
-    def in_the_file() -> int:
-        with Recording.open(tmp_path / "x.mcap", unfinished=True) as recording:
-            return sum(len(batch) for _, batch in recording.raw_batches())
-
     with RecordingMessageWriter(tmp_path / "x.mcap") as writer:
         writer(EVERY_KIND[0])
-        wait_until(lambda: in_the_file() == 1)
+        wait_until(lambda: frames_in(tmp_path / "x.mcap") == 1)
         assert writer.file_size() > 0
 
 
@@ -198,9 +197,30 @@ def test_a_damaged_or_foreign_file_is_one_clear_error(tmp_path: Path, number: in
 # The tools themselves, as they are installed.
 
 
+GROUP = "239.74.163.2"
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("", 0))
+        return int(s.getsockname()[1])
+
+
+def multicast_or_skip(port: int) -> can.BusABC:
+    try:
+        bus = can.Bus(interface="udp_multicast", channel=GROUP, port=port)  # which hears itself
+        bus.send(can.Message(arbitration_id=1))
+        if bus.recv(2.0) is not None:
+            return bus
+        bus.shutdown()
+    except (OSError, can.CanError):
+        pass
+    pytest.skip("there is no multicast on the loopback")
+
+
 @pytest.fixture
-def tool(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs one of python-can's tools, to which the entry points of this project are known."""
+def environment(tmp_path: Path) -> dict[str, str]:
+    """In which python-can's tools know the entry points of this project, installed or not."""
     groups = tomllib.loads((PROJECT / "pyproject.toml").read_text("utf-8"))["project"]["entry-points"]
     known = tmp_path / "site" / "triaxcal_entry_points-0.dist-info"
     known.mkdir(parents=True)
@@ -209,17 +229,43 @@ def tool(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     text = "".join(f"[{g}]\n" + "".join(f"{k} = {v}\n" for k, v in groups[g].items()) for g in wanted)
     (known / "entry_points.txt").write_text(text)
     paths = [str(known.parent), *(p for p in sys.path if p)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
-    def run(name: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-        if not (BIN / name).exists():
-            pytest.skip(f"{name} is not installed")
+
+def path_of(tool: str) -> Path:
+    if not (BIN / tool).exists():
+        pytest.skip(f"{tool} is not installed")
+    return BIN / tool
+
+
+@pytest.fixture
+def tool(tmp_path: Path, environment: dict[str, str]) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs one of python-can's tools to its end."""
+
+    def run(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [BIN / name, *map(str, arguments)],
+            [path_of(name), *arguments],
             env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False,
         )  # fmt: skip
 
     return run
+
+
+@pytest.fixture
+def tool_at_work(tmp_path: Path, environment: dict[str, str]) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts one of python-can's tools."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(name: str, *arguments: str) -> subprocess.Popen[str]:
+        started.append(
+            subprocess.Popen([path_of(name), *arguments], env=environment, cwd=tmp_path, stdout=DEVNULL, text=True)
+        )
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".asc", ".log"])
@@ -244,6 +290,36 @@ def test_can_player_sends_what_a_recording_holds(tmp_path: Path, tool: Callable[
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if line.startswith("Timestamp:")]
     assert [line.split("ID:")[1].split()[0] for line in lines] == ["123", "1abcdef0", "7ff", "127"]
+
+
+def frames_in(path: Path) -> int:
+    """Of a file that is being written; -1 where its head is not there yet."""
+    try:
+        with Recording.open(path, unfinished=True) as recording:
+            return sum(len(batch) for _, batch in recording.raw_batches())
+    except RecordingError:
+        return -1
+
+
+def test_can_logger_records_what_comes_over_a_bus_until_it_is_interrupted(
+    tmp_path: Path,
+    tool_at_work: Callable[..., subprocess.Popen[str]],
+    wait_until: Callable[[Callable[[], bool]], None],
+) -> None:
+    port = free_port()
+    with multicast_or_skip(port) as bus:
+        logger = tool_at_work("can_logger", "-i", "udp_multicast", "-c", GROUP, "--bus-kwargs", f"port={port}",
+                              "-f", "x.mcap")  # fmt: skip
+        wait_until(lambda: frames_in(tmp_path / "x.mcap") == 0)
+        for i in range(50):
+            bus.send(can.Message(arbitration_id=0x100 + i, data=bytes([i]), is_extended_id=False))
+        bus.send(can.Message(arbitration_id=0x1ABCDEF0, data=bytes(20), is_fd=True, bitrate_switch=True))
+        wait_until(lambda: frames_in(tmp_path / "x.mcap") == 51)
+        logger.send_signal(signal.SIGINT)
+        assert logger.wait(60) == 0
+    got = read(tmp_path / "x.mcap")
+    assert [m.arbitration_id for m in got] == [*range(0x100, 0x132), 0x1ABCDEF0]
+    assert (got[-1].is_fd, got[-1].bitrate_switch, got[-1].is_extended_id, got[-1].dlc) == (True, True, True, 20)
 
 
 def test_no_format_takes_longer_to_open_for_ours_being_known() -> None:

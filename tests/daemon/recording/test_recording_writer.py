@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import io
+import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -130,6 +131,52 @@ def test_a_record_is_with_the_operating_system_after_one_second(
     clock.now_ns += 1_000_000_000
     writer.event("tick")
     wait_until(lambda: in_the_file() == 10)
+
+
+def test_the_disk_has_it_every_so_many_seconds_and_the_name_of_the_file_at_once(
+    tmp_path: Path, new_writer: NewWriter, clock: Any, batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forced: list[str] = []
+    real = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        forced.append(os.path.basename(os.readlink(f"/proc/self/fd/{descriptor}")))
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with new_writer(sync_s=10.0) as writer:
+        assert forced == [tmp_path.name]
+        for i in range(25):
+            clock.now_ns += 1_000_000_000
+            writer.raw("calibration", batch_of(10 * i, 10))
+            writer.drain()
+        assert forced == [tmp_path.name, "rec.mcap", "rec.mcap"]
+    assert forced[3:] == ["rec.mcap", tmp_path.name]
+
+
+def test_a_caller_that_waits_loses_nothing_however_slow_the_disk(
+    tmp_path: Path, new_writer: NewWriter, disks: list[Disk], batch_of: BatchOf, wait_until: Callable[..., None]
+) -> None:
+    writer = new_writer(queue_batches=3, waits=True)
+    writer.drain()
+    disks[0].ready.clear()
+    writer.attach("block", "text/plain", b"")
+    given: list[int] = []
+
+    def give() -> None:
+        for i in range(20):
+            writer.raw("calibration", batch_of(10 * i, 10))
+            given.append(i)
+
+    caller = threading.Thread(target=give)
+    caller.start()
+    wait_until(lambda: len(given) == 3)
+    disks[0].ready.set()
+    caller.join()
+    writer.close()
+    with Recording.open(tmp_path / "rec.mcap") as rec:
+        assert rec.raw_digest().records == 200
+        assert (list(rec.losses()), writer.losses) == ([], {})
 
 
 def test_a_batch_that_finds_the_queue_full_is_dropped_and_counted(
