@@ -16,7 +16,7 @@ from triaxcald.files import write_durably
 
 FORMAT = "triaxcal.segments/1"
 SUFFIX = ".segments.json"
-MANIFEST_MOST = 32 * 2**20  # bytes; an entry has some 400, and there are 8760 hours in a year
+MANIFEST_MOST = 8 * 2**20  # bytes; an entry has some 400, and there are 8760 hours in a year
 State = Literal["open", "closed", "cut_short"]
 
 
@@ -106,6 +106,8 @@ def load_manifest(path: Path) -> Manifest:
     segments = tuple(_segment(entry, f"{path}: segments[{i}]") for i, entry in enumerate(listed))
     if any(later.number <= earlier.number for earlier, later in pairwise(segments)):
         raise RecordingError(f"{path}: segments: expected numbers that rise")
+    if len({s.file for s in segments}) < len(segments):
+        raise RecordingError(f"{path}: segments: a file is named twice")
     counts = {str(reason): _count(n, f"{path}: deleted") for reason, n in deleted.items()}
     return Manifest(path, segments, counts)
 

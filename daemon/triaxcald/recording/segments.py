@@ -106,7 +106,10 @@ class SegmentedWriter(RecordingWriter):
             self._file = self._next()
             self._told_low = False
             self._retain()
-        if self._lacks() and not self._told_low and not self._retain():
+
+    def _flushed(self) -> None:
+        super()._flushed()
+        if not self._told_low and self._lacks() and not self._retain():
             self._told_low = True
             self._say("disk_low", {"wanted_bytes": self._retention.free_bytes if self._retention else 0})
 

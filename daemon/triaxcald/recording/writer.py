@@ -253,7 +253,15 @@ class RecordingWriter:
                 self._look_after()
 
     def _look_after(self) -> None:
-        if self._file.flush_when_due() and (free := self._file.lacks_room()) is not None:
+        if self._file.flush_when_due():
+            self._flushed()
+
+    def _flush(self) -> None:
+        self._file.flush()
+        self._flushed()
+
+    def _flushed(self) -> None:
+        if (free := self._file.lacks_room()) is not None:
             self._end_for_lack_of_room(free)
 
     def _end_for_lack_of_room(self, free: int) -> None:
@@ -275,9 +283,6 @@ class RecordingWriter:
         for topic, first, records in lost:
             loss = schema.Loss(self._clock_ns(), topic, first, records, "the queue to the disk was full")
             self._write(schema.LOSS, loss)
-
-    def _flush(self) -> None:
-        self._file.flush()
 
     def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:
         self._file.raw(phase, first, batch)

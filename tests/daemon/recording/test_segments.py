@@ -370,6 +370,18 @@ def test_a_manifest_names_files_beside_it_alone(
     assert "segments[0]: file: expected the name of an .mcap beside it" in done.err
 
 
+def test_a_manifest_names_no_file_twice(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], triaxcal: Callable[..., Any]
+) -> None:
+    with new() as writer:
+        minutes(writer, 1)
+    text = (tmp_path / "rec.segments.json").read_text()
+    (tmp_path / "rec.segments.json").write_text(text.replace("rec-000002", "rec-000001"))
+    done = triaxcal("poses", tmp_path / "rec.segments.json")
+    assert done.code == 2
+    assert "segments: a file is named twice" in done.err
+
+
 def test_no_result_of_a_recording_in_segments_is_audited(
     tmp_path: Path, new: NewWriter, minutes: Callable[..., None]
 ) -> None:
