@@ -33,7 +33,7 @@ from triaxcald.recording.writer import RecordingWriter
 GOLDEN = Path(__file__).parents[1] / "recordings" / "can-second-order.mcap"
 GROUP = "239.74.163.2"
 LAST = 0x7FE  # the identifier that ends a reception
-RATE_HZ = 2000  # what a Python sender keeps up with beside four receivers on two processors
+RATE_HZ = 1000  # what a Python sender keeps up with beside four receivers on two processors
 
 
 class McapMessageWriter:
@@ -240,8 +240,10 @@ def receive(name: str, folder: Path, port: int) -> None:
 
 
 def _until_last(bus: can.BusABC) -> Iterator[can.Message]:
-    while (message := bus.recv(20.0)) is not None and message.arbitration_id != LAST:
+    timeout_s = 60.0  # until the others are ready too
+    while (message := bus.recv(timeout_s)) is not None and message.arbitration_id != LAST:
         yield message
+        timeout_s = 5.0
 
 
 def main(arguments: list[str] | None = None) -> int:
