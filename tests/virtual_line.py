@@ -18,8 +18,10 @@ import pytest
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
+from triaxcald.provision.access import RegisterLink
+from triaxcald.provision.pace import Pace
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run import line
+from triaxcald.run import line, write_back
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.simulation.can_unit import ABORT_CODES, tpdos
 from triaxcald.simulation.modbus_unit import ModbusMap
@@ -50,6 +52,11 @@ class VirtualDevice:
 
     def now_ns(self) -> int:
         return START_NS + round(self.time_base.now_s() * 1e9)
+
+    @property
+    def pace(self) -> Pace:
+        """What a deadline goes by. A pause takes none of this time, since nothing is asked in it."""
+        return Pace(lambda _: asyncio.sleep(0), self.time_base.now_s)
 
     async def open(self) -> None:
         await self.time_base.advance(REQUEST_S)
@@ -132,6 +139,11 @@ class _VirtualRun(line.UnitRun):
         return self._device.writer
 
 
+def _linked(device: VirtualDevice, *arguments: Any) -> RegisterLink:
+    """By the host's clock a store would stall while another unit's fit keeps this one from being asked."""
+    return RegisterLink(device, *arguments, pace=device.pace)
+
+
 @contextlib.contextmanager
 def virtual_line(*units: ReferenceUnit) -> Iterator[None]:
     """While it is entered, a station's places have these units, by their serials, and it goes by their clocks."""
@@ -148,6 +160,8 @@ def virtual_line(*units: ReferenceUnit) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Place, "device", device)
         patch.setattr(line, "UnitRun", _VirtualRun)
+        for module in (line, write_back):
+            patch.setattr(module, "RegisterLink", _linked)
         patch.setattr(collection, "LOOK_SAMPLES_S", LOOK_S)
         patch.setattr(collection, "LOOK_HOST_S", 0.0)
         patch.setattr(collection, "LOOK_SHARE", 0.0)
