@@ -102,16 +102,16 @@ def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:
     calm = np.asarray((w.variance <= quiet_limit(w.variance[live], w.size - 1)).all(axis=1)) & ~stuck
     if _only_moves(w, calm):
         return []
-    found, noise = _still_runs(w, calm, live, _rounding(step, raw[calm & live]))
+    found, noise, steady = _still_runs(w, calm, live, _rounding(step, raw[calm & live]))
     for _ in range(2):
         inside = _inside(w, found) & live
         if inside.sum() < 2 * SPAN_LEAST_WINDOWS:
             break
         calm = np.asarray((w.variance <= _limit_within(w.variance[inside], w.size - 1)).all(axis=1)) & ~stuck
-        found, noise = _still_runs(w, calm, live, _rounding(step, raw[inside & calm]))
+        found, noise, steady = _still_runs(w, calm, live, _rounding(step, raw[inside & calm]))
     taken, pieces = _quiet_pieces(w, found, noise)
     shaken = shaken_runs(w, [*taken, *runs(stuck, w.joined)], noise)
-    disturbed = ~_steady(w, calm, noise)
+    disturbed = ~steady
     if turn_s is None:
         kept, longest = sorted([*pieces, *shaken], key=lambda p: int(p[0])), REJOIN_S
     else:
@@ -165,14 +165,14 @@ def _frozen(w: Windows, step: Floats) -> Bools:
     return frozen
 
 
-def _still_runs(w: Windows, calm: Bools, live: Bools, rounding: Rounding) -> tuple[list[Ints], NoiseScales]:
-    """Runs of windows that are calm and do not move, and the noise they were
-    judged by, learned from the ``live``."""
+def _still_runs(w: Windows, calm: Bools, live: Bools, rounding: Rounding) -> tuple[list[Ints], NoiseScales, Bools]:
+    """Runs of windows that are calm and do not move, the noise they were judged
+    by, learned from the ``live``, and which windows are steady by it."""
     noise = NoiseScales.learned(w, calm & live, rounding, first=True)
     for _ in range(2):
         noise = NoiseScales.learned(w, _steady(w, calm, noise) & live, rounding)
     still = _steady(w, calm, noise)
-    return [run for run in runs(still, w.joined) if len(run) >= SPAN_LEAST_WINDOWS], noise
+    return [run for run in runs(still, w.joined) if len(run) >= SPAN_LEAST_WINDOWS], noise, still
 
 
 def _under_way(w: Windows, run: Ints, noise: NoiseScales) -> bool:
@@ -293,12 +293,17 @@ def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
 def _common_climb(at: Ints, z: Floats) -> Floats:
     """(len, 3) what the quietest quarter of the differences of each run have in
     common: the pace of a steady creep."""
-    out = np.zeros_like(z)
-    for part in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) > 1) + 1):
-        quiet = part[np.argsort(np.abs(z[part]).max(axis=1), kind="stable")[: max(len(part) // 4, 1)]]
-        climb = z[quiet].mean(axis=0)
-        out[part] = np.where(np.abs(climb) > 1, climb, 0.0)
-    return out
+    begins = np.diff(at, prepend=at[0] - 2) > 1
+    run, first = np.cumsum(begins) - 1, np.flatnonzero(begins)
+    length = np.diff(first, append=len(at))
+    # Run by run the quietest first: in that order they are added up.
+    ordered = np.lexsort((np.abs(z).max(axis=1), run))
+    count = np.maximum(length // 4, 1)
+    quiet = ordered[np.arange(len(at)) - first[run] < count[run]]
+    climb = np.zeros((len(count), 3))
+    np.add.at(climb, run[quiet], z[quiet])
+    climb /= count[:, None]
+    return np.asarray(np.where(np.abs(climb) > 1, climb, 0.0)[run])
 
 
 def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
