@@ -17,7 +17,7 @@ from pathlib import Path
 
 MODULES = Path("/usr/lib/uml/modules")
 NEEDED = ("net/can/can", "net/can/can-raw", "drivers/net/can/dev/can-dev", "drivers/net/can/vcan")
-OPTIONAL = ("drivers/net/can/slcan/slcan",)
+OPTIONAL = ("drivers/net/can/vxcan", "drivers/net/can/slcan/slcan")
 MEMORY_MB = 768
 PROGRAMS = {"linux.uml": "user-mode-linux", "insmod": "kmod", "ip": "iproute2", "candump": "can-utils"}
 PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"

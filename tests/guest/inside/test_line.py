@@ -1,98 +1,88 @@
-"""The whole way: a simulated unit on a CAN interface, recorded, with candump beside it."""
+"""The whole way: a simulated unit on a CAN bus, recorded across a link that goes down, with candump beside it."""
 
 from __future__ import annotations
 
-import os
-import signal
+import json
 import subprocess
-import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
-from tests.guest.inside.witness import PATIENCE_S, listeners, seen, wait_until
-from triaxcald.cli.commands import main
-from triaxcald.cli.signals import heed_stop_signals
-from triaxcald.recording.reader import Recording
-from triaxcald.simulation import bench, can_unit  # noqa: F401 - which take long: once for both processes
-from triaxcald.station import collection  # noqa: F401
-from triaxcald.station.lock import FOLDER_VARIABLE
+from tests.guest.inside.program import events, recorder, records, simulated_unit
+from tests.guest.inside.witness import PATIENCE_S, Seen, listeners, seen, wait_until
+from triaxcal_drivers.interface import RawFlag
 
-SECONDS = 2
-DEVICE = """\
-format = "triaxcal.device/1"
-profile = "triax-ref-can"
-serial = 4711
-speed = 1.0
-fixture = {{ poses = 9 }}
-bus = {{ interface = "socketcan", channel = "{0}", node_id = 5 }}
-"""
-STATION = """\
-format = "triaxcal.station/1"
-name = "bench"
-[[units]]
-name = "unit"
-profile = "triax-ref-can"
-serial = "4711"
-bus = {{ interface = "socketcan", channel = "{0}", node_id = 5 }}
-"""
+SECONDS = 4  # of the samples' time, in which the gap is
 
 
-def started(said: Path, *arguments: object) -> int:
-    """A command of ours in a process of its own, with what is imported here already; the process's number."""
-    said.touch()
-    process = os.fork()
-    if process == 0:
-        code = 70
-        try:
-            sys.stdout = sys.stderr = open(said, "w", buffering=1)  # noqa: SIM115
-            heed_stop_signals()
-            code = main([str(argument) for argument in arguments])
-        finally:
-            os._exit(code)
-    return process
+@pytest.fixture
+def witness(tmp_path: Path) -> Iterator[Callable[[str], Callable[[], list[Seen]]]]:
+    """Lets candump log an interface from now on, also when that goes down; what it gives stops it, and has all that it
+    saw."""
+    running: list[subprocess.Popen[bytes]] = []
+
+    def watch(name: str) -> Callable[[], list[Seen]]:
+        log, before = tmp_path / "candump.log", listeners(name)
+        with open(log, "w") as out:
+            process = subprocess.Popen(["candump", "-D", "-L", "-r", "8000000", name], stdout=out)
+        running.append(process)
+        wait_until(lambda: listeners(name) > before)
+
+        def stopped() -> list[Seen]:
+            process.terminate()
+            process.wait(PATIENCE_S)
+            return [seen(line) for line in log.read_text().splitlines()]
+
+        return stopped
+
+    yield watch
+    for process in running:
+        process.kill()
+        process.wait()
 
 
-def test_a_recording_holds_every_frame_that_candump_saw(
-    vcan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def pair() -> Iterator[tuple[str, str]]:
+    """Two interfaces that are one bus, of which each can go down alone."""
+    names = ("vxcan0", "vxcan1")
+    subprocess.run(["ip", "link", "add", names[0], "type", "vxcan", "peer", "name", names[1]], check=True)
+    for name in names:
+        subprocess.run(["ip", "link", "set", name, "up"], check=True)
+    yield names
+    subprocess.run(["ip", "link", "del", names[0]], check=True)
+
+
+def test_a_recording_has_every_frame_that_candump_saw_before_and_after_its_gap(
+    pair: tuple[str, str], tmp_path: Path, witness: Any
 ) -> None:
-    (tmp_path / "device.toml").write_text(DEVICE.format(vcan))
-    (tmp_path / "station.toml").write_text(STATION.format(vcan))
-    recording, log = tmp_path / "recording.mcap", tmp_path / "candump.log"
-    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    before = listeners(vcan)
-    with open(log, "w") as out:
-        witness = subprocess.Popen(["candump", "-L", "-r", "8000000", vcan], stdout=out)
-    wait_until(lambda: listeners(vcan) > before)
-    unit = started(tmp_path / "unit", "sim", tmp_path / "device.toml")
-    wait_until(lambda: "serving triax-ref-can, serial 4711" in (tmp_path / "unit").read_text())
-    station = started(
-        tmp_path / "station", "record", tmp_path / "station.toml", "-o", recording, "--seconds", str(SECONDS)
-    )
-    code = os.waitstatus_to_exitcode(os.waitpid(station, 0)[1])
-    os.kill(unit, signal.SIGINT)
-    os.waitpid(unit, 0)
-    witness.send_signal(signal.SIGINT)
-    witness.wait(PATIENCE_S)
-    assert code == 0, (tmp_path / "station").read_text()
+    unit_side, station_side = pair
+    path, dumped = tmp_path / "recording.mcap", witness(station_side)
+    unit = simulated_unit(tmp_path, unit_side)
+    before = listeners(station_side)
+    record = recorder(tmp_path, station_side, path, "--seconds", SECONDS)
+    record.says("recording")
+    wait_until(lambda: listeners(station_side) > before)
+    subprocess.run(["ip", "link", "set", station_side, "down"], check=True)
+    record.says("the link is down")
+    subprocess.run(["ip", "link", "set", station_side, "up"], check=True)
+    assert record.ends() == 0, record.said.read_text()
+    unit.stop()
 
-    recorded = _records(recording)
-    identifiers = {identifier for _, identifier, _ in recorded}
-    dumped = [(f.time_us, f.word, f.data) for f in map(seen, log.read_text().splitlines()) if f.word in identifiers]
-    first = next(i for i, (_, *frame) in enumerate(dumped) if frame == list(recorded[0][1:]))
-    witnessed = dumped[first : first + len(recorded)]
-    assert [frame[1:] for frame in recorded] == [frame[1:] for frame in witnessed]
-    apart_us = np.array([frame[0] for frame in recorded]) - np.array([frame[0] for frame in witnessed])
-    assert np.abs(apart_us).max() <= 1
-    assert len(recorded) >= SECONDS * 100 * len(identifiers) - 10  # 100 Hz
-
-
-def _records(path: Path) -> list[tuple[int, int, bytes]]:
-    records = []
-    with Recording.open(path) as recording:
-        for _, batch in recording.raw_batches():
-            ends = np.cumsum(batch.length)
-            for time_ns, source, begin, end in zip(batch.time_ns, batch.source, ends - batch.length, ends, strict=True):
-                records.append((int(time_ns) // 1000, int(source), batch.payload[begin:end]))
-    return records
+    recorded, watched = records(path), dumped()
+    (after,) = (i for i, (_, _, flags, _) in enumerate(recorded) if flags & RawFlag.LOST_BEFORE)
+    identifiers = {source for _, source, _, _ in recorded}
+    seen_there = [(frame.time_us, frame.word, frame.data) for frame in watched if frame.word in identifiers]
+    for part in recorded[:after], recorded[after:]:
+        frames = [(time_us, source, data) for time_us, source, _, data in part]
+        first = seen_there.index(frames[0])
+        assert frames == seen_there[first : first + len(frames)]
+    told = {kind: detail for kind, detail in events(path) if kind in ("interrupted", "gap")}
+    for kind in ("interrupted", "gap"):
+        down = f"socketcan {station_side}: the link is down: `ip link set {station_side} up`"
+        assert down in json.dumps(told[kind]), kind
+    assert told["gap"]["to_ns"] // 1000 == recorded[after][0]
+    assert told["gap"]["from_ns"] // 1000 == recorded[after - 1][0]
+    assert after > 0
+    assert len(recorded) > after + 1
