@@ -121,9 +121,9 @@ def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
 
 def _summary(kept: Kept) -> str:
     parts = [f"{kept.path}: {kept.counts['samples']} samples in {kept.seconds:.1f} s"]
-    parts += [f"{n} {kind}" for kind, n in kept.counts.items() if n and kind != "samples"]
-    if kept.gaps_s:
-        parts.append(f"{kept.gaps_s:.1f} s of gaps")
+    parts += [f"{n} {kind}" for kind, n in kept.counts.items() if n and kind not in ("samples", "receiver_overflows")]
+    if kept.gaps:
+        parts.append(f"{kept.gaps} gaps of {kept.gaps_s:.1f} s in all")
     if kept.lost:
         parts.append(f"{kept.lost} records lost between bus and disk")
     return ", ".join(parts)

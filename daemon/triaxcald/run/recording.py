@@ -27,13 +27,15 @@ from triaxcald.station.coming_back import Patience
 @dataclass(frozen=True)
 class Kept:
     """What a unit's recording has come to. ``counts`` are of its readings,
-    which span ``seconds``; ``gaps_s`` of them it was lost, and ``lost`` raw
-    records did not get to the disk. ``error`` is one line where it failed."""
+    which span ``seconds``; in ``gaps`` gaps it was lost for ``gaps_s``, and
+    ``lost`` raw records did not get to the disk. ``error`` is one line where it
+    failed."""
 
     unit: str
     path: Path | None
     counts: dict[str, int]
     seconds: float = 0.0
+    gaps: int = 0
     gaps_s: float = 0.0
     lost: int = 0
     exit_code: int = DONE
@@ -159,7 +161,15 @@ class UnitRecording:
 
     def _kept(self, e: BaseException | None) -> Kept:
         readings, unit = self._recorded.streams[READINGS], self._session.name
-        kept = Kept(unit, self._path, dict(readings.counts), readings.seconds, self._recorded.gaps_s, self._lost)
+        kept = Kept(
+            unit,
+            self._path,
+            dict(readings.counts),
+            readings.seconds,
+            self._recorded.gaps,
+            self._recorded.gaps_s,
+            self._lost,
+        )
         if e is None:
             return kept
         ending = aborted(e, None)

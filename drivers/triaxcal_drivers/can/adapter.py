@@ -39,5 +39,9 @@ class Adapter(Protocol):
     def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
         """Raises BusError."""
 
+    def missed(self) -> int:
+        """Frames that are known to be lost, and that no received frame has told
+        of yet."""
+
     def close(self) -> None:
         """Raises nothing."""

@@ -123,6 +123,8 @@ class CanLine:
                 frames = adapter.receive(POLL_S)
             except BusError as e:
                 if self._adapter is adapter:
+                    if missed := adapter.missed():  # which no frame will tell of any more
+                        e = BusError(f"{e}; {missed} frames before it were lost")
                     self._adapter, self._failure = None, e
                     for queue in self._queues:
                         queue.fail(e)

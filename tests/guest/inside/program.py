@@ -62,8 +62,11 @@ class Command:
         """Waits for it; the exit code."""
         return os.waitstatus_to_exitcode(os.waitpid(self._process, 0)[1])
 
+    def signal(self, number: signal.Signals) -> None:
+        os.kill(self._process, number)
+
     def stop(self) -> None:
-        os.kill(self._process, signal.SIGINT)
+        self.signal(signal.SIGINT)
         self.ends()
 
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 import struct
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.guest.inside.conftest import ip
-from tests.guest.inside.test_line import started
-from tests.guest.inside.witness import Sender, listeners, wait_until
+from tests.guest.inside.program import Command, events
+from tests.guest.inside.witness import Sender, listeners
 from triaxcal_drivers.can.receive import OVERFLOW
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.loading import BUILT_IN
@@ -77,34 +75,16 @@ async def until(true: Callable[[], bool]) -> None:
         await asyncio.sleep(0.01)
 
 
-def events_of(path: Path) -> list[tuple[str, Any]]:
-    with Recording.open(path) as recording:
-        return [(e.kind, e.detail) for e in recording.events() if e.kind != "recording_started"]
-
-
 def decoded(path: Path) -> tuple[DecodedStream, np.ndarray]:
     with Recording.open(path) as recording:
         stream = DecodedStream(bundle_of(recording), READINGS)
         return stream, np.concatenate([stream.feed(batch).counter for batch in recording.raw(CALIBRATION)])
 
 
-def test_a_link_that_goes_down_and_up_leaves_a_gap_in_one_recording(
-    vcan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    cause = over_a_fault(vcan, tmp_path, ["set", vcan, "down"], ["set", vcan, "up"])
-    assert "the link is down" in cause
-
-
 def test_an_interface_that_is_removed_and_added_leaves_a_gap_in_one_recording(
     vcan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    over_a_fault(vcan, tmp_path, ["del", vcan], ["add", "dev", vcan, "up", "type", "vcan"])
-
-
-def over_a_fault(vcan: str, tmp_path: Path, breaks: list[str], mends: list[str]) -> str:
-    """What the recording says of its cause."""
     station, told, path = load_station(station_file(tmp_path, vcan)), Told(), tmp_path / "rec.mcap"
     recording = UnitRecording(UnitSession(station, station.places[0], told), lambda _: path)
 
@@ -114,11 +94,11 @@ def over_a_fault(vcan: str, tmp_path: Path, breaks: list[str], mends: list[str])
         sender = Sender(vcan)
         send(sender, range(50))
         await until(lambda: recording.status.records == 100)
-        ip("link", *breaks)
+        ip("link", "del", vcan)
         await until(lambda: recording.status.state is State.WAITING)
         sender.close()
         await until(lambda: any(said.startswith("lost: cannot open socketcan") for said in told.said))
-        ip("link", *mends)
+        ip("link", "add", "dev", vcan, "up", "type", "vcan")
         sender, counter = Sender(vcan), 200
         while recording.status.state is State.WAITING:
             send(sender, [counter])
@@ -131,13 +111,11 @@ def over_a_fault(vcan: str, tmp_path: Path, breaks: list[str], mends: list[str])
         await running
 
     asyncio.run(work())
-    kinds = [kind for kind, _ in events_of(path)]
-    assert kinds == ["interrupted", "gap", "ended"]
+    assert [kind for kind, _ in events(path)] == ["recording_started", "interrupted", "gap", "ended"]
     stream, counters = decoded(path)
     assert counters[:42].tolist() == list(range(42)), "the last of them wait for those after them"
     assert stream.counts["receiver_overflows"] == 1
     assert (np.diff(counters) >= 1).all()
-    return str(events_of(path)[0][1]["cause"])
 
 
 def test_what_a_stopped_process_does_not_fetch_is_counted_with_its_place(
@@ -145,26 +123,26 @@ def test_what_a_stopped_process_does_not_fetch_is_counted_with_its_place(
 ) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     station = station_file(tmp_path, vcan, "receive_buffer = 65536")
-    path, said = tmp_path / "rec.mcap", tmp_path / "station"
-    process = started(said, "record", station, "-o", path)
-    wait_until(lambda: "recording" in said.read_text() and listeners(vcan) > 0)
+    path = tmp_path / "rec.mcap"
+    command = Command(tmp_path, "record", station, "-o", path)
+    command.says("recording")
     sender = Sender(vcan)
     for counter in range(100):
         send(sender, [counter])
         time.sleep(0.01)
-    os.kill(process, signal.SIGSTOP)
+    command.signal(signal.SIGSTOP)
     send(sender, range(100, 2100))
     time.sleep(3.0)  # longer than the unit may be silent
-    os.kill(process, signal.SIGCONT)
+    command.signal(signal.SIGCONT)
     for counter in range(2100, 2300):
         send(sender, [counter])
         time.sleep(0.002)
     time.sleep(1.0)
-    os.kill(process, signal.SIGINT)
-    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 130, said.read_text()
-    events = events_of(path)
-    gaps = [detail for kind, detail in events if kind == "gap"]
-    assert "interrupted" not in [kind for kind, _ in events], "the unit was not silent"
+    command.signal(signal.SIGINT)
+    assert command.ends() == 130, command.said.read_text()
+    told = events(path)
+    gaps = [detail for kind, detail in told if kind == "gap"]
+    assert "interrupted" not in [kind for kind, _ in told], "the unit was not silent"
     assert {gap["cause"] for gap in gaps} == {OVERFLOW}
     with Recording.open(path) as recording:
         batches = [batch for _, batch in recording.raw_batches()]
