@@ -12,7 +12,7 @@ from typing import Any
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import disk, schema
-from triaxcald.recording.ending import EndedBecause, ended_because
+from triaxcald.recording.ending import ended_because
 from triaxcald.recording.file import Head, RecordingFile
 from triaxcald.recording.inventory import Document
 from triaxcald.recording.manifest import Manifest, Segment, State, load_manifest, manifest_path
@@ -62,8 +62,8 @@ class SegmentedWriter(RecordingWriter):
     def _told(self) -> Path:
         return self._file.path
 
-    def _left_with(self, error: BaseException | None) -> EndedBecause | None:
-        return ended_because(error)
+    def _leave(self, error: BaseException | None) -> None:
+        self.close(ended_because(error))
 
     def _begin(self, head: Head) -> RecordingFile:
         self._head = replace(head, metadata={name: dict(record) for name, record in head.metadata.items()})

@@ -183,7 +183,7 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self.close(None if self._closed else self._left_with(value))
+            self._leave(value)
         except RecordingError as e:
             if value is None:
                 raise
@@ -194,10 +194,9 @@ class RecordingWriter:
         """The file that messages name."""
         return self.path
 
-    def _left_with(self, error: BaseException | None) -> EndedBecause | None:
-        """What to say of why it ended; None where whoever writes it says so
-        himself."""
-        return None
+    def _leave(self, error: BaseException | None) -> None:
+        """Closes it, left as a context manager with ``error``."""
+        self.close()
 
     def _check(self) -> None:
         if self._failure is not None:
