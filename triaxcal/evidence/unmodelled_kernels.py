@@ -158,7 +158,7 @@ def kinds_of(rows: LinearisedData) -> list[UnmodelledCovariance]:
 
 
 def _covariances(rows: LinearisedData) -> Iterator[tuple[UnmodelledKind, float, _Between]]:
-    yield UnmodelledKind.EACH_POSE, 0.0, lambda p, q: _of_means(p, q, _same(p, q))
+    yield UnmodelledKind.EACH_POSE, 0.0, _own_of_means
     sphere = _Sphere.of(rows)
     for length in SMOOTH:
         yield UnmodelledKind.DIRECTION, length, sphere.covariance(partial(_smooth, length=length))
@@ -169,7 +169,7 @@ def _covariances(rows: LinearisedData) -> Iterator[tuple[UnmodelledKind, float, 
     for share in IN_TIME:
         yield UnmodelledKind.TIME, share, partial(_in_time, length=share * duration_of(rows))
     if rows.slopes:
-        yield UnmodelledKind.WITHIN_POSE, 0.0, lambda p, q: _of_slopes(p, q, _same(p, q))
+        yield UnmodelledKind.WITHIN_POSE, 0.0, _own_of_slopes
 
 
 def _same(p: PoseInputs, q: PoseInputs) -> Floats:
@@ -187,6 +187,14 @@ def _of_slopes(p: PoseInputs, q: PoseInputs, covariance: Floats) -> Floats:
     whole = np.zeros((len(p.error), len(q.error)))
     whole[p.k :, q.k :] = covariance
     return whole
+
+
+def _own_of_means(p: PoseInputs, q: PoseInputs) -> Floats:
+    return _of_means(p, q, _same(p, q))
+
+
+def _own_of_slopes(p: PoseInputs, q: PoseInputs) -> Floats:
+    return _of_slopes(p, q, _same(p, q))
 
 
 def _by_the_pose_before(p: PoseInputs, q: PoseInputs) -> Floats:
@@ -229,17 +237,26 @@ class _Sphere:
 
     def covariance(self, of: _Covariance) -> _Between:
         """Of a function of direction, less its linear part over the sphere."""
-        inner = of(self.everywhere, self.everywhere)
+        return _LessLinear(self, of, of(self.everywhere, self.everywhere))
 
-        def between(p: PoseInputs, q: PoseInputs) -> Floats:
-            here, there = p.reading_geometry.linear @ self.fit, q.reading_geometry.linear @ self.fit
-            crossed = of(p.reading_geometry, self.everywhere) @ there.T
-            mirrored = here @ of(self.everywhere, q.reading_geometry)
-            return _of_means(
-                p, q, of(p.reading_geometry, q.reading_geometry) - crossed - mirrored + here @ inner @ there.T
-            )
 
-        return between
+@dataclass(frozen=True, eq=False)
+class _LessLinear:
+    """A `_Between`; no closure, so that a diagnosis can be pickled. ``inner``
+    is the covariance over the sphere."""
+
+    sphere: _Sphere
+    of: _Covariance
+    inner: Floats
+
+    def __call__(self, p: PoseInputs, q: PoseInputs) -> Floats:
+        of, everywhere, fit = self.of, self.sphere.everywhere, self.sphere.fit
+        here, there = p.reading_geometry.linear @ fit, q.reading_geometry.linear @ fit
+        crossed = of(p.reading_geometry, everywhere) @ there.T
+        mirrored = here @ of(everywhere, q.reading_geometry)
+        return _of_means(
+            p, q, of(p.reading_geometry, q.reading_geometry) - crossed - mirrored + here @ self.inner @ there.T
+        )
 
 
 def reading_geometry(rows: LinearisedData, u: Floats) -> ReadingGeometry:
