@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,12 @@ class Forgery:
                 elif isinstance(record, Attachment | Metadata | Message):
                     found.records.append(record)
         return found
+
+    def copied(self) -> Forgery:
+        """To be changed while this one stays. The messages, which are thousands, are the same: they are replaced,
+        never changed."""
+        records = [r if isinstance(r, Message) else deepcopy(r) for r in self.records]
+        return Forgery(self.profile, deepcopy(self.schemas), deepcopy(self.channels), records)
 
     def write(self, out: Path, spoil: Callable[[Any], object] = lambda _: None, **options: Any) -> Path:
         """``options`` are mcap's writer's; ``spoil`` gets the writer before it writes its indices."""

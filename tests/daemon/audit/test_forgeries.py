@@ -400,7 +400,7 @@ def source(finished_run: Any) -> Forgery:
 def test_what_is_changed_or_taken_out_is_found(
     source: Forgery, tmp_path: Path, said: Callable[[Path], list[str]], row: Row
 ) -> None:
-    forged = deepcopy(source)
+    forged = source.copied()
     row.make(forged)
     if row.sealed:
         forged.seal()
@@ -411,7 +411,7 @@ def test_what_is_changed_or_taken_out_is_found(
 def test_the_table_is_of_forgeries_and_not_of_the_forger(
     source: Forgery, tmp_path: Path, said: Callable[[Path], list[str]]
 ) -> None:
-    copy = deepcopy(source)
+    copy = source.copied()
     assert said(copy.write(tmp_path / "copied.mcap")) == []
     copy.seal()
     assert said(copy.write(tmp_path / "sealed.mcap")) == []
@@ -421,7 +421,7 @@ def test_a_recording_turned_back_is_told_as_such_with_its_digests_mended(
     finished_run: Any, source: Forgery, tmp_path: Path, said: Callable[[Path], list[str]]
 ) -> None:
     """The certificate's own digest is of what the recording ends with."""
-    forged = deepcopy(source)
+    forged = source.copied()
     _turned_back_with_digest(finished_run.can, forged)
     found = said(forged.write(tmp_path / "forged.mcap"))
     assert any("was turned back into the format before it" in line for line in found), found
@@ -470,7 +470,7 @@ def test_in_a_recording_from_before_there_were_outcomes_too(
 def test_a_file_beside_an_aborted_unit_s_recording_that_says_it_was_certified_is_found(
     finished_run: Any, tmp_path: Path, said: Callable[[Path], list[str]], source: Forgery
 ) -> None:
-    forged = deepcopy(source)
+    forged = source.copied()
     _aborted(forged)
     path = forged.write(tmp_path / "unit.mcap")
     path.with_suffix(f".{CERTIFICATE}").write_text(json.dumps({}))

@@ -9,16 +9,9 @@ from typing import Any
 import pytest
 
 from tests.daemon.audit.forging import Forgery
-from triaxcald.audit import Audit, audit, text
+from triaxcald.audit import audit, text
 
 EARLIER = Path(__file__).parents[3] / "recordings" / "by-0.1.0.mcap"
-
-
-def audited(change: Callable[[Any], object], folder: Path) -> Audit:
-    """With a certificate that was changed."""
-    forgery = Forgery.of(EARLIER)
-    forgery.edit("certificate.json", change)
-    return audit(forgery.write(folder / "changed.mcap"))
 
 
 def test_what_its_search_found_is_taken_as_it_stands_and_that_is_said() -> None:
@@ -29,7 +22,7 @@ def test_what_its_search_found_is_taken_as_it_stands_and_that_is_said() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "says"),
     [
         (
             lambda c: c["result"]["calibration"]["poses"][3]["mean"].__setitem__(0, 1.0),
@@ -52,5 +45,9 @@ def test_what_its_search_found_is_taken_as_it_stands_and_that_is_said() -> None:
         (lambda c: c["result"].pop("calibration"), "certificate.json: cannot be computed again: "),
     ],
 )
-def test_a_certificate_that_was_changed_differs(change: Callable[[Any], object], said: str, tmp_path: Path) -> None:
-    assert any(text.difference(d).startswith(said) for d in audited(change, tmp_path).differences)
+def test_a_certificate_that_was_changed_differs(
+    change: Callable[[Any], object], says: str, tmp_path: Path, said: Callable[[Path], list[str]]
+) -> None:
+    forgery = Forgery.of(EARLIER)
+    forgery.edit("certificate.json", change)
+    assert any(line.startswith(says) for line in said(forgery.write(tmp_path / "changed.mcap")))
