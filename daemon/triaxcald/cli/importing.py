@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 
 from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.logs.kinds import Kind, opened
@@ -10,6 +11,7 @@ from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
 from triaxcald.imports import text
+from triaxcald.imports.of_recording import is_own, own_log
 
 
 def import_command(a: argparse.Namespace) -> int:
@@ -20,7 +22,8 @@ def import_command(a: argparse.Namespace) -> int:
         raise InputError(f"{a.profile}: driver '{driver}' has no logs that can be imported, expected can or mcap")
     if driver == "mcap" and (a.node is not None or a.channel is not None):
         raise InputError(f"--{'channel' if a.channel else 'node'}: of a CAN bus; the profile's driver is 'mcap'")
-    with opened(a.log) as log:
+    own = driver == "can" and is_own(a.log)
+    with nullcontext(own_log(a.log)) if own else opened(a.log) as log:
         if isinstance(log.kind, Kind) != (driver == "can"):
             name = log.kind.name if isinstance(log.kind, Kind) else log.kind
             held = "frames of CAN" if driver == "can" else "messages"

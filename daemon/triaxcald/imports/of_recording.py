@@ -1,0 +1,45 @@
+"""Frames of a bus that triaxcal itself recorded, as those of any log."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from triaxcal_drivers.files import open_file
+from triaxcal_drivers.logs.frames import Account, LoggedFrame
+from triaxcal_drivers.logs.kinds import MCAP, Kind, Log
+from triaxcald.errors import InputError
+from triaxcald.recording.bus import frame_rows, is_of_bus
+from triaxcald.recording.manifest import is_manifest
+from triaxcald.recording.schema import PROFILE
+from triaxcald.recording.series import open_recording
+
+_PROFILE = slice(len(MCAP) + 13, len(MCAP) + 13 + len(PROFILE))
+"""Of an MCAP file, behind its header's type and length and its own."""
+
+
+def is_own(path: Path) -> bool:
+    """Whether it is a recording of ours, or the manifest of one in segments."""
+    if is_manifest(path):
+        return True
+    try:
+        with open_file(path) as file:
+            head = file.read(_PROFILE.stop)
+    except OSError:
+        return False
+    return head.startswith(MCAP) and head[_PROFILE] == PROFILE.encode()
+
+
+def own_log(path: Path) -> Log:
+    """Its frames raise RecordingError, InputError."""
+
+    def frames(_: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
+        with open_recording(path) as recording:
+            if not is_of_bus(recording):
+                raise InputError(f"{path}: a recording of one unit already, expected one of all frames of a bus")
+            for row in frame_rows(recording):
+                yield LoggedFrame(*row)
+
+    return Log(str(path), Kind("triaxcal", frames), io.BytesIO())
