@@ -21,7 +21,7 @@ from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.pace import Pace
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run import line, write_back
+from triaxcald.run import line, session, write_back
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.simulation.can_unit import ABORT_CODES, tpdos
 from triaxcald.simulation.modbus_unit import ModbusMap
@@ -160,7 +160,7 @@ def virtual_line(*units: ReferenceUnit) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Place, "device", device)
         patch.setattr(line, "UnitRun", _VirtualRun)
-        for module in (line, write_back):
+        for module in (session, write_back):
             patch.setattr(module, "RegisterLink", _linked)
         patch.setattr(collection, "LOOK_SAMPLES_S", LOOK_S)
         patch.setattr(collection, "LOOK_HOST_S", 0.0)
