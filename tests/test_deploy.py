@@ -7,6 +7,7 @@ import json
 import shlex
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,10 +31,21 @@ def test_the_service_starts_a_command_that_there_is(unit: configparser.ConfigPar
     assert Path(program).name == "triaxcal"
     chosen = parser().parse_args(command)
     assert (chosen.command, chosen.metrics, chosen.log_format) == ("record", 9464, "json")
+    assert chosen.segment_time == 3600, "one file would grow for ever, and is not finished by a kill"
+    assert chosen.keep_free > 0
+
+
+def test_a_recorder_loads_nothing_that_draws() -> None:
+    """Under the service's sandbox matplotlib finds no folder to write to, and it takes memory for months."""
+    code = (
+        "import sys, triaxcald.cli.record, triaxcald.run.recording, triaxcald.run.session, triaxcald.service.metrics\n"
+        "sys.exit('matplotlib' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 0
 
 
 def test_the_container_starts_the_same_command(unit: configparser.ConfigParser) -> None:
-    lines = (DEPLOY / "Dockerfile").read_text().splitlines()
+    lines = (DEPLOY / "Dockerfile").read_text().replace("\\\n", "").splitlines()
     (command,) = (json.loads(line.removeprefix("CMD ")) for line in lines if line.startswith("CMD "))
     assert command == shlex.split(unit["Service"]["ExecStart"])[1:]
 

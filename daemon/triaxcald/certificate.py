@@ -117,6 +117,12 @@ def certify(
     return Certified(document, loop, image, not outside)
 
 
+def drawn_with() -> dict[str, str]:
+    """Versions of what draws a report, which other versions draw otherwise;
+    known without loading it, since a recorder draws nothing."""
+    return {"matplotlib": version("matplotlib"), "jinja2": version("jinja2")}
+
+
 def software() -> dict[str, str]:
     """Versions of what computes the numbers."""
     return {

@@ -11,6 +11,9 @@ STEP_NS = 100_000_000
 moves the running clock too, and reading both takes microseconds, on a busy
 machine some milliseconds."""
 
+STEPS_MOST = 30
+"""Steps that are remembered; a clock that makes more has other troubles."""
+
 
 def _running_ns() -> int:
     """Time since the start of the machine, while it slept too where the system
@@ -28,31 +31,39 @@ class SteadyClock:
         self._now_ns, self._running = now_ns, running_ns
         self._begun_ns = now_ns() - running_ns()
         self._lock = threading.Lock()
-        self._steps_ns = self._before_ns = 0
+        self._steps_ns = [0]  # sums of the steps so far, the last by now
 
     def now_ns(self) -> int:
         return self._running() + self._begun_ns
+
+    @property
+    def stepped(self) -> bool:
+        """Whether it ever did, though it may be back."""
+        return len(self._steps_ns) > 1
 
     def steps_ns(self) -> int:
         """All steps that the clock has made by now, as far as anybody
         looked."""
         with self._lock:
-            step_ns = self._now_ns() - self.now_ns() - self._steps_ns
+            sums = self._steps_ns
+            step_ns = self._now_ns() - self.now_ns() - sums[-1]
             if abs(step_ns) >= STEP_NS:
-                self._before_ns, self._steps_ns = self._steps_ns, self._steps_ns + step_ns
-            return self._steps_ns
+                self._steps_ns = [0, *sums[-STEPS_MOST:], sums[-1] + step_ns]
+            return self._steps_ns[-1]
 
     def steady_ns(self, stamp_ns: int) -> int:
         """The stamp of a record that has just been received on the steady line.
 
         A stamp by the host's clock was made before the last step or after it,
-        one by an adapter's own clock knows nothing of it: what is nearer to now
-        is meant. Call `steps_ns` first.
+        one by an adapter's own clock knows of none, or of those before it was
+        laid on the host's: what is nearest to now is meant. Call `steps_ns`
+        first.
         """
-        if self._steps_ns == self._before_ns == 0:
+        sums = self._steps_ns
+        if len(sums) == 1:
             return stamp_ns
         now_ns = self.now_ns()
-        return min((stamp_ns - steps for steps in (self._steps_ns, self._before_ns)), key=lambda t: abs(t - now_ns))
+        return min((stamp_ns - steps for steps in sums), key=lambda t: abs(t - now_ns))
 
 
 HOST = SteadyClock()

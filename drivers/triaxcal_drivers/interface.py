@@ -85,6 +85,21 @@ class RawBatch:
         flags[:1] |= np.uint8(RawFlag.LOST_BEFORE)
         return replace(self, flags=flags, gap=gap)
 
+    def part(self, start: int, stop: int) -> RawBatch:
+        """The records from ``start`` to before ``stop``."""
+        if (start, stop) == (0, len(self)):
+            return self
+        ends = np.concatenate([[0], np.cumsum(self.length, dtype=np.int64)])
+        piece = slice(start, stop)
+        return RawBatch(
+            self.time_ns[piece],
+            self.source[piece],
+            self.flags[piece],
+            self.length[piece],
+            self.payload[int(ends[start]) : int(ends[stop])],
+            self.gap if start == 0 else None,
+        )
+
     @staticmethod
     def joined(batches: Sequence[RawBatch]) -> RawBatch:
         """One after the other as one. Their gaps are lost: the flags tell of

@@ -68,6 +68,18 @@ def test_stamps_of_an_adapters_own_clock_are_not_moved_by_the_hosts_step() -> No
         assert clock.steady_ns(BEGUN_NS + second * 10**9) == BEGUN_NS + second * 10**9
 
 
+def test_an_adapters_clock_is_not_moved_by_a_second_step_either() -> None:
+    host = Host()
+    clock = host.clock()
+    for second in range(1, 30):
+        host.running_ns = second * 10**9
+        host.steps_ns = 3_000_000_000 * (second // 10)
+        clock.steps_ns()
+        assert clock.steady_ns(BEGUN_NS + second * 10**9) == BEGUN_NS + second * 10**9
+        assert clock.steady_ns(host.now_ns()) == BEGUN_NS + second * 10**9
+    assert clock.stepped
+
+
 def test_steps_there_and_back_leave_nothing() -> None:
     host = Host()
     clock = host.clock()

@@ -25,7 +25,7 @@ from triaxcald.audit.results import (
     report_of,
 )
 from triaxcald.audit.traffic import Said, Traffic, check
-from triaxcald.certificate import software
+from triaxcald.certificate import drawn_with, software
 from triaxcald.documents import to_text
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, REFUSED
@@ -37,7 +37,6 @@ from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import END_RECORD, EVENTS, RAW_RECORD, RECOVERY_RECORD
 from triaxcald.recording.survey import Survey, survey
-from triaxcald.report.unit import drawn_with
 from triaxcald.run.line import CERTIFICATE, REPORT
 from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
 

@@ -8,8 +8,14 @@ from triaxcald.provision.journal import open_journal
 from triaxcald.station.config import Station
 
 
+def of_a_journal(station: Station, unit: str, serial: str | None) -> str | None:
+    """What there is to warn of, where an earlier provisioning of the unit is
+    not settled."""
+    journal = open_journal(station.folder, unit, serial)
+    return text.unfinished(journal, unit, station.path) if journal else None
+
+
 def warn_of_a_journal(station: Station, unit: str, serial: str | None) -> None:
-    """To standard error, where an earlier provisioning of the unit is not
-    settled."""
-    if journal := open_journal(station.folder, unit, serial):
-        say(f"warning: unit {unit}: {text.unfinished(journal, unit, station.path)}")
+    """To standard error."""
+    if warning := of_a_journal(station, unit, serial):
+        say(f"warning: unit {unit}: {warning}")

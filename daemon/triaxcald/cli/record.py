@@ -12,7 +12,7 @@ from triaxcald import text
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import Bars, say
 from triaxcald.cli.interrupt import run_interruptible
-from triaxcald.cli.journals import warn_of_a_journal
+from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import severest
@@ -56,7 +56,10 @@ async def _record(
         return lambda identity: Path(a.output) / session.recording_name(identity)
 
     def identified(session: UnitSession, identity: IdentityRead) -> None:
-        warn_of_a_journal(session.station, session.name, identity.serial)
+        if not isinstance(progress, JsonLines):
+            warn_of_a_journal(session.station, session.name, identity.serial)
+        elif warning := of_a_journal(session.station, session.name, identity.serial):
+            progress.say("warning", "journal", unit=session.name, message=warning)
 
     segments = _segments(a)
     serials = SerialsSeen()

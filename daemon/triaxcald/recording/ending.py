@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 from typing import Literal
 
-from triaxcald.errors import DiskError
+from triaxcal_drivers.errors import DriverError
+from triaxcald.errors import DiskError, ProvisionError
 
 ENDED = "ended"
-EndedBecause = Literal["asked", "signal", "disk", "unit gave up"]
+EndedBecause = Literal["asked", "signal", "disk", "unit gave up", "failed"]
 
 
 def ended_because(error: BaseException | None) -> EndedBecause:
@@ -20,5 +21,7 @@ def ended_because(error: BaseException | None) -> EndedBecause:
             return "disk"
         case asyncio.CancelledError() | KeyboardInterrupt():
             return "signal"
-        case _:
+        case DriverError() | ProvisionError():
             return "unit gave up"
+        case _:
+            return "failed"

@@ -16,7 +16,7 @@ from triaxcald.files import write_durably
 
 FORMAT = "triaxcal.segments/1"
 SUFFIX = ".segments.json"
-MANIFEST_MOST = 8 * 2**20  # bytes; an entry has some 400, and there are 8760 hours in a year
+MANIFEST_MOST = 64 * 2**20  # bytes; an entry has some 400: 18 years of hours, four months of minutes
 State = Literal["open", "closed", "cut_short"]
 
 

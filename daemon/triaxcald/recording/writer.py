@@ -80,6 +80,11 @@ class RecordingWriter:
     def _begin(self, head: Head) -> RecordingFile:
         return RecordingFile(self.path, head, clock_ns=self._clock_ns, sync_s=self._sync_s)
 
+    @property
+    def current(self) -> Path:
+        """The file that is being written."""
+        return self._file.path
+
     def raw(self, phase: str, batch: RawBatch) -> bool:
         """Whether there was room for the batch."""
         self._check()

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from importlib.metadata import version
 from typing import Any
 
 from triaxcald import text
@@ -18,11 +17,6 @@ from triaxcald.report.stream import overview_of
 
 _DRAWING = threading.Lock()
 """The pictures' style is the process's own: one report is drawn at a time."""
-
-
-def drawn_with() -> dict[str, str]:
-    """Versions of what draws the page; other versions draw other bytes."""
-    return {"matplotlib": version("matplotlib"), "jinja2": version("jinja2")}
 
 
 def unit_report(

@@ -17,6 +17,7 @@ from triaxcald.exit_codes import DONE, exit_code_of
 from triaxcald.inputs import CALIBRATION
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.ending import ended_because
+from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.endings import aborted
 from triaxcald.run.session import Segments, UnitSession
@@ -92,12 +93,12 @@ class UnitRecording:
             self._session.name,
             self._state,
             self._trouble,
-            self._path,
+            self._path if writer is None else writer.current,
             recorded.digest.records,
             dict(recorded.streams[READINGS].counts),
             recorded.gaps,
             recorded.gaps_s,
-            sum(writer.losses.values()) if writer is not None else self._lost,
+            writer.losses.get(RAW, 0) if writer is not None else self._lost,
             recorded.last_ns,
             dict(recorded.latest),
         )
@@ -114,10 +115,14 @@ class UnitRecording:
         """Until there are so many ``seconds`` of samples, for ever where None,
         or until the unit is given up. Raises nothing, not even when it is
         cancelled."""
-        session = self._session
+        session, found = self._session, list[IdentityRead]()
+
+        async def identify(device: Device) -> None:
+            found[:] = [await session.identify(device)]
+
         try:
-            async with session.place.opened(patience, self._waits) as device:
-                identity = await session.identify(device)
+            async with session.place.opened(patience, self._waits, identify) as device:
+                (identity,) = found
                 self._identified(session, identity)
                 self._path = self._path_of(identity)
                 with session.writer(self._path, identity, segments=self._segments) as writer:
@@ -149,7 +154,7 @@ class UnitRecording:
         else:
             writer.close("asked")
         finally:
-            self._lost, self._writer = sum(writer.losses.values()), None
+            self._lost, self._writer = writer.losses.get(RAW, 0), None
 
     def _end(self, writer: RecordingWriter, e: BaseException) -> None:
         """Says why, and finishes the file; where the disk has failed, that is

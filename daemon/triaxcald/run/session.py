@@ -11,7 +11,7 @@ from typing import Any
 
 from triaxcal_drivers.interface import Device
 from triaxcald import text
-from triaxcald.certificate import software
+from triaxcald.certificate import drawn_with, software
 from triaxcald.errors import InputError
 from triaxcald.inputs import PROFILE, STATION_FILE, preview_channels
 from triaxcald.provision.access import RegisterLink
@@ -19,7 +19,6 @@ from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.recording.retention import Retention
 from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.report.unit import drawn_with
 from triaxcald.station.collection import Progress
 from triaxcald.station.coming_back import Patience, Returning
 from triaxcald.station.config import Place, Station

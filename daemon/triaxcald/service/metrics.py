@@ -8,7 +8,7 @@ import json
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.registry import Collector
 
+from triaxcal_drivers.host_clock import HOST
 from triaxcald.errors import InputError
 from triaxcald.run.recording import State, UnitStatus
 
@@ -62,16 +63,18 @@ class UnitMetrics(Collector):
             gaps.add_metric([u.unit], u.gaps)
             gaps_s.add_metric([u.unit], u.gaps_s)
             if u.last_ns is not None:
-                last.add_metric([u.unit], u.last_ns / 1e9)
-            if u.path is not None and u.path.exists():
-                size.add_metric([u.unit], u.path.stat().st_size)
+                last.add_metric([u.unit], (u.last_ns + HOST.steps_ns()) / 1e9)  # as the host's clock has it
+            if u.path is not None:
+                with suppress(OSError):  # it was taken away: that is seen elsewhere
+                    size.add_metric([u.unit], u.path.stat().st_size)
             for name, value in u.latest.items():
                 channel.add_metric([u.unit, name], value)
             for name, family in counted.items():
                 family.add_metric([u.unit], u.counts.get(name, 0))
         yield from (recording, records, lost, gaps, gaps_s, last, size, channel, *counted.values())
         free = GaugeMetricFamily("triaxcal_disk_free_bytes", "Where recordings go")
-        free.add_metric([], shutil.disk_usage(self._folder).free)
+        with suppress(OSError):
+            free.add_metric([], shutil.disk_usage(self._folder).free)
         yield free
 
 

@@ -26,12 +26,16 @@ class Supervisor:
         self.watchdog_s = int(watchdog_us) / 1e6 if watchdog_us.isdigit() and int(watchdog_us) else None
 
     def tell(self, **said: str) -> None:
-        """Each as a variable of its own; nowhere where nobody wants to hear."""
+        """Each as a variable of its own; nowhere where nobody wants to hear, or
+        nobody reads: nothing waits for it."""
         if not self._address:
             return
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         text = "\n".join(f"{name}={' '.join(value.split())}" for name, value in said.items())
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as out:
+        with (
+            suppress(OSError),
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK) as out,
+        ):
             out.sendto(text.encode(), address)
 
     @asynccontextmanager

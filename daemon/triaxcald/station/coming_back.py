@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, Sequence
-from contextlib import aclosing, contextmanager
+from contextlib import ExitStack, aclosing, contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Protocol, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.host_clock import HOST
@@ -20,9 +22,18 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 """Between attempts, doubled each time: a unit that restarts is there again in a
 second or two, and an operator who plugs one in waits no longer than this."""
 
-LOST = (BusError, DeviceAbsent, DeviceSilent, RegisterRefused, WrongUnit)
-"""What another attempt may mend. A unit that is starting may refuse a register;
-for the wrong unit the right one may be put there again."""
+HOLE_S = 10.0
+"""Nothing for so long is a gap, though nobody was told of a loss: a laptop
+slept, a process was stopped. Shorter holes leave a counter of 16 bits at 1 kHz
+in no doubt, and a busy machine makes them."""
+UNHEARD = "nothing was received meanwhile"
+
+ABSENT = (BusError, DeviceAbsent, DeviceSilent, RegisterRefused)
+"""What another attempt to open a unit may mend; one that is starting may refuse
+a register."""
+LOST = (*ABSENT, WrongUnit)
+"""And of one that was there: for the wrong unit the right one may be put there
+again."""
 
 
 class Streaming(Protocol):
@@ -97,31 +108,46 @@ class Patience:
                 yield
 
 
+@dataclass
+class _Waited:
+    """How far the waiting for a lost unit has gone."""
+
+    pause_s: float = FIRST_PAUSE_S
+    waited_s: float = 0.0
+    told: str = ""
+
+    async def rest(self, patience: Patience) -> bool:
+        """Until the next attempt; whether there is to be one."""
+        rested_s = await patience.rest(self.pause_s, self.waited_s)
+        if rested_s is None:
+            return False
+        self.waited_s += rested_s
+        self.pause_s = min(2 * self.pause_s, LONGEST_PAUSE_S)
+        return True
+
+
 async def until_open(
     attempt: Callable[[], Awaitable[None]], patience: Patience, tell: Callable[[Exception], None]
 ) -> None:
-    """Attempts again until it works. Raises the last trouble of `LOST` once
+    """Attempts again until it works. Raises the last trouble of `ABSENT` once
     patience ends; ``tell`` is told each one that is new."""
-    pause_s, waited_s, told = FIRST_PAUSE_S, 0.0, ""
     try:
         await attempt()
         return
-    except LOST as e:
+    except ABSENT as e:
         trouble = e
+    waited = _Waited()
     with patience.waiting():
         while True:
-            if str(trouble) != told:
-                told = str(trouble)
+            if str(trouble) != waited.told:
+                waited.told = str(trouble)
                 tell(trouble)
-            rested_s = await patience.rest(pause_s, waited_s)
-            if rested_s is None:
+            if not await waited.rest(patience):
                 raise trouble
-            waited_s += rested_s
-            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
             try:
                 await attempt()
                 return
-            except LOST as e:
+            except ABSENT as e:
                 trouble = e
 
 
@@ -142,39 +168,90 @@ class Returning:
     ) -> None:
         self._device, self._identify, self._patience, self._tell = device, identify, patience, tell
         self._now_ns = now_ns
+        self._trouble: Exception | None = None
+
+    def interrupt(self, trouble: DeviceSilent) -> None:
+        """Whoever takes the records finds them of no use: the unit counts as
+        lost."""
+        self._trouble = trouble
 
     async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
         """As the device's own. An interruption begins with a batch without
         records whose gap is not over; the first record after it that is no
-        error ends the gap. Raises what the device's stream does once patience
-        ends."""
+        error ends the gap. Until then the unit is waited for, however often it
+        opens meanwhile. A hole of more than `HOLE_S` is a gap too. Raises what
+        the device's stream does once patience ends."""
         last_ns: int | None = None
         gap: Gap | None = None
-        while True:
-            try:
-                async with aclosing(cast(Any, self._device.stream(names))) as stream:
-                    async for batch in stream:
-                        if gap is not None and (good := _first_good(batch)) is not None:
-                            gap = Gap(gap.from_ns, int(batch.time_ns[good]), gap.cause)
-                            batch, gap = batch.after(gap), None
-                            self._tell(None)
-                        if len(batch):
-                            last_ns = int(batch.time_ns[-1])
-                        yield batch
-                return
-            except LOST as e:
-                trouble = e
-            if gap is None:
-                gap = Gap(self._now_ns() if last_ns is None else last_ns, None, str(trouble))
-                yield RawBatch.of([]).after(gap)
-            await until_open(self._again, self._patience, lambda e: self._tell(str(e)))
+        trouble: Exception | None
+        waited = _Waited()
+        with ExitStack() as waiting:
+            while True:
+                try:
+                    async with aclosing(cast(Any, self._device.stream(names))) as stream:
+                        async for batch in stream:
+                            good = _good(batch)
+                            if gap is not None and len(good):
+                                lost = batch.gap.lost if batch.gap is not None else None
+                                gap = Gap(gap.from_ns, int(batch.time_ns[good[0]]), gap.cause, lost)
+                                batch, gap = batch.after(gap), None
+                                waiting.close()
+                                self._tell(None)
+                            for part in _parted(batch, good, last_ns):
+                                yield part
+                            if len(good):
+                                last_ns = int(batch.time_ns[good[-1]])
+                            self._check()
+                    return
+                except LOST as e:
+                    trouble = e
+                if gap is None:
+                    gap, waited = Gap(self._now_ns() if last_ns is None else last_ns, None, str(trouble)), _Waited()
+                    waiting.enter_context(self._patience.waiting())
+                    self._say(waited, trouble)
+                    yield RawBatch.of([]).after(gap)
+                    trouble = await self._attempt(trouble)
+                while trouble is not None:
+                    self._say(waited, trouble)
+                    if not await waited.rest(self._patience):
+                        raise trouble
+                    trouble = await self._attempt(trouble)
 
-    async def _again(self) -> None:
-        await self._device.close()
-        await self._device.open()
-        await self._identify()
+    def _check(self) -> None:
+        trouble, self._trouble = self._trouble, None
+        if trouble is not None:
+            raise trouble
+
+    def _say(self, waited: _Waited, trouble: Exception) -> None:
+        if str(trouble) != waited.told:
+            waited.told = str(trouble)
+            self._tell(waited.told)
+
+    async def _attempt(self, trouble: Exception) -> Exception | None:
+        """What is the matter still."""
+        try:
+            await self._device.close()
+            await self._device.open()
+            await self._identify()
+        except LOST as e:
+            return e
+        return None
 
 
-def _first_good(batch: RawBatch) -> int | None:
-    good = np.flatnonzero((batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) == 0)
-    return int(good[0]) if len(good) else None
+def _good(batch: RawBatch) -> NDArray[np.intp]:
+    """Where the records are that are no errors."""
+    return np.flatnonzero((batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) == 0)
+
+
+def _parted(batch: RawBatch, good: NDArray[np.intp], last_ns: int | None) -> Iterator[RawBatch]:
+    """The batch in parts, from each hole to the next."""
+    if not len(good):
+        yield batch
+        return
+    times = batch.time_ns[good]
+    before = np.concatenate([[times[0] if last_ns is None else last_ns], times[:-1]])
+    holes = np.flatnonzero((times - before > HOLE_S * 1e9) & ((batch.flags[good] & RawFlag.LOST_BEFORE) == 0))
+    gaps = {int(good[i]): Gap(int(before[i]), int(times[i]), UNHEARD) for i in holes}
+    for start, stop in pairwise(sorted({0, *gaps, len(batch)})):
+        part = batch.part(start, stop)
+        yield part.after(gaps[start]) if start in gaps else part

@@ -6,7 +6,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from itertools import combinations
@@ -205,22 +205,28 @@ class Place:
 
     @asynccontextmanager
     async def opened(
-        self, patience: Patience | None = None, tell: Callable[[Exception], None] = lambda _: None
+        self,
+        patience: Patience | None = None,
+        tell: Callable[[Exception], None] = lambda _: None,
+        identify: Callable[[Device], Awaitable[None]] | None = None,
     ) -> AsyncIterator[Device]:
         """The device, open and nobody else's until the context ends. Raises
-        DeviceInUse; BusError, DeviceAbsent, with ``patience`` once that ends
-        (``tell`` is told meanwhile).
+        DeviceInUse; BusError, DeviceAbsent and what ``identify`` does, with
+        ``patience`` once that ends (``tell`` is told meanwhile).
 
         Whoever closes it and opens it again in between, as a reset does, keeps
         it.
         """
         device = self.device()
+
+        async def attempt() -> None:
+            await device.open()
+            if identify is not None:
+                await identify(device)
+
         async with locked(claim_of(self.bus)):
             try:
-                if patience is None:
-                    await device.open()
-                else:
-                    await until_open(device.open, patience, tell)
+                await (attempt() if patience is None else until_open(attempt, patience, tell))
                 yield device
             finally:
                 with suppress(DriverError):

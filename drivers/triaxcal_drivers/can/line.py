@@ -25,6 +25,9 @@ from triaxcal_drivers.interface import RawFlag
 
 POLL_S = 0.1
 """How long closing waits for the receive thread to look up."""
+JOIN_S = 2.0
+"""A driver that hangs in its own call is left to itself after this time: the
+bus is opened anew all the same."""
 MUTE_S = 5.0
 """A bus on which nobody was heard for so long is opened anew when a unit on it
 is: an adapter may hang without an error. Ten times the slowest heartbeat that
@@ -71,7 +74,7 @@ class CanLine:
 
         def close() -> None:
             if thread is not None:
-                thread.join()
+                thread.join(JOIN_S)
             if adapter is not None:
                 adapter.close()
 
@@ -132,7 +135,8 @@ class CanLine:
                 return
             if frames:
                 self._heard_s = self.attention.now_s()
-                if HOST.steps_ns():
+                HOST.steps_ns()
+                if HOST.stepped:
                     frames = [frame._replace(time_ns=HOST.steady_ns(frame.time_ns)) for frame in frames]
                 for queue in self._queues:
                     queue.put(frames)

@@ -20,7 +20,7 @@ CAPACITY = 1 << 16
 """Frames of a unit that wait for the event loop: a whole minute of the fastest
 one."""
 OVERRUN = "this program did not keep up with the bus"
-OVERFLOW = "the receive buffer of the bus overflowed"
+OVERFLOW = "the receive buffer of the bus overflowed; frames of all its units count"
 
 
 class FrameQueue:

@@ -198,10 +198,11 @@ def leave(line: Line) -> None:
     """Closes the line once nobody uses it any more."""
     line.users -= 1
     if line.users == 0:
-        line.close()
         lines = _lines.get(line.attention.loop, {})
-        if lines.get(_key(line.where)) is line:
-            del lines[_key(line.where)]
+        # By identity: the port behind a link may be another one by now.
+        for key in [key for key, known in lines.items() if known is line]:
+            del lines[key]
+        line.close()
 
 
 def _key(where: TcpAddress | SerialLine) -> str:

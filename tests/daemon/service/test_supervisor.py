@@ -51,17 +51,25 @@ def test_it_hears_that_the_service_is_up_that_it_lives_and_that_it_stops(heard: 
 
 
 def test_a_loop_that_hangs_gives_no_sign_of_life(heard: socket.socket) -> None:
-    async def work() -> None:
-        virtual().late_s = 100.0
-        await lives(Supervisor(environment(heard, WATCHDOG_USEC="3000000")), 1.0)
+    async def work(late_s: float) -> int:
+        virtual().late_s = late_s
+        await lives(Supervisor(environment(heard, WATCHDOG_USEC="3000000")), 7.5)
+        return sum("WATCHDOG" in said for said in all_of(heard))
 
-    run(work())
-    assert sum("WATCHDOG" in said for said in all_of(heard)) <= 2
+    assert run(work(0.0)) == 8
+    assert run(work(100.0)) <= 2, "none of its own thread, which would not notice"
 
 
 def test_a_watchdog_that_is_meant_for_another_process_is_not_this_ones(heard: socket.socket) -> None:
     assert Supervisor(environment(heard, WATCHDOG_USEC="3000000", WATCHDOG_PID="1")).watchdog_s is None
     assert Supervisor(environment(heard, WATCHDOG_USEC="3000000")).watchdog_s == 3.0
+
+
+def test_a_supervisor_that_does_not_read_holds_nothing_up(heard: socket.socket) -> None:
+    supervisor = Supervisor(environment(heard))
+    for _ in range(10_000):  # more than any queue holds
+        supervisor.tell(WATCHDOG="1")
+    assert all_of(heard)
 
 
 @pytest.mark.parametrize("address", ["", "/no/such/socket"])

@@ -14,7 +14,7 @@ from tests.drivers.virtual_time import run, virtual
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceRestarted, DeviceSilent, ProfileError
 from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
 from triaxcald.provision.identity import WrongUnit
-from triaxcald.station.coming_back import LONGEST_PAUSE_S, AtWork, Patience, Returning, until_open
+from triaxcald.station.coming_back import LONGEST_PAUSE_S, UNHEARD, AtWork, Patience, Returning, until_open
 
 BEGUN_NS = 1_700_000_000_000_000_000
 Step = list[tuple[int, int]] | Exception
@@ -77,7 +77,7 @@ def test_a_stream_goes_on_after_the_device_is_opened_again_with_the_gap_in_it() 
         ([52], [0], None),
     ]
     assert device.opened_s == [0.0], "at once: a unit that restarts is there again soon"
-    assert device.told == [None]
+    assert device.told == ["it booted", None]
 
 
 def test_a_gap_ends_with_the_first_record_that_is_no_error_however_often_the_unit_is_lost_meanwhile() -> None:
@@ -98,7 +98,7 @@ def test_a_gap_ends_with_the_first_record_that_is_no_error_however_often_the_uni
         ([9], [RawFlag.LOST_BEFORE], gap(1, 9, "the link is down")),
         ([10], [0], None),
     ]
-    assert device.told == ["no such interface", None]
+    assert device.told == ["the link is down", "no such interface", "still nothing", None]
 
 
 def test_a_unit_that_was_never_heard_is_lost_from_the_moment_it_was_missed() -> None:
@@ -111,14 +111,14 @@ def test_attempts_are_ever_rarer_and_go_on_for_ever() -> None:
     run(device.all(Patience()))
     pauses = [b - a for a, b in zip(device.opened_s, device.opened_s[1:], strict=False)]
     assert pauses == pytest.approx([0.5, 1, 2, 4, 8, *[LONGEST_PAUSE_S] * 7])
-    assert device.told == ["nothing answers"], "said once"
+    assert device.told == ["gone", "nothing answers"], "said once"
 
 
 def test_another_unit_in_its_place_is_not_taken_for_it() -> None:
     other = WrongUnit("the unit on node 5 is serial 12, expected 11")
     device = Played([[records(1), DeviceSilent("gone")], [records(2)]], identities=[other, other, None])
     assert len(run(device.all(Patience()))) == 3
-    assert device.told == [str(other), None]
+    assert device.told == ["gone", str(other), None]
     assert len(device.opened_s) == 3
 
 
@@ -128,6 +128,65 @@ def test_who_gives_up_says_the_last_trouble(most_s: float, attempts: int) -> Non
     with pytest.raises(BusError, match=rf"^attempt {attempts - 1}$"):
         run(device.all(Patience(most_s=most_s)))
     assert device.opened_s[-1] == pytest.approx(most_s)
+
+
+def test_a_unit_that_opens_and_sends_nothing_is_lost_all_the_same() -> None:
+    """It answers, and its stream is silent: said once, asked ever more rarely, and given up in its time."""
+    device = Played([[records(1), DeviceSilent("it sends nothing")], *([[DeviceSilent("it sends nothing")]] * 20)])
+    with pytest.raises(DeviceSilent):
+        run(device.all(Patience(most_s=20.0)))
+    assert device.told == ["it sends nothing"]
+    assert device.opened_s == pytest.approx([0, 0.5, 1.5, 3.5, 7.5, 15.5, 20.0])
+
+
+def test_a_unit_that_sends_nothing_is_given_up_when_the_others_are_done() -> None:
+    async def work() -> None:
+        others = AtWork(2)
+        device = Played([[DeviceSilent("it sends nothing")]] * 50)
+        waiting = asyncio.ensure_future(device.all(Patience(others=others)))
+        await asyncio.sleep(100)
+        assert not waiting.done()
+        others.leave()
+        with pytest.raises(DeviceSilent):
+            await waiting
+
+    run(work())
+
+
+def test_a_hole_that_nobody_was_told_of_is_a_gap_too() -> None:
+    hour = 3600 * 10**9
+    device = Played(
+        [[records(1, 2, 2 + hour, 3 + hour), records(3 + 2 * hour, flags=RawFlag.ERROR), records(4 + 2 * hour)]]
+    )
+    assert shown(run(device.all(Patience()))) == [
+        ([1, 2], [0, 0], None),
+        ([2 + hour, 3 + hour], [RawFlag.LOST_BEFORE, 0], gap(2, 2 + hour, UNHEARD)),
+        ([3 + 2 * hour], [RawFlag.ERROR], None),
+        ([4 + 2 * hour], [RawFlag.LOST_BEFORE], gap(3 + hour, 4 + 2 * hour, UNHEARD)),
+    ]
+
+
+def test_who_takes_the_records_may_find_them_of_no_use() -> None:
+    async def work() -> list[str | None]:
+        device = Played([[records(1), records(2)], [records(3)]])
+        returning = Returning(cast(Any, device), device.identify, Patience(), device.told.append, lambda: BEGUN_NS)
+        async with aclosing(returning.stream(["readings"])) as stream:
+            async for batch in stream:
+                if batch.time_ns.tolist() == [BEGUN_NS + 1]:
+                    returning.interrupt(DeviceSilent("no whole sample"))
+        return device.told
+
+    assert run(work()) == ["no whole sample", None]
+
+
+def test_a_count_of_the_kernels_that_comes_with_the_return_is_kept() -> None:
+    class Counting(Played):
+        async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
+            async for batch in super().stream(names):
+                yield batch.after(Gap(0, 1, "overflow", 7)) if batch.time_ns[0] == BEGUN_NS + 9 else batch
+
+    device = Counting([[records(1), DeviceSilent("gone")], [records(9)]])
+    assert run(device.all(Patience()))[-1].gap == Gap(BEGUN_NS + 1, BEGUN_NS + 9, "gone", 7)
 
 
 def test_a_fault_of_the_profile_is_not_waited_for() -> None:
