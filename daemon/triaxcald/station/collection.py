@@ -20,7 +20,7 @@ from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.recording.schema import Phase, RawDigest
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import Returning, Streaming
+from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 
@@ -142,13 +142,7 @@ class Recorded:
         watch = self._watch(READINGS, clock_s)
         async with aclosing(self.records(device, writer)) as records:
             async for _ in records:
-                try:
-                    watch.look()
-                except DeviceSilent as e:
-                    if not isinstance(device, Returning):
-                        raise
-                    device.interrupt(e)
-                    watch = self._watch(READINGS, clock_s)
+                watch.look()
                 if seconds is not None and readings.seconds >= seconds:
                     return
 

@@ -168,12 +168,6 @@ class Returning:
     ) -> None:
         self._device, self._identify, self._patience, self._tell = device, identify, patience, tell
         self._now_ns = now_ns
-        self._trouble: Exception | None = None
-
-    def interrupt(self, trouble: DeviceSilent) -> None:
-        """Whoever takes the records finds them of no use: the unit counts as
-        lost."""
-        self._trouble = trouble
 
     async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
         """As the device's own. An interruption begins with a batch without
@@ -201,7 +195,6 @@ class Returning:
                                 yield part
                             if len(good):
                                 last_ns = int(batch.time_ns[good[-1]])
-                            self._check()
                     return
                 except LOST as e:
                     trouble = e
@@ -216,11 +209,6 @@ class Returning:
                     if not await waited.rest(self._patience):
                         raise trouble
                     trouble = await self._attempt(trouble)
-
-    def _check(self) -> None:
-        trouble, self._trouble = self._trouble, None
-        if trouble is not None:
-            raise trouble
 
     def _say(self, waited: _Waited, trouble: Exception) -> None:
         if str(trouble) != waited.told:

@@ -166,19 +166,6 @@ def test_a_hole_that_nobody_was_told_of_is_a_gap_too() -> None:
     ]
 
 
-def test_who_takes_the_records_may_find_them_of_no_use() -> None:
-    async def work() -> list[str | None]:
-        device = Played([[records(1), records(2)], [records(3)]])
-        returning = Returning(cast(Any, device), device.identify, Patience(), device.told.append, lambda: BEGUN_NS)
-        async with aclosing(returning.stream(["readings"])) as stream:
-            async for batch in stream:
-                if batch.time_ns.tolist() == [BEGUN_NS + 1]:
-                    returning.interrupt(DeviceSilent("no whole sample"))
-        return device.told
-
-    assert run(work()) == ["no whole sample", None]
-
-
 def test_a_count_of_the_kernels_that_comes_with_the_return_is_kept() -> None:
     class Counting(Played):
         async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
