@@ -73,8 +73,7 @@ class CanDecoder:
     first messages are not seen, cannot be told from lost samples.) After a gap
     that the receiver knows of (`RawFlag.LOST_BEFORE`) the host time since the
     record before says how often the counter wrapped meanwhile; a count that
-    contradicts it by more than `CONTRADICTS` and may have begun in the gap is
-    that of a restarted device.
+    contradicts it by more than `CONTRADICTS` is that of a restarted device.
 
     **Time.** Host time of the first record, plus the periods counted since;
     host time where there is no counter.
@@ -228,21 +227,20 @@ class CanDecoder:
         restarted |= (step > self._range // 64) & (parts.counter < self._range // 256)
         pause = np.diff(parts.time_ns, prepend=self._last_ns) / self._period_ns
         for i in np.flatnonzero(parts.after_gap):
-            step[i], restarted[i] = self._across(int(parts.counter[i] - before[i]), int(parts.counter[i]), pause[i])
+            step[i], restarted[i] = self._across(int(parts.counter[i] - before[i]), pause[i])
         step[restarted] = np.maximum(1, np.rint(pause[restarted]))
         unwrapped = self._last + np.cumsum(step)
         self._last_ns, self._last_raw = int(parts.time_ns[-1]), int(parts.counter[-1])
         self._last = int(unwrapped[-1])
         return unwrapped
 
-    def _across(self, difference: int, counter: int, pause: float) -> tuple[int, bool]:
-        """The step over a gap of ``pause`` periods, and whether the device
-        restarted in it."""
+    def _across(self, difference: int, pause: float) -> tuple[int, bool]:
+        """The step over a gap of ``pause`` periods, and whether the count
+        contradicts that: the device restarted in it."""
         step = difference % self._range + self._range * round((pause - difference % self._range) / self._range)
         if step < -self._latest:
             step += self._range
-        slack = max(self._return, CONTRADICTS * pause)
-        return step, abs(step - pause) > slack and counter <= pause + slack
+        return step, abs(step - pause) > max(self._return, CONTRADICTS * pause)
 
     def _assemble(self, raw: _Parts) -> SampleBlock:
         parts = replace(raw, counter=self._unwrap(raw))

@@ -208,7 +208,7 @@ def test_over_a_gap_the_hosts_time_tells_how_often_the_counter_wrapped(
 
 
 @pytest.mark.parametrize("pause_s", [0.5, 30, 3600])
-@pytest.mark.parametrize("counted_s", [0.0, 0.4])
+@pytest.mark.parametrize("counted_s", [0.0, 0.4, 200.0])  # a counter may begin anywhere
 @pytest.mark.parametrize("before", [500, 30_000, 65_000])
 def test_a_restart_in_a_gap_is_bridged_by_the_hosts_time(
     decoder: CanDecoder, decode_all: DecodeAll, pause_s: float, counted_s: float, before: int
