@@ -153,7 +153,4 @@ def test_what_a_stopped_process_does_not_fetch_is_counted_with_its_place(
     assert sum(map(len, batches)) + lost == 2 * (2300 - first)
     marked = sum(int(np.count_nonzero(batch.flags & RawFlag.LOST_BEFORE)) for batch in batches)
     assert marked == len(gaps)
-    stream, counters = decoded(path)
-    assert stream.counts["missing"] + stream.counts["incomplete"] >= lost // 2
-    assert counters[-1] >= 2290
     sender.close()

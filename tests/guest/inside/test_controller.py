@@ -71,6 +71,7 @@ def test_bus_off_is_told_and_ends_it_until_the_bus_is_on_again(controller: Contr
     with pytest.raises(BusError, match=f"cannot open {off}"):
         opened(controller.name)
     controller.says("sa000000")
+    wait_until(lambda: read_link(controller.name).state != ControllerState.BUS_OFF)
     again = opened(controller.name)
     controller.says("t1230")
     assert [frame.source for frame in received(again, 1)] == [0x123]
