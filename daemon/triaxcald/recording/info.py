@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ def describe(path: Path) -> dict[str, Any]:
     Raises RecordingError.
     """
     with open_recording(path, unfinished=True) as recording:
-        topics = _topics(recording)
+        topics, events = _topics(recording), list(recording.events())
         starts = [topic["start_ns"] for topic in topics.values()]
         ends = [topic["end_ns"] for topic in topics.values()]
         return {
@@ -32,8 +33,8 @@ def describe(path: Path) -> dict[str, Any]:
             "duration_s": (max(ends) - min(starts)) / 1e9 if starts else 0.0,
             "topics": topics,
             "raw": _phases(recording),
-            **_imported(recording),
-            "ended": next((_detail(e) for e in reversed(list(recording.events())) if e.kind == ENDED), None),
+            **_imported(events),
+            "ended": next((_detail(e) for e in reversed(events) if e.kind == ENDED), None),
             **({"bus": describe_bus(recording)} if is_of_bus(recording) else {}),
             "metadata": recording.metadata,
             "attachments": {
@@ -43,7 +44,7 @@ def describe(path: Path) -> dict[str, Any]:
                 }
                 for name in recording.attachments
             },
-            "events": [{"time_ns": e.time_ns, "kind": e.kind, "detail": _detail(e)} for e in recording.events()],
+            "events": [{"time_ns": e.time_ns, "kind": e.kind, "detail": _detail(e)} for e in events],
             "losses": [asdict(loss) for loss in recording.losses()],
         }
 
@@ -56,9 +57,9 @@ def _detail(event: schema.Event) -> Any:
         return event.text
 
 
-def _imported(recording: Contents) -> dict[str, Any]:
+def _imported(events: Sequence[schema.Event]) -> dict[str, Any]:
     """From which log the recording was made, where it was."""
-    details = [_detail(event) for event in recording.events() if event.kind == schema.IMPORTED]
+    details = [_detail(event) for event in events if event.kind == schema.IMPORTED]
     return {"imported": details[0]} if details else {}
 
 

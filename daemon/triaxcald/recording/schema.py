@@ -221,20 +221,8 @@ def parse(name: str, data: bytes) -> Any:
 
 def cut(batch: RawBatch, records: int = MAX_RECORDS) -> Iterator[RawBatch]:
     """The batch in pieces of at most ``records``."""
-    if len(batch) <= records:
-        yield batch
-        return
-    ends = np.concatenate(([0], np.cumsum(batch.length, dtype=np.int64)))
-    for start in range(0, len(batch), records):
-        stop = min(start + records, len(batch))
-        piece = slice(start, stop)
-        yield RawBatch(
-            batch.time_ns[piece],
-            batch.source[piece],
-            batch.flags[piece],
-            batch.length[piece],
-            batch.payload[int(ends[start]) : int(ends[stop])],
-        )
+    for start in range(0, max(len(batch), 1), records):
+        yield batch.part(start, min(start + records, len(batch)))
 
 
 class RawDigest:

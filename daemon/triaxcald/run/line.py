@@ -46,6 +46,7 @@ from triaxcald.recording.writer import RecordingWriter
 from triaxcald.report.unit import unit_report
 from triaxcald.run.endings import aborted, judged
 from triaxcald.run.session import UnitSession
+from triaxcald.run.together import side_by_side
 from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.coming_back import AtWork, Patience, Streaming
@@ -385,11 +386,4 @@ async def run_station(
     with ExitStack() as stack:
         for run in runs:
             stack.enter_context(at_abort(run.left))
-        units = [asyncio.ensure_future(work(run)) for run in runs]
-        while not all(unit.done() for unit in units):
-            try:
-                await asyncio.wait(units)
-            except asyncio.CancelledError:
-                for unit in units:
-                    unit.cancel()
-        return [unit.result() for unit in units]
+        return await side_by_side(map(work, runs))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.endings import aborted
 from triaxcald.run.session import Segments, UnitSession
+from triaxcald.run.together import side_by_side
 from triaxcald.station.collection import Recorded
 from triaxcald.station.coming_back import Patience
 
@@ -178,7 +179,7 @@ class UnitRecording:
         if e is None:
             return kept
         ending = aborted(e, None)
-        return Kept(**{**vars(kept), "exit_code": exit_code_of(e), "error": f"unit {unit}: {ending.reason}"})
+        return replace(kept, exit_code=exit_code_of(e), error=f"unit {unit}: {ending.reason}")
 
 
 async def record_units(
@@ -196,11 +197,4 @@ async def record_units(
         ended(kept)
         return kept
 
-    units = [asyncio.ensure_future(work(recording)) for recording in recordings]
-    while not all(unit.done() for unit in units):
-        try:
-            await asyncio.wait(units)
-        except asyncio.CancelledError:
-            for unit in units:
-                unit.cancel()
-    return [unit.result() for unit in units]
+    return await side_by_side(map(work, recordings))

@@ -109,16 +109,42 @@ class Patience:
 
 
 @dataclass
-class _Waited:
-    """How far the waiting for a lost unit has gone."""
+class _Waiting:
+    """How far the waiting for a lost unit has gone: the first attempt is made
+    at once, the next ones ever more rarely."""
 
+    patience: Patience
+    tell: Callable[[Exception], None]
+    attempted: bool = False
     pause_s: float = FIRST_PAUSE_S
     waited_s: float = 0.0
     told: str = ""
 
-    async def rest(self, patience: Patience) -> bool:
+    def say(self, trouble: Exception) -> None:
+        if str(trouble) != self.told:
+            self.told = str(trouble)
+            self.tell(trouble)
+
+    async def until(
+        self, attempt: Callable[[], Awaitable[None]], mended: tuple[type[Exception], ...], trouble: Exception
+    ) -> None:
+        """Attempts until it works. Raises the last trouble once patience ends,
+        and at once what is none of those that an attempt may have
+        ``mended``."""
+        while True:
+            self.say(trouble)
+            if self.attempted and not await self._rest():
+                raise trouble
+            self.attempted = True
+            try:
+                await attempt()
+                return
+            except mended as e:
+                trouble = e
+
+    async def _rest(self) -> bool:
         """Until the next attempt; whether there is to be one."""
-        rested_s = await patience.rest(self.pause_s, self.waited_s)
+        rested_s = await self.patience.rest(self.pause_s, self.waited_s)
         if rested_s is None:
             return False
         self.waited_s += rested_s
@@ -133,22 +159,9 @@ async def until_open(
     patience ends; ``tell`` is told each one that is new."""
     try:
         await attempt()
-        return
     except ABSENT as e:
-        trouble = e
-    waited = _Waited()
-    with patience.waiting():
-        while True:
-            if str(trouble) != waited.told:
-                waited.told = str(trouble)
-                tell(trouble)
-            if not await waited.rest(patience):
-                raise trouble
-            try:
-                await attempt()
-                return
-            except ABSENT as e:
-                trouble = e
+        with patience.waiting():
+            await _Waiting(patience, tell, attempted=True).until(attempt, ABSENT, e)
 
 
 class Returning:
@@ -177,9 +190,8 @@ class Returning:
         the device's stream does once patience ends."""
         last_ns: int | None = None
         gap: Gap | None = None
-        trouble: Exception | None
-        waited = _Waited()
-        with ExitStack() as waiting:
+        waiting = self._waiting()
+        with ExitStack() as at_rest:
             while True:
                 try:
                     async with aclosing(cast(Any, self._device.stream(names))) as stream:
@@ -189,7 +201,7 @@ class Returning:
                                 lost = batch.gap.lost if batch.gap is not None else None
                                 gap = Gap(gap.from_ns, int(batch.time_ns[good[0]]), gap.cause, lost)
                                 batch, gap = batch.after(gap), None
-                                waiting.close()
+                                at_rest.close()
                                 self._tell(None)
                             for part in _parted(batch, good, last_ns):
                                 yield part
@@ -197,33 +209,24 @@ class Returning:
                                 last_ns = int(batch.time_ns[good[-1]])
                     return
                 except LOST as e:
-                    trouble = e
+                    trouble: Exception = e
                 if gap is None:
-                    gap, waited = Gap(self._now_ns() if last_ns is None else last_ns, None, str(trouble)), _Waited()
-                    waiting.enter_context(self._patience.waiting())
-                    self._say(waited, trouble)
+                    gap, waiting = (
+                        Gap(self._now_ns() if last_ns is None else last_ns, None, str(trouble)),
+                        self._waiting(),
+                    )
+                    at_rest.enter_context(self._patience.waiting())
+                    waiting.say(trouble)
                     yield RawBatch.of([]).after(gap)
-                    trouble = await self._attempt(trouble)
-                while trouble is not None:
-                    self._say(waited, trouble)
-                    if not await waited.rest(self._patience):
-                        raise trouble
-                    trouble = await self._attempt(trouble)
+                await waiting.until(self._again, LOST, trouble)
 
-    def _say(self, waited: _Waited, trouble: Exception) -> None:
-        if str(trouble) != waited.told:
-            waited.told = str(trouble)
-            self._tell(waited.told)
+    def _waiting(self) -> _Waiting:
+        return _Waiting(self._patience, lambda trouble: self._tell(str(trouble)))
 
-    async def _attempt(self, trouble: Exception) -> Exception | None:
-        """What is the matter still."""
-        try:
-            await self._device.close()
-            await self._device.open()
-            await self._identify()
-        except LOST as e:
-            return e
-        return None
+    async def _again(self) -> None:
+        await self._device.close()
+        await self._device.open()
+        await self._identify()
 
 
 def _good(batch: RawBatch) -> NDArray[np.intp]:

@@ -1,0 +1,22 @@
+"""Units at work side by side, each of which comes to its own end."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine, Iterable
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+async def side_by_side(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
+    """What each gives, in their order. When this is cancelled every one of them
+    is, again each time, and waited for."""
+    units = [asyncio.ensure_future(one) for one in work]
+    while not all(unit.done() for unit in units):
+        try:
+            await asyncio.wait(units)
+        except asyncio.CancelledError:
+            for unit in units:
+                unit.cancel()
+    return [unit.result() for unit in units]
