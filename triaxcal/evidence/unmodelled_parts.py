@@ -54,6 +54,29 @@ class DiagonalisedData:
         """The sum of squares with no term."""
         return float(self.z @ (self.weight * self.z))
 
+    @cached_property
+    def score(self) -> Floats:
+        """Of every scaled coefficient (C,), with no term."""
+        return np.asarray(self.columns.T @ (self.weight * self.z))
+
+    @cached_property
+    def _information(self) -> dict[bytes, Floats]:
+        return {}
+
+    def information(self, places: Ints) -> Floats:
+        """Of terms with coefficients at ``places`` (t,q), one by one: (t,q,q),
+        or (t,) where each has one coefficient. Every set of a diagnosis asks
+        for the same terms, so each answer is kept."""
+        key = places.tobytes() + bytes(places.shape[1:])
+        if key not in self._information:
+            columns = self.columns[:, places]
+            self._information[key] = (
+                self.weight @ columns[:, :, 0] ** 2
+                if places.shape[1] == 1
+                else _squared(np.sqrt(self.weight)[:, None, None] * columns)
+            )
+        return self._information[key]
+
     def normal_equations(self, places: Ints) -> tuple[Floats, Floats]:
         """Information (q,q) and score (q,) of these scaled coefficients."""
         own = self.columns[:, places]
@@ -67,7 +90,7 @@ class DiagonalisedData:
         lower = np.linalg.cholesky(np.eye(len(places)) + own.T @ (self.weight[:, None] * own))
         taken = np.linalg.solve(lower, (own * self.weight[:, None]).T @ self.columns)
         absorbed = np.linalg.solve(lower, own.T @ (self.weight * self.z))
-        score = self.columns.T @ (self.weight * self.z) - taken.T @ absorbed
+        score = self.score - taken.T @ absorbed
         chi2 = self.chi2 - float(absorbed @ absorbed)
         return ConditionalData(self, score, chi2, taken, float(np.log(np.diag(lower)).sum()))
 
@@ -94,11 +117,10 @@ class ConditionalData:
         """Of further terms, with coefficients at ``places`` (t,q), one by one:
         eigenvalues (t,q) of the information, and the squared scores along its
         axes."""
-        weight, columns = self.data.weight, self.data.columns[:, places]
+        matrix = self.data.information(places)
         if places.shape[1] == 1:
-            information = weight @ columns[:, :, 0] ** 2 - np.sum(self.taken[:, places[:, 0]] ** 2, axis=0)
+            information = matrix - np.sum(self.taken[:, places[:, 0]] ** 2, axis=0)
             return np.maximum(information, 0.0)[:, None], self.score[places] ** 2
-        matrix = _squared(np.sqrt(weight)[:, None, None] * columns)
         if len(self.taken):
             matrix = matrix - _squared(self.taken[:, places])
         information, axes = np.linalg.eigh(matrix)

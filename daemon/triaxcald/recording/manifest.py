@@ -24,10 +24,12 @@ State = Literal["open", "closed", "cut_short"]
 class Segment:
     """One file. Running indices of raw records from ``first`` to before ``end``
     are its own, of which ``records`` are in it; ``start_ns`` and ``end_ns`` are
-    host times of the first and the last, None where there are none. ``bytes``
-    and ``sha256`` are of the whole file, ``raw_sha256`` is the digest of its
-    raw records. ``open``: it is being written, or was when the power failed;
-    ``cut_short``: it was not finished."""
+    host times of the first and the last, None where there are none;
+    ``closed_ns`` is the host's clock when the last of the file was written,
+    None in manifests of old. ``bytes`` and ``sha256`` are of the whole file,
+    ``raw_sha256`` is the digest of its raw records. ``open``: it is being
+    written, or was when the power failed; ``cut_short``: it was not
+    finished."""
 
     file: str
     number: int
@@ -37,6 +39,7 @@ class Segment:
     records: int = 0
     start_ns: int | None = None
     end_ns: int | None = None
+    closed_ns: int | None = None
     bytes: int = 0
     sha256: str = ""
     raw_sha256: str = ""

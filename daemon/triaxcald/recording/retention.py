@@ -18,8 +18,9 @@ Reason = Literal["age", "disk"]
 
 @dataclass(frozen=True)
 class Retention:
-    """Segments that end more than ``keep_s`` ago go (None: no age is too much);
-    and the oldest go while less than ``free_bytes`` of the disk are free."""
+    """Segments that were closed more than ``keep_s`` ago go (None: no age is too
+    much); and the oldest go while less than ``free_bytes`` of the disk are
+    free."""
 
     keep_s: float | None = None
     free_bytes: int = 0
@@ -52,8 +53,10 @@ def surplus(
 
 
 def _too_old(segment: Segment, keep_s: float | None, now_ns: int) -> bool:
-    """One without a record is as old as any."""
-    return keep_s is not None and (segment.end_ns is None or now_ns - segment.end_ns > keep_s * 1e9)
+    """One that does not say from when it is, is as old as any. Records' times
+    come second: they run on where the clock was set."""
+    closed_ns = segment.end_ns if segment.closed_ns is None else segment.closed_ns
+    return keep_s is not None and (closed_ns is None or now_ns - closed_ns > keep_s * 1e9)
 
 
 def evidence(manifest: Manifest) -> frozenset[str]:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import disk, schema
@@ -34,8 +35,10 @@ class SegmentedWriter(RecordingWriter):
 
     Attachments that come before the first raw record are in every segment.
     ``retention`` takes the oldest segments away; ``deleted`` are those, and
-    events of the current segment say it too. Left as a context manager it says
-    by an event why it ended.
+    events of the current segment say it too. Their age is counted by the clock
+    and by ``steady_ns``, a line that no setting of the clock moves: the younger
+    counts, so that a clock set forward takes nothing away. Left as a context
+    manager it says by an event why it ended.
     """
 
     def __init__(
@@ -46,11 +49,13 @@ class SegmentedWriter(RecordingWriter):
         size_bytes: int = SEGMENT_BYTES,
         time_s: float = SEGMENT_S,
         retention: Retention | None = None,
+        steady_ns: Callable[[], int] = HOST.now_ns,
         **options: Any,
     ) -> None:
         self.manifest = manifest_path(path)
         self.deleted: list[Surplus] = []
-        self._size_bytes, self._time_ns, self._retention = size_bytes, round(time_s * 1e9), retention
+        self._size_bytes, self._time_ns = size_bytes, round(time_s * 1e9)
+        self._retention, self._steady_ns = retention, steady_ns
         self._kept: list[tuple[int, str, str, bytes]] = []
         self._recorded = self._told_low = False
         super().__init__(self.manifest, metadata=metadata, **options)
@@ -119,7 +124,8 @@ class SegmentedWriter(RecordingWriter):
         start_ns, end_ns = file.span_ns or (None, None)
         closed = replace(
             last, state="closed", end=file.raw_end, records=file.digest.records, start_ns=start_ns, end_ns=end_ns,
-            bytes=file.size, sha256=digest_of(file.path), raw_sha256=file.digest.hexdigest(),
+            closed_ns=self._clock_ns(), bytes=file.size, sha256=digest_of(file.path),
+            raw_sha256=file.digest.hexdigest(),
         )  # fmt: skip
         self._segments = self._segments.with_last(closed)
         self._segments.save()
@@ -139,7 +145,7 @@ class SegmentedWriter(RecordingWriter):
         if self._retention is None:
             return []
         chosen = surplus(
-            self._segments.segments, self._retention, now_ns=self._clock_ns(),
+            self._segments.segments, self._retention, now_ns=min(self._clock_ns(), self._steady_ns()),
             free_bytes=disk.free_bytes(self.manifest.parent), kept=evidence(self._segments),
         )  # fmt: skip
         gone = delete(self._segments, chosen)
@@ -190,6 +196,6 @@ def _settled(manifest: Manifest) -> Manifest:
         replace(
             last, state=state, end=last.first + digest.records + lost, records=digest.records,
             start_ns=span[0] if span else None, end_ns=span[1] if span else None,
-            bytes=size, sha256=digest_of(path), raw_sha256=digest.hexdigest(),
+            closed_ns=path.stat().st_mtime_ns, bytes=size, sha256=digest_of(path), raw_sha256=digest.hexdigest(),
         )
     )  # fmt: skip

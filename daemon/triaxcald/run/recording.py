@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from pathlib import Path
 
 from triaxcal_drivers.interface import Device
@@ -21,7 +22,7 @@ from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.endings import aborted
 from triaxcald.run.session import Segments, UnitSession
-from triaxcald.run.together import side_by_side
+from triaxcald.run.together import side_by_side, whole_on_a_thread
 from triaxcald.station.collection import Recorded
 from triaxcald.station.coming_back import Patience
 
@@ -126,7 +127,10 @@ class UnitRecording:
                 (identity,) = found
                 self._identified(session, identity)
                 self._path = self._path_of(identity)
-                with session.writer(self._path, identity, segments=self._segments) as writer:
+                # Finding the end of a segment that was cut off may take a while.
+                with await whole_on_a_thread(
+                    partial(session.writer, self._path, identity, segments=self._segments)
+                ) as writer:
                     await self._record(device, identity, writer, seconds, patience)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
             return self._kept(e)
@@ -150,20 +154,20 @@ class UnitRecording:
             returning = session.returning(device, identity, patience, self._is_lost)
             await self._recorded.for_seconds(returning, writer, seconds)
         except (Exception, asyncio.CancelledError) as e:
-            self._end(writer, e)
+            await self._end(writer, e)
             raise
         else:
-            writer.close("asked")
+            await whole_on_a_thread(partial(writer.close, "asked"))
         finally:
             self._lost, self._writer = writer.losses.get(RAW, 0), None
 
-    def _end(self, writer: RecordingWriter, e: BaseException) -> None:
+    async def _end(self, writer: RecordingWriter, e: BaseException) -> None:
         """Says why, and finishes the file; where the disk has failed, that is
         on its way already."""
         with suppress(RecordingError):
             if not isinstance(e, asyncio.CancelledError):
                 writer.event("failed", {"error": aborted(e, None).reason})
-            writer.close(ended_because(e))
+            await whole_on_a_thread(partial(writer.close, ended_because(e)))
 
     def _kept(self, e: BaseException | None) -> Kept:
         readings, unit = self._recorded.streams[READINGS], self._session.name

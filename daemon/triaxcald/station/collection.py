@@ -20,7 +20,7 @@ from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.recording.schema import Phase, RawDigest
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import Streaming
+from triaxcald.station.coming_back import Returning, Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 
@@ -131,18 +131,22 @@ class Recorded:
 
     async def for_seconds(
         self,
-        device: Streaming,
+        device: Returning,
         writer: RecordingWriter,
         seconds: float | None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Records so many seconds of the readings' own time; for ever where
-        None."""
+        None. A device that sends, but no whole reading, is opened anew."""
         readings = self.streams[READINGS]
         watch = self._watch(READINGS, clock_s)
         async with aclosing(self.records(device, writer)) as records:
             async for _ in records:
-                watch.look()
+                try:
+                    watch.look()
+                except DeviceSilent as e:
+                    device.complain(e)
+                    watch = self._watch(READINGS, clock_s)
                 if seconds is not None and readings.seconds >= seconds:
                     return
 

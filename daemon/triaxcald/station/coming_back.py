@@ -181,6 +181,12 @@ class Returning:
     ) -> None:
         self._device, self._identify, self._patience, self._tell = device, identify, patience, tell
         self._now_ns = now_ns
+        self._complaint: Exception | None = None
+
+    def complain(self, trouble: Exception) -> None:
+        """Of what the stream gave last: the device sends, but not what it is to
+        send. It is opened anew, as if it were lost."""
+        self._complaint = trouble
 
     async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
         """As the device's own. An interruption begins with a batch without
@@ -207,14 +213,17 @@ class Returning:
                                 yield part
                             if len(good):
                                 last_ns = int(batch.time_ns[good[-1]])
+                            if self._complaint is not None:
+                                raise self._complaint
                     return
                 except LOST as e:
                     trouble: Exception = e
+                complaint, self._complaint = self._complaint, None
                 if gap is None:
-                    gap, waiting = (
-                        Gap(self._now_ns() if last_ns is None else last_ns, None, str(trouble)),
-                        self._waiting(),
-                    )
+                    gap = Gap(self._now_ns() if last_ns is None else last_ns, None, str(trouble))
+                    if complaint is None:  # of which there may be one after each opening
+                        waiting = self._waiting()
+                    waiting.told = ""
                     at_rest.enter_context(self._patience.waiting())
                     waiting.say(trouble)
                     yield RawBatch.of([]).after(gap)

@@ -9,9 +9,11 @@ import threading
 from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.can.adapter import Frame, Identifier
+from triaxcal_drivers.can.error_frame import ErrorClass, error_frame
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
 
@@ -21,6 +23,18 @@ CAPACITY = 1 << 16
 one."""
 OVERRUN = "this program did not keep up with the bus"
 OVERFLOW = "the receive buffer of the bus overflowed; frames of all its units count"
+CONTROLLER_OVERFLOW = "the receive buffer of the CAN controller overflowed, which counts no frames"
+
+
+class _Loss(NamedTuple):
+    """``frames`` is None where nobody counted them."""
+
+    frames: int | None
+    cause: str
+
+    def and_before(self, earlier: _Loss | None) -> _Loss:
+        before = 0 if earlier is None else earlier.frames
+        return self._replace(frames=None if self.frames is None or before is None else before + self.frames)
 
 
 class FrameQueue:
@@ -37,9 +51,9 @@ class FrameQueue:
         self._attention = attention
         self._capacity = capacity
         self._lock = threading.Lock()
-        self._frames: deque[tuple[Frame, str]] = deque()  # and why those before it were lost
+        self._frames: deque[tuple[Frame, _Loss | None]] = deque()  # and what was lost just before
         self._identifiers: frozenset[Identifier] | None = None
-        self._lost, self._cause = 0, ""
+        self._loss: _Loss | None = None
         self._failure: Exception | None = None
         self._some, self._enough = asyncio.Event(), asyncio.Event()
         self._last_ns: int | None = None
@@ -52,7 +66,7 @@ class FrameQueue:
         """Take these from now on; returns what `close` wants."""
         with self._lock:
             self._frames.clear()
-            self._lost, self._failure, self._last_ns = 0, None, None
+            self._loss, self._failure, self._last_ns = None, None, None
             self._identifiers = opened = frozenset(identifiers)
         self._some.clear()
         self._enough.clear()
@@ -76,11 +90,12 @@ class FrameQueue:
             before = len(self._frames)
             for frame in frames:
                 if frame.lost:
-                    self._lost, self._cause = self._lost + frame.lost, OVERFLOW
-                mine = frame.flags & RawFlag.ERROR or (
-                    (frame.source, bool(frame.flags & RawFlag.EXTENDED_ID)) in wanted
-                )
-                if mine:
+                    self._lose(_Loss(frame.lost, OVERFLOW))
+                if frame.flags & RawFlag.ERROR:
+                    self._keep(frame)
+                    if ErrorClass.RECEIVE_OVERFLOW in error_frame(frame.source, frame.data).classes:
+                        self._lose(_Loss(None, CONTROLLER_OVERFLOW))
+                elif (frame.source, bool(frame.flags & RawFlag.EXTENDED_ID)) in wanted:
                     self._keep(frame)
             waiting = len(self._frames)
         if waiting > before == 0:
@@ -91,12 +106,15 @@ class FrameQueue:
     def _keep(self, frame: Frame) -> None:
         if len(self._frames) >= self._capacity:
             self.dropped += 1
-            self._lost, self._cause = self._lost + 1, OVERRUN
+            self._lose(_Loss(1, OVERRUN))
             return
-        if self._lost:
-            frame = frame._replace(flags=frame.flags | RawFlag.LOST_BEFORE, lost=self._lost)
-            self._lost = 0
-        self._frames.append((frame, self._cause))
+        loss, self._loss = self._loss, None
+        if loss is not None:
+            frame = frame._replace(flags=frame.flags | RawFlag.LOST_BEFORE)
+        self._frames.append((frame, loss))
+
+    def _lose(self, loss: _Loss) -> None:
+        self._loss = loss.and_before(self._loss)
 
     def fail(self, failure: Exception) -> None:
         """From the receive thread, when receiving has failed."""
@@ -133,18 +151,18 @@ class FrameQueue:
             self._enough.clear()
         return self._batch(taken)
 
-    def _take(self) -> list[tuple[Frame, str]]:
-        taken: list[tuple[Frame, str]] = []
-        while self._frames and len(taken) < BATCH_FRAMES and not (taken and self._frames[0][0].lost):
+    def _take(self) -> list[tuple[Frame, _Loss | None]]:
+        taken: list[tuple[Frame, _Loss | None]] = []
+        while self._frames and len(taken) < BATCH_FRAMES and not (taken and self._frames[0][1]):
             taken.append(self._frames.popleft())
         return taken
 
-    def _batch(self, taken: Sequence[tuple[Frame, str]]) -> RawBatch:
+    def _batch(self, taken: Sequence[tuple[Frame, _Loss | None]]) -> RawBatch:
         batch = RawBatch.of([frame[:4] for frame, _ in taken])
         if taken:
-            first, cause = taken[0]
-            if first.lost:
+            first, loss = taken[0]
+            if loss is not None:
                 from_ns = first.time_ns if self._last_ns is None else self._last_ns
-                batch = replace(batch, gap=Gap(from_ns, first.time_ns, cause, first.lost))
+                batch = replace(batch, gap=Gap(from_ns, first.time_ns, loss.cause, loss.frames))
             self._last_ns = taken[-1][0].time_ns
         return batch

@@ -205,13 +205,37 @@ def test_segments_older_than_they_are_kept_go_and_that_is_said(tmp_path: Path, n
             writer.event("minute")
             writer.drain()
     gone = [one.segment.file for one in writer.deleted]
-    assert gone == ["rec-000001.mcap", "rec-000002.mcap", "rec-000003.mcap"]
-    assert files(tmp_path) == ["rec-000004.mcap", "rec-000005.mcap", "rec-000006.mcap"]
+    assert gone == ["rec-000001.mcap", "rec-000002.mcap"]
+    assert files(tmp_path) == ["rec-000003.mcap", "rec-000004.mcap", "rec-000005.mcap", "rec-000006.mcap"]
     manifest = load_manifest(tmp_path / "rec.segments.json")
-    assert ([s.number for s in manifest.segments], manifest.deleted) == ([4, 5, 6], {"age": 3})
+    assert ([s.number for s in manifest.segments], manifest.deleted) == ([3, 4, 5, 6], {"age": 2})
     with Series(tmp_path / "rec.segments.json") as series:
         told = [s["file"] for e in series.events() if e.kind == "deleted" for s in e.detail["segments"]]
     assert told == gone
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_a_clock_that_is_set_takes_no_fresh_segment_away(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], clock: Any, step_s: int
+) -> None:
+    begun_ns, stepped_ns = clock.now_ns, 0
+    keep = {"retention": Retention(keep_s=600.0), "steady_ns": lambda: clock.now_ns - stepped_ns}
+    with new(**keep) as writer:
+        minutes(writer, 2)
+        stepped_ns = step_s * S
+        clock.now_ns += stepped_ns
+        minutes(writer, 2, first=20)
+    assert writer.deleted == []
+    assert clock.now_ns - stepped_ns - begun_ns == 240 * S
+
+
+def test_a_segment_is_as_old_as_its_file_whatever_its_records_say(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], clock: Any
+) -> None:
+    with new(retention=Retention(keep_s=600.0)) as writer:
+        clock.now_ns += 86_400 * S  # the records' times stay behind
+        minutes(writer, 3)
+    assert writer.deleted == []
 
 
 def test_the_oldest_make_room_where_too_little_of_the_disk_is_free(

@@ -49,6 +49,9 @@ class Bus:
     def clock_s(self) -> float:
         return self.now_s
 
+    def complain(self, trouble: Exception) -> None:
+        raise trouble
+
     async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
         assert list(names) == [READINGS, CORRECTED]
         unit = ReferenceUnit(ConstantPhysics(), serial_number=1)

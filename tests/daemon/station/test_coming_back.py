@@ -122,6 +122,30 @@ def test_another_unit_in_its_place_is_not_taken_for_it() -> None:
     assert len(device.opened_s) == 3
 
 
+def test_a_device_whose_records_are_not_those_wanted_is_opened_anew_ever_more_rarely() -> None:
+    device = Played([[records(10 * i, 10 * i + 1)] for i in range(12)])
+
+    async def complained() -> list[RawBatch]:
+        returning = Returning(cast(Any, device), device.identify, Patience(), device.told.append)
+        seen: list[RawBatch] = []
+        async with aclosing(returning.stream(["readings"])) as stream:
+            async for batch in stream:
+                seen.append(batch)
+                if len(batch) and len(device.streams) > 5:
+                    returning.complain(DeviceSilent("no whole sample"))
+        return seen
+
+    batches = run(complained())
+    assert device.opened_s == pytest.approx([0, 0.5, 1.5, 3.5, 7.5, 15.5])
+    assert device.told == ["no whole sample", None] * 6
+    assert shown(batches)[:4] == [
+        ([0, 1], [0, 0], None),
+        ([], [], gap(1, None, "no whole sample")),
+        ([10, 11], [RawFlag.LOST_BEFORE, 0], gap(1, 10, "no whole sample")),
+        ([], [], gap(11, None, "no whole sample")),
+    ]
+
+
 @pytest.mark.parametrize(("most_s", "attempts"), [(0.0, 1), (0.4, 2), (0.5, 2), (10.0, 6)])
 def test_who_gives_up_says_the_last_trouble(most_s: float, attempts: int) -> None:
     device = Played([[records(1), DeviceSilent("gone")]], [BusError(f"attempt {i}") for i in range(20)])

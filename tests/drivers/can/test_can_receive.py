@@ -7,7 +7,7 @@ import pytest
 
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.can.adapter import Frame
-from triaxcal_drivers.can.receive import BATCH_FRAMES, OVERFLOW, OVERRUN, FrameQueue
+from triaxcal_drivers.can.receive import BATCH_FRAMES, CONTROLLER_OVERFLOW, OVERFLOW, OVERRUN, FrameQueue
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import Gap, RawFlag
 
@@ -97,6 +97,24 @@ async def test_an_overflow_is_counted_and_flagged_on_the_next_frame_kept() -> No
     assert second.gap == Gap(BEGUN_NS + 2, BEGUN_NS + 5, OVERRUN, 2)
     assert second.flags.tolist() == [RawFlag.LOST_BEFORE, 0]
     assert second.payload == bytes.fromhex("0500 0600")
+
+
+async def test_a_controller_that_overflowed_lost_frames_before_the_next_though_it_does_not_say_how_many() -> None:
+    frames = await opened()
+    overflow = Frame(BEGUN_NS + 2, 0x20000004, RawFlag.ERROR, bytes.fromhex("0001000000000000"))
+    passive = Frame(BEGUN_NS + 4, 0x20000004, RawFlag.ERROR, bytes.fromhex("0010000000000000"))
+    frames.put([frame(1), overflow, frame(3, lost=5), passive, frame(5)])
+    before, after = await frames.batch(1.0), await frames.batch(1.0)
+    assert before is not None
+    assert after is not None
+    assert (before.flags.tolist(), before.gap) == ([0, RawFlag.ERROR], None)
+    assert after.flags.tolist() == [RawFlag.LOST_BEFORE, RawFlag.ERROR, 0]
+    assert after.gap == Gap(BEGUN_NS + 2, BEGUN_NS + 3, OVERFLOW, None)
+    frames.put([overflow, frame(6)])
+    assert (batch := await frames.batch(1.0)) is not None
+    assert batch.gap is None
+    assert (batch := await frames.batch(1.0)) is not None
+    assert batch.gap == Gap(BEGUN_NS + 2, BEGUN_NS + 6, CONTROLLER_OVERFLOW, None)
 
 
 @pytest.mark.parametrize("turns", range(8))
