@@ -7,7 +7,7 @@ TOOLS = $(VENV)/.tools
 # The matrices are small: threads of linear algebra would only wait for each other.
 ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: demo test check format bench docs clean
+.PHONY: demo test test-slow check format bench docs clean
 
 # An environment; the extras of $(1) in it, and $(2) says what for.
 define environment
@@ -26,13 +26,18 @@ $(TOOLS): pyproject.toml | $(READY)
 	$(call environment,test,what the tests need)
 
 demo: $(READY)  ## the whole line on two simulated units
-	@echo "Calibrating two simulated units: half a minute"
+	@echo "Calibrating two simulated units: about a minute"
 	$(BIN)/triaxcal demo --out demo-out
 
 # Two processes more than processors: some tests wait for a bus, and others work meanwhile.
 WORKERS = $(shell $(BIN)/python -c 'import os; print(min(os.cpu_count(), 8) + 2)')
-test: $(TOOLS)  ## the whole test suite
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
+PYTEST = $(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
+test: $(TOOLS)  ## the tests, in some minutes
+	@echo "Testing: some five minutes on two cores; make test-slow runs the rest"
+	$(PYTEST) -m "not slow"
+
+test-slow: $(TOOLS)  ## many seeds, whole processes, a CAN kernel: half an hour on two cores
+	$(PYTEST) -m slow
 
 bench: $(TOOLS)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)

@@ -35,6 +35,7 @@ def test_the_service_starts_a_command_that_there_is(unit: configparser.ConfigPar
     assert chosen.keep_free > 0
 
 
+@pytest.mark.slow
 def test_a_recorder_loads_nothing_that_draws() -> None:
     """Under the service's sandbox matplotlib finds no folder to write to, and it takes memory for months."""
     code = (

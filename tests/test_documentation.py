@@ -153,6 +153,7 @@ def test_every_make_target_shown_is_in_the_makefile(make: str) -> None:
 RUNNABLE = [page for page in PAGES if any(b.note.startswith("run") for b in blocks(page))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNABLE, ids=name_of)
 def test_the_commands_of_a_page_that_are_marked_as_runnable_run(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -269,6 +270,7 @@ def test_every_toml_file_in_the_documentation_is_valid(page: Path, tmp_path: Pat
             check_toml(tmp_path / block.file)
 
 
+@pytest.mark.slow
 def test_the_driver_of_the_how_to_is_found_and_decodes(tmp_path: Path) -> None:
     """Installed as pip would, by its metadata, in a folder of its own."""
     folder_of(OTHERS_DRIVER, tmp_path)
@@ -424,6 +426,7 @@ def test_every_key_of_a_recordings_documents_is_explained(attachment: str) -> No
     assert keys_of(document, NAMED) - documented_keys() - EFFECT_LEAVES == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [

@@ -36,6 +36,7 @@ def diagnosed(name: str) -> Any:
 CHECKED = {"certificate.json", "verification.json", "registers-before.json", "registers-after.json"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LINE)
 def test_an_audit_gets_the_same_bytes_but_for_how_the_report_looks(name: str) -> None:
     """A report may be drawn otherwise in the next commit of the same development version."""
@@ -45,6 +46,7 @@ def test_an_audit_gets_the_same_bytes_but_for_how_the_report_looks(name: str) ->
     assert (found.notes.older, found.notes.earlier) == (False, False)
 
 
+@pytest.mark.slow
 def test_an_audit_of_what_an_earlier_version_made_gets_the_same_numbers() -> None:
     found = audit(RECORDINGS / EARLIER)
     assert set(found.checked) == CHECKED
@@ -56,6 +58,7 @@ CPUINFO = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuin
 WIDE = pytest.mark.skipif("avx512f" not in CPUINFO, reason="this processor has no AVX-512")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processor", ["Prescott", "Haswell", pytest.param("SkylakeX", marks=WIDE)])
 def test_an_audit_gets_the_same_numbers_with_the_linear_algebra_of_another_processor(processor: str) -> None:
     """Each core type of OpenBLAS has kernels of its own, which differ in the last bits."""
@@ -71,6 +74,7 @@ def test_an_audit_gets_the_same_numbers_with_the_linear_algebra_of_another_proce
     assert all(d.startswith("report.html: ") for d in differences), differences
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_the_hidden_effect_is_named_and_nothing_else(name: str) -> None:
     loop = diagnosed(name)

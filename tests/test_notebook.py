@@ -33,6 +33,7 @@ def run(cells: list[dict[str, Any]]) -> dict[str, Any]:
     return names
 
 
+@pytest.mark.slow
 def test_the_units_are_calibrated_to_the_noise_of_their_poses(run: dict[str, Any]) -> None:
     assert list(run["table"]["poses"]) == [27] * 5
     assert run["errors"]["with effects"].max() < 60

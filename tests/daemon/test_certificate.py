@@ -77,6 +77,7 @@ def plain(anew: Make) -> Certified:
     return anew()
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes(anew: Make, plain: Certified) -> None:
     assert to_text(anew().document) == to_text(plain.document)
 
@@ -93,6 +94,7 @@ def test_the_document_says_what_it_stands_on(plain: Certified) -> None:
     assert document["result"]["format"] == "triaxcal.loop/1"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "verdict", "outside"),
     [
@@ -129,6 +131,7 @@ def test_the_registers_hold_the_result_and_what_rounding_costs_is_said(plain: Ce
     assert made.image.words[-1].role == "calibration_crc"
 
 
+@pytest.mark.slow
 def test_an_effect_without_registers_is_left_to_the_host_and_the_linear_part_comes_as_near_as_it_can(
     anew: Make, plain: Certified
 ) -> None:
@@ -147,6 +150,7 @@ def test_an_effect_without_registers_is_left_to_the_host_and_the_linear_part_com
     assert np.all(np.abs(off) < 0.3 * before)
 
 
+@pytest.mark.slow
 def test_a_device_without_calibration_registers_gets_a_certificate_all_the_same(
     anew: Make,
 ) -> None:
@@ -159,6 +163,7 @@ def test_a_device_without_calibration_registers_gets_a_certificate_all_the_same(
     assert made.document["result"]["calibration"]["effects"]
 
 
+@pytest.mark.slow
 def test_what_no_register_can_hold_is_refused(anew: Make) -> None:
     def narrow(text: str) -> str:
         return text.replace("minimum = -10.0, maximum = 10.0", "minimum = -2.0, maximum = 2.0")

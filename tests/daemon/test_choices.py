@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
+import pytest
 
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects import effect_of
@@ -30,12 +31,14 @@ def closed(*names: str) -> Loop:
     return loop
 
 
+@pytest.mark.slow
 def test_where_nothing_is_found_the_linear_model_is_all_there_is_to_correct() -> None:
     loop = closed()
     assert [(c.corrected_by, c.terms) for c in choices_of(loop)] == [(("host",), ("linear",))]
     assert [(c.corrected_by, c.terms) for c in choices_of(loop, loop.after)] == [(("registers",), ("linear",))]
 
 
+@pytest.mark.slow
 def test_without_registers_the_host_corrects_the_effect_or_nobody_does() -> None:
     loop = closed("second_order_nonlinearity")
     alone, whole = choices_of(loop)
@@ -59,6 +62,7 @@ def test_registers_that_hold_everything_leave_the_host_nothing() -> None:
     assert told[-1].terms == loop.after.terms
 
 
+@pytest.mark.slow
 def test_what_belongs_to_the_recording_is_the_business_of_the_process() -> None:
     loop = closed("warm_up")
     told = choices_of(loop, loop.after)

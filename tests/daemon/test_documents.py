@@ -137,6 +137,7 @@ def test_units_name_the_reference_of_another_sensor(poses: list[Pose]) -> None:
     assert document["effects"]["second_order_nonlinearity"]["x"]["unit"] == "µT/µT²"
 
 
+@pytest.mark.slow
 def test_a_loop_says_what_each_pose_was_before(poses: list[Pose]) -> None:
     document = loop_document(diagnose(poses, signs=SIGNS), data_quality=["missing_samples: 1 of 2"])
     assert document["data_quality"] == ["missing_samples: 1 of 2"]
@@ -147,6 +148,7 @@ def test_a_loop_says_what_each_pose_was_before(poses: list[Pose]) -> None:
     assert np.sqrt(np.mean(after**2)) == pytest.approx(document["after"]["rms_g"], abs=2e-11)
 
 
+@pytest.mark.slow
 def test_a_loop_has_the_keys_of_the_contract() -> None:
     rng = np.random.default_rng(3)
     warm = replace(TRUTH, effects=((effect_named("temperature_bias"), np.array([3e-4, -2e-4, 4e-4])),))
@@ -174,6 +176,7 @@ def test_a_loop_has_the_keys_of_the_contract() -> None:
     assert all(0 <= p["outlier_probability"] < 0.5 for p in calibration["poses"])
 
 
+@pytest.mark.slow
 def test_each_effect_of_an_average_has_its_weight_and_that_comes_back(poses: list[Pose]) -> None:
     loop = diagnose(poses, signs=SIGNS)
     document = json.loads(to_text(loop_document(loop)))
@@ -210,6 +213,7 @@ def test_the_shape_of_an_effect_stands_beside_its_coefficients_and_comes_back(
     assert sensor.specific_force(u, own) == pytest.approx(fitted.sensor.specific_force(u, own), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_the_calibration_is_found_in_a_loop_and_in_a_certificate(poses: list[Pose]) -> None:
     loop = loop_document(diagnose(poses, signs=SIGNS))
     inner = loop["calibration"]

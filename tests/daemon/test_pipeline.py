@@ -51,6 +51,7 @@ def _poses_equal(one: list[Pose], other: list[Pose]) -> None:
         np.testing.assert_array_equal(p.covariance, q.covariance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stream", [READINGS, CORRECTED])
 @pytest.mark.parametrize("size", [5, 1024])
 def test_poses_are_the_same_however_the_records_are_cut(
@@ -102,6 +103,7 @@ def test_a_sample_that_comes_twice_is_used_once_and_its_messages_are_counted(
     assert pipeline.data_quality() == ["duplicate_samples: 2"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [5, 1024])
 def test_a_frozen_axis_is_said_however_the_records_are_cut(
     records: list[tuple[int, int, int, bytes]], size: int
@@ -162,6 +164,7 @@ def test_nothing_fed_is_no_pose_and_no_window() -> None:
     assert pipeline.first_host_ns is None
 
 
+@pytest.mark.slow
 def test_poses_so_far_can_be_asked_for_at_any_time(records: list[tuple[int, int, int, bytes]]) -> None:
     pipeline = Pipeline(BUNDLE, READINGS)
     seen = []

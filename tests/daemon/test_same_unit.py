@@ -97,6 +97,7 @@ def _recorded(unit: Sensor, seed: int, poses: int = 26, temp_c: float = 25.0) ->
     return noisy_poses(unit, up, 2e-5, rng, channels=channels, channel_reference={"temp_c": 25.0})
 
 
+@pytest.mark.slow
 def test_a_unit_is_not_asked_about_beside_itself_in_another_temperature() -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -62,6 +62,7 @@ def elsewhere(tmp_path: Path):
     return install
 
 
+@pytest.mark.slow
 def test_a_driver_installed_by_somebody_else_is_found(elsewhere):
     elsewhere("their_drivers", DRIVER, "their-serial = their_drivers:SerialDriver")
     found = json.loads(
@@ -84,6 +85,7 @@ def test_a_profile_for_it_is_read_by_it(elsewhere):
     assert said.split() == ["Serial", "xyz"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "reason"),
     [
@@ -105,6 +107,7 @@ def test_a_driver_that_does_not_load_is_listed_with_the_reason(elsewhere, module
     assert found["modbus"] is None
 
 
+@pytest.mark.slow
 def test_a_driver_whose_packages_are_not_there_is_listed_with_what_brings_them(elsewhere):
     lacking = DRIVER.replace("class SerialDriver:", 'class SerialDriver:\n    packages = ("json", "no_such_module")')
     assert lacking != DRIVER

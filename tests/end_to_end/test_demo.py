@@ -6,7 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
 
+
+@pytest.mark.slow
 def test_the_demo_finds_what_is_hidden_and_it_is_gone_after_a_power_cycle(
     tmp_path: Path, triaxcal: Callable[..., Any]
 ) -> None:

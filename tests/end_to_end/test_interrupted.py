@@ -75,6 +75,7 @@ def at_work(workshop: Any, start: Callable[..., Any], free_port: int) -> Callabl
     return begin
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["record", "run"])
 def test_a_killed_process_loses_at_most_a_second_and_the_rest_can_be_fitted(
     workshop: Any,
@@ -116,6 +117,7 @@ def test_a_killed_process_loses_at_most_a_second_and_the_rest_can_be_fitted(
     triaxcal("audit", mended).failed(2, "missing; the recording holds no result")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["record", "run"])
 def test_an_interrupt_finishes_the_recording_and_leaves_the_unit_alone(
     workshop: Any,
@@ -146,6 +148,7 @@ def test_an_interrupt_finishes_the_recording_and_leaves_the_unit_alone(
     assert (workshop.folder / "eeprom.bin").read_bytes() == Stored(factory_calibration()).image()
 
 
+@pytest.mark.slow
 def test_a_unit_whose_process_dies_in_mid_recording_is_an_error(
     workshop: Any,
     triaxcal: Callable[..., Any],

@@ -19,6 +19,7 @@ SLOW = Trouble(late=1.0, late_s=0.03)
 """So that there is a middle to be killed in."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finish", ["resume", "restore"])
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_it_is_finished_or_taken_back_by_another(

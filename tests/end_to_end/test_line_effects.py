@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import pytest
+
 from tests.virtual_line import described, virtual_line
 
 FIXTURE = {"poses": 26, "hold_s": 2.0, "move_s": 0.8}
@@ -14,6 +16,7 @@ START_S = 1.0
 STEP = {"x": 7e-4, "y": -6e-4, "z": 8e-4, "at": KNOCKED_S}
 
 
+@pytest.mark.slow
 def test_a_unit_with_an_effect_that_no_register_takes_is_told_of_with_every_coefficient(
     workshop: Any, triaxcal: Any
 ) -> None:

@@ -164,6 +164,7 @@ def _by_turntable_and_oven(triad: Triad) -> dict[tuple[str, str], np.ndarray]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "effects"),
     [
@@ -201,6 +202,7 @@ def _same_calibration(unit: Finished) -> bool:
     return held.valid and held.calibration == Stored.from_image(unit.before).calibration
 
 
+@pytest.mark.slow
 def test_what_no_register_takes_is_named_and_left_to_the_host_and_the_unit_gets_its_old_calibration_back(
     run: Callable[..., Finished],
 ) -> None:
@@ -217,6 +219,7 @@ def test_what_no_register_takes_is_named_and_left_to_the_host_and_the_unit_gets_
     assert _error_g(unit.triad, unit.after) == _error_g(unit.triad, unit.before)
 
 
+@pytest.mark.slow
 def test_what_no_catalogue_has_stays_unexplained_and_the_unit_as_it_was(run: Callable[..., Finished]) -> None:
     unit = run(uneven_ladder, seed=31)
     result = unit.result

@@ -110,6 +110,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return bench, told, {outcome.unit: outcome for outcome in outcomes}, ended
 
 
+@pytest.mark.slow
 def test_all_but_the_dead_one_are_calibrated(ran: Any) -> None:
     bench, _, outcomes, _ = ran
     assert set(outcomes) == set(bench.units)
@@ -131,6 +132,7 @@ def test_the_dead_one_is_told_at_once_and_given_up_when_the_others_are_done(ran:
     assert waits < max(i for i, (unit, _) in enumerate(told.said) if unit != DIES)
 
 
+@pytest.mark.slow
 def test_a_recording_with_gaps_agrees_with_itself(ran: Any) -> None:
     _, _, outcomes, _ = ran
     assert audit(outcomes[RESTARTS].recording).differences == ()

@@ -76,6 +76,7 @@ def buses(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holder", COMMANDS)
 def test_of_two_commands_at_one_device_the_first_goes_on_and_the_second_says_who_that_is(
     workshop: Any, triaxcal: Run, start: Run, buses: Any, holder: str
@@ -98,6 +99,7 @@ def test_of_two_commands_at_one_device_the_first_goes_on_and_the_second_says_who
         assert triaxcal("registers", station).code == 0
 
 
+@pytest.mark.slow
 def test_a_command_that_is_killed_holds_nothing_any_more(workshop: Any, triaxcal: Run, start: Run) -> None:
     with workshop.serve(workshop.device()) as served, _hesitating(served) as (asked, go_on):
         station = workshop.station({"bus": served.bus, "profile": _patient_profile(workshop)})
@@ -177,6 +179,7 @@ def test_two_commands_at_two_units_of_one_gateway_both_go_on(workshop: Any, tria
         assert json.loads(first.out)["serial"] == "4711"
 
 
+@pytest.mark.slow
 def test_two_commands_at_two_nodes_of_one_can_bus_both_go_on(
     workshop: Any, triaxcal: Run, start: Run, free_port: int, multicast_fault: str | None
 ) -> None:

@@ -40,6 +40,7 @@ def buses(request: pytest.FixtureRequest, tmp_path: Path, free_port: int, multic
     )
 
 
+@pytest.mark.slow
 def test_a_unit_is_calibrated_across_processes_and_stays_so_when_its_power_goes(
     workshop: Any, triaxcal: Callable[..., Any], start: Callable[..., Any], buses: Any
 ) -> None:
@@ -90,6 +91,7 @@ def test_a_unit_is_calibrated_across_processes_and_stays_so_when_its_power_goes(
     assert (workshop.folder / "eeprom.bin").read_bytes() == held.image()
 
 
+@pytest.mark.slow
 def test_a_unit_that_was_never_written_keeps_its_factory_calibration(
     workshop: Any, start: Callable[..., Any], wait_until: Callable[..., None], free_port: int
 ) -> None:

@@ -14,6 +14,7 @@ QUICK = [n for n in range(14) if COMMANDS[n % len(COMMANDS)] != "run"]
 """Without `run`, which takes as long as all the others; `benchmarks/stop_signals.py` has it too."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", QUICK)
 async def test_a_command_that_is_stopped_ends_in_good_order(number: int) -> None:
     ended = await fire(shot_of(1, number, sys.executable, transports=("tcp",)), deadline_s=DEADLINE_S)

@@ -20,6 +20,7 @@ def inner_tests() -> list[str]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", inner_tests())
 def test_on_a_can_kernel(name: str, ended: dict[str, Inner]) -> None:
     inner = ended.get(name)

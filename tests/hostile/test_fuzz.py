@@ -7,6 +7,7 @@ from benchmarks.fuzz import KINDS, many
 COUNT, PARTS = 300, 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
 def test_whatever_comes_of_a_spoiled_input_is_an_error_of_ours_or_a_clean_exit(part: int) -> None:
     found = many(1, range(part, COUNT, PARTS))

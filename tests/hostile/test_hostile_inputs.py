@@ -62,6 +62,7 @@ def faults(row: Row, outcome: dict[str, Any], secret: str) -> list[str]:
     return [f"{row.what}: {fault}" for fault in found]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", range(BATCHES))
 def test_a_hostile_input_is_one_line_soon_and_in_little_memory(tmp_path: Path, batch: int) -> None:
     from tests.hostile.rows import ROWS, SECRET  # many megabytes, made where they are wanted and not on collection

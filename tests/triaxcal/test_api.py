@@ -62,6 +62,7 @@ def test_poses_say_themselves_in_a_few_lines(poses: Any) -> None:
     assert len(repr(poses)) < 500
 
 
+@pytest.mark.slow
 def test_a_unit_that_was_said_of_the_poses_is_the_calibrations(recorded: Recorded) -> None:
     found = tc.find_poses(recorded.frame(), output_unit="V")
     assert tc.calibrate(found, signs=MINUS).output_unit == "V"
@@ -77,6 +78,7 @@ def test_rows_may_be_labelled_by_their_times(recorded: Recorded, poses: Any) -> 
         assert [p.samples for p in found] == [p.samples for p in poses]
 
 
+@pytest.mark.slow
 def test_numbers_whose_name_states_another_unit_are_not_seconds(recorded: Recorded) -> None:
     frame = recorded.frame()
     for name, unit, scale in (("millis", "ms", 1e3), ("time (us)", "us", 1e6), ("t_ns", "ns", 1e9)):
@@ -94,6 +96,7 @@ def test_what_is_meant_as_an_output_is_no_channel(recorded: Recorded) -> None:
         tc.find_poses(recorded.frame(), columns={"u_x": "ux"})
 
 
+@pytest.mark.slow
 def test_times_may_be_seconds_datetimes_or_integers_of_a_unit(recorded: Recorded, poses: Any) -> None:
     ns = np.round(recorded.t * 1e9).astype(np.int64)
     started_problem = np.datetime64("2026-03-01T08:00:00", "ns")
@@ -164,6 +167,7 @@ def test_what_cannot_be_samples_is_said_with_what_was_expected(t: Any, u: Any, m
 # Calibrations
 
 
+@pytest.mark.slow
 def test_the_truth_is_recovered_and_the_linear_one_is_beside_it(recorded: Recorded, diagnosed: tc.Diagnosis) -> None:
     found, truth = diagnosed.calibration, recorded.unit.sensor
     assert found.terms == ("linear", "temperature_bias")
@@ -208,6 +212,7 @@ def test_a_calibration_is_verified_on_poses_that_no_fit_saw(recorded: Recorded, 
         tc.verify(diagnosed.calibration, [])
 
 
+@pytest.mark.slow
 def test_the_moment_for_which_it_holds_is_chosen(poses: Any) -> None:
     held = {at: tc.diagnose(poses, signs=MINUS, at=at).calibration.holds_at for at in ("end", "mean", 12.5)}
     assert [h.t_s for h in held.values() if h] == pytest.approx(
@@ -269,6 +274,7 @@ def test_one_effect_may_be_named_without_a_list(poses: Any) -> None:
     assert tc.calibrate(poses, signs=MINUS, effects="temperature_bias").terms == ("linear", "temperature_bias")
 
 
+@pytest.mark.slow
 def test_a_check_recording_may_be_a_table(recorded: Recorded, poses: Any) -> None:
     assert tc.diagnose(poses, signs=MINUS, check=recorded.frame()).held_out is not None
 
@@ -316,6 +322,7 @@ def test_a_reference_that_is_no_positive_number_is_said(poses: tc.Poses, referen
         tc.calibrate(poses, signs=MINUS, reference=reference)
 
 
+@pytest.mark.slow
 def test_an_arrow_table_is_taken_and_a_lazy_one_is_to_be_collected(recorded: Recorded) -> None:
     frame = recorded.frame()
     found = tc.find_poses(pa.Table.from_pandas(frame, preserve_index=False))

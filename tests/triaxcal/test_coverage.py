@@ -21,6 +21,7 @@ def pose(dof: float, shared_dof: float = np.inf) -> Pose:
     return Pose(0.0, 1.0, 100, np.zeros(3), np.eye(3), dof, shared_dof=shared_dof)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("poses", "knowledge", "excess", "search"),
     [
@@ -42,6 +43,7 @@ def test_intervals_cover_whatever_is_known_of_the_noise(
     assert 0.93 - uncertainty < share.mean() < 0.97 + uncertainty
 
 
+@pytest.mark.slow
 def test_normal_quantiles_would_not_cover_at_five_degrees_of_freedom() -> None:
     c = Condition("", PAPER_UNIT, plan(14), np.array(1.5e-5))
     inside = []

@@ -26,6 +26,7 @@ def closed(poses: list[Pose], **options: object) -> Loop:
     return diagnose(poses, signs=MINUS, **options)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_an_effect_that_is_certain_is_adopted_with_its_coefficients(poses_with: Poses) -> None:
     loop = closed(poses_with(3, temperature_bias=[5e-4, -4e-4, 6e-4]))
     (found,) = loop.findings
@@ -41,6 +42,7 @@ def test_an_effect_that_is_certain_is_adopted_with_its_coefficients(poses_with: 
     assert loop.probabilities["temperature_bias"] == found.probability
 
 
+@pytest.mark.slow
 def test_one_of_several_is_told_with_the_probability_of_each(poses_with: Poses) -> None:
     """A drift, which on poses without slopes inside looks like a warm-up too."""
     loops = [closed(poses_with(seed, warm_up=[4e-4, 3e-4, -5e-4])) for seed in range(4)]
@@ -52,6 +54,7 @@ def test_one_of_several_is_told_with_the_probability_of_each(poses_with: Poses) 
     assert all(sum(loop.probabilities.values()) > 0.05 for loop in loops)
 
 
+@pytest.mark.slow
 def test_a_likely_name_is_a_candidate_with_what_it_would_be(poses_with: Poses) -> None:
     for seed in range(2):
         loop = closed(poses_with(seed, second_order_nonlinearity=[3e-4, -3e-4, 2.4e-4]))
@@ -66,6 +69,7 @@ def test_a_likely_name_is_a_candidate_with_what_it_would_be(poses_with: Poses) -
         assert abs(value - 3e-4) < 4 * error
 
 
+@pytest.mark.slow
 def test_where_nothing_acts_nothing_is_told(poses_with: Poses) -> None:
     for seed in range(3):
         loop = closed(poses_with(seed))
@@ -76,6 +80,7 @@ def test_where_nothing_acts_nothing_is_told(poses_with: Poses) -> None:
         assert loop.advice.actions == ()
 
 
+@pytest.mark.slow
 def test_where_something_has_no_name_nothing_is_corrected() -> None:
     recording = Case("dead_zone", 1, (100.0, 200.0), 26, "white").make()
     loop = diagnose(still_poses(recording.samples()), signs=recording.signs)
@@ -86,6 +91,7 @@ def test_where_something_has_no_name_nothing_is_corrected() -> None:
     assert all(f.verdict is Verdict.CONFOUNDED for f in loop.findings)
 
 
+@pytest.mark.slow
 def test_an_outlier_is_left_out_before_and_after(poses_with: Poses, knocked: Knocked) -> None:
     loop = closed(knocked(poses_with(2, temperature_bias=[5e-4, -4e-4, 6e-4]), 7, 2e-3))
     for calibration in (loop.before, loop.after):
@@ -96,12 +102,14 @@ def test_an_outlier_is_left_out_before_and_after(poses_with: Poses, knocked: Kno
     assert loop.after.residual.rms_g < 1.3 * SIGMA_G
 
 
+@pytest.mark.slow
 def test_poses_that_an_effect_explains_are_no_outliers(poses_with: Poses) -> None:
     loop = closed(poses_with(8, bias_step=[3e-3, -2e-3, 3e-3]))
     assert all(p.used for p in loop.before.poses)
     assert max(loop.posterior.outlier_probabilities) < 0.5
 
 
+@pytest.mark.slow
 def test_a_faulty_pose_has_no_part_and_stays_in_the_list(poses_with: Poses) -> None:
     poses = poses_with(3, hysteresis=[8e-4, -7e-4, 9e-4])
     poses[4] = replace(poses[4], fault="stuck_output", mean=poses[4].mean * 1.1)
@@ -112,6 +120,7 @@ def test_a_faulty_pose_has_no_part_and_stays_in_the_list(poses_with: Poses) -> N
     assert [f.effect for f in loop.findings] == ["hysteresis"]
 
 
+@pytest.mark.slow
 def test_an_effect_of_time_holds_at_the_moment_asked_for(poses_with: Poses) -> None:
     poses = poses_with(3, bias_drift=[9e-7, -8e-7, 9e-7])
     for at in (Moment.END, Moment.MEAN, 30.0):
@@ -121,6 +130,7 @@ def test_an_effect_of_time_holds_at_the_moment_asked_for(poses_with: Poses) -> N
         assert at in (loop.after.holds_at.moment, loop.after.holds_at.t_s)
 
 
+@pytest.mark.slow
 def test_poses_of_another_recording_judge_before_and_after(poses_with: Poses) -> None:
     effects = {"second_order_nonlinearity": [5e-4, -4e-4, 5e-4]}
     loop = closed(poses_with(3, **effects), check=poses_with(99, **effects))
@@ -128,6 +138,7 @@ def test_poses_of_another_recording_judge_before_and_after(poses_with: Poses) ->
     assert loop.held_out.after_rms_g < 0.3 * loop.held_out.before_rms_g
 
 
+@pytest.mark.slow
 def test_what_poses_cannot_show_is_told_with_the_reason(poses_with: Poses) -> None:
     still = [replace(p, channels={"temp_c": 25.0}) for p in poses_with(3)]
     loop = closed(still)
@@ -146,6 +157,7 @@ def test_poses_with_hardly_anything_to_spare_correct_nothing_that_nobody_knows(p
     assert loop.findings == ()
 
 
+@pytest.mark.slow
 def test_effects_of_several_runs_are_looked_for_once(poses_with: Poses) -> None:
     poses = together([poses_with(1), poses_with(2)])
     terms = posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS).evidence.terms

@@ -124,6 +124,7 @@ def test_a_data_frame_comes_back_as_one_of_its_own_kind(library: Any, paper_unit
         c.apply(u, columns={"ux": "x"})
 
 
+@pytest.mark.slow
 def test_uncertainties_are_those_that_the_errors_of_a_calibration_scatter_with(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:

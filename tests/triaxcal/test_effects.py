@@ -482,6 +482,7 @@ def test_an_effect_of_another_package_is_in_the_catalogue_by_its_entry_point() -
     assert names[-3:] == ["radiation", "channel_bias:dose_gy", "channel_scale_factor:dose_gy"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("installed")
 def test_an_effect_of_another_package_is_searched_for(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     (radiation,) = plugins()[0]
@@ -551,6 +552,7 @@ FAILING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("kind", FAILING)
 def test_an_effect_that_fails_on_real_poses_is_left_out_with_its_reason(

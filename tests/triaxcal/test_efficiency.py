@@ -30,6 +30,7 @@ def test_the_bound_by_the_whole_likelihood_is_the_bound_by_the_ellipsoid_s_norma
     assert best @ np.diag(c.error.ravel() ** 2) @ best.T == pytest.approx(whole, rel=1e-9, abs=1e-12 * np.max(whole))
 
 
+@pytest.mark.slow
 def test_a_thousand_fits_of_a_unit_with_every_difficulty_at_once_are_at_the_bound() -> None:
     seeds = 1000
     found = measure(hard(), seeds)
@@ -40,6 +41,7 @@ def test_a_thousand_fits_of_a_unit_with_every_difficulty_at_once_are_at_the_boun
     assert np.all(np.abs(np.mean(found.errors / found.bound, axis=0)) < limit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 import triaxcal
 
 ROOT = Path(__file__).parents[2]
@@ -53,6 +55,7 @@ print(*sorted(tops - sys.stdlib_module_names - {"__main__", "__mp_main__"}))
 """
 
 
+@pytest.mark.slow
 def test_the_metrology_lives_on_numpy_and_scipy_alone() -> None:
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -69,6 +69,7 @@ def equal_weights_rss(means: np.ndarray) -> float:
     return float(np.sum(least_squares(miss, first, xtol=1e-15, ftol=1e-15, gtol=1e-15).fun ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", [1, 5, 6])
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_every_sensor_of_the_array_shows_its_21_poses(run: int, sensor: int, poses: Poses) -> None:
@@ -138,6 +139,7 @@ NOT_CORRECTED = 8
 """Of this sensor something in time that has no name is likelier than a drift or a warm-up."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_run_6_holds_a_drift_and_the_residual_falls_threefold_with_it(
     sensor: int, diagnosed: Callable[[str], Loop]
@@ -155,6 +157,7 @@ def test_run_6_holds_a_drift_and_the_residual_falls_threefold_with_it(
         assert loop.after.residual.rms_g < loop.before.residual.rms_g / 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_run_5_of_the_same_array_holds_none(sensor: int, diagnosed: Callable[[str], Loop]) -> None:
     loop = diagnosed(f"mimu4444/run5_sensor{sensor}")
@@ -164,6 +167,7 @@ def test_run_5_of_the_same_array_holds_none(sensor: int, diagnosed: Callable[[st
     assert [c.effect for c in loop.candidates] == (["cross_coupling"] if sensor == 2 else [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("run", "sensor"), [*((1, s) for s in SENSORS), (5, 2)])
 def test_no_recording_of_the_array_shows_a_nonlinearity(
     run: int, sensor: int, diagnosed: Callable[[str], Loop]

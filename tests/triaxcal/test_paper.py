@@ -65,6 +65,7 @@ def trials(paper_unit: Sensor, fourteen: np.ndarray) -> Trials:
     )
 
 
+@pytest.mark.slow
 def test_pulls_of_all_nine_coefficients_have_mean_zero(trials: Trials) -> None:
     pulls = trials.errors / (trials.standard_errors / trials.birge_ratio[:, None])
     limit = stats.norm.isf(EACH / 2) / np.sqrt(SEEDS)

@@ -21,6 +21,7 @@ assert callable(tc.budget) and callable(tc.verify) and callable(tc.diagnose)
 """
 
 
+@pytest.mark.slow
 def test_every_name_is_what_it_was_after_every_module_is_imported() -> None:
     done = subprocess.run([sys.executable, "-c", AFTER_ALL], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -118,6 +118,7 @@ def deficient(kind: str, rng: np.random.Generator) -> np.ndarray:
 KINDS = ["few", "few of the cube", "cap", "plane", "cone", "clusters", "nine of fourteen", "faces"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("alike", [True, False], ids=["triads alike", "triads of any kind"])
 def test_the_poses_wanted_mend_a_deficient_set_in_one_round(kind: str, alike: bool) -> None:
@@ -180,6 +181,7 @@ def wobbling(degrees: float) -> np.ndarray:
     return unit(ring + np.radians(degrees) * np.random.default_rng(1).standard_normal(ring.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NEARLY)
 @pytest.mark.parametrize("noise_g", [1e-6, 3e-4])
 def test_a_set_that_is_nearly_singular_is_warned_of_and_its_errors_are_true(
@@ -223,6 +225,7 @@ def test_no_pose_at_all_is_refused() -> None:
     assert len(refusal.value.wanted) == 9
 
 
+@pytest.mark.slow
 def test_the_singular_nine_pose_subsets_of_the_fourteen_and_only_they_are_refused(
     paper_unit: Sensor, fourteen: np.ndarray
 ) -> None:
@@ -245,6 +248,7 @@ def test_the_singular_nine_pose_subsets_of_the_fourteen_and_only_they_are_refuse
     assert not any(refused(subset) for subset in np.random.default_rng(0).permutation(subsets[~singular])[:150])
 
 
+@pytest.mark.slow
 def test_any_eleven_of_the_fourteen_are_enough(paper_unit: Sensor, fourteen: np.ndarray) -> None:
     poses = measured(paper_unit, fourteen)
     for subset in itertools.combinations(range(14), 11):

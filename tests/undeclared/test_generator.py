@@ -170,6 +170,7 @@ def chi_square(r: Recording, *, effect: bool) -> float:
     return float(2 * found.cost)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses", [26, 14])
 def test_the_size_is_what_a_fit_of_nine_parameters_leaves(poses: int) -> None:
     """χ² is noncentral by s² with the effect, and central without: over many kinds of effect together."""
@@ -272,6 +273,7 @@ def test_the_next_recording_begins_anew_what_is_the_recordings_own() -> None:
     assert nonlinear.held_out.added_g.any()
 
 
+@pytest.mark.slow
 def test_effects_are_drawn_at_random_and_two_are_two() -> None:
     seen = {e.kind for seed in range(6) for e in recording(seed).effects}
     assert len(seen) >= 3

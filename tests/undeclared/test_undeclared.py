@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 from scipy import stats
 
 from tests.undeclared import physics, uncatalogued
@@ -33,6 +34,7 @@ def examined(cases: Sequence[Case]) -> list[Outcome]:
     return outcomes
 
 
+@pytest.mark.slow
 def test_nothing_is_found_where_nothing_is() -> None:
     cases = [Case("none", 540 + i, (1.0, 1.0), 26 if i % 3 else 14, noise) for noise in NOISES[:2] for i in range(2)]
     outcomes = examined(cases)
@@ -41,6 +43,7 @@ def test_nothing_is_found_where_nothing_is() -> None:
     assert at_most(0.05, [o.detected for o in outcomes])
 
 
+@pytest.mark.slow
 def test_a_large_effect_is_told_and_a_unique_name_is_not_wrong() -> None:
     """With 26 poses every third kind: named, listed with others of which one acts, or likely. With 14 two, which
     leave more open."""
@@ -53,6 +56,7 @@ def test_a_large_effect_is_told_and_a_unique_name_is_not_wrong() -> None:
     assert at_most(0.02, [o.wrong for o in [*many, *few]]), told
 
 
+@pytest.mark.slow
 def test_a_small_effect_is_seen_nearly_as_often_as_by_the_test_that_was_told() -> None:
     kinds = list(enumerate(physics.KINDS))[1::2]
     outcomes = examined([Case(k, 560 + i, (5.0, 5.0), 26, NOISES[i % 3]) for i, k in kinds])
@@ -62,6 +66,7 @@ def test_a_small_effect_is_seen_nearly_as_often_as_by_the_test_that_was_told() -
     assert at_most(0.02, [o.wrong for o in outcomes]), lines
 
 
+@pytest.mark.slow
 def test_what_no_catalogue_has_stays_unexplained() -> None:
     """Of 14 poses effects explain nearly anything, and it is said that it may be none of them."""
     kinds = uncatalogued.KINDS
@@ -73,6 +78,7 @@ def test_what_no_catalogue_has_stays_unexplained() -> None:
     assert at_most(0.02, [o.wrong for o in [*many, *few]]), told
 
 
+@pytest.mark.slow
 def test_of_two_at_once_both_are_told_more_often_than_not() -> None:
     outcomes = examined([Case("two", 600 + i, (20.0, 40.0), 26, NOISES[i % 3]) for i in range(3)])
     told = "\n".join(o.line for o in outcomes)
@@ -81,6 +87,7 @@ def test_of_two_at_once_both_are_told_more_often_than_not() -> None:
     assert at_most(0.02, [o.wrong for o in outcomes]), told
 
 
+@pytest.mark.slow
 def test_with_the_effect_in_the_model_held_out_poses_are_as_good_as_without_it() -> None:
     """Pooled over recordings, at most a tenth above nine parameters on the noise alone, as far as chance allows."""
     cases = [Case(k, 620, LARGE, 26, "white", held_out=True) for k in ("second_order_nonlinearity", "warm_up")]

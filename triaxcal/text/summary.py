@@ -43,6 +43,11 @@ def poses(found: Sequence[Pose], data_quality: Iterable[str]) -> str:
     return "\n".join([*lines, *(f"  {line}" for line in data_quality)])
 
 
+TOLD = 2.0
+"""Times the expected error, from which on the ratio is told: noise alone makes
+more in one of twenty recordings of a single pose, and never in nine poses."""
+
+
 def verification(poses: str, rms: float, noise_floor: float, expected: float, reference: tuple[str, float]) -> str:
     """The error in poses of another recording, beside what noise and the
     calibration's uncertainty make there."""
@@ -50,7 +55,8 @@ def verification(poses: str, rms: float, noise_floor: float, expected: float, re
     line = f"{poses}: rms {small.in_full(rms)}, noise floor {small.in_full(noise_floor)}"
     if math.isnan(expected):
         return line
-    return f"{line}, {small.in_full(expected)} expected of noise and the calibration's uncertainty"
+    line = f"{line}, {small.in_full(expected)} expected of noise and the calibration's uncertainty"
+    return f"{line}: the error is {rms / expected:.2g} times that" if rms > TOLD * expected else line
 
 
 def html(c: Calibration, output_unit: str, reference_unit: str, warnings: Iterable[str]) -> str:

@@ -60,7 +60,7 @@ def _command(commands: Any, name: str, run: str, help_line: str, more: str = "",
 
 def _line(commands: Any) -> None:
     p = _command(
-        commands, "demo", "line:demo_command", "the whole line on two simulated units, in under a minute",
+        commands, "demo", "line:demo_command", "the whole line on two simulated units, in about a minute",
         "A CAN and a Modbus unit with hidden effects are recorded, calibrated, written, power-cycled and verified.",
         "demo --out demo-out",
     )  # fmt: skip

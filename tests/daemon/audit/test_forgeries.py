@@ -396,6 +396,7 @@ def source(finished_run: Any) -> Forgery:
     return Forgery.of(finished_run.can)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name + (" (sealed)" if row.sealed else ""))
 def test_what_is_changed_or_taken_out_is_found(
     source: Forgery, tmp_path: Path, said: Callable[[Path], list[str]], row: Row

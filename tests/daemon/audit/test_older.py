@@ -14,6 +14,7 @@ from triaxcald.audit import audit, text
 EARLIER = Path(__file__).parents[3] / "recordings" / "by-0.1.0.mcap"
 
 
+@pytest.mark.slow
 def test_what_its_search_found_is_taken_as_it_stands_and_that_is_said() -> None:
     found = audit(EARLIER)
     assert found.differences == ()

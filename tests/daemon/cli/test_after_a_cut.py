@@ -40,6 +40,7 @@ def cut_short(bench: Bench) -> Path:
     return journal
 
 
+@pytest.mark.slow
 @every_transport
 def test_a_provisioning_that_was_cut_short_is_finished(tmp_path: Path, triaxcal, transport: Transport) -> None:
     with Bench(tmp_path, triaxcal, transport, CUT, timing=QUICK) as bench:
@@ -51,6 +52,7 @@ def test_a_provisioning_that_was_cut_short_is_finished(tmp_path: Path, triaxcal,
         assert not journal.exists()
 
 
+@pytest.mark.slow
 @every_transport
 def test_or_what_the_device_held_before_is_put_back(tmp_path: Path, triaxcal, transport: Transport) -> None:
     with Bench(tmp_path, triaxcal, transport, CUT, timing=QUICK) as bench:
@@ -62,6 +64,7 @@ def test_or_what_the_device_held_before_is_put_back(tmp_path: Path, triaxcal, tr
         assert not journal.exists()
 
 
+@pytest.mark.slow
 def test_the_outcome_of_a_resumed_provisioning_replaces_that_of_the_one_cut_short(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
         cut_short(bench)
@@ -72,6 +75,7 @@ def test_the_outcome_of_a_resumed_provisioning_replaces_that_of_the_one_cut_shor
         assert outcome["registers"]["cut_short_before"]
 
 
+@pytest.mark.slow
 def test_a_restore_that_no_restart_proves_is_proven_by_the_supply(
     tmp_path: Path, triaxcal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -90,6 +94,7 @@ def test_a_restore_that_no_restart_proves_is_proven_by_the_supply(
         assert not journal.exists()
 
 
+@pytest.mark.slow
 def test_a_restore_ends_with_an_outcome_too(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
         journal = cut_short(bench)
@@ -102,6 +107,7 @@ def test_a_restore_ends_with_an_outcome_too(tmp_path: Path, triaxcal) -> None:
         assert 0 < len(outcome["registers"]["written"]) <= len(outcome["registers"]["differing"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoilt", ["{", '{"format": "triaxcal.journal/1", "step": "writing"}'])
 def test_a_journal_that_cannot_be_read_does_not_keep_a_recordings_registers_away(
     tmp_path: Path, triaxcal, spoilt: str
@@ -128,6 +134,7 @@ def test_a_device_that_holds_the_values_in_use_is_not_said_to_have_them_stored(t
         assert "journal" not in told
 
 
+@pytest.mark.slow
 def test_a_provisioning_that_ends_before_it_has_looked_names_the_journal_of_an_earlier_one(
     tmp_path: Path, triaxcal
 ) -> None:
@@ -139,6 +146,7 @@ def test_a_provisioning_that_ends_before_it_has_looked_names_the_journal_of_an_e
         assert "triaxcal provision --resume" in done.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "provision"])
 def test_and_so_does_one_that_does_not_reach_the_device(tmp_path: Path, triaxcal, command: str) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
@@ -150,6 +158,7 @@ def test_and_so_does_one_that_does_not_reach_the_device(tmp_path: Path, triaxcal
         assert f"triaxcal provision --resume {bench.station} --unit unit" in done.err
 
 
+@pytest.mark.slow
 def test_a_restore_heeds_the_serial_number_of_the_station(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
         journal = cut_short(bench)
@@ -160,6 +169,7 @@ def test_a_restore_heeds_the_serial_number_of_the_station(tmp_path: Path, triaxc
         assert bench.place.requests == requests
 
 
+@pytest.mark.slow
 def test_a_run_with_a_journal_that_cannot_be_read_takes_no_pose(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
         journal = cut_short(bench)
@@ -168,6 +178,7 @@ def test_a_run_with_a_journal_that_cannot_be_read_takes_no_pose(tmp_path: Path, 
         assert list(tmp_path.glob("**/*.mcap")) == []
 
 
+@pytest.mark.slow
 def test_and_so_does_a_run(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
         journal = cut_short(bench)
@@ -178,6 +189,7 @@ def test_and_so_does_a_run(tmp_path: Path, triaxcal) -> None:
         assert f"triaxcal provision --resume {bench.station} --unit unit" in unit["error"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["registers", "record"])
 def test_who_reads_or_records_a_unit_in_between_is_warned(tmp_path: Path, triaxcal, command: str) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
@@ -200,6 +212,7 @@ def test_there_is_nothing_to_resume_where_nothing_was_cut_short(tmp_path: Path, 
         assert bench.unit.written == []
 
 
+@pytest.mark.slow
 def test_a_journal_is_for_its_own_unit_alone(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK, serial=None) as bench:
         journal = cut_short(bench)

@@ -47,6 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_columns_of_the_input_stay_and_the_calibrated_ones_are_behind_them(
     folder: Path, triaxcal, tmp_path: Path
 ) -> None:
@@ -89,6 +90,7 @@ def test_of_a_foreign_table_every_column_stays_as_it_stood(folder: Path, triaxca
     assert list(found["ax (input)"].astype(int)) == list(foreign["ax"])
 
 
+@pytest.mark.slow
 def test_a_channel_is_found_under_the_name_it_has_in_the_calibration(folder: Path, triaxcal, tmp_path: Path) -> None:
     """Python keeps names as they are; of a file by itself the one temperature is temp_c."""
     table = pd.read_csv(folder / "rec.csv").rename(columns={"temp_c": "temperature_degC"})
@@ -104,6 +106,7 @@ def test_a_channel_is_found_under_the_name_it_has_in_the_calibration(folder: Pat
     assert done.code == 0, done.err
 
 
+@pytest.mark.slow
 def test_outputs_in_another_unit_than_those_calibrated_are_refused(folder: Path, triaxcal, tmp_path: Path) -> None:
     table = pd.read_csv(folder / "rec.csv").drop(columns="temp_c")
     names = {f"u{axis}": f"a{axis} [m/s2]" for axis in "xyz"}
@@ -131,6 +134,7 @@ def test_compressed_and_in_columns_it_says_the_same(folder: Path, triaxcal, tmp_
     assert plain["u_ax"].between(1e-6, 1e-4).all()
 
 
+@pytest.mark.slow
 def test_a_recording_is_read_block_by_block_as_its_export_is(triaxcal, tmp_path: Path) -> None:
     exported, cal = tmp_path / "rec.csv", tmp_path / "cal.json"
     assert triaxcal("log", "export", GOLDEN, "-o", exported).code == 0

@@ -48,6 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_check_recording_of_another_unit_is_an_error_that_names_both_serials(triaxcal: Run) -> None:
     main, check = RECORDINGS / "can-second-order.mcap", RECORDINGS / "modbus-temperature-bias.mcap"
     triaxcal("diagnose", main, "--check", check).failed(2, f"{check}: unit: 1002; {main} has 1001")
@@ -58,6 +59,7 @@ def test_a_check_recording_that_is_read_otherwise_is_an_error(folder: Path, tria
     done.failed(2, "check.csv: signs of the scale factors: +,+,+", "-,-,-")
 
 
+@pytest.mark.slow
 def test_an_error_of_other_settings_names_the_option_that_says_them_of_both(folder: Path, triaxcal: Run) -> None:
     later = folder / "later.csv"
     stated = folder / "stated.csv"
@@ -81,6 +83,7 @@ def test_what_is_diagnosed_is_no_check_however_its_path_is_written(folder: Path,
             assert done.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_what_spoils_the_check_recording_stands_behind_its_name(folder: Path, triaxcal: Run) -> None:
     main, check = folder / "main.csv", folder / "check.csv"
     document = triaxcal("diagnose", main, "--check", check, "--json").json
@@ -90,6 +93,7 @@ def test_what_spoils_the_check_recording_stands_behind_its_name(folder: Path, tr
     assert triaxcal("diagnose", main, "--json").json["data_quality"] == []
 
 
+@pytest.mark.slow
 def test_a_check_recording_that_cannot_be_of_this_unit_is_told_from_one_whose_unit_has_aged(
     folder: Path, triaxcal: Run
 ) -> None:
@@ -102,6 +106,7 @@ def test_a_check_recording_that_cannot_be_of_this_unit_is_told_from_one_whose_un
     assert triaxcal("diagnose", main, "--check", aged).err == ""
 
 
+@pytest.mark.slow
 def test_a_recording_of_a_unit_of_the_same_type_is_asked_about(folder: Path, triaxcal: Run, tmp_path: Path) -> None:
     """Its errors are within what age could make of this one; its axes stand otherwise."""
     main, other, cal = folder / "main.csv", folder / "other.csv", tmp_path / "main.json"
@@ -115,6 +120,7 @@ def test_a_recording_of_a_unit_of_the_same_type_is_asked_about(folder: Path, tri
     assert said.startswith(f"{cal} {asked}")
 
 
+@pytest.mark.slow
 def test_verify_says_when_a_recording_cannot_be_of_the_unit_of_the_calibration(folder: Path, triaxcal: Run) -> None:
     cal, strange, aged = folder / "main.json", folder / "strange.csv", folder / "aged.csv"
     assert triaxcal("fit", folder / "main.csv", "-o", cal).code == 0
@@ -133,6 +139,7 @@ def test_a_refusal_is_told_with_what_spoils_the_recording(folder: Path, triaxcal
     assert f"warning: {REPEATED}\n" in done.err
 
 
+@pytest.mark.slow
 def test_of_several_units_a_refusal_names_the_recording_that_is_spoiled(folder: Path, triaxcal: Run) -> None:
     few = folder / "few.csv"
     done = triaxcal("diagnose", "--units", folder / "main.csv", few)
@@ -140,6 +147,7 @@ def test_of_several_units_a_refusal_names_the_recording_that_is_spoiled(folder: 
     assert f"warning: {few}: {REPEATED}\n" in done.err
 
 
+@pytest.mark.slow
 def test_a_report_is_headed_by_the_name_of_the_file_alone(folder: Path, triaxcal: Run) -> None:
     page = folder / "page.html"
     assert triaxcal("fit", folder / "main.csv", "--report", page).code == 0
@@ -147,6 +155,7 @@ def test_a_report_is_headed_by_the_name_of_the_file_alone(folder: Path, triaxcal
     assert str(folder) not in page.read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_verify_says_which_effects_of_the_calibration_stayed_behind_with_its_recording(
     folder: Path, triaxcal: Run, tmp_path: Path
 ) -> None:

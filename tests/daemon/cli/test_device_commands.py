@@ -53,6 +53,7 @@ def test_registers_are_read_and_explained(workshop: Any, triaxcal: Run) -> None:
     assert "checksum right" in shown.out
 
 
+@pytest.mark.slow
 def test_a_dry_run_shows_what_would_be_written_and_writes_nothing(workshop: Any, triaxcal: Run) -> None:
     cal = workshop.write("cal.json", json.dumps(CAL))
     with workshop.serve(workshop.device()) as served:
@@ -76,6 +77,7 @@ def test_a_dry_run_shows_what_would_be_written_and_writes_nothing(workshop: Any,
     assert f"dry run: {len(done.json['differing'])} registers would be written, nothing was" in shown.out
 
 
+@pytest.mark.slow
 def test_a_calibration_is_written_and_read_back_and_a_second_time_nothing_differs(workshop: Any, triaxcal: Run) -> None:
     cal = workshop.write("cal.json", json.dumps({"format": "triaxcal.loop/1", "calibration": CAL}))
     with workshop.serve(workshop.device()) as served:
@@ -175,6 +177,7 @@ def _each_is_absent(workshop: Any, triaxcal: Run, station: Path, *words: str) ->
     assert sorted(workshop.folder.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_nobody_on_the_can_bus(workshop: Any, triaxcal: Run) -> None:
     bus = {"interface": "virtual", "channel": "nobody-here", "node_id": 9}
     station = workshop.station({"profile": workshop.impatient_profile("triax-ref-can"), "bus": bus})
@@ -186,6 +189,7 @@ def test_a_connection_that_is_refused(workshop: Any, triaxcal: Run, closed_port:
     _each_is_absent(workshop, triaxcal, station, f"127.0.0.1:{closed_port}", "refused")
 
 
+@pytest.mark.slow
 def test_a_server_that_says_nothing(workshop: Any, triaxcal: Run, deaf_port: int) -> None:
     profile = workshop.impatient_profile()
     station = workshop.station({"profile": profile, "bus": {"host": "127.0.0.1", "port": deaf_port}})
@@ -216,6 +220,7 @@ def test_a_can_interface_that_is_not_there(workshop: Any, triaxcal: Run, bus: di
     _each_is_absent(workshop, triaxcal, workshop.station({"profile": "triax-ref-can", "bus": bus}), words)
 
 
+@pytest.mark.slow
 def test_a_recording_of_so_many_seconds(workshop: Any, triaxcal: Run) -> None:
     rec = workshop.folder / "rec.mcap"
     with workshop.serve(workshop.device()) as served:
@@ -240,6 +245,7 @@ def test_a_recording_goes_to_no_folder_that_is_not_there(workshop: Any, triaxcal
     triaxcal("record", station, "-o", rec).failed(2, f"{rec}: there is no folder ")
 
 
+@pytest.mark.slow
 def test_all_units_of_a_station_are_recorded_at_once_into_a_folder(workshop: Any, triaxcal: Run) -> None:
     channel = {"interface": "virtual", "channel": f"recorded-{id(workshop)}", "node_id": 9}
     can = workshop.device("can.toml", profile="triax-ref-can", serial=12, bus=channel)
@@ -263,6 +269,7 @@ def test_all_units_of_a_station_are_recorded_at_once_into_a_folder(workshop: Any
         assert info["events"][-1]["kind"] == "ended"
 
 
+@pytest.mark.slow
 def test_a_recording_in_segments_goes_on_with_the_next_start_and_is_read_by_its_manifest(
     workshop: Any, triaxcal: Run
 ) -> None:
@@ -309,6 +316,7 @@ def test_options_of_a_recording_say_what_they_take(triaxcal: Run, option: str, v
     triaxcal("record", "station.toml", "-o", "rec.mcap", option, value).failed(2, option, words)
 
 
+@pytest.mark.slow
 def test_a_unit_that_stops_in_the_middle_of_a_recording_leaves_a_finished_file(workshop: Any, triaxcal: Run) -> None:
     rec = workshop.folder / "rec.mcap"
     with workshop.serve(workshop.device(speed=10.0), Faults(die_at_s=22.0)) as served:
@@ -340,6 +348,7 @@ def test_devices_lists_drivers_and_profiles(triaxcal: Run) -> None:
     assert all(p["fault"] is None for p in profiles.values())
 
 
+@pytest.mark.slow
 def test_devices_says_what_is_wrong_with_somebody_elses_broken_driver(tmp_path: Path) -> None:
     (tmp_path / "theirs.py").write_text("import no_such_module\n")
     info = tmp_path / "theirs-1.0.dist-info"

@@ -88,6 +88,7 @@ def cells(said: str, name: str) -> list[str]:
     return [cell.strip() for cell in row.strip("│ ").split("│")]
 
 
+@pytest.mark.slow
 def test_a_warm_up_is_told_with_its_time_constant_and_the_values_are_said_to_hold_long_after_it(
     settling: Path, asked: Run
 ) -> None:
@@ -104,6 +105,7 @@ def test_a_warm_up_is_told_with_its_time_constant_and_the_values_are_said_to_hol
     assert "since_start_s" not in said
 
 
+@pytest.mark.slow
 def test_a_step_is_told_with_its_moment_and_the_values_are_said_to_hold_after_it(knocked: Path, triaxcal: Run) -> None:
     said = triaxcal("diagnose", knocked, "--verbose").out
     _, moment, error, _, unit = cells(said, "bias_step.at")
@@ -114,11 +116,13 @@ def test_a_step_is_told_with_its_moment_and_the_values_are_said_to_hold_after_it
     assert "held_s" not in said
 
 
+@pytest.mark.slow
 def test_values_that_hold_always_are_not_said_to_hold_anywhere(rippled: Path, asked: Run) -> None:
     assert "hold" not in asked("fit", rippled).out.split("uncertainty")[0]
     assert asked("fit", rippled, "--json").json["holds"] == []
 
 
+@pytest.mark.slow
 def test_values_without_an_effect_of_temperature_are_said_to_be_those_at_the_mean_of_the_poses(
     warm: Path, rippled: Path, asked: Run
 ) -> None:
@@ -131,6 +135,7 @@ def test_values_without_an_effect_of_temperature_are_said_to_be_those_at_the_mea
     assert f"{said}{mean} °C, the mean of the poses ({low} to {high} °C)\n" in shown
 
 
+@pytest.mark.slow
 def test_a_budget_that_temperature_dominates_says_what_of_it_is_assumed(
     warm: Path, rippled: Path, tmp_path: Path, triaxcal: Run, asked: Run
 ) -> None:
@@ -144,6 +149,7 @@ def test_a_budget_that_temperature_dominates_says_what_of_it_is_assumed(
     assert "assumption" not in asked("fit", rippled).out
 
 
+@pytest.mark.slow
 def test_no_probability_is_said_to_be_nothing_or_certainty_and_no_error_has_an_exponent(
     rippled: Path, settling: Path, asked: Run
 ) -> None:
@@ -175,6 +181,7 @@ def test_a_finding_has_its_probability_and_keys_that_mean_nothing_any_more_are_n
     assert (document["call"], document["not_corrected"], document["another_unit"]) == ("usable", None, None)
 
 
+@pytest.mark.slow
 def test_what_no_effect_describes_is_told_with_its_probability_and_nothing_is_corrected(
     tmp_path: Path, triaxcal: Run
 ) -> None:
@@ -191,6 +198,7 @@ def test_what_no_effect_describes_is_told_with_its_probability_and_nothing_is_co
     assert document["after"] == document["before"]
 
 
+@pytest.mark.slow
 def test_units_side_by_side_are_told_each_by_itself_and_every_column_is_explained(
     plain: Path, settling: Path, triaxcal: Run
 ) -> None:
@@ -211,6 +219,7 @@ def test_the_reference_explains_the_columns_of_units_in_the_same_words(column: s
     assert f"| {column} | {COLUMNS[column].replace('|a|', chr(92) + '|a' + chr(92) + '|')} |" in page
 
 
+@pytest.mark.slow
 def test_of_poses_that_can_show_no_effect_the_console_says_so_and_why(
     tmp_path: Path, plain: Path, triaxcal: Run, asked: Run
 ) -> None:

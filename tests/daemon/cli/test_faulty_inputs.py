@@ -112,6 +112,7 @@ def _each_fails(path: Path, triaxcal: Run, words: str) -> None:
     assert sorted(path.parent.iterdir()) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
 def test_a_recording_that_was_cut_short(finished_run: Any, good: Path, triaxcal: Run, share: float) -> None:
     whole = finished_run.can.read_bytes()
@@ -120,6 +121,7 @@ def test_a_recording_that_was_cut_short(finished_run: Any, good: Path, triaxcal:
     _each_fails(path, triaxcal, "log recover" if share else "")
 
 
+@pytest.mark.slow
 def test_a_recording_with_a_flipped_byte_anywhere(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
     """Every byte of a finished recording is under a checksum."""
     whole = bytearray(finished_run.can.read_bytes())
@@ -218,6 +220,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["-o", "--report"])
 @pytest.mark.parametrize("where", ["missing/x", "file/x", "folder"])
 def test_a_place_where_no_result_can_go(short: Path, tmp_path: Path, triaxcal: Run, option: str, where: str) -> None:
@@ -283,6 +286,7 @@ def test_help_is_no_error(triaxcal: Run) -> None:
         assert f"\n    {command}" in done.out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["plan"], ["plan", "--json"]])
 def test_a_standard_output_that_takes_no_more_is_an_error_of_one_line(arguments: list[str]) -> None:
     with open("/dev/full", "w") as full:
@@ -290,6 +294,7 @@ def test_a_standard_output_that_takes_no_more_is_an_error_of_one_line(arguments:
     assert (done.returncode, done.stderr) == (2, "triaxcal: standard output: No space left on device\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["plan"], ["plan", "--json"]])
 def test_a_reader_that_has_gone_is_no_error(arguments: list[str]) -> None:
     reading, writing = os.pipe()

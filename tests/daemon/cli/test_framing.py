@@ -182,6 +182,7 @@ def test_units_on_two_fixtures_are_no_success(first: Path, seed: int, tmp_path: 
     assert json.loads(output.read_text()) == done.json
 
 
+@pytest.mark.slow
 def test_units_on_one_fixture_are_a_success(
     first: Path, fixture: SyntheticFixture, tmp_path: Path, triaxcal: Run
 ) -> None:
@@ -194,6 +195,7 @@ def test_units_on_one_fixture_are_a_success(
     assert codes.count(1) <= 1  # one in a hundred is expected
 
 
+@pytest.mark.slow
 def test_a_calibration_from_a_file_gives_the_same_frame_and_its_uncertainty(
     first: Path, calibration: str, tmp_path: Path, triaxcal: Run
 ) -> None:
@@ -223,6 +225,7 @@ def test_a_recording_of_the_faces_alone_goes_with_a_calibration(
     assert max(exact["standard_error_rad"]) < max(unit["standard_error_rad"])
 
 
+@pytest.mark.slow
 def test_a_plan_labels_the_poses_in_order(second: Path, tmp_path: Path, triaxcal: Run) -> None:
     labels = [*SEQUENCE.split(",")[::-1], *(label for label, _ in directions(26) if len(label) > 2)]
     plan = tmp_path / "plan.json"
@@ -240,6 +243,7 @@ def test_headings_give_the_tables_tilt_its_direction(first: Path, fixture: Synth
     assert unit["poses"][1]["heading_deg"] == pytest.approx(180)
 
 
+@pytest.mark.slow
 def test_a_person_reads_tables_and_warnings(first: Path, second: Path, triaxcal: Run) -> None:
     done = triaxcal(
         "frame", first, second, SIGNS, "--faces", SEQUENCE, f"--faces={','.join(SEQUENCE.split(',')[::-1])}"
@@ -285,6 +289,7 @@ def test_a_recording_of_no_faces_is_refused(fixture: SyntheticFixture, tmp_path:
     triaxcal("frame", spiral, SIGNS, "--faces", stars).failed(3, "poses on +X faces do not give a rotation")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -331,6 +336,7 @@ def test_a_calibration_that_is_none_is_named(
     triaxcal("frame", first, SIGNS, "--calibration", cal, "--json").failed(2, str(cal), words)
 
 
+@pytest.mark.slow
 def test_every_key_of_the_document_is_explained(first: Path, second: Path, triaxcal: Run) -> None:
     backwards = ",".join(SEQUENCE.split(",")[::-1])
     document = triaxcal("frame", first, second, SIGNS, "--faces", SEQUENCE, f"--faces={backwards}", "--json").json
@@ -345,6 +351,7 @@ def keys(value: Any) -> set[str]:
     return {*(value if isinstance(value, dict) else ())}.union(*(keys(v) for v in inner))
 
 
+@pytest.mark.slow
 def test_an_effect_in_the_calibration_is_taken_off_first(
     fixture: SyntheticFixture, tmp_path: Path, triaxcal: Run
 ) -> None:
@@ -359,6 +366,7 @@ def test_an_effect_in_the_calibration_is_taken_off_first(
     assert max(unit["standard_error_rad"]) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hand", "knocks"), [("slides it slowly", None), ("is quick", None), ("slides it slowly", (0.1, 0.2))]
 )
@@ -380,6 +388,7 @@ def test_two_orientations_are_told_on_a_level_table(
     assert {f["label"] for f in unit["table"]["faces"] if f["resolved"]} == set(LABELS)
 
 
+@pytest.mark.slow
 def test_labels_that_count_nothing_are_refused_on_a_level_table(tmp_path: Path, triaxcal: Run) -> None:
     stream = stood(SENSOR, HANDS["is quick"], 0.0, 6)
     path = tmp_path / "level.csv"

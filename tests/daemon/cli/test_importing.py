@@ -79,6 +79,7 @@ def imported(triaxcal: Run, tmp_path: Path) -> Callable[..., Any]:
     return take
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind"),
     [("a.blf", "BLF"), ("a.asc", "ASC"), ("a.log", "candump"), ("a.trc", "TRC"), ("a.mf4", "MF4"), ("a.pcap", "pcap")],
@@ -97,6 +98,7 @@ def test_a_log_of_any_kind_gives_the_samples_that_were_recorded(
     np.testing.assert_array_equal(found, wanted)
 
 
+@pytest.mark.slow
 def test_poses_fit_diagnose_and_apply_work_as_on_a_recording_of_ours(
     finished_run: Any, messages: list[can.Message], tmp_path: Path, triaxcal: Run, imported: Run
 ) -> None:
@@ -194,6 +196,7 @@ def test_a_log_without_times_is_laid_at_the_profiles_rate(
     np.testing.assert_allclose(np.diff(found[:, 0]), 0.01)
 
 
+@pytest.mark.slow
 def test_a_log_cut_short_is_imported_as_far_as_it_goes_and_a_bad_one_refused(
     messages: list[can.Message], tmp_path: Path, imported: Run
 ) -> None:
@@ -249,6 +252,7 @@ VEHICLES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.datasets
 @pytest.mark.skipif(not any(LOGS.glob("*.mf4")), reason="no logs of others in ../shared/logs")
 @pytest.mark.parametrize("vehicle", VEHICLES)

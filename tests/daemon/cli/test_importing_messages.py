@@ -121,6 +121,7 @@ def test_messages_need_no_chunks(tmp_path: Path, triaxcal: Run, imported: Run) -
     np.testing.assert_array_equal(samples(triaxcal, tmp_path)[:, 1:], wanted())
 
 
+@pytest.mark.slow
 def test_an_imu_inside_another_message_whose_stamp_stands_still(tmp_path: Path, triaxcal: Run, imported: Run) -> None:
     text = f"uint8 Node_ID\nsensor_msgs/Imu imu\n{LINE}\nMSG: sensor_msgs/Imu\n{IMU_FIELDS}" + IMU[len(IMU_FIELDS) :]
     inside = [(t, b"\0\1\0\0" + b"\x07\0\0\0" + data[4:]) for t, data in drive(moving=False)]
@@ -198,6 +199,7 @@ def test_what_is_not_there_is_named_with_the_nearest(tmp_path: Path, imported: R
     assert not (tmp_path / "rec.mcap").exists()
 
 
+@pytest.mark.slow
 def test_messages_that_are_not_as_defined_are_counted(tmp_path: Path, triaxcal: Run, imported: Run) -> None:
     rows = drive()
     rows[3] = (rows[3][0], rows[3][1][:50])
@@ -212,6 +214,7 @@ def test_messages_that_are_not_as_defined_are_counted(tmp_path: Path, triaxcal: 
     )
 
 
+@pytest.mark.slow
 def test_a_file_cut_anywhere_gives_what_is_whole(tmp_path: Path, imported: Run) -> None:
     whole = log_of(tmp_path / "bag.mcap", drive(), IMU_SCHEMA, chunk_size=2000).read_bytes()
     by = profile(tmp_path)

@@ -197,6 +197,7 @@ def test_a_recording_is_finished_and_the_device_left_alone(
     assert int(info["metadata"]["raw"]["records"]) == info["raw"]["calibration"]["records"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "second"), [(INT, INT), (TERM, HUP)])
 def test_two_signals_in_the_check_poses_do_not_keep_the_old_calibration_away(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, first: int, second: int
@@ -226,6 +227,7 @@ def test_two_signals_in_the_check_poses_do_not_keep_the_old_calibration_away(
         assert "registers-before.json" in recording.attachments
 
 
+@pytest.mark.slow
 def test_a_signal_while_a_calibration_that_failed_its_verification_is_put_back_is_heeded_after_it(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,6 +245,7 @@ def test_a_signal_while_a_calibration_that_failed_its_verification_is_put_back_i
     assert (unit["outcome"]["device_state"], unit["report"]) == ("old", None)
 
 
+@pytest.mark.slow
 def test_a_device_that_could_not_be_put_back_after_an_interruption_is_4_and_said(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -264,6 +267,7 @@ def test_a_device_that_could_not_be_put_back_after_an_interruption_is_4_and_said
     assert done.err.splitlines()[-1] == f"triaxcal: {unit['error']}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dead", "code", "state"), [(False, 130, "old"), (True, 4, "unknown")])
 def test_provision_interrupted_says_what_the_device_holds(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, dead: bool, code: int, state: str

@@ -65,6 +65,7 @@ class Unit:
         return np.std(found, axis=0, ddof=1) / np.array(list(promised.values()), dtype=float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count", "sizes"),
     [
@@ -86,6 +87,7 @@ def test_plan_for_within_a_tenth_of_what_simulation_gives(name: str, count: int,
         assert 0.9 < ratio < 1.1, size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 1e-3])
 def test_what_poses_do_not_come_back_to_is_noise_and_the_effect_is_not(size: float) -> None:
     unit = Unit("third_order_nonlinearity", size, 26, comes_back_g=5e-5)

@@ -125,6 +125,7 @@ def test_fit_of_the_exported_text_is_fit_of_the_recording(
     assert of_text == of_recording
 
 
+@pytest.mark.slow
 def test_text_may_be_compressed_or_come_through_standard_input(
     exported: Path, tmp_path: Path, triaxcal: Run, asked: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,6 +154,7 @@ def test_another_reference_scales_the_answer(exported: Path, triaxcal: Run, aske
     assert fifty["residual"]["rms_g"] == pytest.approx(50 * one["residual"]["rms_g"], abs=0.5e-9 + 50 * 0.5e-11 + 1e-12)
 
 
+@pytest.mark.slow
 def test_what_diagnose_finds_does_not_hang_on_the_size_of_the_reference(exported: Path, asked: Run) -> None:
     """A power of ten: the force below which a sign is not certain (remanence, hysteresis) goes by powers of ten."""
     one, hundred = (asked("diagnose", exported, "--json", SIGNS, *r).json for r in ([], ["--reference", "100"]))
@@ -164,6 +166,7 @@ def test_what_diagnose_finds_does_not_hang_on_the_size_of_the_reference(exported
     assert hundred["after"]["rms_g"] == pytest.approx(100 * one["after"]["rms_g"], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_results_go_to_files_and_are_the_printed_document(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
     cal, report = tmp_path / "cal.json", tmp_path / "r.html"
     done = triaxcal("fit", finished_run.can, "--json", "-o", cal, "--report", report)
@@ -175,6 +178,7 @@ def test_results_go_to_files_and_are_the_printed_document(finished_run: Any, tmp
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cal.json", "r.html"]
 
 
+@pytest.mark.slow
 def test_diagnose_finds_what_is_hidden_and_judges_it_on_another_recording(
     finished_run: Any, exported: Path, tmp_path: Path, triaxcal: Run
 ) -> None:
@@ -210,6 +214,7 @@ def test_without_a_check_there_is_no_held_out_error(exported: Path, asked: Run) 
     assert set(document) == LOOP
 
 
+@pytest.mark.slow
 def test_verify_judges_a_recording_by_a_calibration(finished_run: Any, calibrations: Path, triaxcal: Run) -> None:
     linear, closed = calibrations / "linear.json", calibrations / "closed.json"
     fitted = json.loads(linear.read_text())
@@ -227,6 +232,7 @@ def test_verify_judges_a_recording_by_a_calibration(finished_run: Any, calibrati
     assert triaxcal("verify", certificate, finished_run.can, "--json").json == by_closed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["fit"], ["diagnose"], ["verify", "linear.json"]])
 def test_a_limit_decides_between_0_and_1(
     finished_run: Any, calibrations: Path, triaxcal: Run, asked: Run, command: list[str]
@@ -251,6 +257,7 @@ def test_the_same_for_people_is_a_table_and_no_json(
     assert "none is wanted" in triaxcal("plan", finished_run.can).out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "poses"),
     [([], 26), (["--poses", "14"], 14), (["--poses", "26"], 26), (["--poses", "9"], 9), (["--poses", "40"], 40),
@@ -306,6 +313,7 @@ def _remade(text: bytes, **settings: Any) -> bytes:
     return "\n".join([head, *(f"{k} = {v}" for k, v in settings.items()), rest]).encode()
 
 
+@pytest.mark.slow
 def test_fit_and_diagnose_of_a_recording_take_its_signs_and_its_reference(
     finished_run: Any, rewrite: Callable[..., Path], triaxcal: Run
 ) -> None:
@@ -330,6 +338,7 @@ def test_the_users_word_goes_before_the_recordings(finished_run: Any, triaxcal: 
     assert fitted["reference"] == 1.05
 
 
+@pytest.mark.slow
 def test_verify_accepts_what_the_calibration_was_made_with_and_nothing_else(
     finished_run: Any, tmp_path: Path, triaxcal: Run
 ) -> None:
@@ -346,6 +355,7 @@ def test_verify_accepts_what_the_calibration_was_made_with_and_nothing_else(
         triaxcal("verify", cal, finished_run.can, option, "--json").failed(2, words)
 
 
+@pytest.mark.slow
 def test_the_unit_of_another_reference_is_that_of_every_coefficient(
     exported: Path, tmp_path: Path, triaxcal: Run
 ) -> None:
@@ -379,6 +389,7 @@ def test_what_is_no_number_is_within_no_limit(capsys: pytest.CaptureFixture[str]
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 
+@pytest.mark.slow
 def test_a_terminal_that_knows_ascii_alone_is_shown_everything(exported: Path) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     command = [Path(sys.executable).with_name("triaxcal"), "fit", exported, "--reference=50", "--reference-unit=µT"]
@@ -389,6 +400,7 @@ def test_a_terminal_that_knows_ascii_alone_is_shown_everything(exported: Path) -
     assert b"Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_a_place_gives_the_reference_and_its_uncertainty(exported: Path, triaxcal: Run, asked: Run) -> None:
     plain = asked("fit", exported, SIGNS, "--json").json
     placed = triaxcal("fit", exported, SIGNS, "--latitude", "50.45", "--height", "179", "--json").json

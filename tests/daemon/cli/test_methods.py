@@ -106,6 +106,7 @@ def is_calibration(document: dict[str, Any]) -> None:
 # A unit that turns
 
 
+@pytest.mark.slow
 def test_a_turning_unit_gives_a_calibration_that_verify_takes(files: Path, triaxcal: Run, tmp_path: Path) -> None:
     cal, report = tmp_path / "cal.json", tmp_path / "r.html"
     done = triaxcal("fit", files / "turning.csv", "--turning", SIGNS, "--json", "-o", cal, "--report", report)
@@ -130,6 +131,7 @@ def test_a_turning_unit_at_the_console(files: Path, triaxcal: Run) -> None:
     assert "scale_factor.x" in done.out
 
 
+@pytest.mark.slow
 def test_a_turning_unit_says_at_which_temperature_its_biases_hold(files: Path, triaxcal: Run, tmp_path: Path) -> None:
     warm, cal, older = tmp_path / "warm.csv", tmp_path / "cal.json", tmp_path / "older.json"
     header, *rows = (files / "turning.csv").read_text().splitlines()
@@ -157,6 +159,7 @@ def test_a_turning_unit_through_standard_input(files: Path, triaxcal: Run, monke
     assert triaxcal("fit", "-", "--turning", SIGNS, "--json").json == there
 
 
+@pytest.mark.slow
 def test_a_recording_is_read_sample_by_sample_too(triaxcal: Run) -> None:
     done = triaxcal("fit", RECORDING, "--turning", "--json")
     assert done.code == 0
@@ -200,6 +203,7 @@ def test_a_limit_outside_is_exit_one(files: Path, triaxcal: Run) -> None:
 # Poses of known attitude
 
 
+@pytest.mark.slow
 def test_labels_are_attitudes(files: Path, triaxcal: Run, tmp_path: Path) -> None:
     cal, report = tmp_path / "cal.json", tmp_path / "r.html"
     done = triaxcal(
@@ -314,6 +318,7 @@ def datasheet(files: Path, asked: Run, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_four_poses_refine_a_datasheet(files: Path, triaxcal: Run, tmp_path: Path, datasheet: Path) -> None:
     cal, report = tmp_path / "cal.json", tmp_path / "r.html"
     done = triaxcal("fit", files / "4.csv", "--datasheet", datasheet, "--json", "-o", cal, "--report", report)
@@ -454,6 +459,7 @@ def test_options_that_do_not_go_together_are_one_line(
 # Other references than gravity
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REFERENCES)
 def test_another_reference_goes_the_whole_way(name: str, triaxcal: Run, tmp_path: Path) -> None:
     sensor, magnitude, noise, options = REFERENCES[name]
@@ -481,6 +487,7 @@ def test_another_reference_goes_the_whole_way(name: str, triaxcal: Run, tmp_path
     assert triaxcal("plan", main, *options, "--json").json["have"] == 26
 
 
+@pytest.mark.slow
 def test_a_loop_about_a_magnetometer_finds_nothing_that_is_not_there(triaxcal: Run, tmp_path: Path) -> None:
     sensor, magnitude, noise, options = REFERENCES["magnetometer"]
     ups = np.array([v for _, v in cube_directions()])
@@ -491,6 +498,7 @@ def test_a_loop_about_a_magnetometer_finds_nothing_that_is_not_there(triaxcal: R
     assert looped["held_out"]["after_rms_g"] < 2 * looped["held_out"]["noise_floor_g"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REFERENCES)
 def test_another_reference_turns_is_stated_and_refined(name: str, triaxcal: Run, tmp_path: Path) -> None:
     sensor, magnitude, noise, options = REFERENCES[name]

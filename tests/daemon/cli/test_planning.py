@@ -51,6 +51,7 @@ def _x_of(document: Any) -> list[float]:
     return [p["up"][0] for p in document["poses"]]
 
 
+@pytest.mark.slow
 def test_the_recording_may_follow_the_effects_that_it_is_wanted_for(half: Path, triaxcal: Run, asked: Run) -> None:
     plain = asked("plan", half, "--json").json
     for effects in (["second_order_nonlinearity"], ["temperature_bias", "second_order_nonlinearity"]):
@@ -103,6 +104,7 @@ def test_the_same_poses_have_the_same_dilution_in_a_plan_and_in_a_fit(tmp_path: 
     assert plain["dilution"] == pytest.approx(fitted["dilution"], rel=0.03)  # its first pose is there twice
 
 
+@pytest.mark.slow
 def test_what_cannot_show_is_said_in_words(tmp_path: Path, fourteen: Path, triaxcal: Run) -> None:
     """Directions that are a degree off tell the third order by next to nothing."""
     rng = np.random.default_rng(2)
@@ -123,6 +125,7 @@ def test_what_cannot_show_is_said_in_words(tmp_path: Path, fourteen: Path, triax
     assert seen["cannot_show"] == {}
 
 
+@pytest.mark.slow
 def test_the_poses_wanted_of_a_recording_that_is_refused_mend_it(tmp_path: Path, triaxcal: Run) -> None:
     faces = [v for label, v in directions(14) if len(label) == 2]
     where = dict(directions(26))
@@ -152,6 +155,7 @@ def _plan(triaxcal: Run, *arguments: str) -> Any:
     return done.json
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("poses", "effects"),
     [
@@ -177,6 +181,7 @@ def test_a_plan_for_effects_has_as_many_directions_as_asked_for_and_shows_them(
         assert all(0 < v < 4 for v in document["promised"][effect].values())
 
 
+@pytest.mark.slow
 def test_a_plan_for_temperature_says_how_it_has_to_move(triaxcal: Run) -> None:
     document = _plan(triaxcal, "--poses", "16", "--for", "temperature_bias")
     levels = [p["levels"]["temp_c"] for p in document["poses"]]
@@ -188,6 +193,7 @@ def test_a_plan_for_temperature_says_how_it_has_to_move(triaxcal: Run) -> None:
     assert "t_s" in _plan(triaxcal, "--poses", "15", "--for", "bias_drift")["moves"]
 
 
+@pytest.mark.slow
 def test_effects_that_share_a_part_are_warned_of(triaxcal: Run) -> None:
     done = triaxcal("plan", "--poses", "16", "--for", "temperature_bias", "temperature_bias_quadratic", "--json")
     assert done.code == 0
@@ -196,6 +202,7 @@ def test_effects_that_share_a_part_are_warned_of(triaxcal: Run) -> None:
     assert done.json["promised"]["temperature_bias"]["x"] is None
 
 
+@pytest.mark.slow
 def test_the_same_effect_twice_is_asked_for_once(triaxcal: Run) -> None:
     twice = _plan(triaxcal, "--poses", "14", "--for", "second_order_nonlinearity", "second_order_nonlinearity")
     assert twice["for"] == ["second_order_nonlinearity"]
@@ -207,6 +214,7 @@ def test_too_few_poses_for_the_effects_are_refused_with_the_number_that_does(tri
     assert _plan(triaxcal, "--poses", "12", "--for", "third_order_nonlinearity")["directions"] == 12
 
 
+@pytest.mark.slow
 def test_people_read_the_same(triaxcal: Run, fourteen: Path) -> None:
     out = triaxcal("plan", "--poses", "14").out
     assert "14 directions, the first repeated at the end" in out
@@ -243,6 +251,7 @@ def test_the_size_of_the_reference_does_not_change_the_plan(half: Path, triaxcal
     assert triaxcal("plan", half, "--json", "--reference", "50").json == plain.json
 
 
+@pytest.mark.slow
 def test_the_signs_and_the_reference_are_those_of_the_recording(
     finished_run: Any, rewrite: Callable[..., Path], triaxcal: Run
 ) -> None:

@@ -14,6 +14,7 @@ import pytest
 Run = Callable[..., Any]
 
 
+@pytest.mark.slow
 def test_audit_says_that_all_is_the_same(finished_run: Any, triaxcal: Run) -> None:
     done = triaxcal("audit", finished_run.can, finished_run.modbus, "--json")
     assert (done.code, done.err) == (0, "")
@@ -25,6 +26,7 @@ def test_audit_says_that_all_is_the_same(finished_run: Any, triaxcal: Run) -> No
     assert done.json["summary"] == {"recordings": 2, "agree": 2, "differ": 0, "unreadable": 0}
 
 
+@pytest.mark.slow
 def test_audit_ends_with_1_and_names_the_difference(
     finished_run: Any, rewrite: Callable[..., Path], triaxcal: Run
 ) -> None:
@@ -89,6 +91,7 @@ def test_export_knows_its_streams(finished_run: Any, triaxcal: Run) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_recording_cut_short_is_mended_and_the_loss_is_counted(
     finished_run: Any, tmp_path: Path, triaxcal: Run
 ) -> None:
@@ -125,6 +128,7 @@ def test_a_place_where_nothing_can_be_mended_to(finished_run: Any, tmp_path: Pat
     triaxcal("log", "recover", finished_run.can, "-o", tmp_path / out).failed(2, f"{tmp_path / out}: ")
 
 
+@pytest.mark.slow
 def test_a_whole_recording_recovers_without_a_loss(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
     out = tmp_path / "again.mcap"
     recovery = triaxcal("log", "recover", finished_run.can, "-o", out, "--json").json
@@ -134,6 +138,7 @@ def test_a_whole_recording_recovers_without_a_loss(finished_run: Any, tmp_path: 
     assert done.json["audits"][0]["notes"][0] == "the recording was cut short or damaged, and mended"
 
 
+@pytest.mark.slow
 def test_no_recording_hides_another(finished_run: Any, tmp_path: Path, triaxcal: Run) -> None:
     good, cut, other = tmp_path / "a.mcap", tmp_path / "b.mcap", tmp_path / "deeper" / "c.mcap"
     other.parent.mkdir()

@@ -192,6 +192,7 @@ def test_a_unit_whose_profile_can_be_no_file(workshop: Any, triaxcal: Run) -> No
     triaxcal("run", station).failed(2, f"{station}, line 7: units.0.profile: string should match pattern")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_run_that_nobody_reads_the_result_of_fails_all_the_same(workshop: Any, unbuffered: str) -> None:
     reading, writing = os.pipe()

@@ -59,6 +59,7 @@ def settling(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     ]
 
 
+@pytest.mark.slow
 def test_recordings_of_different_units_given_as_one_are_remarked_on(
     tmp_path: Path, runs: list[Path], triaxcal: Run, asked: Run
 ) -> None:
@@ -68,6 +69,7 @@ def test_recordings_of_different_units_given_as_one_are_remarked_on(
     assert "do not look like" not in asked("diagnose", *runs).err
 
 
+@pytest.mark.slow
 def test_the_document_says_which_pose_is_of_which_recording(runs: list[Path], triaxcal: Run) -> None:
     document = triaxcal("diagnose", *runs, "--json").json
     assert document["format"] == "triaxcal.loop/1"
@@ -108,6 +110,7 @@ def test_what_no_command_knows_is_told(triaxcal: Run, arguments: list[str], left
     assert done.err == f"triaxcal: unrecognized arguments: {left}\n"
 
 
+@pytest.mark.slow
 def test_the_calibration_of_two_runs_serves_another(runs: list[Path], triaxcal: Run, tmp_path: Path) -> None:
     cal, page = tmp_path / "cal.json", tmp_path / "page.html"
     assert triaxcal("diagnose", *runs, "-o", cal, "--report", page).code == 0
@@ -124,12 +127,14 @@ def test_a_person_sees_a_line_for_each_recording(runs: list[Path], asked: Run) -
     assert "two.csv" in said
 
 
+@pytest.mark.slow
 def test_one_recording_has_no_word_of_several(runs: list[Path], triaxcal: Run) -> None:
     document = triaxcal("diagnose", runs[0], "--json").json
     assert not {"recordings", "by_recording"} & set(document)
     assert "recording" not in document["calibration"]["poses"][0]
 
 
+@pytest.mark.slow
 def test_units_that_warm_up_alike_agree_on_it(settling: list[Path], triaxcal: Run, tmp_path: Path) -> None:
     out = tmp_path / "agreement.json"
     document = triaxcal("diagnose", "--units", *settling, "--json", "-o", out).json
@@ -156,6 +161,7 @@ def test_units_that_warm_up_alike_agree_on_it(settling: list[Path], triaxcal: Ru
     assert [u["recording"] for u in document["units"]] == [str(p) for p in settling]
 
 
+@pytest.mark.slow
 def test_a_person_sees_what_units_agree_on(settling: list[Path], triaxcal: Run) -> None:
     done = triaxcal("diagnose", "--units", *settling, "--limit", "1e-9")
     assert done.code == 1
@@ -175,6 +181,7 @@ def test_what_does_not_go_together_is_said_in_a_line(runs: list[Path], triaxcal:
     triaxcal("diagnose", runs[0], short).failed(3, "short.csv", "no still pose")
 
 
+@pytest.mark.slow
 def test_a_channel_that_one_of_several_recordings_lacks_is_told(
     runs: list[Path], triaxcal: Run, asked: Run, tmp_path: Path
 ) -> None:
@@ -192,6 +199,7 @@ def test_help_says_that_the_order_of_several_recordings_is_that_of_time(triaxcal
     assert "in order of time" in " ".join(triaxcal("diagnose", "--help").out.split())
 
 
+@pytest.mark.slow
 def test_two_units_are_told_apart_behind_a_recording_that_names_none(triaxcal: Run) -> None:
     folder = Path(__file__).parents[3] / "recordings"
     names = ("paper-unit.csv.gz", "can-second-order.mcap", "modbus-temperature-bias.mcap")

@@ -192,6 +192,7 @@ raise_signal(SIGTERM)
     assert path.read_bytes() == b""
 
 
+@pytest.mark.slow
 def test_a_thread_that_hangs_does_not_hold_up_the_end_and_what_was_said_is_out() -> None:
     code = """
 from triaxcald.cli import main

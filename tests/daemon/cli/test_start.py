@@ -90,6 +90,7 @@ def test_a_command_that_there_is_not_is_answered_with_the_nearest(
     assert said in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "walls"),
     [

@@ -75,6 +75,7 @@ def _at_fault(document: Any) -> list[Any]:
     return [p for p in document["poses"] if not p["used"]]
 
 
+@pytest.mark.slow
 def test_verify_leaves_a_pose_at_a_rail_out_of_every_figure(folder: Path, cal: Path, triaxcal: Run) -> None:
     document = triaxcal("verify", cal, folder / "rail.csv", "--json").json
     (pose,) = _at_fault(document)
@@ -88,6 +89,7 @@ def test_verify_leaves_a_pose_at_a_rail_out_of_every_figure(folder: Path, cal: P
     assert triaxcal("verify", cal, folder / "rail.csv", "--limit", "1e-3").code == 0
 
 
+@pytest.mark.slow
 def test_verify_marks_such_a_pose_and_says_what_spoils_it(folder: Path, cal: Path, triaxcal: Run) -> None:
     done = triaxcal("verify", cal, folder / "rail.csv")
     assert "left out" in done.out
@@ -106,6 +108,7 @@ def test_verify_refuses_a_recording_without_a_pose_that_can_be_trusted(folder: P
     assert "warning: stuck_output: y freezes 2 times, " in done.err
 
 
+@pytest.mark.slow
 def test_creep_that_the_calibration_explains_is_not_in_the_noise_floor(
     folder: Path, cal: Path, triaxcal: Run, tmp_path: Path
 ) -> None:
@@ -118,6 +121,7 @@ def test_creep_that_the_calibration_explains_is_not_in_the_noise_floor(
     assert any(line.startswith("creeping_pose: ") for line in explained["data_quality"])
 
 
+@pytest.mark.slow
 def test_poses_marks_them_in_the_table_and_in_the_document(folder: Path, triaxcal: Run) -> None:
     (pose,) = _at_fault(triaxcal("poses", folder / "rail.csv", "--json").json)
     assert pose["fault"] == "saturation"
@@ -128,6 +132,7 @@ def test_poses_marks_them_in_the_table_and_in_the_document(folder: Path, triaxca
     assert "left out" not in triaxcal("poses", folder / "clean.csv").out
 
 
+@pytest.mark.slow
 def test_plan_does_not_count_what_cannot_be_trusted_among_what_is_there(tmp_path: Path, triaxcal: Run) -> None:
     ups = [v for label, v in UPS.items() if v[0] < 0.1 or label == "+X"]
     whole, spoiled = (_csv(tmp_path / f"few-{r}.csv", ups, rail=r) for r in (False, True))
@@ -155,6 +160,7 @@ def test_poses_too_few_for_a_fit_are_planned_for_as_if_those_at_a_rail_were_not_
     assert [p["label"] for p in document["poses"]] == [p["label"] for p in wanted["poses"]]
 
 
+@pytest.mark.slow
 def test_fit_says_how_many_of_the_poses_it_left_out(folder: Path, triaxcal: Run) -> None:
     fitted = triaxcal("fit", folder / "rail.csv", "--json").json
     left_out = sum(not p["used"] for p in fitted["poses"])
@@ -162,6 +168,7 @@ def test_fit_says_how_many_of_the_poses_it_left_out(folder: Path, triaxcal: Run)
     assert f"26 poses, {left_out} of them left out: residual rms " in triaxcal("fit", folder / "rail.csv").out
 
 
+@pytest.mark.slow
 def test_diagnose_advises_to_take_such_a_pose_again(folder: Path, triaxcal: Run, asked: Run) -> None:
     said = triaxcal("diagnose", folder / "rail.csv").out
     assert "\nnext     take again the pose at 0.1 s: excluded (saturation)\n" in said

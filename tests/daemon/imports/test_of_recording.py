@@ -37,6 +37,7 @@ def bus_in_segments(folder: Path) -> Path:
     return folder / "bus.segments.json"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [bus_in_one, bus_in_segments])
 def test_the_poses_are_those_of_the_unit_s_own_recording(
     tmp_path: Path, triaxcal: Callable[..., Any], make: Callable[[Path], Path]

@@ -47,6 +47,7 @@ def assert_true(host: Host) -> None:
     assert said in (None, host.starts_with()), host.provisioning.held
 
 
+@pytest.mark.slow
 @every_make
 @finished
 async def test_the_supply_fails_at_any_byte_of_any_write(tmp_path: Path, habits: Habits, finish: str) -> None:
@@ -72,6 +73,7 @@ async def test_the_supply_fails_for_a_moment_at_any_byte(tmp_path: Path, habits:
         assert_true(host)
 
 
+@pytest.mark.slow
 @every_make
 @finished
 async def test_the_supply_fails_again_while_that_is_mended(tmp_path: Path, habits: Habits, finish: str) -> None:
@@ -92,6 +94,7 @@ async def test_the_supply_fails_again_while_that_is_mended(tmp_path: Path, habit
             assert host.starts_with() == WANTED[finish], (byte, again)
 
 
+@pytest.mark.slow
 @every_make
 @finished
 @pytest.mark.parametrize("answered", [False, True])

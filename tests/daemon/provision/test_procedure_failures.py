@@ -197,6 +197,7 @@ async def operations_of_a_clean_run(make_bench) -> int:
     return bench.device.operations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -240,6 +241,7 @@ async def test_whatever_operation_is_struck_the_outcome_is_as_told(make_bench, k
             assert {UNTOUCHED, OLD} <= states <= {UNTOUCHED, OLD, *NEW}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "error"),
     [

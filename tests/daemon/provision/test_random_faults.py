@@ -9,6 +9,7 @@ import pytest
 from benchmarks.faulty_devices import results_of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hundred", range(4))
 async def test_nothing_false_is_said_of_devices_and_lines_with_random_faults(tmp_path: Path, hundred: int) -> None:
     for seed in range(100 * hundred, 100 * (hundred + 1)):

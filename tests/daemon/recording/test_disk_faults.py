@@ -177,6 +177,7 @@ def test_where_no_segment_may_go_a_full_disk_ends_the_recording(small_disk: Call
         Recording.open(path).close()  # each of them finished
 
 
+@pytest.mark.slow
 def test_record_ends_with_5_and_says_up_to_when_the_file_is_sound(workshop: Any, tmp_path: Path) -> None:
     path = tmp_path / "rec.mcap"
     with workshop.serve(workshop.device()) as served:

@@ -126,6 +126,7 @@ def test_a_message_that_its_sender_changes_afterwards_is_recorded_as_it_was(tmp_
     assert [(m.arbitration_id, bytes(m.data)) for m in read(tmp_path / "x.mcap")] == [(1, b"\x01")]
 
 
+@pytest.mark.slow
 def test_a_message_does_not_wait_for_others_to_come(
     tmp_path: Path, wait_until: Callable[[Callable[[], bool]], None]
 ) -> None:
@@ -268,6 +269,7 @@ def tool_at_work(tmp_path: Path, environment: dict[str, str]) -> Iterator[Callab
         process.communicate()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".blf", ".asc", ".log"])
 def test_can_logconvert_makes_a_recording_of_another_log_and_that_log_of_it(
     tmp_path: Path, tool: Callable[..., Any], suffix: str
@@ -284,6 +286,7 @@ def test_can_logconvert_makes_a_recording_of_another_log_and_that_log_of_it(
     assert_same(read(tmp_path / "b.mcap"), first)
 
 
+@pytest.mark.slow
 def test_can_player_sends_what_a_recording_holds(tmp_path: Path, tool: Callable[..., Any]) -> None:
     write(tmp_path / "x.mcap", [m for m in EVERY_KIND if not m.is_fd])
     done = tool("can_player", "-v", "-i", "virtual", "-c", "0", "x.mcap")
@@ -301,6 +304,7 @@ def frames_in(path: Path) -> int:
         return -1
 
 
+@pytest.mark.slow
 def test_can_logger_records_what_comes_over_a_bus_until_it_is_interrupted(
     tmp_path: Path,
     tool_at_work: Callable[..., subprocess.Popen[str]],
@@ -322,6 +326,7 @@ def test_can_logger_records_what_comes_over_a_bus_until_it_is_interrupted(
     assert (got[-1].is_fd, got[-1].bitrate_switch, got[-1].is_extended_id, got[-1].dlc) == (True, True, True, 20)
 
 
+@pytest.mark.slow
 def test_no_format_takes_longer_to_open_for_ours_being_known() -> None:
     code = "import sys, can.io; import triaxcald.recording.python_can; print([m for m in {} if m in sys.modules])"
     heavy = ["pydantic", "mcap", "google.protobuf", "zstandard", "triaxcal_drivers.interface"]

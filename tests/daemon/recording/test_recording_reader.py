@@ -86,6 +86,7 @@ def test_reading_never_takes_more_than_a_chunk_at_once(
     assert sum(len(b) for b in rec.raw("calibration")) == 40 * schema.MAX_RECORDS
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_reported(recording: Path) -> None:
     whole = recording.read_bytes()
     for at in range(len(whole)):
@@ -117,6 +118,7 @@ def _chunk_offsets(data: bytes) -> list[int]:
     return offsets
 
 
+@pytest.mark.slow
 def test_a_recording_cut_short_is_an_error_at_every_length(recording: Path) -> None:
     whole = recording.read_bytes()
     with pytest.raises(RecordingError, match=r"^rec: the file is empty; nothing was recorded$"):

@@ -65,6 +65,7 @@ def test_a_whole_recording_is_carried_over_without_loss(recording: Path, tmp_pat
         assert new.metadata["recovery"]["sha256_when_written"] == old.metadata["raw"]["sha256"]
 
 
+@pytest.mark.slow
 def test_a_file_cut_anywhere_is_mended_and_holds_only_what_was_written(recording: Path, tmp_path: Path) -> None:
     whole = recording.read_bytes()
     rows = raw_rows(recording)
@@ -161,6 +162,7 @@ def test_without_its_first_chunk_raw_records_registers_and_events_are_still_know
     assert mend(bytes(finished), tmp_path)[0].undeclared_messages == 0  # the summary declares them too
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_anywhere_never_makes_a_record(recording: Path, tmp_path: Path) -> None:
     whole = recording.read_bytes()
     rows = raw_rows(recording)

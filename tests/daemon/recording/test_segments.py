@@ -320,6 +320,7 @@ def test_info_tells_the_segments_and_what_is_in_them(
     assert done.json["raw"]["calibration"]["records"] == 20
 
 
+@pytest.mark.slow
 def test_poses_of_a_recording_in_segments_are_those_of_the_same_in_one_file(
     tmp_path: Path, triaxcal: Callable[..., Any]
 ) -> None:

@@ -99,6 +99,7 @@ def add(document: dict[str, Any], effect: str, coefficients: dict[str, Any], **m
     )
 
 
+@pytest.mark.slow
 def test_nothing_found_says_so_in_the_first_sentence(page_of_nothing: tuple[str, str]) -> None:
     html, text = page_of_nothing
     assert text.index("Nothing found beyond noise") < text.index("No effect beyond the linear model was found.") < 300
@@ -119,6 +120,7 @@ def test_an_adopted_effect_has_words_formula_shape_and_what_to_change(words: dic
     assert 'class="verdict within"' in html
 
 
+@pytest.mark.slow
 def test_a_step_is_marked_on_the_time_axis_and_said_to_lie_between_its_poses(loop: dict[str, Any]) -> None:
     poses = loop["calibration"]["poses"]
     at_s = 0.5 * (poses[3]["end_s"] + poses[4]["start_s"])
@@ -151,6 +153,7 @@ def test_a_step_at_the_edge_of_a_pose_may_have_been_beside_it(bare: dict[str, An
     assert said in page(bare)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gaps", "words"), [(1 / 12**0.5, "; the poses tell it no nearer."), (0.4, "; two standard")])
 def test_a_step_between_poses_lies_there_where_its_error_is_that_of_a_rectangle(
     gaps: float, words: str, loop: dict[str, Any]
@@ -200,6 +203,7 @@ def test_a_confounded_effect_within_its_limits_is_within_limits(words: dict[str,
     assert 'class="verdict within"' in html
 
 
+@pytest.mark.slow
 def test_two_effects_are_corrected_at_once_in_pictures_above_the_channels_that_moved(loop: dict[str, Any]) -> None:
     add(loop, "channel_bias:supply_v", {"x": (1e-4, 1e-5, "g/[supply_v]")})
     add(loop, "hysteresis", {"x": (1e-4, 1e-5, "g/g")}, alternatives=["bias_drift"])
@@ -259,6 +263,7 @@ def test_a_fault_of_another_recording_keeps_its_title(words: dict[str, Any]) -> 
     assert "Readings at the end of the range : b/check.csv: x at 2.1 in 687 samples: take again" in text
 
 
+@pytest.mark.slow
 def test_poses_left_out_are_named_above_all_figures(loop: dict[str, Any]) -> None:
     loop["calibration"]["poses"][4] |= {"used": False, "residual_g": 3.062e-3}
     html, text = page(loop)
@@ -352,6 +357,7 @@ def test_faults_that_spoil_poses_come_first_and_the_rest_stay_remarks(words: dic
     assert f"odd_fault: {HOSTILE}" in rest
 
 
+@pytest.mark.slow
 def test_another_reference_writes_its_errors_in_its_own_unit(loop: dict[str, Any]) -> None:
     loop["calibration"]["units"] |= {"reference": "µT", "bias": "µT"}
     add(loop, "bias_drift", {"x": (3e-5, 1e-6, "µT/s")}, reason="falls from 1.53e+04 1e-6 µT to 12 1e-6 µT")
@@ -461,6 +467,7 @@ def test_a_channel_that_a_pose_lacks_is_not_drawn(loop: dict[str, Any], damage: 
     assert "temp_c" not in drawing
 
 
+@pytest.mark.slow
 def test_a_small_set_of_poses_carries_its_numbers_and_a_large_one_does_not() -> None:
     for count, numbered in ((14, True), (60, False)):
         outcome = read_document(samples.loop_document(count))
@@ -469,6 +476,7 @@ def test_a_small_set_of_poses_carries_its_numbers_and_a_large_one_does_not() -> 
         assert (">13</text>" in drawing) is numbered
 
 
+@pytest.mark.slow
 def test_a_pose_taken_twice_has_one_label_with_both_numbers() -> None:
     document = copy.deepcopy(_SAMPLE)
     poses = document["calibration"]["poses"]

@@ -109,6 +109,7 @@ def page(loop: dict[str, Any], stream: StreamOverview) -> Page:
     return render(loop, stream=stream, certificate=samples.certificate())
 
 
+@pytest.mark.slow
 def test_the_verdict_is_said_in_words_with_the_error_before_and_after(page: Page) -> None:
     assert page.verdict == "within"
     assert "Within limits" in page.text
@@ -190,6 +191,7 @@ def test_drawings_take_their_colours_from_the_page(page: Page) -> None:
     assert used <= set(re.findall(r"(--[a-z]+):", page.html))
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes_after_other_pages_and_in_another_process(
     loop: dict[str, Any], stream: StreamOverview, page: Page
 ) -> None:
@@ -205,6 +207,7 @@ def test_the_same_input_gives_the_same_bytes_after_other_pages_and_in_another_pr
     assert written.decode() == render(loop, stream=stream, certificate=samples.certificate()).html == page.html
 
 
+@pytest.mark.slow
 def test_hostile_text_stays_text(changed: dict[str, Any]) -> None:
     hostile = '"><script>alert(1)</script><img src=x onerror=alert(1)>{{ 7*7 }}\u202e\x00'
     changed["findings"][0].update(effect=hostile, reason=hostile, verdict=hostile, alternatives=[hostile])
@@ -304,6 +307,7 @@ def test_a_fit_alone_judges_by_its_lack_of_fit_and_claims_no_search(bare: dict[s
     assert "Not assessed" in render(untested).text
 
 
+@pytest.mark.slow
 def test_directions_come_from_the_matrix_where_the_document_has_none(changed: dict[str, Any]) -> None:
     for pose in changed["calibration"]["poses"]:
         del pose["direction"], pose["before_residual_g"]
@@ -311,6 +315,7 @@ def test_directions_come_from_the_matrix_where_the_document_has_none(changed: di
     assert [label for label in labels if "over the sphere for 26 poses, after" in label]
 
 
+@pytest.mark.slow
 def test_a_rejected_pose_is_counted_and_named(changed: dict[str, Any]) -> None:
     changed["calibration"]["poses"][4]["used"] = False
     page = render(changed)
@@ -319,6 +324,7 @@ def test_a_rejected_pose_is_counted_and_named(changed: dict[str, Any]) -> None:
     assert "pose 5, not used" in page.html
 
 
+@pytest.mark.slow
 def test_four_hundred_poses_stay_below_a_megabyte_and_a_half() -> None:
     document = samples.loop_document(400)
     times, readings = samples.raw_stream(document, 10.0)
@@ -350,6 +356,7 @@ def budgeted(bare: dict[str, Any]) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.slow
 def test_the_budget_is_a_table_with_the_largest_source_first(budgeted: dict[str, Any]) -> None:
     page = render(budgeted)
     assert page.row("Reference") == ["Reference", "B", "43.0 µg", "100 %", "a <map>"]
@@ -373,6 +380,7 @@ def test_a_damaged_budget_still_gives_a_page(budgeted: dict[str, Any], damage: d
     assert "cause uncertain" in render(document).text
 
 
+@pytest.mark.slow
 def test_another_reference_has_its_own_unit_everywhere(changed: dict[str, Any]) -> None:
     changed["calibration"]["units"] = {**changed["calibration"].get("units", {}), "reference": "<uT>", "output": "V"}
     page = render(changed)
@@ -380,6 +388,7 @@ def test_another_reference_has_its_own_unit_everywhere(changed: dict[str, Any]) 
     assert "× 10⁻⁶ <uT> rms" in page.text
 
 
+@pytest.mark.slow
 def test_a_limit_below_the_expanded_uncertainty_is_reserved_against(budgeted: dict[str, Any]) -> None:
     said = "The expanded uncertainty of the magnitude, 86.0 µg, is above the limit of 50.0 µg"
     assert said in render(budgeted, certificate={"limits": {"rms_g": 5e-5}}).text

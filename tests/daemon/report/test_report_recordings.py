@@ -71,6 +71,7 @@ def shown() -> tuple[str, str]:
     return page(document)
 
 
+@pytest.mark.slow
 def test_a_moment_lies_between_poses_of_the_recording_whose_clock_it_is_on(bare: dict[str, Any]) -> None:
     said = "The moment lies between pose 8 and pose 9 of second.csv, that is between 36.0 s and 46.0 s"
     assert said in page(bare)[1]
@@ -80,6 +81,7 @@ def test_a_moment_lies_between_poses_of_the_recording_whose_clock_it_is_on(bare:
     assert "The moment lies" not in page(bare)[1]
 
 
+@pytest.mark.slow
 def test_each_recording_has_its_picture_over_time_and_the_moment_is_marked_in_its_own(
     shown: tuple[str, str],
 ) -> None:
@@ -141,6 +143,7 @@ def test_damaged_names_of_recordings_still_give_a_page(loop: dict[str, Any], dam
     assert "Bias step" in page(loop)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", ["T", "<uT>", "µg-like"])
 def test_names_with_the_unit_of_errors_in_them_stay_as_they_are(loop: dict[str, Any], unit: str) -> None:
     """Where the reference is not in g."""
@@ -156,6 +159,7 @@ def test_names_with_the_unit_of_errors_in_them_stay_as_they_are(loop: dict[str, 
     assert f"residual, 10⁻¹² {unit}" in unescape(html)
 
 
+@pytest.mark.slow
 def test_errors_of_a_small_reference_have_digits(bare: dict[str, Any]) -> None:
     bare["calibration"]["units"] = {"reference": "T", "output": "V"}
     bare["calibration"]["reference"] = 5e-5

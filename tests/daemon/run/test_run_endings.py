@@ -58,6 +58,7 @@ async def _outcome(workshop: Any, served: Any, **settings: Any) -> Outcome:
     return outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terminal", [False, True])
 def test_a_standard_error_that_is_closed_in_the_check_poses_stops_nothing(workshop: Any, terminal: bool) -> None:
     """As by `2>&1 | head`; rich takes a pipe for a terminal where the environment says so."""
@@ -104,6 +105,7 @@ async def test_an_internal_error_is_an_outcome_even_where_nobody_can_be_told(
     assert outcome.device_state is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["attaching", "writing", "closing"])
 def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_is_in(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, where: str
@@ -146,6 +148,7 @@ def test_a_disk_that_fails_after_the_verification_says_that_the_new_calibration_
         assert unit["outcome"]["verdict"] == "aborted"
 
 
+@pytest.mark.slow
 async def test_the_table_and_the_document_say_that_the_old_calibration_is_back(
     workshop: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -177,6 +180,7 @@ def test_a_limit_that_no_device_could_be_verified_by_is_refused_on_loading(works
     triaxcal("run", station).failed(2, f"{station}: limits.verification_rms_g: unit unit0 has no corrected stream")
 
 
+@pytest.mark.slow
 async def test_a_device_without_a_corrected_stream_is_written_and_said_to_be_unverified(
     workshop: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -193,6 +197,7 @@ async def test_a_device_without_a_corrected_stream_is_written_and_said_to_be_unv
     assert NEW[1:] in Path(str(outcome.report)).read_text()
 
 
+@pytest.mark.slow
 def test_an_internal_error_in_one_unit_does_not_disturb_the_other(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,6 +223,7 @@ def test_an_internal_error_in_one_unit_does_not_disturb_the_other(
     assert units["bad"]["report"] is None
 
 
+@pytest.mark.slow
 async def test_a_device_that_cannot_hold_a_calibration_is_left_alone_and_told_why(
     workshop: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -241,6 +247,7 @@ async def test_a_device_that_cannot_hold_a_calibration_is_left_alone_and_told_wh
     assert f"  no registers written: {why}\n" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_corrected_frames_that_stop_are_found_out_and_the_old_calibration_is_put_back(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,6 +301,7 @@ def slow_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RecordingWriter, "__init__", stingy)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("slow_disk")
 async def test_what_a_run_loses_between_bus_and_disk_is_in_its_table_and_its_document(
     workshop: Any, triaxcal: Run, capsys: pytest.CaptureFixture[str]
@@ -313,6 +321,7 @@ async def test_what_a_run_loses_between_bus_and_disk_is_in_its_table_and_its_doc
     assert f"missing_samples: {lost} records were lost between bus and disk" in fitted.json["data_quality"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("slow_disk")
 def test_what_a_recording_loses_between_bus_and_disk_is_in_its_summary(workshop: Any, triaxcal: Run) -> None:
     path = workshop.folder / "rec.mcap"

@@ -73,6 +73,7 @@ def _outcome(path: Path) -> Any:
         return json.loads(recording.attachments["outcome.json"])
 
 
+@pytest.mark.slow
 def test_verification_outside_the_limit_brings_the_old_calibration_back(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
@@ -103,6 +104,7 @@ def _whitewashed(path: Path) -> None:
     assert 'outcome.json: verdict: stored "pass", computed again "fail"' in lines
 
 
+@pytest.mark.slow
 def test_a_fit_outside_its_limit_writes_nothing(workshop: Any, triaxcal: Callable[..., Any]) -> None:
     done, served, path = _run(workshop, triaxcal, limits={"rms_g": 1e-9})
     assert done.code == 1
@@ -116,6 +118,7 @@ def test_a_fit_outside_its_limit_writes_nothing(workshop: Any, triaxcal: Callabl
     assert list(workshop.folder.glob("*.certificate.json")) == []
 
 
+@pytest.mark.slow
 def test_a_station_that_is_told_not_to_write_does_not(workshop: Any, triaxcal: Callable[..., Any]) -> None:
     done, served, path = _run(workshop, triaxcal, provisioning={"write": False})
     assert done.code == 0
@@ -127,6 +130,7 @@ def test_a_station_that_is_told_not_to_write_does_not(workshop: Any, triaxcal: C
         assert all(a.operation == "read" for a in recording.register_accesses())
 
 
+@pytest.mark.slow
 def test_a_register_that_is_refused_leaves_the_old_calibration(workshop: Any, triaxcal: Callable[..., Any]) -> None:
     done, served, path = _run(workshop, triaxcal, Faults(refuse_registers=frozenset({"misalignment_y"})))
     done.failed(4, "unit unit0: ", "provisioning failed at writing misalignment_y: ", "nothing was stored")
@@ -136,6 +140,7 @@ def test_a_register_that_is_refused_leaves_the_old_calibration(workshop: Any, tr
         assert [a.register for a in recording.register_accesses() if a.error] == ["misalignment_y"]
 
 
+@pytest.mark.slow
 def test_a_store_that_the_unit_forgets_is_found_after_the_restart(workshop: Any, triaxcal: Callable[..., Any]) -> None:
     done, served, _ = _run(workshop, triaxcal, Faults(forget_store=True))
     done.failed(
@@ -147,6 +152,7 @@ def test_a_store_that_the_unit_forgets_is_found_after_the_restart(workshop: Any,
     _holds_old(served)
 
 
+@pytest.mark.slow
 def test_a_unit_that_dies_while_it_is_written_is_not_said_to_be_restored(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
@@ -155,6 +161,7 @@ def test_a_unit_that_dies_while_it_is_written_is_not_said_to_be_restored(
     assert served.unit.eeprom == OLD.image()
 
 
+@pytest.mark.slow
 def test_a_unit_that_falls_silent_leaves_a_readable_recording_and_no_result(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
@@ -172,6 +179,7 @@ def test_a_unit_that_falls_silent_leaves_a_readable_recording_and_no_result(
     assert (ended["verdict"], ended["device_state"], ended["measured"]) == ("aborted", "untouched", None)
 
 
+@pytest.mark.slow
 def test_a_unit_that_falls_silent_in_the_verification_is_an_error(
     workshop: Any, triaxcal: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,6 +203,7 @@ def test_a_unit_that_falls_silent_in_the_verification_is_an_error(
     assert Path(_outcome(path)["journal"]).exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", ["scale_factor_y", "reset"])
 def test_a_disk_that_fails_while_registers_are_written_does_not_keep_the_old_ones_away(
     workshop: Any, triaxcal: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, at: str
@@ -216,6 +225,7 @@ def test_a_disk_that_fails_while_registers_are_written_does_not_keep_the_old_one
     _holds_old(served)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fails_in_the_verification_brings_the_old_calibration_back(
     workshop: Any, triaxcal: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,6 +246,7 @@ def test_a_disk_that_fails_in_the_verification_brings_the_old_calibration_back(
     _holds_old(served)
 
 
+@pytest.mark.slow
 def test_old_registers_that_will_not_come_back_are_an_error(
     workshop: Any, triaxcal: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -254,6 +265,7 @@ def test_old_registers_that_will_not_come_back_are_an_error(
     done.failed(4, "verification outside limits", "could not be put back", "'triaxcal restore ")
 
 
+@pytest.mark.slow
 def test_no_new_pose_for_too_long_is_refused_with_the_poses_that_are_wanted(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:
@@ -264,6 +276,7 @@ def test_no_new_pose_for_too_long_is_refused_with_the_poses_that_are_wanted(
     done.failed(3, "no new still pose for 8 s; ", " of 26 are there; add the poses ")
 
 
+@pytest.mark.slow
 def test_of_two_units_the_sound_one_finishes_and_the_worst_code_counts(
     workshop: Any, triaxcal: Callable[..., Any]
 ) -> None:

@@ -84,6 +84,7 @@ CAN = {"profile": "triax-ref-can", "serial": 12}
 MODBUS = {"profile": "triax-ref-modbus", "serial": 4711}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["can", "modbus"])
 async def test_a_unit_that_goes_and_comes_back_is_in_one_recording_with_the_gap(
     workshop: Any, kind: str, request: pytest.FixtureRequest
@@ -116,6 +117,7 @@ async def test_a_unit_that_goes_and_comes_back_is_in_one_recording_with_the_gap(
     assert decoded.seconds >= 3.0
 
 
+@pytest.mark.slow
 async def test_another_unit_that_is_put_in_its_place_is_not_recorded_as_the_same(workshop: Any) -> None:
     bench, told = Bench(workshop, [MODBUS]), Told()
     where = await bench.put(0)
@@ -135,6 +137,7 @@ async def test_another_unit_that_is_put_in_its_place_is_not_recorded_as_the_same
     assert (ended.kind, ended.detail) == ("ended", {"reason": "unit gave up"})
 
 
+@pytest.mark.slow
 async def test_a_unit_that_is_not_there_keeps_nobody_waiting_and_is_recorded_once_it_is(
     workshop: Any, request: pytest.FixtureRequest
 ) -> None:

@@ -132,6 +132,7 @@ async def test_what_no_limit_judges_stays_and_is_not_said_to_be_verified(
         assert _stored_bias(bench.served) == pytest.approx(BIAS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("failure", "raised"),
     [
@@ -209,6 +210,7 @@ async def test_without_a_check_pose_that_can_be_trusted_the_old_calibration_is_b
         _holds_old(bench.served)
 
 
+@pytest.mark.slow
 async def test_without_a_limit_a_calibration_worse_than_the_old_one_does_not_stay(
     open_bench: OpenBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -228,6 +230,7 @@ async def test_without_a_limit_a_calibration_worse_than_the_old_one_does_not_sta
         _holds_old(bench.served)
 
 
+@pytest.mark.slow
 async def test_a_unit_that_cannot_be_put_back_is_said_to_be_uncertain(open_bench: OpenBench) -> None:
     async def dies(check: Collection) -> None:
         bench.served.unit._died_s = 0.0
@@ -245,6 +248,7 @@ async def test_a_unit_that_cannot_be_put_back_is_said_to_be_uncertain(open_bench
         assert back.provisioning.journal.path.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "state"),
     [
@@ -266,6 +270,7 @@ async def test_writing_that_fails_says_what_the_device_holds(
         assert Stored.from_image(bench.served.unit.eeprom).calibration == OLD.calibration
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "at"),
     [

@@ -343,6 +343,7 @@ def multicast_port() -> int:
     return port
 
 
+@pytest.mark.slow
 async def test_a_unit_in_another_process_is_reached_over_udp_multicast(bundle: Bundle, multicast_port: int) -> None:
     settings = CanBus(interface="udp_multicast", channel=GROUP, node_id=9, options={"port": multicast_port})
     served = subprocess.Popen(

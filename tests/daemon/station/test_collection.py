@@ -92,6 +92,7 @@ async def _until_posed(bundle: Bundle, bus: Any, stream: str) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stream", "stopped"),
     [(CORRECTED, OF_CORRECTED), (CORRECTED, (0x485,)), (READINGS, OF_READINGS), (READINGS, (0x185,))],
@@ -118,6 +119,7 @@ async def test_recording_ends_with_the_readings_and_not_with_the_corrected_outpu
         assert timeout_s <= bus.now_s - STOP_S < timeout_s + 3 * BATCH_S
 
 
+@pytest.mark.slow
 async def test_a_pause_shorter_than_the_time_out_ends_nothing(bundle: Bundle, timeout_s: float, tmp_path: Path) -> None:
     bus = Bus(OF_READINGS, again_s=STOP_S + timeout_s - 2 * BATCH_S)
     device: Any = bus
@@ -165,6 +167,7 @@ async def test_samples_from_before_the_start_are_no_part_of_the_recording(tmp_pa
     assert len(counters) == collection.pipelines[READINGS].counts["samples"]
 
 
+@pytest.mark.slow
 def test_record_of_so_many_seconds_ends_where_the_readings_stop(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pytest
 
 from triaxcal.model.directions import directions, elsewhere
 from triaxcal.poses.pose import Pose
@@ -110,6 +111,7 @@ def test_poses_in_any_order_leave_the_rest_of_the_plan_in_its_order() -> None:
     assert state.hint == f"next: {LABELS[0]} up"
 
 
+@pytest.mark.slow
 def test_in_a_dense_plan_a_pose_covers_the_direction_that_it_is_nearest_to_alone() -> None:
     plan = directions(60)
     state = _guide([_pose(plan[10][1])], wanted=60)

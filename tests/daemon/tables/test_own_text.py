@@ -165,6 +165,7 @@ def test_a_file_that_is_not_there_is_one_line(tmp_path: Path) -> None:
         read_csv(tmp_path / "none.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.datasets
 @pytest.mark.skipif(not DATASETS.is_dir(), reason="the measured recordings are not beside the project")
 def test_the_measured_recordings_are_read() -> None:

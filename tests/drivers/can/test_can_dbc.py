@@ -48,6 +48,7 @@ def files(draw: st.DrawFn) -> str:
     return HEAD + "\n".join(lines) + "\n" + comment + "\n".join(types) + "\n"
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(files())
 def test_messages_and_signals_are_those_that_cantools_reads(text: str) -> None:

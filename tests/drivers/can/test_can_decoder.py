@@ -270,6 +270,7 @@ def troubled_streams(draw: st.DrawFn) -> list[Record]:
     return records
 
 
+@pytest.mark.slow
 @shared
 @given(troubled_streams(), st.data())
 def test_samples_and_counts_are_the_same_however_the_records_are_cut(

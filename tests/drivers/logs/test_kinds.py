@@ -63,6 +63,7 @@ def test_a_packed_log_that_is_cut_short_gives_what_is_whole(tmp_path: Path) -> N
     assert account.damaged
 
 
+@pytest.mark.slow
 def test_a_packed_file_of_nothing_ends(tmp_path: Path) -> None:
     path = tmp_path / "log.gz"
     path.write_bytes(gzip.compress(b"(1436509052.249713) vcan0 044#2A\n" + b"\n" * 2**26))

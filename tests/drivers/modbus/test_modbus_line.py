@@ -136,6 +136,7 @@ async def test_an_absent_unit_is_absent_and_the_others_go_on(bundle: Make) -> No
         await one.close()
 
 
+@pytest.mark.slow
 async def test_a_dead_unit_is_asked_ever_more_rarely_until_it_is_silent(bundle: Make) -> None:
     """Were it asked again at once, it would be asked twenty times and have the line all the time."""
     unit, dead = Unit(11), Unit(22)

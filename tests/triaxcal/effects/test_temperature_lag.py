@@ -164,6 +164,7 @@ def test_the_time_constant_is_where_least_is_left_and_has_an_error(
     assert 0.1 < error < 10
 
 
+@pytest.mark.slow
 def test_from_a_stream_it_comes_back_with_the_trends_inside_the_poses(
     twenty_six: np.ndarray,
     with_effect: Callable[[Effect, Sequence[float]], Sensor],
@@ -209,6 +210,7 @@ def test_inside_a_pose_it_explains_the_creep_of_the_lagging_temperature(
         assert np.linalg.norm(after.creep) <= 0.2 * np.linalg.norm(before.creep) + 1e-12
 
 
+@pytest.mark.slow
 def test_poses_whose_temperature_stands_still_or_is_not_known_say_so(
     twenty_six: np.ndarray, with_effect: Callable[[Effect, Sequence[float]], Sensor]
 ) -> None:

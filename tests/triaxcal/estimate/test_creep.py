@@ -125,6 +125,7 @@ def test_drift_explains_the_creep_of_its_own_slope(paper_unit: Sensor, twenty_si
         assert np.linalg.norm(p.creep) < 0.1 * np.linalg.norm(creep)
 
 
+@pytest.mark.slow
 def test_a_bias_that_follows_a_channel_inside_the_poses_is_named_with_errors_that_are_not_inflated(
     paper_unit: Sensor, twenty_six: np.ndarray, rates: np.ndarray
 ) -> None:
@@ -148,6 +149,7 @@ def test_a_bias_that_follows_a_channel_inside_the_poses_is_named_with_errors_tha
     assert np.sum(np.square(pulls)) < 27.9  # chi-square of nine, 0.1 %
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slopes", [False, True])
 @pytest.mark.parametrize("along", [False, True])
 def test_creep_that_nothing_explains_makes_no_effect_and_widens_the_errors_where_the_magnitude_creeps(
@@ -175,6 +177,7 @@ def test_creep_that_nothing_explains_makes_no_effect_and_widens_the_errors_where
         assert np.max(wider) < 1.05
 
 
+@pytest.mark.slow
 def test_what_is_left_is_no_less_than_the_residuals_that_are_told(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     """A slow swing of the bias that nothing explains, in poses that creep by it and are weighed by that."""
     rng = np.random.default_rng(0)
@@ -205,6 +208,7 @@ def test_in_another_recording_the_channel_explains_creep_and_the_clock_does_not(
     assert with_unexplained_creep(other, steep, elsewhere=True) == other
 
 
+@pytest.mark.slow
 def test_the_noise_floor_of_held_out_poses_has_only_the_creep_that_the_model_does_not_explain(
     warm: list[Pose], paper_unit: Sensor, twenty_six: np.ndarray, rates: np.ndarray
 ) -> None:

@@ -67,6 +67,7 @@ def test_a_swing_that_no_model_has_leaves_honest_errors_and_no_pose_looks_spoile
     assert left_out <= 1
 
 
+@pytest.mark.slow
 def test_a_swing_that_no_effect_has_is_unexplained_and_no_pose_is_an_outlier() -> None:
     for seed in range(3):
         c, poses = swinging(seed, 5e-4, 40.0)
@@ -123,6 +124,7 @@ def test_unequal_noise_that_is_twice_what_the_poses_tell_has_honest_errors_too()
     assert 0.85 < rms(found) < 1.15
 
 
+@pytest.mark.slow
 def test_noise_alone_keeps_its_weights() -> None:
     assert not any(fit((c := unequal(seed)).draw(seed)[0], signs=c.signs).excess_g for seed in range(3 * SEEDS))
 

@@ -27,6 +27,7 @@ def poses_of(unit: Sensor, up: np.ndarray, seed: int) -> list[Pose]:
     return noisy_poses(unit, up[rng.permutation(len(up))], SIGMA_G, rng)
 
 
+@pytest.mark.slow
 def test_the_error_in_other_poses_falls_to_the_noise_where_what_acts_is_corrected(
     with_effects: Callable[..., Sensor], twenty_six: np.ndarray
 ) -> None:

@@ -47,6 +47,7 @@ def left_out(c: Calibration) -> list[int]:
     return [i for i, p in enumerate(c.poses) if not p.used]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigmas", [10, 30, 1000])
 @pytest.mark.parametrize("number", [1, 2])
 def test_one_or_two_spoiled_poses_of_the_26_are_named(
@@ -69,6 +70,7 @@ def test_one_or_two_spoiled_poses_of_the_26_are_named(
     assert np.sqrt(np.mean(np.square(pulls))) <= 1.1 * np.sqrt(np.mean(np.square(clean_pulls)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("poses", "excess", "dof"), [(14, 1.0, 1e6), (26, 1.0, 1e6), (26, 1.0, 8.0), (50, 1.5, 1e6), (26, 1.0, 0.0)]
 )
@@ -78,6 +80,7 @@ def test_a_clean_set_hardly_ever_loses_a_pose(poses: int, excess: float, dof: fl
     assert clean_loses(poses, runs, excess, dof) <= stats.binom.ppf(0.999, runs, 0.01) / runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigmas", [10.0, 1000.0])
 def test_a_spoiled_pose_of_the_14_is_named_nearly_as_often_as_it_can_be(sigmas: float) -> None:
     runs = 120
@@ -89,6 +92,7 @@ def test_a_spoiled_pose_of_the_14_is_named_nearly_as_often_as_it_can_be(sigmas: 
     assert found.optimum - found.named < 0.05
 
 
+@pytest.mark.slow
 def test_two_spoiled_poses_of_the_14_that_cannot_be_told_from_others_are_not_guessed() -> None:
     runs = 60
     found = measure(14, 2, 30.0, runs, peer=False)

@@ -99,6 +99,7 @@ def test_the_jacobian_is_that_of_central_differences_with_every_effect_on(
         assert J[:, column] == pytest.approx(slope, rel=1e-6, abs=1e-8 * np.abs(J[:, column]).max())
 
 
+@pytest.mark.slow
 def test_the_standard_error_of_a_residual_is_the_noise_along_its_gradient(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
@@ -113,6 +114,7 @@ def test_the_standard_error_of_a_residual_is_the_noise_along_its_gradient(
     assert np.std(draws, axis=0) / s == pytest.approx(np.ones(len(s)), abs=4.5 / np.sqrt(2 * 400))
 
 
+@pytest.mark.slow
 def test_the_covariance_of_effects_too_is_the_spread_over_seeds(
     with_effects: Callable[..., Sensor], twenty_six: np.ndarray
 ) -> None:
@@ -165,6 +167,7 @@ def test_leverage_is_how_much_a_pose_pulls_its_own_residual(paper_unit: Sensor, 
         assert change / 1e-7 == pytest.approx(1 - whole.poses[i].leverage, abs=0.02)
 
 
+@pytest.mark.slow
 def test_poses_measured_worse_weigh_less(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     error = np.where(np.arange(26) % 2 == 0, 1e-5, 1e-3)[:, None] * np.ones(3)
     truth = np.concatenate([paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias])
@@ -180,6 +183,7 @@ def test_poses_measured_worse_weigh_less(paper_unit: Sensor, twenty_six: np.ndar
     assert np.mean(np.square(equal)) > 20
 
 
+@pytest.mark.slow
 def test_a_noisy_axis_weighs_less_and_the_errors_stay_true(paper_unit: Sensor, twenty_six: np.ndarray) -> None:
     truth = np.concatenate([paper_unit.scale_factor, paper_unit.misalignment, paper_unit.bias])
     pulls, z_errors, flat_errors = [], [], []
@@ -298,6 +302,7 @@ def test_a_faulty_pose_and_a_spoiled_one_are_both_left_out(paper_unit: Sensor, t
     assert [i for i, p in enumerate(fit(poses, signs=MINUS, excluded=(3, 5)).poses) if not p.used] == [3, 5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "amount", "name"),
     [(47, 0.5, "third_order_nonlinearity"), (283, 0.5, "second_order_nonlinearity"), (0, 0.8, "cross_coupling")],

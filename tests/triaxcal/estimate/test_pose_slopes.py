@@ -157,6 +157,7 @@ OF_TIME = {"bias_drift", "warm_up", "bias_step", "temperature_bias", "temperatur
            "temperature_scale_factor", "temperature_lag", "thermal_gradient", "scale_factor_drift"}  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "size"), [(TEMPERATURE, 0.3 * SENSITIVITY), (SQUARE, np.array([2e-4, -1e-4, 3e-4]))]
 )
@@ -177,6 +178,7 @@ def test_of_fourteen_poses_trends_tell_what_the_means_cannot(
         assert both.effect_probabilities[effect.name] > 0.99 > 0.95 > means.effect_probabilities[effect.name]
 
 
+@pytest.mark.slow
 def test_what_has_no_name_and_moves_inside_the_poses_goes_with_the_time(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
@@ -193,6 +195,7 @@ def test_what_has_no_name_and_moves_inside_the_poses_goes_with_the_time(
     assert rests.posterior.unmodelled_kind_probabilities[UnmodelledKind.TIME] < 0.01
 
 
+@pytest.mark.slow
 def test_a_step_between_two_poses_is_no_slope_inside_them(paper_unit: Sensor, fourteen: np.ndarray) -> None:
     """Hundreds of times what noise does, while the unit is turned from the eighth pose to the ninth."""
     path = Tumble(fourteen, hold_s=10.0, move_s=1.5)
@@ -236,6 +239,7 @@ class Table(Effect):
         raise NotImplementedError
 
 
+@pytest.mark.slow
 def test_an_effect_of_another_package_that_is_known_at_the_means_alone_is_left_out_and_told(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
@@ -262,6 +266,7 @@ QUADRATIC = effect_named("temperature_bias_quadratic")
 CURVED = np.array([4e-4, -3e-4, 5e-4, 6e-5, 8e-5, -7e-5])  # g/K and g/K²
 
 
+@pytest.mark.slow
 def test_trends_fitted_along_with_the_means_narrow_the_intervals_and_these_hold_the_truth(
     paper_unit: Sensor, fourteen: np.ndarray
 ) -> None:
@@ -311,6 +316,7 @@ def test_trends_have_no_part_in_a_model_that_nothing_moves_inside_the_poses(
         assert np.array_equal(c.values, means.values)
 
 
+@pytest.mark.slow
 def test_fourteen_poses_carry_six_coefficients_by_what_moves_inside_them(
     paper_unit: Sensor, fourteen: np.ndarray
 ) -> None:
@@ -368,6 +374,7 @@ def test_what_all_poses_have_beside_their_noise_widens_the_trend_of_each_as_its_
     assert some == pytest.approx(after[:, [3, 20]])
 
 
+@pytest.mark.slow
 def test_means_that_come_back_less_well_leave_honest_errors_beside_the_trends(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
@@ -399,6 +406,7 @@ def test_the_budget_of_a_fit_to_means_and_trends_has_the_errors_of_the_fit(
     assert np.all(reference.parameters[9:] < 1e-3 * np.abs(SENSITIVITY))
 
 
+@pytest.mark.slow
 def test_what_moves_inside_the_poses_alone_says_nothing_of_the_means(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
@@ -416,6 +424,7 @@ def test_what_moves_inside_the_poses_alone_says_nothing_of_the_means(
         assert np.all(np.abs(loop.after.values[9:] - truth) < 4 * loop.after.standard_errors[9:])
 
 
+@pytest.mark.slow
 def test_what_an_effect_of_the_means_foretells_in_vain_inside_the_poses_is_a_part_of_their_slopes(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
@@ -436,6 +445,7 @@ def test_what_an_effect_of_the_means_foretells_in_vain_inside_the_poses_is_a_par
         assert np.all(np.abs(loop.after.values[9:] - SENSITIVITY) < 4 * loop.after.standard_errors[9:])
 
 
+@pytest.mark.slow
 def test_a_channel_that_foretells_what_the_poses_do_not_do_inside_is_not_named_beside_one_that_does(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:

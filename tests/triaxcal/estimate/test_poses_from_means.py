@@ -18,6 +18,7 @@ def means(seed: int, bend: float = 0.0) -> np.ndarray:
     return UNIT.output(UPS + bend * UPS**2, {}) + np.random.default_rng(seed).normal(0, NOISE, UPS.shape)
 
 
+@pytest.mark.slow
 def test_the_noise_told_from_residuals_gives_errors_of_the_right_size() -> None:
     ratios, scores = [], []
     for seed in range(60):
@@ -30,6 +31,7 @@ def test_the_noise_told_from_residuals_gives_errors_of_the_right_size() -> None:
     assert np.std(scores) == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_standard_errors_that_are_known_are_taken_and_lack_of_fit_shows() -> None:
     bent = means(1, bend=3e-3)
     known = tc.calibrate(tc.Poses.of_means(bent, standard_errors=np.full(bent.shape, NOISE)))

@@ -175,6 +175,7 @@ def test_elsewhere_everything_that_was_a_runs_own_is_zero(three: list[Pose]) -> 
 # The truth comes back
 
 
+@pytest.mark.slow
 def test_coefficients_and_standard_errors_of_three_runs_are_right_over_many_seeds() -> None:
     """A square term of the unit, a drift in the second run, another bias in each: χ² of all 24 coefficients."""
     square, slope = np.array([2e-4, -1e-4, 3e-4]), np.array([1e-6, -2e-6, 1e-6])
@@ -196,6 +197,7 @@ def test_coefficients_and_standard_errors_of_three_runs_are_right_over_many_seed
     assert low < chi2 < high
 
 
+@pytest.mark.slow
 def test_the_loop_finds_a_square_term_of_the_unit_a_drift_of_one_run_and_the_runs_biases() -> None:
     rng = np.random.default_rng(0)
     square, slope = np.array([2e-4, -2e-4, 3e-4]), np.array([1.5e-6, -2e-6, 1e-6])
@@ -215,6 +217,7 @@ def test_the_loop_finds_a_square_term_of_the_unit_a_drift_of_one_run_and_the_run
     assert loop.after.residual.cross_validated_rms_g < 1.5 * SIGMA_G
 
 
+@pytest.mark.slow
 def test_runs_that_come_back_with_another_bias_show_that_and_nothing_else() -> None:
     rng = np.random.default_rng(5)
     shifts = [1e-4 * rng.standard_normal(3) for _ in range(3)]
@@ -228,6 +231,7 @@ def test_runs_that_come_back_with_another_bias_show_that_and_nothing_else() -> N
         assert np.all(np.abs(first - mean) < 5 * error)
 
 
+@pytest.mark.slow
 def test_a_drift_that_is_alike_in_all_runs_has_one_slope() -> None:
     rng = np.random.default_rng(7)
     slope = np.array([2e-6, -1e-6, 2e-6])
@@ -240,6 +244,7 @@ def test_a_drift_that_is_alike_in_all_runs_has_one_slope() -> None:
         assert abs(got - value) < 4 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_nothing_is_found_where_runs_differ_in_nothing(seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
@@ -247,6 +252,7 @@ def test_nothing_is_found_where_runs_differ_in_nothing(seed: int) -> None:
     assert loop.findings == ()
 
 
+@pytest.mark.slow
 def test_a_scale_factor_that_differs_from_run_to_run_is_named() -> None:
     rng = np.random.default_rng(8)
     first, second = recording(rng, count=14), recording(rng, count=14)
@@ -260,6 +266,7 @@ def test_a_scale_factor_that_differs_from_run_to_run_is_named() -> None:
         assert abs(got - value) < 5 * error
 
 
+@pytest.mark.slow
 def test_the_residual_by_run_is_the_rms_over_its_poses() -> None:
     rng = np.random.default_rng(4)
     runs = [recording(rng, count=14), recording(rng, lambda t: np.outer(t, [2e-6, 0, 0]), count=18)]

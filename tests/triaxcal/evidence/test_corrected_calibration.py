@@ -29,6 +29,7 @@ def of(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> tuple[Calibration
     return before, corrected(before, posterior_of(poses, before, signs=signs, catalogue=FEW), START)
 
 
+@pytest.mark.slow
 def test_coefficients_are_as_uncertain_as_the_budget_says(
     poses_with: Poses, with_effects: Callable[..., Sensor]
 ) -> None:
@@ -44,6 +45,7 @@ def test_coefficients_are_as_uncertain_as_the_budget_says(
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
 
 
+@pytest.mark.slow
 def test_residuals_in_the_poses_come_down_to_their_noise(poses_with: Poses) -> None:
     before, after = of(poses_with(4, hysteresis=[8e-4, -7e-4, 9e-4]))
     assert after.terms == ("linear", "hysteresis")
@@ -55,6 +57,7 @@ def test_residuals_in_the_poses_come_down_to_their_noise(poses_with: Poses) -> N
     assert 0 < sum(p.leverage for p in after.poses) < len(after.parameters)
 
 
+@pytest.mark.slow
 def test_a_budget_has_the_whole_covariance_and_says_what_may_act(poses_with: Poses) -> None:
     _, after = of(poses_with(2, second_order_nonlinearity=[8e-5, -8e-5, 6e-5]))
     found = budget(after)
@@ -71,6 +74,7 @@ def test_temperature_is_in_the_budget_as_far_as_the_poses_leave_it_open(poses_wi
     assert line.magnitude < SIGMA_G
 
 
+@pytest.mark.slow
 def test_where_nothing_is_corrected_the_linear_calibration_stays_with_wider_errors() -> None:
     recording = Case("dead_zone", 1, (100.0, 200.0), 26, "white").make()
     before, after = of(still_poses(recording.samples()), recording.signs)
@@ -80,12 +84,14 @@ def test_where_nothing_is_corrected_the_linear_calibration_stays_with_wider_erro
     assert budget(after).magnitude.standard > budget(before).magnitude.standard
 
 
+@pytest.mark.slow
 def test_the_linear_calibration_is_kept_beside_the_effects(poses_with: Poses) -> None:
     before, after = of(poses_with(4, hysteresis=[8e-4, -7e-4, 9e-4]))
     assert after.linear_only is before
     assert after.weights == pytest.approx({"hysteresis": 1.0})
 
 
+@pytest.mark.slow
 def test_beyond_the_last_pose_the_error_of_the_extrapolation_is_told(
     poses_with: Poses, with_effects: Callable[..., Sensor]
 ) -> None:

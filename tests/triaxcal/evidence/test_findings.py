@@ -22,18 +22,21 @@ def told(poses: list[Pose], signs: tuple[float, ...] = MINUS) -> Findings:
     return findings(posterior_of(poses, fit(poses, signs=signs), signs=signs))
 
 
+@pytest.mark.slow
 def test_where_nothing_acts_that_is_the_likeliest(poses_with: Poses) -> None:
     found = told(poses_with(0))
     assert (found.named, dict(found.candidates), dict(found.outliers), found.change_point) == ((), {}, {}, None)
     assert found.nothing > 0.3
 
 
+@pytest.mark.slow
 def test_an_effect_that_is_certain_is_named_alone(poses_with: Poses) -> None:
     (named,) = told(poses_with(11, temperature_bias=[5e-4, -4e-4, 6e-4])).named
     assert named.unique
     assert named.effect == "temperature_bias"
 
 
+@pytest.mark.slow
 def test_effects_that_do_the_same_are_named_together_each_with_its_probability(
     poses_with: Poses, paper_unit: Sensor
 ) -> None:
@@ -48,6 +51,7 @@ def test_effects_that_do_the_same_are_named_together_each_with_its_probability(
     assert sum(found.named[0].probabilities.values()) > 0.9
 
 
+@pytest.mark.slow
 def test_an_outlier_is_told_with_its_pose(
     poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]]
 ) -> None:
@@ -56,6 +60,7 @@ def test_an_outlier_is_told_with_its_pose(
     assert found.nothing < 0.01
 
 
+@pytest.mark.slow
 def test_what_has_no_name_goes_with_what_it_went_with(poses_with: Poses, paper_unit: Sensor) -> None:
     """A bias that swings twice in the recording."""
 
@@ -86,6 +91,7 @@ def test_poses_are_counted_among_all_that_were_given(
     assert list(told(poses).outliers) == [7]
 
 
+@pytest.mark.slow
 def test_a_name_that_hangs_on_one_pose_is_a_candidate_and_no_finding(
     monkeypatch: pytest.MonkeyPatch, poses_with: Poses
 ) -> None:

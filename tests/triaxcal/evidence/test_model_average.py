@@ -37,6 +37,7 @@ def errors_of(made: Sensor, truth: Sensor) -> np.ndarray:
     return np.linalg.norm(made.specific_force(truth.output(up, still), still), axis=1) - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effects", [{"third_order_nonlinearity": [2e-3, -1e-3, 2e-3]}, {"scale_factor_asymmetry": [1e-3, 8e-4, -9e-4]}, {}]
 )
@@ -62,6 +63,7 @@ def stated(made: Average, truth: Sensor) -> np.ndarray:
     return np.sqrt(sum((errors_of(made.sensor.moved(step), truth) - here) ** 2 for step in steps))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effects",
     [{}, {"third_order_nonlinearity": [3e-4, -1e-4, 2e-4]}, {"second_order_nonlinearity": [1e-4, 8e-5, -9e-5]}],
@@ -88,6 +90,7 @@ def test_a_document_has_one_shape_for_a_name_and_coefficients_that_do_the_same(
     assert len(made.covariance) == 9 + sum(len(q) for _, q in made.sensor.effects)
 
 
+@pytest.mark.slow
 def test_a_knock_moves_the_average_as_little_as_if_it_were_left_out(
     poses_with: Callable[..., list[Pose]],
     with_effects: Callable[..., Sensor],
@@ -98,16 +101,19 @@ def test_a_knock_moves_the_average_as_little_as_if_it_were_left_out(
     assert np.sqrt(np.mean(with_knock**2)) < SIGMA_G
 
 
+@pytest.mark.slow
 def test_what_has_no_name_is_not_corrected() -> None:
     recording = Case("dead_zone", 1, (100.0, 200.0), 26, "white").make()
     assert refusal(seen_in(still_poses(recording.samples()), recording.signs)) is Refusal.UNMODELLED
 
 
+@pytest.mark.slow
 def test_a_name_is_corrected_where_nothing_else_acts(poses_with: Callable[..., list[Pose]]) -> None:
     assert refusal(seen_in(poses_with(1, temperature_bias=[5e-4, -4e-4, 6e-4]))) is None
     assert refusal(seen_in(poses_with(1))) is None
 
 
+@pytest.mark.slow
 def test_a_process_in_time_says_where_the_bias_is_at_the_moment_asked_for(
     poses_with: Callable[..., list[Pose]], paper_unit: Sensor
 ) -> None:
@@ -126,6 +132,7 @@ def test_a_process_in_time_says_where_the_bias_is_at_the_moment_asked_for(
     assert np.sqrt(np.mean((told - truth) ** 2)) < 0.2 * np.sqrt(np.mean(truth**2))
 
 
+@pytest.mark.slow
 def test_the_bias_at_a_moment_is_as_sure_as_a_process_in_time_leaves_it(
     poses_with: Callable[..., list[Pose]], paper_unit: Sensor
 ) -> None:

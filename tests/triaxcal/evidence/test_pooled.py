@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tests.triaxcal.evidence.conftest import MINUS
 from triaxcal.effects import effect_named
@@ -28,6 +29,7 @@ def of_units(poses: Sequence[list[Pose]]) -> list[Posterior]:
     return [posterior_of(p, fit(p, signs=MINUS), signs=MINUS, catalogue=FEW).resized(LEAST_G) for p in poses]
 
 
+@pytest.mark.slow
 def test_an_effect_with_common_values_is_certain_in_all_and_in_none_alone(
     poses_with: Callable[..., list[Pose]],
 ) -> None:
@@ -42,6 +44,7 @@ def test_an_effect_with_common_values_is_certain_in_all_and_in_none_alone(
     assert any("temperature_bias" in group for group in found.certain(0.99))
 
 
+@pytest.mark.slow
 def test_values_of_their_own_are_not_called_common(poses_with: Callable[..., list[Pose]]) -> None:
     rng = np.random.default_rng(3)
     values = rng.standard_normal((UNITS, 3)) * 4e-5
@@ -50,6 +53,7 @@ def test_values_of_their_own_are_not_called_common(poses_with: Callable[..., lis
     assert found.common["temperature_bias"] < 0.01
 
 
+@pytest.mark.slow
 def test_where_nothing_acts_nothing_is_found_together(poses_with: Callable[..., list[Pose]]) -> None:
     found = pool(of_units([poses_with(seed + 50) for seed in range(UNITS)]))
     assert max(found.probability.values()) < 0.5
@@ -58,6 +62,7 @@ def test_where_nothing_acts_nothing_is_found_together(poses_with: Callable[..., 
     assert found.certain(0.99) == ()
 
 
+@pytest.mark.slow
 def test_what_one_unit_has_alone_is_no_effect_of_all(poses_with: Callable[..., list[Pose]]) -> None:
     """Each unit for itself is far likelier."""
     poses = [poses_with(seed + 70) for seed in range(UNITS)]
@@ -69,6 +74,7 @@ def test_what_one_unit_has_alone_is_no_effect_of_all(poses_with: Callable[..., l
     assert found.nothing < 0.01
 
 
+@pytest.mark.slow
 def test_what_takes_the_place_of_an_unmodelled_part_in_each_is_an_effect_of_all(
     poses_with: Callable[..., list[Pose]],
 ) -> None:
@@ -88,6 +94,7 @@ def test_names_that_one_unit_cannot_show_are_left_out(poses_with: Callable[..., 
     assert "hysteresis" in found.probability
 
 
+@pytest.mark.slow
 def test_what_no_name_describes_in_each_is_no_common_effect(poses_with: Callable[..., list[Pose]]) -> None:
     """A bias that wanders smoothly, otherwise in each."""
     poses = []

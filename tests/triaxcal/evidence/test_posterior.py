@@ -25,6 +25,7 @@ def found(poses: list[Pose]) -> Posterior:
     return posterior_of(poses, fit(poses, signs=MINUS), signs=MINUS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_is_named_where_nothing_acts(poses_with: Poses, seed: int) -> None:
     posterior = found(poses_with(seed))
@@ -33,6 +34,7 @@ def test_nothing_is_named_where_nothing_acts(poses_with: Poses, seed: int) -> No
     assert posterior.unmodelled_probability < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "coefficients"),
     [
@@ -53,6 +55,7 @@ def test_what_acts_is_named(poses_with: Poses, name: str, coefficients: list[flo
     assert posterior.unmodelled_probability < 0.2
 
 
+@pytest.mark.slow
 def test_two_effects_at_once_are_both_named(poses_with: Poses) -> None:
     posterior = found(poses_with(5, hysteresis=[8e-4, -7e-4, 9e-4], temperature_bias=[5e-4, -4e-4, 6e-4]))
     names, probability = next(iter(posterior.effect_set_probabilities.items()))
@@ -69,6 +72,7 @@ def test_a_knocked_pose_is_an_outlier_and_nothing_else(
     assert max(posterior.effect_probabilities.values(), default=0.0) < 0.3
 
 
+@pytest.mark.slow
 def test_a_name_that_one_pose_decides_does_not_survive_its_loss(
     poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]]
 ) -> None:
@@ -78,6 +82,7 @@ def test_a_name_that_one_pose_decides_does_not_survive_its_loss(
         assert all(posterior.least_leave_one_out(name) < 0.5 for name in posterior.effect_probabilities)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["dead_zone", "random_walk", "magnetic_field"])
 def test_what_is_in_no_catalogue_is_unmodelled(kind: str) -> None:
     recording = Case(kind, 1, (100.0, 200.0), 26, "white").make()
@@ -87,6 +92,7 @@ def test_what_is_in_no_catalogue_is_unmodelled(kind: str) -> None:
     assert all(posterior.least_leave_one_out(name) < 0.99 for name in posterior.effect_probabilities)
 
 
+@pytest.mark.slow
 def test_probabilities_are_those_of_a_partition(poses_with: Poses) -> None:
     posterior = found(poses_with(1, warm_up=[2e-4, 3e-4, -2e-4]))
     assert posterior.set_probabilities.sum() == pytest.approx(1.0)
@@ -95,6 +101,7 @@ def test_probabilities_are_those_of_a_partition(poses_with: Poses) -> None:
     assert posterior.unmodelled_probability <= sum(posterior.unmodelled_kind_probabilities.values()) + 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_channels_that_were_exchanged_on_the_way_are_seen_with_the_pose(poses_with: Poses, seed: int) -> None:
     first = 9 + 4 * seed
@@ -106,6 +113,7 @@ def test_channels_that_were_exchanged_on_the_way_are_seen_with_the_pose(poses_wi
     assert refusal(posterior) is Refusal.CHANGE_POINT
 
 
+@pytest.mark.slow
 def test_another_unit_from_some_pose_on_is_seen(poses_with: Poses) -> None:
     poses = poses_with(3)
     scale = np.array([1.004, 0.995, 1.002])
@@ -113,11 +121,13 @@ def test_another_unit_from_some_pose_on_is_seen(poses_with: Poses) -> None:
     assert posterior.change_point_probabilities[12:17].sum() > 0.9
 
 
+@pytest.mark.slow
 def test_one_unit_all_through_is_no_other(poses_with: Poses) -> None:
     for effects in ({}, {"bias_step": [4e-4, 3e-4, -5e-4]}, {"warm_up": [4e-4, 3e-4, -5e-4]}):
         assert found(poses_with(6, **effects)).change_point_probabilities.sum() < 0.05
 
 
+@pytest.mark.slow
 def test_the_unit_of_the_reference_changes_no_probability(poses_with: Poses) -> None:
     """A tenth of g: effects that go by the sign of a force know its size by its order of magnitude alone."""
     poses = poses_with(9, second_order_nonlinearity=[2e-4, 1e-4, -2e-4], hysteresis=[6e-5, -5e-5, 4e-5])
@@ -129,6 +139,7 @@ def test_the_unit_of_the_reference_changes_no_probability(poses_with: Poses) -> 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mg", [2.0, 5.0, 15.0])
 @pytest.mark.parametrize("name", ["second_order_nonlinearity", "third_order_nonlinearity", "temperature_bias"])
 def test_a_strong_effect_is_as_certain_as_a_weak_one(poses_with: Poses, name: str, mg: float) -> None:
@@ -138,6 +149,7 @@ def test_a_strong_effect_is_as_certain_as_a_weak_one(poses_with: Poses, name: st
     assert refusal(posterior) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_g", [0.01, 0.4, 0.9])
 def test_a_pose_is_an_outlier_however_far_it_is_off(
     poses_with: Poses, knocked: Callable[[list[Pose], int, float], list[Pose]], by_g: float
@@ -147,6 +159,7 @@ def test_a_pose_is_an_outlier_however_far_it_is_off(
     assert posterior.unmodelled_probability < 0.3
 
 
+@pytest.mark.slow
 def test_a_unit_turned_in_its_socket_is_seen_with_the_pose(poses_with: Poses) -> None:
     """As a connector plugged in the other way round: two channels change their signs."""
     poses = poses_with(7)
@@ -155,6 +168,7 @@ def test_a_unit_turned_in_its_socket_is_seen_with_the_pose(poses_with: Poses) ->
     assert refusal(posterior) is Refusal.CHANGE_POINT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("bent_g", [0.0, 2e-4])
 def test_a_repeat_that_contradicts_is_time_or_memory_and_no_outlier(

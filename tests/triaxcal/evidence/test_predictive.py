@@ -46,6 +46,7 @@ def test_poses_that_were_taken_are_to_come_as_they_were(poses_with: Poses) -> No
                 )
 
 
+@pytest.mark.slow
 def test_a_covariance_with_poses_to_come_is_that_of_the_rows_where_they_are_the_same() -> None:
     _, rows = recorded()
     evidence = Evidence(rows, terms_of(rows, [], Odds()), Odds())

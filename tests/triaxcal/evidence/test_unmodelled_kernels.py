@@ -27,6 +27,7 @@ def rows(request: pytest.FixtureRequest, poses_with: Callable[..., list[Pose]]) 
     return rows
 
 
+@pytest.mark.slow
 def test_every_kind_has_a_mean_variance_of_one_in_its_own_axes(rows: LinearisedData) -> None:
     for kind in kinds_of(rows):
         assert kind.variance.mean() == pytest.approx(1.0), kind.what

@@ -164,6 +164,7 @@ def within(pulls: np.ndarray, doubt: float = 1e-3) -> np.ndarray:
     return np.asarray((low < square) & (square < high))
 
 
+@pytest.mark.slow
 def test_pulls_of_rotation_faces_and_tilt_have_the_variance_they_should(paper_unit: Sensor) -> None:
     """The noise of the poses and of seatings being known; errors of faces and table of 1 mrad each."""
     rotation, faces, tilt = [], [], []
@@ -250,6 +251,7 @@ def test_squareness_and_parallelism_are_those_of_the_fixture(paper_unit: Sensor)
         assert np.hypot(*(q.value for q in fixture.parallelism[axis])) == pytest.approx(wedge, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_seatings_that_differ_are_found_and_the_intervals_still_cover(paper_unit: Sensor) -> None:
     """By Student's t, since their size is known from five degrees of freedom."""
     seeds, inside, sizes = 50, 0, []
@@ -264,6 +266,7 @@ def test_seatings_that_differ_are_found_and_the_intervals_still_cover(paper_unit
     assert np.sqrt(np.mean(sizes)) == pytest.approx(1e-4, rel=4.5 / np.sqrt(2 * 5 * seeds) + 0.02)
 
 
+@pytest.mark.slow
 def test_several_units_come_into_one_frame_and_share_the_fixture(paper_unit: Sensor) -> None:
     other = Sensor(paper_unit.scale_factor * 2e5, -paper_unit.misalignment, -paper_unit.bias)
     quarter = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
@@ -332,6 +335,7 @@ def test_fewer_faces_give_a_frame_of_those(paper_unit: Sensor, faces: list[str])
         assert FacesMissing(tuple(label for label in LABELS if label not in faces)) in result.cautions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("datum", [None, ("-Z", "-X"), ("+Y", "-Z")])
 def test_what_the_datum_leaves_open_is_said(paper_unit: Sensor, datum: tuple[str, str] | None) -> None:
     """How far the frame lies from the one that a fixture with such faces was made to: farther if two faces define it
@@ -357,6 +361,7 @@ def test_too_few_faces_are_refused_and_the_missing_ones_named(paper_unit: Sensor
     assert {"+Y", "-Y", "+Z", "-Z"} <= set(refused.value.wanted)
 
 
+@pytest.mark.slow
 def test_a_face_that_stood_one_way_gets_the_tilt_of_the_others_as_uncertainty(paper_unit: Sensor) -> None:
     pulls = []
     for seed in range(40):
@@ -435,6 +440,7 @@ def test_orientations_a_quarter_turn_apart_cancel_the_tilt_as_well(
     assert np.all(unit.standard_error < 1e-5)
 
 
+@pytest.mark.slow
 def test_headings_that_are_known_resolve_faces_that_stood_one_way(paper_unit: Sensor) -> None:
     rng = np.random.default_rng(6)
     plan = in_pairs(rng)
@@ -512,6 +518,7 @@ def test_labels_that_contradict_the_readings_are_named(paper_unit: Sensor) -> No
         bench.stood(right[:7])
 
 
+@pytest.mark.slow
 def test_a_calibration_of_another_recording_adds_its_uncertainty(paper_unit: Sensor) -> None:
     pulls = []
     for seed in range(40):

@@ -21,6 +21,7 @@ from triaxcal.poses.stillness.turns import TURN_S
 SEEDS = 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [0.0, 5e-5, 2e-4, 5e-4, 1e-3])
 def test_the_rotation_is_within_its_stated_error_on_a_table_of_any_tilt(tilt: float, paper_unit: Sensor) -> None:
     pulls, inside = [], 0

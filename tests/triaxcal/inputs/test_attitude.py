@@ -103,6 +103,7 @@ def test_the_estimate_is_that_of_the_full_likelihood(error_rad: float) -> None:
     assert np.max(np.abs(away) / stated(found)) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ups", "error_rad", "declared"),
     [
@@ -144,6 +145,7 @@ def test_what_the_errors_of_the_attitudes_cost_is_told() -> None:
     assert poor.noise_error == pytest.approx(exact, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_error_of_the_attitudes_is_estimated_and_told() -> None:
     estimates = []
     for seed in range(12):
@@ -165,6 +167,7 @@ def test_an_error_declared_too_small_is_noticed_and_raises_the_errors() -> None:
     assert c.residual.lack_of_fit_p < 1e-6
 
 
+@pytest.mark.slow
 def test_an_error_declared_fifty_times_too_small_is_told_with_the_estimate_and_what_the_fit_would_be() -> None:
     declared, estimated, true, away = [], [], [], []
     for seed in range(20):
@@ -188,6 +191,7 @@ def test_an_error_declared_fifty_times_too_small_is_told_with_the_estimate_and_w
     assert rms[1] == pytest.approx(rms[2], rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses_of_plan", [14, 26])
 def test_the_estimated_error_has_a_true_standard_error(poses_of_plan: int) -> None:
     ups, seeds, away = plan(poses_of_plan), 40, []
@@ -202,6 +206,7 @@ def test_the_estimated_error_has_a_true_standard_error(poses_of_plan: int) -> No
     assert low < np.mean(np.square(away)) < high
 
 
+@pytest.mark.slow
 def test_an_error_declared_rightly_is_hardly_ever_contradicted() -> None:
     contradicted = 0
     for seed in range(60):
@@ -210,6 +215,7 @@ def test_an_error_declared_rightly_is_hardly_ever_contradicted() -> None:
     assert contradicted <= stats.binom.isf(0.001, 60, 0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [2e-5, 1e-3])
 def test_an_error_that_does_not_explain_the_magnitudes_is_not_offered(step: float) -> None:
     """A bias that steps halfway moves |a|, which no attitude does: an estimate would stand for both."""
@@ -262,6 +268,7 @@ def test_a_wrong_row_that_cannot_be_told_from_another_is_not_left_out() -> None:
     assert "row 2" in {row.name for row in c.cautions[0].rows}
 
 
+@pytest.mark.slow
 def test_right_rows_are_hardly_ever_called_wrong() -> None:
     lost = 0
     for seed in range(60):

@@ -110,6 +110,7 @@ def test_shares_of_information_grow_with_every_pose() -> None:
     assert np.all(before > 0.99)
 
 
+@pytest.mark.slow
 def test_a_datasheet_as_good_as_it_says_hardly_ever_conflicts() -> None:
     seeds = 200
     conflicts = [refine(poses(4, seed), datasheet(seed)).conflict_p for seed in range(seeds)]

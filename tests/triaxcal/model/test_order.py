@@ -93,6 +93,7 @@ def test_no_random_order_has_a_smaller_sum_of_variances(count: int) -> None:
     assert all(variances(np.append(0, 1 + rng.permutation(count - 1))) > ours - 1e-9 for _ in range(200))
 
 
+@pytest.mark.slow
 def test_the_same_directions_give_the_same_order_and_every_one_is_taken_once() -> None:
     a = np.array([v for _, v in cube_directions()])
     order = in_order(a)

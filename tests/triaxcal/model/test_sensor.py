@@ -94,6 +94,7 @@ def test_the_magnitude_s_gradient_is_its_central_difference(with_effects: Callab
         assert gradient[:, axis] == pytest.approx(difference, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_derivatives_by_every_parameter_are_their_central_differences(with_effects: Callable[..., Sensor]) -> None:
     sensor = with_effects(**EVERYTHING)
     rng = np.random.default_rng(2)

@@ -85,6 +85,7 @@ def test_the_bound_is_the_optimum_that_another_algorithm_finds(effects: list[Eff
 # Against brute force
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("effect", "power", "count"), [(SECOND, 3, 14), (THIRD, 4, 14), (THIRD, 4, 20)])
 def test_no_choice_from_the_cube_is_better(effect: Effect, power: int, count: int) -> None:
     ours = planned(count, effect).ups
@@ -107,6 +108,7 @@ def test_no_choice_from_the_cube_is_better(effect: Effect, power: int, count: in
     assert log_information(ours, ours**power) > best - 0.03 - 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "count"), [(SECOND, 13), (WARM, 13), (SECOND, 20), (THIRD, 20), (DRIFT, 20), (WARM, 20)]
 )
@@ -130,6 +132,7 @@ def test_it_beats_the_plain_plan_of_as_many_poses_and_keeps_the_nine_parameters_
     assert 0.75 < found.efficiency <= 1
 
 
+@pytest.mark.slow
 def test_channels_go_up_and_come_back_and_do_not_go_with_time_nor_with_each_other() -> None:
     found = optimal(26, [effect_named("temperature_bias"), Humid()])
     t = np.linspace(-1, 1, 27)
@@ -141,6 +144,7 @@ def test_channels_go_up_and_come_back_and_do_not_go_with_time_nor_with_each_othe
     assert (np.diff(temperature) != 0).sum() == 2
 
 
+@pytest.mark.slow
 def test_a_parabola_in_temperature_takes_three_levels() -> None:
     assert set(optimal(16, [BENT]).levels["temp_c"]) == {-1.0, 0.0, 1.0}
 
@@ -148,6 +152,7 @@ def test_a_parabola_in_temperature_takes_three_levels() -> None:
 # Against fits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [[THIRD], [WARM], [DRIFT, SECOND]], ids=lambda e: e[0].name)
 def test_fits_to_poses_of_the_plan_scatter_as_promised(effects: list[Effect], paper_unit: Sensor) -> None:
     found = planned(20, *effects)
@@ -232,6 +237,7 @@ def test_what_the_nine_parameters_absorb_is_refused_whatever_the_plan() -> None:
         optimal(26, [Gain()])
 
 
+@pytest.mark.slow
 def test_of_an_effect_of_which_a_part_shows_that_part_is_planned_for() -> None:
     found = optimal(20, [Swirl()])
     assert found.asked.rank == 1
@@ -240,6 +246,7 @@ def test_of_an_effect_of_which_a_part_shows_that_part_is_planned_for() -> None:
     assert found.errors["swirl"]["bend"] is not None
 
 
+@pytest.mark.slow
 def test_effects_that_share_a_part_leave_it_open_whose_it_is() -> None:
     found = optimal(16, [WARM, BENT])
     assert found.asked.rank == 6
@@ -247,6 +254,7 @@ def test_effects_that_share_a_part_leave_it_open_whose_it_is() -> None:
     assert all(found.errors["temperature_bias_quadratic"][f"quadratic_{axis}"] is not None for axis in "xyz")
 
 
+@pytest.mark.slow
 def test_fewer_poses_than_parameters_are_refused_with_the_number_that_it_takes() -> None:
     with pytest.raises(Refused, match=r"11 poses cannot show third_order_nonlinearity; at least 12"):
         optimal(11, [THIRD])

@@ -48,6 +48,7 @@ def test_labels_say_which_axes_point_up() -> None:
         assert v == pytest.approx(expected / np.linalg.norm(expected)), label
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [9, 10, 14, 18, 20, 26, 33, 100])
 def test_a_plan_has_as_many_distinct_unit_vectors_as_asked_for(count: int) -> None:
     v = vectors(directions(count))

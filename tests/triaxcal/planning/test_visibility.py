@@ -68,6 +68,7 @@ def test_a_coefficient_that_does_nothing_does_not_hide_the_others(twenty_six: np
     assert (found.visible, found.hidden) == (2, ({"y": 1.0},))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [26, 40, 60])
 def test_poses_enough_show_every_effect_of_the_catalogue(count: int) -> None:
     assert unseen_effects(np.array([v for _, v in directions(count)])) == []

@@ -98,6 +98,7 @@ def test_a_logged_channel_stands_beside_the_derived_condition_of_its_name(name: 
         covariates_elsewhere(three, reference, K, B)
 
 
+@pytest.mark.slow
 def test_an_effect_of_a_channel_is_found_whatever_the_channel_is_called(
     paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:

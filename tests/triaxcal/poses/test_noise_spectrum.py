@@ -87,6 +87,7 @@ def pulls(kind: Callable[..., np.ndarray], *parameter: float, seconds: float = 5
     return np.array(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "parameter", "seconds"),
     [
@@ -107,6 +108,7 @@ def test_pulls_have_variance_one_within_a_twentieth_for_white_and_coloured_noise
     assert by_run.mean() == pytest.approx(1, abs=0.05 + 3 * by_run.std(ddof=1) / np.sqrt(len(by_run)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 6])
 def test_with_few_windows_student_intervals_still_cover(count: int) -> None:
     hits, trials = 0, 0
@@ -121,6 +123,7 @@ def test_with_few_windows_student_intervals_still_cover(count: int) -> None:
     assert hits / trials > 0.95 - 3 * np.sqrt(0.95 * 0.05 / 120)
 
 
+@pytest.mark.slow
 def test_one_noise_is_seen_where_the_axes_differ_a_thousandfold() -> None:
     squares = []
     for seed in range(10):

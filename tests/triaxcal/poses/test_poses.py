@@ -43,6 +43,7 @@ def pulls_of(sensor: Sensor, directions: np.ndarray, kind: str, detect: Detect, 
     return np.array(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["white", "moving average of a third of a window"])
 def test_pulls_of_pose_means_have_variance_one_within_a_twentieth(
     kind: str, paper_unit: Sensor, twenty_six: np.ndarray, detect: Detect
@@ -94,6 +95,7 @@ def test_a_coarse_thermometer_says_how_little_it_knows_of_the_rate(
         assert abs(pose.rates["temp_c"] - 0.01) < 2 * pose.rate_errors["temp_c"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["white", "moving average of a window"])
 def test_pulls_of_trends_along_the_measured_vector_have_variance_one(
     paper_unit: Sensor, fourteen: np.ndarray, detect: Detect, kind: str
@@ -194,6 +196,7 @@ def test_a_machine_that_shakes_the_stand_does_not_make_poses_creep(
     assert not any(p.creep.any() for p in poses)
 
 
+@pytest.mark.slow
 def test_a_faulty_span_is_named_and_tells_nothing_of_the_noise_of_the_others(
     paper_unit: Sensor, twenty_six: np.ndarray, detect: Detect
 ) -> None:

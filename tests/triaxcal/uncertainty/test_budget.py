@@ -51,6 +51,7 @@ def test_noise_alone_is_what_the_fit_itself_says(paper_unit: Sensor, twenty_six:
     assert b.dominant.magnitude == float(b.magnitude.standard)
 
 
+@pytest.mark.slow
 def test_all_sources_together_scatter_as_the_budget_says(
     monkeypatch: pytest.MonkeyPatch, paper_unit: Sensor, twenty_six: np.ndarray
 ) -> None:
@@ -92,6 +93,7 @@ def _creeping(pose: Pose, change: np.ndarray, rng: np.random.Generator) -> Pose:
     return replace(moved, covariance=pose.covariance + moved.creep_covariance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved_k", [0.1, 2.0])
 def test_a_thermal_effect_that_shows_in_the_residuals_counts_once(
     paper_unit: Sensor, twenty_six: np.ndarray, moved_k: float

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.diagnosis import diagnose
@@ -23,6 +24,7 @@ def one_after_the_other(poses: list[Pose], every_s: float, duration_s: float) ->
     return out
 
 
+@pytest.mark.slow
 def test_a_drift_that_may_be_a_warm_up_holds_the_truth_in_the_middle_of_the_recording() -> None:
     """Both are corrected where neither is certain, each by its probability, and the budget names them."""
     both = 0
@@ -47,6 +49,7 @@ def test_a_drift_that_may_be_a_warm_up_holds_the_truth_in_the_middle_of_the_reco
     assert both == 1
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_that_none_of_the_names_has() -> None:
     alone, pulls = [], []
     for seed in range(5):

@@ -65,6 +65,7 @@ def test_few_recordings_widen_the_interval(paper_unit: Sensor) -> None:
     assert found.expanded_uncertainty > 2.5 * found.start_to_start
 
 
+@pytest.mark.slow
 def test_errors_in_the_next_recording_stay_within_what_is_stated(paper_unit: Sensor) -> None:
     within = []
     for seed in range(30):

@@ -78,6 +78,7 @@ def chance(seeds: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "noise_g", "seeds"),
     [(1000, 1e-4, 60), (1000, 0.05, 60), (10_000, 0.02, 40), (100_000, 0.02, 25)],
@@ -100,6 +101,7 @@ def test_the_mean_over_seeds_is_the_truth_where_an_ordinary_fit_is_biased(unit: 
     assert np.max(np.abs(pulls)) < stats.norm.isf(0.0005 / 9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_g", [[0.02, 0.01, 0.02], [0.01, 0.01, 0.03]])
 def test_unequal_noise_is_told_by_axis_and_biases_nothing(unit: Sensor, noise_g: list[float]) -> None:
     a, seeds = path(20_000), 30
@@ -114,6 +116,7 @@ def test_unequal_noise_is_told_by_axis_and_biases_nothing(unit: Sensor, noise_g:
     assert all(warned) if max(noise_g) / min(noise_g) > 2.5 else not any(warned)
 
 
+@pytest.mark.slow
 def test_the_noise_is_estimated(unit: Sensor) -> None:
     for noise_g in (1e-6, 1e-3, 0.02, 0.05):
         estimates = [fitted(outputs(unit, path(20_000), noise_g, seed)).noise_g for seed in range(10)]
@@ -301,6 +304,7 @@ def test_what_is_not_white_is_said_and_covered_by_the_stated_errors(unit: Sensor
     assert np.sqrt(np.mean(np.square(pulls))) < np.sqrt(stats.chi2.isf(0.001, 15 * 3) / (15 * 3))
 
 
+@pytest.mark.slow
 def test_white_noise_alone_raises_no_warning(unit: Sensor) -> None:
     warned = sum(bool(fitted(outputs(unit, path(3000, 0.03), 0.01, seed)).calibration.cautions) for seed in range(100))
     assert warned <= stats.binom.isf(0.001, 100, 0.01)

@@ -105,6 +105,7 @@ NOISES: dict[str, Noise] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("step", "rate_hz", "kind"),
     [

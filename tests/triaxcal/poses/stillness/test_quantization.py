@@ -75,6 +75,7 @@ def test_what_rounding_does_to_means_and_scatters_is_that_of_the_exact_sums(sigm
     assert noise_of(np.array([variance.mean()]))[0] == pytest.approx(sigma, abs=0.004)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decimals", [None, 4])
 @pytest.mark.parametrize("sigma", PARTIAL)
 def test_every_pose_is_found_once_however_little_dither(
@@ -90,6 +91,7 @@ def test_every_pose_is_found_once_however_little_dither(
             assert p.end_s < i * path.step_s + path.hold_s + 0.2
 
 
+@pytest.mark.slow
 def test_knocks_on_a_unit_of_few_bits_split_no_pose(fourteen: np.ndarray, detect: Detect) -> None:
     for seed in range(3):
         t_s, u, _, path = coarse(0.1, seed, fourteen)
@@ -98,6 +100,7 @@ def test_knocks_on_a_unit_of_few_bits_split_no_pose(fourteen: np.ndarray, detect
         assert in_which(detect(t_s, u + shock * knocked[:, None])[2], path) == list(range(len(fourteen)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decimals", [None, 4])
 @pytest.mark.parametrize("sigma", PARTIAL)
 def test_standard_errors_hold_what_partial_dither_leaves(

@@ -66,6 +66,7 @@ def assert_each_hold_is_one_span(stream: Made, poses: list[Pose], *, covered: fl
         assert p.end_s - p.start_s > covered * (end - begin)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("machine", [hum, hiss])
 @pytest.mark.parametrize(("rate_hz", "hz"), [(100.0, 5.0), (50.0, 11.3), (200.0, 19.7), (100.0, 24.0), (1000.0, 190.0)])
 @pytest.mark.parametrize("loud", [5, 50])

@@ -62,6 +62,7 @@ def assert_each_once(stream: Tumbled, poses: list[Pose], *, inside: bool = True)
             assert p.end_s <= i * stream.path.step_s + stream.path.hold_s + 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold_s", [2.0, 5.0, 10.0])
 @pytest.mark.parametrize("rate_hz", [20.0, 50.0, 62.5, 100.0, 400.0, 2000.0])
 def test_every_pose_is_found_once_and_inside_its_hold_at_any_rate(
@@ -128,6 +129,7 @@ def test_a_bump_inside_a_pose_does_not_split_it(
         assert np.max(np.abs((poses[i].mean - truth[i]) / poses[i].standard_error)) < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_g", [2e-4, 1e-2])
 def test_slow_moves_whose_onset_the_noise_hides_put_no_bias_into_a_mean(
     noise_g: float, paper_unit: Sensor, twenty_six: np.ndarray, detect: Detect
@@ -252,6 +254,7 @@ def test_quantised_outputs_show_every_pose_with_honest_errors(
     assert np.mean(pulls**2) < 1.5
 
 
+@pytest.mark.slow
 def test_outputs_far_from_zero_give_the_same_poses(plain: Tumbled, detect: Detect) -> None:
     counts = np.round(plain.u * 1e6)
     _, spans, poses = detect(plain.t_s, counts)
@@ -399,6 +402,7 @@ def holey() -> tuple[Windows, list[list[int]]]:
     return whole.windows(), [s.used.tolist() for s in whole.spans()]
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(cuts=st.lists(st.integers(0, len(HOLEY[0])), max_size=40), ask=st.booleans())
 def test_blocks_of_any_size_give_exactly_the_same_windows_and_spans(

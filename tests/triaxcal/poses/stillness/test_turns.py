@@ -68,6 +68,7 @@ def test_a_long_knock_is_shorter_than_the_turns(paper_unit: Sensor) -> None:
     assert holds_of(stream, w, spans) == [[i] for i in range(12)]
 
 
+@pytest.mark.slow
 def test_spans_are_the_same_in_blocks_of_any_size(paper_unit: Sensor) -> None:
     stream = stood(paper_unit, HANDS["changes its grip half-way"], 0.0, 3, others=False, knocks=(0.1, 0.05))
     whole = [span.used.tolist() for span in found(stream)[1]]
