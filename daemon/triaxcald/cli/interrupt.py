@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import signal
 import socket
-from collections.abc import Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any, TypeVar
 
 from triaxcald.cli.signals import StopSignals, stop_signals
@@ -24,34 +25,41 @@ class Interrupted(Exception):
         self.number, self.notes = number, notes
 
 
-def run_interruptible(work: Coroutine[Any, Any, T]) -> T:
+def run_interruptible(work: Coroutine[Any, Any, T], reload: Callable[[], None] | None = None) -> T:
     """Runs ``work`` in an event loop. Raises Interrupted where it was cancelled
-    and did not make a result of that.
+    and did not make a result of that. ``reload`` is called in the loop at each
+    SIGHUP, which then stops nothing, unless the process is on a terminal.
 
     What it still has running in threads goes on, and is not waited for.
     """
     with stop_signals() as signals:
-        return asyncio.run(_guarded(work, signals))
+        return asyncio.run(_guarded(work, signals, reload))
 
 
-async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals) -> T:
+async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: Callable[[], None] | None) -> T:
     loop = asyncio.get_running_loop()
     loop.set_default_executor(_Unawaited())
     task = asyncio.ensure_future(work)
 
     def cancel() -> bool:
-        with suppress(RuntimeError):  # the loop has ended, and the work with it
-            loop.call_soon_threadsafe(task.cancel)
+        _soon(loop, task.cancel)
         return not task.done()
 
     with _woken(loop):
         signals.cancel_by(cancel)
+        if reload is not None:
+            signals.reload_by(partial(_soon, loop, reload))
         try:
             return await task
         except asyncio.CancelledError as e:
             if signals.caught:
                 raise Interrupted(signals.caught[0], _notes(e)) from None
             raise
+
+
+def _soon(loop: asyncio.AbstractEventLoop, act: Callable[[], object]) -> None:
+    with suppress(RuntimeError):  # the loop has ended, and the work with it
+        loop.call_soon_threadsafe(act)
 
 
 class _Unawaited(ThreadPoolExecutor):

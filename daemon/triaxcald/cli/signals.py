@@ -5,10 +5,14 @@ put things in order, and again by the second; the third ends the process at
 once. Before and without such work the first one does, as there is nothing to
 put in order. No signal raises an exception: at a random place that would come
 out as a trace back, or not at all.
+
+To a service SIGHUP says that its file has changed, to a command on a terminal
+that the terminal is gone.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +27,7 @@ class StopSignals:
     def __init__(self) -> None:
         self.caught: list[int] = []
         self._cancel: Callable[[], bool] | None = None
+        self._reload: Callable[[], None] | None = None
 
     def heed(self) -> dict[int, Any]:
         """From now on; gives the handlers that were there. SIGTERM and SIGHUP
@@ -35,7 +40,16 @@ class StopSignals:
         still is work, and the second again; also once the work has ended."""
         self._cancel = cancel
 
+    def reload_by(self, reload: Callable[[], None]) -> None:
+        """From now on SIGHUP calls ``reload``, once and again, and stops
+        nothing; as ever where the process has a terminal."""
+        if not _on_a_terminal():
+            self._reload = reload
+
     def _strike(self, number: int, _: object) -> None:
+        if self._reload is not None and number == getattr(signal, "SIGHUP", None) and not self.caught:
+            self._reload()
+            return
         self.caught.append(number)
         if self._cancel is None:
             abort("interrupted")
@@ -44,6 +58,15 @@ class StopSignals:
         at_work = self._cancel()
         if len(self.caught) == 2 and at_work:
             tell("triaxcal: putting things in order, please wait; a third signal ends it at once")
+
+
+def _on_a_terminal() -> bool:
+    """That is to say, whether one controls this process, and may go away."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 _process: StopSignals | None = None

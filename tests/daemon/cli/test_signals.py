@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -41,7 +42,8 @@ writer.event("begun")
 
 
 def _heeding() -> None:
-    """Signals that a shell ignores for what it runs in the background, or under nohup."""
+    """Signals that a shell ignores for what it runs in the background, or under nohup; and no terminal."""
+    os.setsid()
     for number in (INT, HUP):
         signal.signal(number, signal.SIG_DFL)
 
@@ -218,3 +220,48 @@ main.entry()
     done = _python(code)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("triaxcal ")
+
+
+def test_what_reloads_at_a_hangup_goes_on_and_the_next_other_signal_ends_it() -> None:
+    code = """
+from triaxcald.cli.interrupt import Interrupted, run_interruptible
+
+reloads = []
+
+async def serve():
+    for _ in range(2):
+        raise_signal(SIGHUP)
+        await asyncio.sleep(0)
+    while len(reloads) < 2:
+        await asyncio.sleep(0)
+    raise_signal(SIGTERM)
+    await asyncio.Event().wait()
+
+try:
+    run_interruptible(serve(), lambda: reloads.append(1))
+except Interrupted as e:
+    print(e.number, len(reloads))
+"""
+    done = _python(code)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{TERM:d} 2\n", "")
+
+
+def test_on_a_terminal_a_hangup_ends_what_would_reload() -> None:
+    code = """
+import fcntl, pty, termios
+from triaxcald.cli.interrupt import Interrupted, run_interruptible
+
+_, terminal = pty.openpty()
+fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+
+async def serve():
+    raise_signal(SIGHUP)
+    await asyncio.Event().wait()
+
+try:
+    run_interruptible(serve(), lambda: print("reloaded"))
+except Interrupted as e:
+    print(e.number)
+"""
+    done = _python(code)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{HUP:d}\n", "")
