@@ -21,6 +21,12 @@ def _running_ns() -> int:
     return time.clock_gettime_ns(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
+def slept_ns() -> int:
+    """How long this machine has slept since its start; 0 where the system does
+    not count that."""
+    return _running_ns() - time.monotonic_ns() if hasattr(time, "CLOCK_BOOTTIME") else 0
+
+
 class SteadyClock:
     """Host time since the epoch, by the clock as it was set when this was made:
     a step of it later on (set by hand, a first contact with a time server) does

@@ -27,6 +27,11 @@ class Adapter(Protocol):
     """One open bus. Its calls block: one thread receives, any may send, and
     `close` ends both."""
 
+    @property
+    def echoes(self) -> bool:
+        """Whether `receive` gives what `send` sends too, once all frames are
+        asked for."""
+
     def receive(self, timeout_s: float) -> list[Frame]:
         """What has come, in order; nothing where nothing comes for
         ``timeout_s``. Raises BusError where the bus has failed: interface gone
@@ -34,7 +39,8 @@ class Adapter(Protocol):
 
     def only(self, identifiers: Collection[Identifier] | None) -> None:
         """Frames of these identifiers and error frames are enough from now on;
-        None for all. An adapter that cannot filter gives more."""
+        None for all, those that it sends among them where it `echoes`. An
+        adapter that cannot filter gives more."""
 
     def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
         """Raises BusError."""

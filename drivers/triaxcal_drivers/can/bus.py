@@ -9,13 +9,13 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from triaxcal_drivers.can.adapter import Adapter
-from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.can.python_can import PythonCan
 
 T = TypeVar("T")
 
 
-def open_bus(settings: CanBus) -> Adapter:
+def open_bus(settings: BusSettings) -> Adapter:
     """Blocking; SocketCAN by a socket of our own, all else by python-can.
     Raises BusError."""
     if settings.interface == "socketcan" and sys.platform == "linux":

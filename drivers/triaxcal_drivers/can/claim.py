@@ -58,6 +58,14 @@ def claim_on_can(interface: str, channel: str | int, node_id: int, options: Mapp
     return Claim(f"node {node_id} on {bus_name(interface, channel, options)}", host=host, serial_port=port)
 
 
+def claim_to_listen(interface: str, channel: str | int, options: Mapping[str, object]) -> Claim | None:
+    """A serial port is one process's; on any other bus as many may listen as
+    like to."""
+    if interface not in _SERIAL:
+        return None
+    return Claim(f"listening on {bus_name(interface, channel, options)}", serial_port=_serial_port(str(channel)))
+
+
 def _serial_port(channel: str) -> str:
     return canonical_port(channel.partition("@")[0])
 

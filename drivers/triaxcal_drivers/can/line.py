@@ -1,4 +1,5 @@
-"""A CAN bus of this process: one open adapter for all units on it.
+"""A CAN bus of this process: one open adapter for all units on it, and for who
+listens to all of it.
 
 Most adapters can be opened once, and a socket for each unit would hand every
 frame of the bus to each of them. So the units share one `CanLine`: one thread
@@ -16,8 +17,7 @@ from weakref import WeakKeyDictionary
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.can.adapter import Adapter, Frame, Identifier
 from triaxcal_drivers.can.bus import open_bus, opened
-from triaxcal_drivers.can.claim import bus_name
-from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.can.receive import FrameQueue
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.host_clock import HOST
@@ -35,12 +35,13 @@ is usual on a bus in use."""
 
 
 class CanLine:
-    """To be had by `join`. ``attention`` is what its time-outs count."""
+    """To be had by `join`. ``attention`` is what its time-outs count;
+    ``openings`` counts how often it has been opened."""
 
-    def __init__(self, settings: CanBus) -> None:
+    def __init__(self, settings: BusSettings) -> None:
         self.settings = settings
         self.name = f"{settings.interface} {settings.channel}"
-        self.users = 0
+        self.users = self.openings = 0
         self.attention = Attention(asyncio.get_running_loop())
         self._opening = asyncio.Lock()
         self._adapter: Adapter | None = None
@@ -56,7 +57,12 @@ class CanLine:
             if self._adapter is not None and self.attention.now_s() - self._heard_s < MUTE_S:
                 return
             await self._close()
-            adapter = await opened(lambda: open_bus(self.settings), Adapter.close)
+            try:
+                adapter = await opened(lambda: open_bus(self.settings), Adapter.close)
+            except BusError as e:  # who listened to the one before waits for nothing
+                self._fail(e)
+                raise
+            self.openings += 1
             self._adapter, self._failure, self._heard_s = adapter, None, self.attention.now_s()
             self._filter()
             self._thread = threading.Thread(target=self._receive, args=(adapter,), name=self.name, daemon=True)
@@ -92,7 +98,13 @@ class CanLine:
         if adapter is None:
             self.check()
             raise BusError(f"{self.name} is not open")
+        sent_ns = HOST.now_ns()
         adapter.send(identifier, data)
+        if not adapter.echoes:
+            frame = Frame(sent_ns, identifier, RawFlag.SENT, data)
+            for queue in self._queues:
+                if queue.identifiers is None:
+                    queue.put([frame])
 
     def hear(self, queue: FrameQueue) -> None:
         """``queue`` gets the frames that it has been opened for."""
@@ -115,9 +127,16 @@ class CanLine:
 
     def _filter(self) -> None:
         if self._adapter is not None:
-            wanted = set(self._listeners).union(*(q.identifiers for q in self._queues))
+            heard = [queue.identifiers for queue in self._queues]
+            units = [identifiers for identifiers in heard if identifiers is not None]
+            wanted = set(self._listeners).union(*units) if len(units) == len(heard) else None
             with suppress(BusError):  # the receive thread finds out
                 self._adapter.only(wanted)
+
+    def _fail(self, failure: BusError) -> None:
+        self._failure = failure
+        for queue in self._queues:
+            queue.fail(failure)
 
     def _receive(self, adapter: Adapter) -> None:
         """In a thread of its own, until the adapter is closed or fails."""
@@ -128,9 +147,8 @@ class CanLine:
                 if self._adapter is adapter:
                     if missed := adapter.missed():  # which no frame will tell of any more
                         e = BusError(f"{e}; {missed} frames before it were lost")
-                    self._adapter, self._failure = None, e
-                    for queue in self._queues:
-                        queue.fail(e)
+                    self._adapter = None
+                    self._fail(e)
                     adapter.close()
                 return
             if frames:
@@ -152,17 +170,16 @@ _lines: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, CanLine]] = WeakK
 """The buses that this process has open, by event loop and name."""
 
 
-async def join(settings: CanBus) -> CanLine:
+async def join(settings: BusSettings) -> CanLine:
     """The bus there, opened where it is not; to be given back by `leave`.
 
-    Raises BusError where it cannot be opened, or where other units have it with
+    Raises BusError where it cannot be opened, or where others have it with
     other settings.
     """
     lines = _lines.setdefault(asyncio.get_running_loop(), {})
-    name = bus_name(settings.interface, settings.channel, settings.options)
-    line = lines.get(name)
+    line = lines.get(settings.name)
     if line is None:
-        line = lines[name] = CanLine(settings)
+        line = lines[settings.name] = CanLine(settings)
     elif settings.driven != line.settings.driven:
         raise BusError(
             f"{line.name}: another unit has it with {line.settings.driven}; this one asks for {settings.driven}"

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from triaxcal_drivers import registers as codec
-from triaxcal_drivers.can.claim import claim_on_can
+from triaxcal_drivers.can.claim import bus_name, claim_on_can, claim_to_listen
 from triaxcal_drivers.claim import Claim
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
@@ -196,6 +196,17 @@ class CanProfile(Profile):
         return codec.decode(self.registers[name], raw, order="little", name=name)
 
 
+LISTEN_ONLY: Mapping[str, Mapping[str, str | int | bool]] = {
+    **{interface: {"listen_only": True} for interface in ("socketcan", "slcan", "vector", "nixnet")},
+    "cantact": {"monitor": True},
+    "kvaser": {"driver_mode": False},  # python-can's name for a silent one
+    "seeedstudio": {"operation_mode": "silent"},
+    **{interface: {"state": "PASSIVE"} for interface in ("pcan", "systec")},
+}
+"""By which options an interface is asked to listen only; the others of
+python-can cannot be asked."""
+
+
 class SocketCanOptions(Strict):
     """Options of interface "socketcan". ``fd`` is CAN FD, by default where the
     interface has it; the names that python-can has mean what they mean there.
@@ -221,9 +232,8 @@ class SocketCanOptions(Strict):
             raise ValueError(str(e)) from e
 
 
-class CanBus(Strict):
-    """Where a unit is: a python-can interface and channel, and its node on that
-    bus.
+class BusSettings(Strict):
+    """A bus: a python-can interface and channel, and how it is driven.
 
     ``options`` are passed on to python-can as they are, except those of
     "socketcan", which is ours; its configuration files are not read.
@@ -231,7 +241,6 @@ class CanBus(Strict):
 
     interface: Annotated[str, Field(description='a python-can interface: "socketcan", "udp_multicast"…')]
     channel: Annotated[str | int, Field(description='"can0", a multicast address…')]
-    node_id: Annotated[int, Field(ge=1, le=127)]
     bitrate: Annotated[int | None, Field(gt=0, description="bit/s")] = None
     options: Mapping[str, str | int | bool] = {}
 
@@ -242,13 +251,36 @@ class CanBus(Strict):
         return self
 
     def __str__(self) -> str:
-        return f"node {self.node_id} on {self.interface} {self.channel}"
+        return f"{self.interface} {self.channel}"
+
+    @property
+    def name(self) -> str:
+        """Of the physical bus, the same however it is spelt."""
+        return bus_name(self.interface, self.channel, self.options)
 
     @property
     def driven(self) -> str:
-        """How the bus is driven, which all units on it must agree on."""
+        """How the bus is driven, which all who are on it must agree on."""
         given = {"bitrate": self.bitrate, **self.options}
         return ", ".join(f"{key} {value}" for key, value in sorted(given.items()) if value is not None) or "no options"
+
+    def listening(self) -> Self:
+        """The same, which asks the adapter to listen only, where its interface
+        can be asked and no option says otherwise."""
+        return self.model_copy(update={"options": {**LISTEN_ONLY.get(self.interface, {}), **self.options}})
+
+    def claim_to_listen(self) -> Claim | None:
+        """What a process has for itself while it listens to all of it."""
+        return claim_to_listen(self.interface, self.channel, self.options)
+
+
+class CanBus(BusSettings):
+    """Where a unit is: a bus, and its node there."""
+
+    node_id: Annotated[int, Field(ge=1, le=127)]
+
+    def __str__(self) -> str:
+        return f"node {self.node_id} on {self.interface} {self.channel}"
 
     def claim(self) -> Claim:
         return claim_on_can(self.interface, self.channel, self.node_id, self.options)

@@ -10,7 +10,7 @@ from typing import Any
 import can
 
 from triaxcal_drivers.can.adapter import Frame, Identifier
-from triaxcal_drivers.can.model import CanBus
+from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import RawFlag
 
@@ -18,6 +18,8 @@ _AT_ONCE = 256
 """Frames that are taken without a pause; more would keep those that wait for
 the first of them."""
 _OFF_CLOCK_NS = 10_000_000_000
+_ECHO = frozenset(("udp_multicast", "gs_usb"))
+"""Interfaces that give what they send, asked for or not."""
 
 
 class HostClock:
@@ -47,12 +49,14 @@ class HostClock:
         return stamp_ns + self._offset_ns
 
 
-def open_python_can(settings: CanBus) -> can.BusABC:
+def open_python_can(settings: BusSettings) -> can.BusABC:
     """Blocking; python-can's configuration files are not read. Raises
     BusError."""
     options: dict[str, Any] = dict(settings.options)
     if settings.bitrate is not None:
         options["bitrate"] = settings.bitrate
+    if isinstance(state := options.get("state"), str) and state in can.BusState.__members__:
+        options["state"] = can.BusState[state]
     try:
         return can.Bus(settings.channel, settings.interface, ignore_config=True, **options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as e:
@@ -62,9 +66,10 @@ def open_python_can(settings: CanBus) -> can.BusABC:
 class PythonCan:
     """An `Adapter`. Raises BusError where the bus cannot be opened."""
 
-    def __init__(self, settings: CanBus) -> None:
+    def __init__(self, settings: BusSettings) -> None:
         self._where = f"{settings.interface} {settings.channel}"
         self._clock = HostClock()
+        self.echoes = settings.interface in _ECHO or bool(settings.options.get("receive_own_messages"))
         self._bus = open_python_can(settings)
 
     def receive(self, timeout_s: float) -> list[Frame]:

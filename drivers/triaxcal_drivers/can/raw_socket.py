@@ -24,7 +24,7 @@ FRAME_BYTES = 768  # that the kernel counts for a frame that waits: 256 and 512
 DROPS, MEMORY = 40, 55  # SO_RXQ_OVFL, SO_MEMINFO
 STAMPS, STAMPS_OLD = 64, 35  # SO_TIMESTAMPNS: of 64 bits everywhere since Linux 5.1, and as before
 HARDWARE, HARDWARE_OLD = 65, 37  # SO_TIMESTAMPING likewise
-FILTER, _ERROR_FILTER, _LOOPBACK, _OWN, _FD = 1, 2, 3, 4, 5  # CAN_RAW_…, at level SOL_CAN_RAW
+FILTER, _ERROR_FILTER, _LOOPBACK, OWN, _FD = 1, 2, 3, 4, 5  # CAN_RAW_…, at level SOL_CAN_RAW
 _ALL_ERRORS = 0x1FFF_FFFF
 _BUFFER_BY_FORCE = 33  # SO_RCVBUFFORCE
 _HARDWARE_FLAGS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 6  # stamps of reception, the adapter's as they are and the kernel's
@@ -45,7 +45,7 @@ def set_up(sock: socket.socket, settings: SocketCanOptions, *, fd: bool) -> None
     raw, every = socket.SOL_CAN_RAW, socket.SOL_SOCKET
     sock.setsockopt(raw, _ERROR_FILTER, _NUMBER.pack(_ALL_ERRORS))
     sock.setsockopt(raw, _LOOPBACK, int(settings.local_loopback))
-    sock.setsockopt(raw, _OWN, int(settings.receive_own_messages))
+    sock.setsockopt(raw, OWN, int(settings.receive_own_messages))
     if fd:
         sock.setsockopt(raw, _FD, 1)
     sock.setsockopt(every, DROPS, 1)

@@ -37,6 +37,13 @@ class _Loss(NamedTuple):
         return self._replace(frames=None if self.frames is None or before is None else before + self.frames)
 
 
+class _Every(frozenset[Identifier]):
+    """All identifiers that there are."""
+
+    def __contains__(self, _: object) -> bool:
+        return True
+
+
 class FrameQueue:
     """Takes the frames of the given identifiers, and error frames, while a
     stream is open.
@@ -59,15 +66,18 @@ class FrameQueue:
         self._last_ns: int | None = None
 
     @property
-    def identifiers(self) -> frozenset[Identifier]:
+    def identifiers(self) -> frozenset[Identifier] | None:
+        """None for all."""
+        if isinstance(self._identifiers, _Every):
+            return None
         return self._identifiers or frozenset()
 
-    def open(self, identifiers: Collection[Identifier]) -> object:
-        """Take these from now on; returns what `close` wants."""
+    def open(self, identifiers: Collection[Identifier] | None) -> object:
+        """Take these from now on, None for all; returns what `close` wants."""
         with self._lock:
             self._frames.clear()
             self._loss, self._failure, self._last_ns = None, None, None
-            self._identifiers = opened = frozenset(identifiers)
+            self._identifiers = opened = _Every() if identifiers is None else frozenset(identifiers)
         self._some.clear()
         self._enough.clear()
         return opened
@@ -84,7 +94,7 @@ class FrameQueue:
     def put(self, frames: Sequence[Frame]) -> None:
         """From the receive thread."""
         wanted = self._identifiers
-        if wanted is None:
+        if wanted is None or self._failure is not None:
             return
         with self._lock:
             before = len(self._frames)

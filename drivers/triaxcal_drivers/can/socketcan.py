@@ -66,6 +66,10 @@ class SocketCan:
         self._waiting.register(self._end, select.POLLIN)
 
     @property
+    def echoes(self) -> bool:
+        return self._options.local_loopback
+
+    @property
     def buffer_frames(self) -> int:
         return self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // raw_socket.FRAME_BYTES
 
@@ -139,10 +143,12 @@ class SocketCan:
 
     def only(self, identifiers: Collection[Identifier] | None) -> None:
         """The kernel filters; what waits already stays. Raises BusError."""
+        own = identifiers is None or self._options.receive_own_messages
         with self._sending:
             self._check()
             try:
                 self._socket.setsockopt(socket.SOL_CAN_RAW, raw_socket.FILTER, raw_frame.filters_of(identifiers))
+                self._socket.setsockopt(socket.SOL_CAN_RAW, raw_socket.OWN, int(own))
             except OSError as e:
                 raise BusError(reason(e, self._name)) from e
 

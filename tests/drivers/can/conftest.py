@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.drivers.can.played import Played
+from triaxcal_drivers.can import line as can_line
 from triaxcal_drivers.can.decode import CanDecoder
 from triaxcal_drivers.can.description import stream_layout
-from triaxcal_drivers.can.model import DbcStream, PdoStream
+from triaxcal_drivers.can.model import BusSettings, DbcStream, PdoStream
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.loading import BUILT_IN, load_bundle, parse_bundle
 from triaxcal_drivers.profile import Bundle
@@ -62,6 +64,19 @@ def decoder(bundle: Bundle) -> CanDecoder:
 def pdo_decoder(profiles: Path) -> CanDecoder:
     stream = PdoStream(layout="pdo", eds=EDS, counter="0x2300:04", channels=PDO_CHANNELS)
     return CanDecoder(stream_layout(stream, {EDS: (profiles / EDS).read_bytes()}, where="test"), rate_hz=100.0)
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[Played]:
+    """The adapters that were opened, in order."""
+    made: list[Played] = []
+
+    def open_bus(_: BusSettings) -> Played:
+        made.append(Played())
+        return made[-1]
+
+    monkeypatch.setattr(can_line, "open_bus", open_bus)
+    return made
 
 
 def joined(blocks: Sequence[SampleBlock]) -> dict[str, Any]:

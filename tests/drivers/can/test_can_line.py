@@ -4,14 +4,13 @@ the test."""
 from __future__ import annotations
 
 import asyncio
-import queue
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 import pytest
 
+from tests.drivers.can.played import Played
 from triaxcal_drivers.can import line as can_line
-from triaxcal_drivers.can.adapter import Frame, Identifier
+from triaxcal_drivers.can.adapter import Frame
 from triaxcal_drivers.can.device import CanDevice
 from triaxcal_drivers.can.driver import CanDriver
 from triaxcal_drivers.can.line import MUTE_S, join, leave
@@ -24,49 +23,6 @@ from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
 
 BEGUN_NS = 1_700_000_000_000_000_000
-
-
-@dataclass
-class Played:
-    """An adapter that receives what the test gives it."""
-
-    waiting: queue.Queue[list[Frame] | BusError] = field(default_factory=queue.Queue)
-    wanted: set[Identifier] = field(default_factory=set)
-    sent: list[tuple[int, str]] = field(default_factory=list)
-    closed: bool = False
-
-    def receive(self, timeout_s: float) -> list[Frame]:
-        try:
-            given = self.waiting.get(timeout=timeout_s)
-        except queue.Empty:
-            return []
-        if isinstance(given, BusError):
-            raise given
-        return given
-
-    def only(self, identifiers: Collection[Identifier] | None) -> None:
-        self.wanted = set(identifiers or ())
-
-    def send(self, identifier: int, data: bytes, *, extended: bool = False) -> None:
-        self.sent.append((identifier, data.hex(" ")))
-
-    def missed(self) -> int:
-        return 7
-
-    def close(self) -> None:
-        self.closed = True
-
-
-@pytest.fixture
-def opened(monkeypatch: pytest.MonkeyPatch) -> list[Played]:
-    made: list[Played] = []
-
-    def open_bus(_: CanBus) -> Played:
-        made.append(Played())
-        return made[-1]
-
-    monkeypatch.setattr(can_line, "open_bus", open_bus)
-    return made
 
 
 @pytest.fixture

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from typing import Any
 
 import can
 import pytest
 
-from triaxcal_drivers.can.model import CanBus
-from triaxcal_drivers.can.python_can import HostClock, PythonCan
+from triaxcal_drivers.can.model import BusSettings, CanBus
+from triaxcal_drivers.can.python_can import HostClock, PythonCan, open_python_can
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.interface import RawFlag
 
@@ -73,6 +74,42 @@ def test_what_is_sent_arrives_at_the_other_end(adapter: PythonCan, peer: can.Bus
     message = peer.recv(2.0)
     assert message is not None
     assert (message.arbitration_id, message.is_extended_id, message.data.hex()) == (0x605, False, "4018100100000000")
+
+
+@pytest.mark.parametrize(("options", "echoes"), [({}, False), ({"receive_own_messages": True}, True)])
+def test_what_it_sends_comes_back_where_it_says_so(
+    channel: str, options: dict[str, bool], echoes: bool, peer: can.BusABC
+) -> None:
+    adapter = PythonCan(BusSettings(interface="virtual", channel=channel, options=options))
+    adapter.only(None)
+    adapter.send(0x123, b"\1")
+    peer.send(can.Message(arbitration_id=0x124, is_extended_id=False))
+    received = [frame for _ in range(2) for frame in adapter.receive(0.1)]
+    adapter.close()
+    assert adapter.echoes is echoes
+    assert [(frame.source, frame.flags) for frame in received] == [(0x123, RawFlag.SENT)] * echoes + [(0x124, 0)]
+
+
+def test_udp_multicast_gives_what_it_sends_unasked() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+        bound.bind(("", 0))
+        port = bound.getsockname()[1]
+    try:
+        adapter = PythonCan(BusSettings(interface="udp_multicast", channel="239.74.163.2", options={"port": port}))
+        adapter.send(0x123, b"\1")
+    except BusError as e:
+        pytest.skip(f"multicast does not work on this machine: {e}")
+    received = adapter.receive(2.0)
+    adapter.close()
+    assert (adapter.echoes, [frame.source for frame in received]) == (True, [0x123])
+
+
+def test_the_state_of_an_adapter_may_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As PCAN's and SYSTEC's, which are asked by it to listen only."""
+    given: dict[str, object] = {}
+    monkeypatch.setattr(can, "Bus", lambda *_, **options: given.update(options))
+    open_python_can(BusSettings(interface="pcan", channel="PCAN_USBBUS1").listening())
+    assert given["state"] is can.BusState.PASSIVE
 
 
 def test_a_bus_that_has_failed_says_so_in_a_line(adapter: PythonCan) -> None:
