@@ -267,7 +267,7 @@ class UnitRun(UnitSession):
 
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
-        tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, writer.ends_with)
+        tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
         returning = self.returning(device, identity, Patience(plan.comes_back_s, others=self.others))
         await self._collect(returning, writer, tumble, READINGS, plan.poses)
         self.progress.stage(self.name, "fitting")

@@ -141,7 +141,7 @@ class WriteBack:
         """What the device's own output is judged to be."""
         if CORRECTED not in self.place.bundle.profile.streams:
             return UNJUDGED
-        check = Collection(VERIFICATION, self.place.bundle, self.place.address, self.writer.ends_with)
+        check = Collection(VERIFICATION, self.place.bundle, self.place.address, ends_with=self.writer.ends_with)
         await self.collect(check)
         found, reference = corrected(check, self.station.file.reference), self.station.file.reference
         fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)

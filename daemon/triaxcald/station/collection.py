@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 from triaxcal.arrays import Floats
@@ -14,15 +14,15 @@ from triaxcal.errors import Refused
 from triaxcal.model.directions import directions
 from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceSilent
-from triaxcal_drivers.host_clock import HOST, SteadyClock
-from triaxcal_drivers.interface import Gap, RawBatch
+from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.pipeline import DecodedStream, Pipeline
-from triaxcald.recording.schema import Phase, RawDigest
+from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.coming_back import Returning, Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
+from triaxcald.station.raw_records import RawRecords
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the
@@ -43,33 +43,22 @@ class Progress(Protocol):
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
 
 
-OVERRUN = "the disk did not keep up"
-
-
 @dataclass
-class Recorded:
-    """Raw records on their way to disk. ``streams`` are decoded on the way: the
-    readings, and the corrected output where the device has one.
+class Recorded(RawRecords):
+    """``streams`` are decoded on the way: the readings, and the corrected output
+    where the device has one.
 
-    ``where`` says where the unit is, for messages; ``ends_with`` is what the
-    recording ends with. ``gaps_s`` is how long the device was lost, all in all;
-    ``last_ns`` host time of the last record, ``latest`` the last values of the
-    readings' other channels.
+    ``where`` says where the unit is, for messages; ``latest`` are the last
+    values of the readings' other channels.
     """
 
     phase: Phase
     bundle: Bundle
     where: str
-    ends_with: str = ""
-    digest: RawDigest = field(init=False)
-    gaps: int = 0
-    gaps_s: float = 0.0
-    last_ns: int | None = None
-    latest: dict[str, float] = field(default_factory=dict)
-    clock: SteadyClock = HOST
+    latest: dict[str, float] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        self.digest = RawDigest(self.ends_with)
+        super().__post_init__()
         self.streams: dict[str, DecodedStream] = {s: self._decoded(s) for s in self._names()}
 
     def _names(self) -> list[str]:
@@ -84,26 +73,9 @@ class Recorded:
         What the disk has no room for goes to neither, so that an audit sees
         what the station saw.
         """
-        unwritten: Gap | None = None
-        stepped_ns = self.clock.steps_ns()
-        async with aclosing(cast(Any, device.stream(list(self.streams)))) as stream:
-            async for batch in stream:
-                self._note(writer, batch.gap)
-                if (steps_ns := self.clock.steps_ns()) != stepped_ns and writer is not None:
-                    writer.event("clock_step", {"by_s": (steps_ns - stepped_ns) / 1e9})
-                stepped_ns = steps_ns
-                if unwritten is not None and len(batch):
-                    unwritten = replace(unwritten, to_ns=int(batch.time_ns[0]))
-                    batch = batch.after(unwritten)
-                if writer is not None and len(batch) and not writer.raw(self.phase, batch):
-                    unwritten = _unwritten(unwritten, batch)
-                    continue
-                if unwritten is not None and len(batch):
-                    self._note(writer, unwritten)
-                    unwritten = None
-                self.digest.update(self.phase, batch)
-                if len(batch):
-                    self.last_ns = int(batch.time_ns[-1])
+        stream = cast(Any, device.stream(list(self.streams)))
+        async with aclosing(self.written(stream, writer)) as written:
+            async for batch in written:
                 for name, decoded in self.streams.items():
                     block = decoded.feed(batch)
                     if len(block) and name == READINGS:
@@ -111,17 +83,6 @@ class Recorded:
                     if writer is not None and len(block):
                         writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
                 yield batch
-
-    def _note(self, writer: RecordingWriter | None, gap: Gap | None) -> None:
-        if gap is None:
-            return
-        detail: dict[str, Any] = {"from_ns": gap.from_ns, "cause": gap.cause}
-        if gap.to_ns is not None:
-            self.gaps += 1
-            self.gaps_s += (gap.to_ns - gap.from_ns) * 1e-9
-            detail |= {"to_ns": gap.to_ns, "lost": gap.lost}
-        if writer is not None:
-            writer.event("interrupted" if gap.to_ns is None else "gap", detail)
 
     def _watch(self, stream: str, clock_s: Callable[[], float]) -> _Watch:
         # Twice what the driver waits, which knows better what is the matter
@@ -149,13 +110,6 @@ class Recorded:
                     watch = self._watch(READINGS, clock_s)
                 if seconds is not None and readings.seconds >= seconds:
                     return
-
-
-def _unwritten(before: Gap | None, batch: RawBatch) -> Gap:
-    """The gap that grows while the disk has no room."""
-    lost = len(batch) + (before.lost or 0 if before else 0)
-    from_ns = int(batch.time_ns[0]) if before is None else before.from_ns
-    return Gap(from_ns, None, OVERRUN, lost)
 
 
 class Collection(Recorded):

@@ -25,8 +25,9 @@ from triaxcald.simulation.modbus_unit import ModbusUnit
 from triaxcald.simulation.physics import ConstantPhysics
 from triaxcald.simulation.time_base import SteppedTimeBase
 from triaxcald.simulation.unit import ReferenceUnit
-from triaxcald.station.collection import OVERRUN, Collection, Recorded, _Watch
+from triaxcald.station.collection import Collection, Recorded, _Watch
 from triaxcald.station.config import Plan
+from triaxcald.station.raw_records import OVERRUN
 
 Run = Callable[..., Any]
 STOP_S, END_S, BATCH_S = 5.0, 60.0, 0.1
