@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.model import CanProfile
+from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.frames import Account, LoggedFrame, Remark
 from triaxcal_drivers.logs.kinds import Kind, Log
 from triaxcal_drivers.profile import Bundle
@@ -35,6 +36,9 @@ def import_can(log: Log, bundle: Bundle, out: Path, *, node: int | None, channel
     return Imported(out, detail, seconds)
 
 
+_LOST_BEFORE = int(RawFlag.LOST_BEFORE)
+
+
 class _Work:
     """What is counted on the way."""
 
@@ -42,7 +46,12 @@ class _Work:
         self._selection, self._account, self._times, self._ticks = selection, account, times, ticks
 
     def records(self, log: Log) -> Iterator[Record]:
+        """A loss before a frame that is not taken was before the next that is:
+        it may have been of the unit's."""
+        lost: set[str] = set()  # channels
         for frame in log.frames(self._account):
+            if frame.flags & _LOST_BEFORE:
+                lost.add(frame.channel)
             if not self._selection.takes(frame):
                 continue
             time_ns = self._time_ns(frame)
@@ -50,7 +59,9 @@ class _Work:
                 self._account.note(f"frame {self._selection.frames}", f"a time of {time_ns} ns")
                 continue
             self._times.note(time_ns)
-            yield time_ns, frame.source, frame.flags, frame.data
+            flags = frame.flags | _LOST_BEFORE if frame.channel in lost else frame.flags
+            lost.discard(frame.channel)
+            yield time_ns, frame.source, flags, frame.data
 
     def _time_ns(self, frame: LoggedFrame) -> int:
         if Remark.NO_TIMES in self._account.remarks:  # where a few lines lack theirs, the others' are of no use either

@@ -8,12 +8,14 @@ from typing import Any
 
 import pytest
 
+from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcald.recording.bus import bus_record, phase_of
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import BUS_RECORD
 from triaxcald.recording.segments import SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
 
+BEGUN_NS = 1_700_000_000_000_000_000
 GOLDEN = Path(__file__).parents[3] / "recordings" / "can-second-order.mcap"
 HEAD: dict[str, Any] = {"metadata": {BUS_RECORD: bus_record("socketcan", "can0")}, "preview_channels": None}
 
@@ -48,6 +50,30 @@ def test_the_poses_are_those_of_the_unit_s_own_recording(
     assert (done.json["kind"], done.json["channels"], done.json["damaged"]) == ("triaxcal", ["can0"], 0)
     imported, own = (triaxcal("poses", path, "--json").json["poses"] for path in (unit, GOLDEN))
     assert imported == own
+
+
+def test_a_loss_before_a_frame_of_somebody_else_is_before_the_unit_s_next(
+    tmp_path: Path, triaxcal: Callable[..., Any]
+) -> None:
+    """Frames of the unit may have been among those that were lost."""
+    bus, unit = tmp_path / "bus.mcap", tmp_path / "unit.mcap"
+    rows: list[tuple[int, int, int, bytes]] = []
+    for counter in range(40):
+        lost = RawFlag.LOST_BEFORE if counter == 20 else 0
+        time_ns, number = BEGUN_NS + counter * 10_000_000, counter.to_bytes(2, "little")
+        rows += [
+            (time_ns, 0x7FF, lost, b""),
+            (time_ns + 1, 0x185, 0, bytes(6) + number),
+            (time_ns + 2, 0x285, 0, bytes(5) + number + bytes(1)),
+        ]
+    with RecordingWriter(bus, **HEAD) as writer:
+        writer.raw(phase_of("can0"), RawBatch.of(rows))
+    assert triaxcal("log", "import", bus, "--profile", "triax-ref-can", "-o", unit).code == 0
+    with Recording.open(unit) as recording:
+        (batch,) = recording.raw("calibration")
+    lost_before = [i for i, flags in enumerate(batch.flags.tolist()) if flags & RawFlag.LOST_BEFORE]
+    assert lost_before == [40]
+    assert batch.source.tolist() == [0x185, 0x285] * 40
 
 
 def test_a_unit_s_recording_is_not_imported_again(tmp_path: Path, triaxcal: Callable[..., Any]) -> None:
