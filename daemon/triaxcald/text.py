@@ -34,21 +34,40 @@ _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
 
 
 IS_BACK = "the unit is back"
+BUS_IS_BACK = "the bus is back"
 
 
 def waits(trouble: str) -> str:
-    """Of a unit that is lost for now."""
-    return f"waiting for the unit: {trouble}"
+    """Of a unit or a bus that is lost for now."""
+    return f"waiting: {trouble}"
 
 
 def metrics_at(port: int) -> str:
     return f"http://127.0.0.1:{port}/metrics has the numbers, http://127.0.0.1:{port}/health says how it stands"
 
 
-def units_recorded(units: int, lost: Sequence[str], records: int) -> str:
+def recorded(units: int, buses: int, lost: Sequence[str], records: int) -> str:
     """How recordings stand, in a line."""
     missing = f", waiting for {', '.join(lost)}" if lost else ""
-    return f"{units - len(lost)} of {units} units recorded, {records} records{missing}"
+    kinds = " and ".join(kind for kind, count in (("units", units), ("buses", buses)) if count)
+    return f"{units + buses - len(lost)} of {units + buses} {kinds} recorded, {records} records{missing}"
+
+
+def one_of_several(units: Sequence[str], buses: Sequence[str], output: Path) -> str:
+    """Where a single file is to hold what a station records."""
+    there = [f"{len(units)} unit{'s' * (len(units) != 1)}"] if units else []
+    there += [f"{len(buses)} bus{'es' * (len(buses) != 1)}"] if buses else []
+    return (
+        f"there are {' and '.join(there)}; name one of {', '.join([*units, *buses])} with --unit, or record all of "
+        f"them into a folder that exists: {output} is none"
+    )
+
+
+def bus_recorded(name: str, counts: Mapping[str, int], seconds: float) -> str:
+    """What the recording of a bus has come to; ``counts`` as
+    `triaxcald.station.listening.Listened` has them."""
+    frames = f"{name}: {counts['frames']} frames of {counts['identifiers']} identifiers in {seconds:.1f} s"
+    return f"{frames}, {counts['errors']} error frames" if counts["errors"] else frames
 
 
 def switch_supply(off_s: float) -> str:

@@ -17,7 +17,8 @@ from triaxcald.run.line import Outcome, run_station
 from triaxcald.simulation.bench import SimulatedUnit, load_device, simulate
 from triaxcald.simulation.modbus_unit import ModbusMap
 from triaxcald.simulation.serial_pair import pty_pair
-from triaxcald.station.config import check_lines, load_station
+from triaxcald.station.config import load_station
+from triaxcald.station.lines import check_lines
 
 ON_CAN, ON_RS485 = range(1, 4), range(1, 3)
 SPEED, BAUDRATE = 4.0, 460_800

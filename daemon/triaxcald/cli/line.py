@@ -24,7 +24,8 @@ from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import severest
-from triaxcald.station.config import check_lines, load_station
+from triaxcald.station.config import load_station
+from triaxcald.station.lines import check_lines
 
 if TYPE_CHECKING:  # a command imports its work once its file is known to be good: matplotlib and all, it takes longer
     from triaxcald.demo import DemoUnit
@@ -34,6 +35,7 @@ if TYPE_CHECKING:  # a command imports its work once its file is known to be goo
 
 def run_command(a: argparse.Namespace) -> int:
     station = load_station(a.station)
+    station.require_units()
     check_lines(station.places, where=str(station.path))
     from triaxcald.run.line import run_station
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,10 +20,12 @@ from triaxcald.errors import InputError
 from triaxcald.exit_codes import severest
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
-from triaxcald.station.config import Place, Station, check_lines, load_station
+from triaxcald.station.buses import BusPlace
+from triaxcald.station.config import Place, Station, load_station
+from triaxcald.station.lines import check_lines
 
 if TYPE_CHECKING:  # matplotlib and all come once the file is known to be good
-    from triaxcald.run.recording import Kept, UnitStatus
+    from triaxcald.run.recording import AtRecording, Kept, UnitStatus
     from triaxcald.run.session import Segments, UnitSession
 
 
@@ -30,26 +34,55 @@ def record_command(a: argparse.Namespace) -> int:
     if not folder:
         writable(a.output)
     station = load_station(a.station)
-    places = _places(station, a.unit, a.output, folder)
-    check_lines(places, where=str(station.path))
+    places, buses = _chosen(station, a.unit, a.output, folder)
+    check_lines(places, buses, where=str(station.path))
     with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
-        kept = run_interruptible(_record(a, station, places, progress))
+        kept = run_interruptible(_record(a, station, places, buses, progress))
     return severest(k.exit_code for k in kept)
 
 
 async def _record(
-    a: argparse.Namespace, station: Station, places: Sequence[Place], progress: Bars | JsonLines
+    a: argparse.Namespace,
+    station: Station,
+    places: Sequence[Place],
+    buses: Sequence[BusPlace],
+    progress: Bars | JsonLines,
 ) -> list[Kept]:
-    from triaxcald.run.recording import State, UnitRecording, record_units
-    from triaxcald.run.session import UnitSession
+    from triaxcald.run.recording import State, record_units
     from triaxcald.service.supervisor import Supervisor
     from triaxcald.station.coming_back import Patience
-    from triaxcald.station.serials import SerialsSeen
 
     folder = a.output.is_dir()
+    recordings = [*_of_units(a, station, places, progress), *_of_buses(a, station, buses, progress)]
+
+    def statuses() -> list[UnitStatus]:
+        return [recording.status for recording in recordings]
+
+    def in_a_line() -> str:
+        there = statuses()
+        lost = [u.unit for u in there if u.state is State.WAITING]
+        return text.recorded(len(places), len(buses), lost, sum(u.records for u in there))
+
+    async with AsyncExitStack() as stack:
+        if a.metrics is not None:
+            from triaxcald.service.metrics import served
+
+            port = stack.enter_context(served(a.metrics, statuses, a.output if folder else a.output.parent))
+            progress.stage("record", text.metrics_at(port))
+        await stack.enter_async_context(Supervisor().kept_informed(in_a_line))
+        patience = Patience(most_s=a.give_up_after)
+        return await record_units(recordings, a.seconds, patience, lambda kept: _ended(kept, progress))
+
+
+def _of_units(
+    a: argparse.Namespace, station: Station, places: Sequence[Place], progress: Bars | JsonLines
+) -> list[AtRecording]:
+    from triaxcald.run.recording import UnitRecording
+    from triaxcald.run.session import UnitSession
+    from triaxcald.station.serials import SerialsSeen
 
     def path_of(session: UnitSession) -> Callable[[IdentityRead], Path]:
-        if not folder:
+        if not a.output.is_dir():
             return lambda _: Path(a.output)
         if segments is not None:  # the next start goes on behind it
             return lambda identity: Path(a.output) / f"{session.name}-{identity.serial or 'unknown'}{SUFFIX}"
@@ -61,28 +94,24 @@ async def _record(
         elif warning := of_a_journal(session.station, session.name, identity.serial):
             progress.say("warning", "journal", unit=session.name, message=warning)
 
-    segments = _segments(a)
-    serials = SerialsSeen()
+    segments, serials = _segments(a), SerialsSeen()
     sessions = [UnitSession(station, place, progress, serials=serials) for place in places]
-    recordings = [UnitRecording(session, path_of(session), identified, segments) for session in sessions]
+    return [UnitRecording(session, path_of(session), identified, segments) for session in sessions]
 
-    def statuses() -> list[UnitStatus]:
-        return [recording.status for recording in recordings]
 
-    def in_a_line() -> str:
-        units = statuses()
-        lost = [u.unit for u in units if u.state is State.WAITING]
-        return text.units_recorded(len(units), lost, sum(u.records for u in units))
+def _of_buses(
+    a: argparse.Namespace, station: Station, buses: Sequence[BusPlace], progress: Bars | JsonLines
+) -> list[AtRecording]:
+    from triaxcald.run.bus_recording import BusRecording, bus_recording_name
 
-    async with AsyncExitStack() as stack:
-        if a.metrics is not None:
-            from triaxcald.service.metrics import served
+    def path_of(bus: BusPlace) -> Path:
+        if not a.output.is_dir():
+            return Path(a.output)
+        name = f"{bus.name}{SUFFIX}" if segments is not None else bus_recording_name(bus.name, time.time_ns())
+        return Path(a.output) / name
 
-            port = stack.enter_context(served(a.metrics, statuses, a.output if folder else a.output.parent))
-            progress.stage("record", text.metrics_at(port))
-        await stack.enter_async_context(Supervisor().kept_informed(in_a_line))
-        patience = Patience(most_s=a.give_up_after)
-        return await record_units(recordings, a.seconds, patience, lambda kept: _ended(kept, progress))
+    segments = _segments(a)
+    return [BusRecording(station, bus, progress, partial(path_of, bus), segments) for bus in buses]
 
 
 def _segments(a: argparse.Namespace) -> Segments | None:
@@ -97,16 +126,21 @@ def _segments(a: argparse.Namespace) -> Segments | None:
     return Segments(a.segment_size or SEGMENT_BYTES, a.segment_time or SEGMENT_S, retention)
 
 
-def _places(station: Station, unit: str | None, output: Path, folder: bool) -> Sequence[Place]:
-    if unit is not None or len(station.places) == 1:
-        return [station.place(unit)]
-    if not folder:
-        names = ", ".join(p.unit.name for p in station.places)
-        raise InputError(
-            f"{station.path}: there are {len(station.places)} units; name one of {names} with --unit, or record all "
-            f"of them into a folder that exists: {output} is none"
-        )
-    return station.places
+def _chosen(
+    station: Station, name: str | None, output: Path, folder: bool
+) -> tuple[Sequence[Place], Sequence[BusPlace]]:
+    """What is to be recorded. Raises InputError."""
+    units, buses = [p.unit.name for p in station.places], [b.name for b in station.buses]
+    if name is None:
+        if not folder and len(units) + len(buses) > 1:
+            raise InputError(f"{station.path}: {text.one_of_several(units, buses, output)}")
+        return station.places, station.buses
+    if name in buses:
+        return [], [station.buses[buses.index(name)]]
+    if name not in units and buses:
+        there = "units and buses" if units else "buses"
+        raise InputError(f"{station.path}: {there}: name one of {', '.join([*units, *buses])} with --unit")
+    return [station.place(name)], []
 
 
 def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
@@ -114,7 +148,8 @@ def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
         counts = {name: n for name, n in kept.counts.items() if n}
         path = str(kept.path) if kept.path else None
         level = "info" if kept.error is None else "error"
-        progress.say(level, "ended", unit=kept.unit, recording=path, message=kept.error, **counts, lost=kept.lost)
+        told = {"message": kept.error, **counts, "lost": kept.lost}
+        progress.say(level, "ended", unit=kept.unit, kind=kept.kind, recording=path, **told)
         return
     if kept.path is not None:
         say(_summary(kept))
@@ -123,8 +158,12 @@ def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
 
 
 def _summary(kept: Kept) -> str:
-    parts = [f"{kept.path}: {kept.counts['samples']} samples in {kept.seconds:.1f} s"]
-    parts += [f"{n} {kind}" for kind, n in kept.counts.items() if n and kind not in ("samples", "receiver_overflows")]
+    if kept.kind == "bus":
+        parts = [text.bus_recorded(kept.unit, kept.counts, kept.seconds), str(kept.path)]
+    else:
+        parts = [f"{kept.path}: {kept.counts['samples']} samples in {kept.seconds:.1f} s"]
+        of_samples = ("samples", "receiver_overflows")
+        parts += [f"{n} {kind}" for kind, n in kept.counts.items() if n and kind not in of_samples]
     if kept.gaps:
         parts.append(f"{kept.gaps} gaps of {kept.gaps_s:.1f} s in all")
     if kept.lost:

@@ -81,14 +81,20 @@ def _line(commands: Any) -> None:
     p.add_argument("device", metavar="DEVICE.toml", type=Path)
     p = _command(
         commands, "record", "record:record_command", "record only",
-        "A unit that is not there, or is lost, is waited for; the gap is in the recording.",
+        "A unit that is not there, or is lost, is waited for; the gap is in the recording. Of the station's buses all "
+        "frames are recorded, for `log import`.",
         "record station.toml -o rec.mcap --seconds 120",
     )  # fmt: skip
     p.add_argument("station", metavar="STATION.toml", type=Path)
     p.add_argument("-o", "--output", type=Path, required=True, metavar="REC.mcap|FOLDER")
-    p.add_argument("--seconds", type=positive, metavar="S", help="of the samples' time; default: until interrupted")
-    p.add_argument("--unit", help="where the station has more than one; default, with a FOLDER: all of them")
-    p.add_argument("--give-up-after", type=not_negative, metavar="S", help="of waiting for a unit; default: never")
+    p.add_argument(
+        "--seconds", type=positive, metavar="S",
+        help="of the samples' time, of a bus by the clock; default: until interrupted",
+    )  # fmt: skip
+    p.add_argument("--unit", help="or bus, where the station has more than one; default, with a FOLDER: all of them")
+    p.add_argument(
+        "--give-up-after", type=not_negative, metavar="S", help="of waiting for a unit or a bus; default: never"
+    )
     p.add_argument(
         "--segment-size", type=size, metavar="SIZE", help="a new file after so much, as 256M, with a manifest"
     )

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
+from typing import Literal, Protocol
 
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import READINGS
@@ -26,13 +27,15 @@ from triaxcald.run.together import side_by_side, whole_on_a_thread
 from triaxcald.station.collection import Recorded
 from triaxcald.station.coming_back import Patience
 
+Kind = Literal["unit", "bus"]
+
 
 @dataclass(frozen=True)
 class Kept:
-    """What a unit's recording has come to. ``counts`` are of its readings,
-    which span ``seconds``; in ``gaps`` gaps it was lost for ``gaps_s``, and
-    ``lost`` raw records did not get to the disk. ``error`` is one line where it
-    failed."""
+    """What the recording of a unit, or of a bus, has come to. ``counts`` are of
+    the unit's readings, which span ``seconds``, or of the bus's frames; in
+    ``gaps`` gaps it was lost for ``gaps_s``, and ``lost`` raw records did not
+    get to the disk. ``error`` is one line where it failed."""
 
     unit: str
     path: Path | None
@@ -43,6 +46,7 @@ class Kept:
     lost: int = 0
     exit_code: int = DONE
     error: str | None = None
+    kind: Kind = "unit"
 
 
 class State(Enum):
@@ -51,9 +55,10 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class UnitStatus:
-    """How a unit's recording stands. ``trouble`` is what is the matter with one
-    that is waited for; ``last_ns`` host time of the last record, ``latest`` the
-    last values of its other channels; the rest as in `Kept`."""
+    """How the recording of a unit, or of a bus, stands. ``trouble`` is what is
+    the matter with one that is waited for; ``last_ns`` host time of the last
+    record, ``latest`` the last values of its other channels; the rest as in
+    `Kept`."""
 
     unit: str
     state: State
@@ -66,6 +71,16 @@ class UnitStatus:
     lost: int
     last_ns: int | None
     latest: Mapping[str, float]
+    kind: Kind = "unit"
+
+
+class AtRecording(Protocol):
+    """One of the recordings that a process makes side by side."""
+
+    @property
+    def status(self) -> UnitStatus: ...
+
+    async def run(self, seconds: float | None, patience: Patience) -> Kept: ...
 
 
 class UnitRecording:
@@ -187,16 +202,16 @@ class UnitRecording:
 
 
 async def record_units(
-    recordings: Sequence[UnitRecording],
+    recordings: Sequence[AtRecording],
     seconds: float | None,
     patience: Patience,
     ended: Callable[[Kept], None] = lambda _: None,
 ) -> list[Kept]:
-    """All units at once; one that ends does not stop the others, and ``ended``
-    is told of each. When it is cancelled every unit is; what was recorded is
-    whole."""
+    """All units and buses at once; one that ends does not stop the others, and
+    ``ended`` is told of each. When it is cancelled every one is; what was
+    recorded is whole."""
 
-    async def work(recording: UnitRecording) -> Kept:
+    async def work(recording: AtRecording) -> Kept:
         kept = await recording.run(seconds, patience)
         ended(kept)
         return kept

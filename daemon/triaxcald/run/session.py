@@ -35,6 +35,11 @@ class Segments:
     retention: Retention | None = None
 
 
+def stamp(time_ns: int) -> str:
+    """A time in UTC for the name of a file."""
+    return time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(time_ns / 1e9))
+
+
 class UnitSession:
     """``progress`` shows the operator how it goes, ``serials`` refuses a unit
     that is there twice, ``clock_ns`` is the host's time since the epoch."""
@@ -89,8 +94,7 @@ class UnitSession:
         return identity
 
     def recording_name(self, identity: IdentityRead) -> str:
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock_ns() / 1e9))
-        return f"{self.name}-{identity.serial or 'unknown'}-{stamp}.mcap"
+        return f"{self.name}-{identity.serial or 'unknown'}-{stamp(self.clock_ns())}.mcap"
 
     def recording_path(self, identity: IdentityRead) -> Path:
         folder = self.station.folder

@@ -31,6 +31,8 @@ _COUNTED = {
     "incomplete": "Samples of which a part was missing",
     "errors": "Error frames and failed requests",
 }
+_OF_A_BUS = ("errors",)
+"""What of them is counted where all frames of a bus are recorded."""
 
 
 class UnitMetrics(Collector):
@@ -41,7 +43,7 @@ class UnitMetrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         units = self._statuses()
-        recording = GaugeMetricFamily("triaxcal_unit_recording", "1 while the unit is there", labels=["unit"])
+        recording = GaugeMetricFamily("triaxcal_unit_recording", "1 while the unit or bus is there", labels=["unit"])
         records = CounterMetricFamily("triaxcal_records", "Raw records taken from the bus", labels=["unit"])
         lost = CounterMetricFamily("triaxcal_lost_records", "Records lost between bus and disk", labels=["unit"])
         gaps = CounterMetricFamily("triaxcal_gaps", "Interruptions and losses on the bus", labels=["unit"])
@@ -53,6 +55,7 @@ class UnitMetrics(Collector):
         channel = GaugeMetricFamily(
             "triaxcal_channel", "Last value of another channel, the temperature among them", labels=["unit", "channel"]
         )
+        identifiers = GaugeMetricFamily("triaxcal_identifiers", "Different ones that came on a bus", labels=["unit"])
         counted = {
             name: CounterMetricFamily(f"triaxcal_{name}", text, labels=["unit"]) for name, text in _COUNTED.items()
         }
@@ -69,9 +72,12 @@ class UnitMetrics(Collector):
                     size.add_metric([u.unit], u.path.stat().st_size)
             for name, value in u.latest.items():
                 channel.add_metric([u.unit, name], value)
+            if u.kind == "bus":
+                identifiers.add_metric([u.unit], u.counts["identifiers"])
             for name, family in counted.items():
-                family.add_metric([u.unit], u.counts.get(name, 0))
-        yield from (recording, records, lost, gaps, gaps_s, last, size, channel, *counted.values())
+                if u.kind == "unit" or name in _OF_A_BUS:
+                    family.add_metric([u.unit], u.counts.get(name, 0))
+        yield from (recording, records, lost, gaps, gaps_s, last, size, channel, identifiers, *counted.values())
         free = GaugeMetricFamily("triaxcal_disk_free_bytes", "Where recordings go")
         with suppress(OSError):
             free.add_metric([], shutil.disk_usage(self._folder).free)
@@ -79,13 +85,14 @@ class UnitMetrics(Collector):
 
 
 def health(units: Sequence[UnitStatus]) -> dict[str, Any]:
-    """``healthy`` where every unit is there and is recorded."""
+    """``healthy`` where every unit and bus is there and is recorded."""
     return {
         "format": "triaxcal.health/1",
         "healthy": all(u.state is State.RECORDING for u in units),
         "units": [
             {
                 "unit": u.unit,
+                "kind": u.kind,
                 "state": u.state.value,
                 "trouble": u.trouble,
                 "recording": str(u.path) if u.path else None,

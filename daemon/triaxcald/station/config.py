@@ -6,31 +6,32 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, FailFast, Field, model_validator
+from pydantic import BaseModel, FailFast, Field, ValidationInfo, field_validator, model_validator
 
 from triaxcal.effects import CATALOGUE
 from triaxcal.model.gravity import local_gravity_g
 from triaxcal.model.moment import Moment
 from triaxcal.uncertainty import Stated
+from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.load import LineLoad
 from triaxcal_drivers.loading import load_bundle
-from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle, Profile, Strict
+from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
 from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
 from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
 from triaxcald.provision.identity import same_serial
+from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
 from triaxcald.station.coming_back import Patience, until_open
 from triaxcald.station.lock import locked
 
@@ -78,7 +79,7 @@ class Provisioning(Strict):
 
 
 class Unit(Strict):
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    name: Annotated[str, Field(pattern=NAME)]
     profile: Annotated[
         str,
         Field(pattern=r"^[^\x00]+$", description="a file beside the station file, or the name of a built-in profile"),
@@ -127,7 +128,12 @@ class StationFile(Strict):
     plan: Plan = Plan()
     limits: Limits = Limits()
     provisioning: Provisioning = Provisioning()
-    units: Annotated[tuple[Unit, ...], Field(min_length=1, max_length=UNITS_MOST), FailFast()]
+    buses: Annotated[
+        tuple[Bus, ...],
+        Field(max_length=BUSES_MOST, description="listened to by `record`: all their frames"),
+        FailFast(),
+    ] = ()
+    units: Annotated[tuple[Unit, ...], Field(max_length=UNITS_MOST, validate_default=True), FailFast()] = ()
 
     @property
     def reference(self) -> float:
@@ -169,12 +175,23 @@ class StationFile(Strict):
                 raise ValueError(f"plan.{name}: there are not so many directions {self.plan.apart_deg:g} degrees apart")
         return self
 
+    @field_validator("units")
+    @classmethod
+    def _something_is_there(cls, units: tuple[Unit, ...], info: ValidationInfo) -> tuple[Unit, ...]:
+        if not units and not info.data.get("buses", True):
+            raise ValueError("expected at least 1, or a bus that is listened to")
+        return units
+
     @model_validator(mode="after")
     def _names_differ(self) -> Self:
-        names = [u.name for u in self.units]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"units: the name '{name}' is given twice")
+        units, buses = [u.name for u in self.units], [b.name for b in self.buses]
+        for field, names in ("units", units), ("buses", units + buses):
+            for name in names:
+                if names.count(name) > 1:
+                    raise ValueError(f"{field}: the name '{name}' is given twice")
+        for name in buses:
+            if unit := taken_for(name, units):
+                raise ValueError(f"buses: recordings of unit {unit} may be called '{name}'")
         return self
 
 
@@ -239,12 +256,14 @@ class Place:
 
 @dataclass(frozen=True)
 class Station:
-    """A validated station file with its own text and the units' profiles."""
+    """A validated station file with its own text, the units' profiles, and the
+    buses that are listened to."""
 
     path: Path
     text: bytes
     file: StationFile
     places: tuple[Place, ...]
+    buses: tuple[BusPlace, ...] = ()
 
     @property
     def folder(self) -> Path:
@@ -252,12 +271,18 @@ class Station:
 
     def place(self, name: str | None) -> Place:
         """The unit of that name, or the only one. Raises InputError."""
+        self.require_units()
         names = [p.unit.name for p in self.places]
         if name is None and len(self.places) == 1:
             return self.places[0]
         if name not in names:
             raise InputError(f"{self.path}: units: name one of {', '.join(names)} with --unit")
         return self.places[names.index(name)]
+
+    def require_units(self) -> None:
+        """Raises InputError where it has none."""
+        if not self.places:
+            raise InputError(f"{self.path}: no units: only `triaxcal record` listens to its buses")
 
 
 def parse_station(text: bytes, *, where: str) -> StationFile:
@@ -290,7 +315,8 @@ def load_station(path: Path) -> Station:
         places.append(Place(unit, bundle, bus))
         places[-1].device()  # so that a fault in the profile's files comes out before any bus is opened
     _check_distinct(places, where=str(path))
-    return Station(path, text, file, tuple(places))
+    driven = [place.bus for place in places if isinstance(place.bus, BusSettings)]
+    return Station(path, text, file, tuple(places), tuple(bus_places(file.buses, driven, text, where=str(path))))
 
 
 def _check_distinct(places: Sequence[Place], *, where: str) -> None:
@@ -309,37 +335,6 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
             raise InputError(
                 f"{where}: units.{i}.serial: unit {b.unit.name} has the serial number of unit {a.unit.name}, "
                 f"{a.unit.serial}"
-            )
-
-
-def check_lines(places: Sequence[Place], *, where: str) -> None:
-    """Every shared line carries those of its units that are recorded, and all
-    of them drive it alike. A unit alone has what the line gives, and its losses
-    are counted. Raises InputError with the arithmetic."""
-    lines: dict[str, list[tuple[int, str, LineLoad]]] = {}
-    for i, place in enumerate(places):
-        loads = getattr(driver_named(place.bundle.profile.driver), "loads", None)
-        of_streams: Mapping[str, LineLoad] = loads(place.bundle, place.bus) if loads else {}
-        for name in (READINGS, CORRECTED):  # which are recorded side by side
-            if name in of_streams:
-                load = of_streams[name]
-                lines.setdefault(load.line, []).append((i, f"{place.unit.name} {name}", load))
-    for line, units in lines.items():
-        first = units[0][2]
-        for i, _, load in units:
-            if load.settings != first.settings:
-                raise InputError(
-                    f"{where}: unit {places[i].unit.name} asks for {load.settings} on {line}, unit "
-                    f"{places[units[0][0]].unit.name} for {first.settings}"
-                )
-        total = sum(load.share for _, _, load in units)
-        if total > 1 and len({i for i, _, _ in units}) > 1:
-            each = " + ".join(
-                f"{name} {load.reads_per_s:.3g}/s × {1e3 * load.read_s:.3g} ms" for _, name, load in units
-            )
-            raise InputError(
-                f"{where}: {line} at {first.settings} cannot carry its units at their rates: "
-                f"{each} = {total:.0%} of its time; raise the baud rate, or lower sampling.rate_hz of the profiles"
             )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -65,6 +66,28 @@ def test_each_unit_has_its_numbers(tmp_path: Path) -> None:
     assert found["triaxcal_unit_recording", (("unit", 'b"\\'),)] == 0.0
     assert found["triaxcal_channel", (("channel", "temp_c"), ("unit", "a"))] == 24.5
     assert found["triaxcal_disk_free_bytes", ()] > 0
+
+
+def test_a_bus_has_its_numbers_and_none_of_a_unit_s(tmp_path: Path) -> None:
+    counts = {"frames": 1998, "identifiers": 12, "errors": 2}
+    bus = replace(status("all"), counts=counts, latest={}, kind="bus")
+    with served(0, lambda: [bus, status("a")], tmp_path) as port:
+        _, text = fetched(port, "/metrics")
+        _, health = fetched(port, "/health")
+    found = samples(text)
+    of_bus = {name: value for (name, labels), value in found.items() if labels == (("unit", "all"),)}
+    assert of_bus == {
+        "triaxcal_unit_recording": 1.0,
+        "triaxcal_records_total": 2000.0,
+        "triaxcal_lost_records_total": 6.0,
+        "triaxcal_gaps_total": 3.0,
+        "triaxcal_gap_seconds_total": 4.5,
+        "triaxcal_last_record_timestamp_seconds": 1_700_000_000.5,
+        "triaxcal_identifiers": 12.0,
+        "triaxcal_errors_total": 2.0,
+    }
+    assert ("triaxcal_identifiers", (("unit", "a"),)) not in found
+    assert [(u["unit"], u["kind"]) for u in json.loads(health)["units"]] == [("all", "bus"), ("a", "unit")]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ import pytest
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.loading import load_bundle
 from triaxcald.errors import InputError
-from triaxcald.station.config import Station, check_lines, load_station
+from triaxcald.station.config import Station, load_station
+from triaxcald.station.lines import check_lines
 
 PROFILE = load_bundle(Path("triax-ref-can")).profile
 

@@ -7,12 +7,13 @@ import os
 import socket
 import subprocess
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.guest.inside.controller import Controller
-from tests.guest.inside.witness import Candump, Sender
+from tests.guest.inside.witness import PATIENCE_S, Candump, Seen, Sender, listeners, seen, wait_until
 from triaxcal_drivers.can.socketcan import SocketCan, open_socketcan
 
 STAMPED, STAMP_NS = 1, 35  # SO_TIMESTAMPNS
@@ -65,6 +66,32 @@ def sender(vcan: str) -> Iterator[Sender]:
 @pytest.fixture
 def candump() -> Callable[[str, int], Candump]:
     return Candump
+
+
+@pytest.fixture
+def witness(tmp_path: Path) -> Iterator[Callable[[str], Callable[[], list[Seen]]]]:
+    """Lets candump log an interface from now on, also when that goes down; what it gives stops it, and has all that it
+    saw."""
+    running: list[subprocess.Popen[bytes]] = []
+
+    def watch(name: str) -> Callable[[], list[Seen]]:
+        log, before = tmp_path / "candump.log", listeners(name)
+        with open(log, "w") as out:
+            process = subprocess.Popen(["candump", "-D", "-L", "-r", "8000000", name], stdout=out)
+        running.append(process)
+        wait_until(lambda: listeners(name) > before)
+
+        def stopped() -> list[Seen]:
+            process.terminate()
+            process.wait(PATIENCE_S)
+            return [seen(line) for line in log.read_text().splitlines()]
+
+        return stopped
+
+    yield watch
+    for process in running:
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture

@@ -4,43 +4,17 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.guest.inside.program import events, recorder, records, simulated_unit
-from tests.guest.inside.witness import PATIENCE_S, Seen, listeners, seen, wait_until
+from tests.guest.inside.witness import listeners, wait_until
 from triaxcal_drivers.interface import RawFlag
 
 SECONDS = 4  # of the samples' time, in which the gap is
-
-
-@pytest.fixture
-def witness(tmp_path: Path) -> Iterator[Callable[[str], Callable[[], list[Seen]]]]:
-    """Lets candump log an interface from now on, also when that goes down; what it gives stops it, and has all that it
-    saw."""
-    running: list[subprocess.Popen[bytes]] = []
-
-    def watch(name: str) -> Callable[[], list[Seen]]:
-        log, before = tmp_path / "candump.log", listeners(name)
-        with open(log, "w") as out:
-            process = subprocess.Popen(["candump", "-D", "-L", "-r", "8000000", name], stdout=out)
-        running.append(process)
-        wait_until(lambda: listeners(name) > before)
-
-        def stopped() -> list[Seen]:
-            process.terminate()
-            process.wait(PATIENCE_S)
-            return [seen(line) for line in log.read_text().splitlines()]
-
-        return stopped
-
-    yield watch
-    for process in running:
-        process.kill()
-        process.wait()
 
 
 @pytest.fixture

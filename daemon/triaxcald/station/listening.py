@@ -1,0 +1,133 @@
+"""A bus that is listened to, across the times in which it cannot be."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from triaxcal_drivers.errors import BusError
+from triaxcal_drivers.host_clock import HOST, slept_ns
+from triaxcal_drivers.interface import Gap, RawBatch, RawFlag
+from triaxcald.recording.writer import RecordingWriter
+from triaxcald.station.coming_back import Patience, until_open
+from triaxcald.station.raw_records import RawRecords
+
+if TYPE_CHECKING:
+    from triaxcal_drivers.can.listener import BusListener
+
+SETTLED_S = 1.0
+"""A bus is back where it brings a frame, or does not fail for so long."""
+SLEPT_S = 0.1  # reading two clocks takes microseconds, on a busy machine some milliseconds
+SLEPT = "this machine slept"
+IDENTIFIERS_MOST = 1 << 16
+"""So many different ones are told apart; a bus in use has some hundred, and one
+of random identifiers is to take no memory."""
+_EXTENDED_KEY = 1 << 32
+
+
+class ReturningBus:
+    """A bus whose frames go on after an interruption.
+
+    Silence is no loss on it, as nobody has to send: what tells of a loss is
+    that the bus fails, or that this machine slept. So a gap ends when the bus
+    is open again, and begins at the last frame or the last look at a quiet
+    bus, whichever is later. ``tell`` is told what is the matter, and None when
+    it is over.
+    """
+
+    def __init__(
+        self,
+        listener: BusListener,
+        patience: Patience,
+        tell: Callable[[str | None], None],
+        *,
+        now_ns: Callable[[], int] = HOST.now_ns,
+        slept_ns: Callable[[], int] = slept_ns,
+    ) -> None:
+        self._listener, self._patience, self._tell = listener, patience, tell
+        self._now_ns, self._slept_ns = now_ns, slept_ns
+
+    async def stream(self) -> AsyncGenerator[RawBatch, None]:
+        """As the listener's own. A batch without records tells of an
+        interruption by a gap that is not over, another one of its end; the
+        first record after it carries RawFlag.LOST_BEFORE. Raises BusError once
+        patience ends."""
+        heard_ns, asleep_ns, lost = self._now_ns(), self._slept_ns(), False
+        while True:
+            try:
+                async with aclosing(self._listener.stream()) as stream:
+                    async for batch in stream:
+                        before_ns, asleep_ns = asleep_ns, self._slept_ns()
+                        if asleep_ns - before_ns > SLEPT_S * 1e9:
+                            yield RawBatch.of([]).after(Gap(heard_ns, heard_ns + asleep_ns - before_ns, SLEPT))
+                            lost = True
+                        if lost and len(batch):
+                            batch, lost = _after_a_loss(batch), False
+                        yield batch
+                        heard_ns = int(batch.time_ns[-1]) if len(batch) else self._now_ns()
+                return
+            except BusError as e:
+                gap = Gap(heard_ns, None, str(e))
+            yield RawBatch.of([]).after(gap)
+            self._tell(gap.cause)
+            await until_open(self._again, self._patience, lambda trouble: self._tell(str(trouble)))
+            heard_ns, asleep_ns, lost = self._now_ns(), self._slept_ns(), True
+            yield RawBatch.of([]).after(replace(gap, to_ns=heard_ns))
+            self._tell(None)
+
+    async def _again(self) -> None:
+        await self._listener.close()
+        await self._listener.open()
+        await self._listener.settled(SETTLED_S)
+
+
+def _after_a_loss(batch: RawBatch) -> RawBatch:
+    flags = batch.flags.copy()
+    flags[0] |= np.uint8(RawFlag.LOST_BEFORE)
+    return replace(batch, flags=flags)
+
+
+@dataclass
+class Listened(RawRecords):
+    """All records of a bus on their way to disk. ``frames`` and ``errors``
+    (error frames) count them, ``seconds`` by the host's time."""
+
+    frames: int = field(default=0, init=False)
+    errors: int = field(default=0, init=False)
+    seconds: float = field(default=0.0, init=False)
+    _seen: set[int] = field(default_factory=set, init=False)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """``identifiers`` are the different ones, `IDENTIFIERS_MOST` at
+        most."""
+        return {"frames": self.frames, "identifiers": len(self._seen), "errors": self.errors}
+
+    async def for_seconds(self, bus: ReturningBus, writer: RecordingWriter, seconds: float | None) -> None:
+        """Records for so many seconds of the host's time, whatever comes in
+        them; for ever where None. Raises BusError once the bus is given up."""
+        now_s = asyncio.get_running_loop().time
+        begun_s = now_s()
+        try:
+            async with asyncio.timeout(seconds) as limit, aclosing(self.written(bus.stream(), writer)) as written:
+                async for batch in written:
+                    self._count(batch)
+        except TimeoutError:
+            if not limit.expired():
+                raise
+        finally:
+            self.seconds = now_s() - begun_s
+
+    def _count(self, batch: RawBatch) -> None:
+        error = (batch.flags & RawFlag.ERROR) != 0
+        errors = int(np.count_nonzero(error))
+        self.errors += errors
+        self.frames += len(batch) - errors
+        key = batch.source.astype(np.int64) + ((batch.flags & RawFlag.EXTENDED_ID) != 0) * _EXTENDED_KEY
+        if len(self._seen) < IDENTIFIERS_MOST:
+            self._seen.update(np.unique(key[~error]).tolist()[: IDENTIFIERS_MOST - len(self._seen)])
