@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal_drivers.host_clock import HOST
-from triaxcal_drivers.interface import RawBatch
+from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ended_because
@@ -25,6 +25,7 @@ from triaxcald.recording.writer import RecordingWriter
 SEGMENT_BYTES, SEGMENT_S = 256 * 2**20, 3600.0
 """What damage to one file costs at most, and the least that retention takes: an
 hour of a busy bus is some hundred MiB."""
+AWAY = "nothing was being recorded meanwhile"
 
 
 class SegmentedWriter(RecordingWriter):
@@ -64,6 +65,10 @@ class SegmentedWriter(RecordingWriter):
         raise RecordingError(f"{self.manifest}: a recording in segments ends with no document")
 
     @property
+    def resumes(self) -> Gap | None:
+        return self._resumes
+
+    @property
     def _told(self) -> Path:
         return self._file.path
 
@@ -75,6 +80,8 @@ class SegmentedWriter(RecordingWriter):
         self._segments = load_manifest(self.manifest) if self.manifest.exists() else Manifest(self.manifest)
         try:
             self._segments = _settled(self._segments)
+            ends = [s.end_ns for s in self._segments.segments if s.end_ns is not None]
+            self._resumes = Gap(ends[-1], None, AWAY) if ends else None
             return self._next()
         except OSError as e:
             raise disk.not_created(self.manifest, e) from e

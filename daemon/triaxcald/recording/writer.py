@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from triaxcal_drivers.interface import RawBatch, SampleBlock
+from triaxcal_drivers.interface import Gap, RawBatch, SampleBlock
 from triaxcald.abort import Left, add_action, discard_action
 from triaxcald.errors import RecordingError
 from triaxcald.recording import disk, schema
@@ -84,6 +84,12 @@ class RecordingWriter:
     def current(self) -> Path:
         """The file that is being written."""
         return self._file.path
+
+    @property
+    def resumes(self) -> Gap | None:
+        """What was not recorded before this writer began, where it goes on
+        behind earlier records; not over yet."""
+        return None
 
     def raw(self, phase: str, batch: RawBatch) -> bool:
         """Whether there was room for the batch."""

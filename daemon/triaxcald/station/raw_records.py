@@ -37,7 +37,7 @@ class RawRecords:
     ) -> AsyncGenerator[RawBatch]:
         """The batches of a stream, which is closed in the end, once they are on
         their way to disk, and without those that it had no room for."""
-        unwritten: Gap | None = None
+        unwritten = None if writer is None else writer.resumes
         stepped_ns = self.clock.steps_ns()
         async with aclosing(stream):
             async for batch in stream:
@@ -65,7 +65,7 @@ class RawRecords:
         detail: dict[str, Any] = {"from_ns": gap.from_ns, "cause": gap.cause}
         if gap.to_ns is not None:
             self.gaps += 1
-            self.gaps_s += (gap.to_ns - gap.from_ns) * 1e-9
+            self.gaps_s += max(gap.to_ns - gap.from_ns, 0) * 1e-9  # between two recorders the clock may go back
             detail |= {"to_ns": gap.to_ns, "lost": gap.lost}
         if writer is not None:
             writer.event("interrupted" if gap.to_ns is None else "gap", detail)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from triaxcal_drivers.errors import DeviceSilent
-from triaxcal_drivers.interface import RawBatch
+from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.audit import audit_each
 from triaxcald.errors import RecordingError
 from triaxcald.recording import disk, schema
@@ -19,7 +19,7 @@ from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
 from triaxcald.recording.retention import Retention
-from triaxcald.recording.segments import SegmentedWriter
+from triaxcald.recording.segments import AWAY, SegmentedWriter
 from triaxcald.recording.series import Series, digest_of
 from triaxcald.recording.survey import survey
 
@@ -155,6 +155,14 @@ def test_a_recording_goes_on_behind_the_manifest_that_is_there(
     with Series(tmp_path / "rec.segments.json") as series:
         times = [t for batch in series.raw("calibration") for t in batch.time_ns.tolist()]
     assert times == batch_of(0, 20).time_ns.tolist()
+
+
+def test_who_goes_on_is_told_since_when_nothing_was_recorded(new: NewWriter, minutes: Callable[..., None]) -> None:
+    with new() as writer:
+        assert writer.resumes is None
+        minutes(writer, 1)
+    with new() as writer:
+        assert writer.resumes == Gap(T0_NS + 9_000_000, None, AWAY)
 
 
 def test_after_a_kill_the_segment_that_was_being_written_is_taken_as_it_lies(

@@ -203,9 +203,12 @@ class Lossy:
             yield batch if gap is None else batch.after(gap)
 
 
-async def events_of(bundle: Bundle, path: Path, device: Lossy) -> tuple[Recorded, list[tuple[str, Any]]]:
-    recorded = Recorded(CALIBRATION, bundle, "node 5", clock=SteadyClock(lambda: device.step_ns, lambda: 0))
-    with RecordingWriter(path, metadata={}, preview_channels=["temp_c", "status"]) as writer:
+async def events_of(
+    bundle: Bundle, path: Path, device: Lossy, writer_of: type[RecordingWriter] = RecordingWriter
+) -> tuple[Recorded, list[tuple[str, Any]]]:
+    clock = SteadyClock(lambda: device.step_ns, lambda: 0)
+    recorded = Recorded(CALIBRATION, bundle, "node 5", clock=clock)
+    with writer_of(path, metadata={}, preview_channels=["temp_c", "status"]) as writer:
         async for _ in recorded.records(device, writer):
             pass
     with Recording.open(path) as recording:
@@ -238,6 +241,16 @@ async def test_what_the_disk_has_no_room_for_is_a_gap_before_the_next_records(
     recorded, events = await events_of(bundle, tmp_path / "rec.mcap", Lossy([None] * 5))
     assert events[1] == ("gap", {"from_ns": 10**9, "to_ns": 3 * 10**9, "cause": OVERRUN, "lost": 2})
     assert recorded.streams[READINGS].counts["receiver_overflows"] == 1
+
+
+async def test_where_a_recording_goes_on_the_first_record_is_after_a_gap(bundle: Bundle, tmp_path: Path) -> None:
+    class Later(RecordingWriter):
+        resumes = Gap(-700 * 10**9, None, "nobody was there")
+
+    recorded, events = await events_of(bundle, tmp_path / "rec.mcap", Lossy([None] * 2), Later)
+    assert events == [("gap", {"from_ns": -700 * 10**9, "to_ns": 0, "cause": "nobody was there", "lost": None})]
+    assert recorded.streams[READINGS].counts["receiver_overflows"] == 1
+    assert (recorded.gaps, recorded.gaps_s) == (1, pytest.approx(700.0))
 
 
 @pytest.mark.parametrize("held_up_s", [4.5, 3600.0])
