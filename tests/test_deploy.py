@@ -39,7 +39,8 @@ def test_the_service_starts_a_command_that_there_is(unit: configparser.ConfigPar
 def test_a_recorder_loads_nothing_that_draws() -> None:
     """Under the service's sandbox matplotlib finds no folder to write to, and it takes memory for months."""
     code = (
-        "import sys, triaxcald.cli.record, triaxcald.run.recording, triaxcald.run.session, triaxcald.service.metrics\n"
+        "import sys, triaxcald.cli.record, triaxcald.run.roster, triaxcald.run.session, triaxcald.service.metrics\n"
+        "import triaxcald.run.bus_recording, triaxcald.run.unit_recording\n"
         "sys.exit('matplotlib' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 0
@@ -67,3 +68,7 @@ def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     done = subprocess.run([systemd, "verify", str(tmp_path / UNIT.name)], capture_output=True, text=True, timeout=60)
     about_it = [line for line in done.stderr.splitlines() if UNIT.name in line]
     assert about_it == []
+
+
+def test_a_reload_is_the_signal_that_the_command_takes_for_one(unit: configparser.ConfigParser) -> None:
+    assert shlex.split(unit["Service"]["ExecReload"])[1:] == ["-HUP", "$MAINPID"]

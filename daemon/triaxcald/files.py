@@ -62,6 +62,12 @@ def write_new(folder: Path, stem: str, suffix: str, text: str) -> Path:
     raise AssertionError("there is always another number")
 
 
+def unused(path: Path) -> Path:
+    """Of that name, with a number where it is there already."""
+    names = (path.with_stem(f"{path.stem}-{number}") if number > 1 else path for number in count(1))
+    return next(name for name in names if not os.path.lexists(name))
+
+
 def write_durably(path: Path, text: str) -> None:
     """Whole or not at all, and on the disk when it returns: it outlives a loss
     of power. Raises OSError."""

@@ -53,6 +53,15 @@ def recorded(units: int, buses: int, lost: Sequence[str], records: int) -> str:
     return f"{units + buses - len(lost)} of {units + buses} {kinds} recorded, {records} records{missing}"
 
 
+def reloaded(changed: Sequence[str]) -> str:
+    """The station file, while what it names is recorded."""
+    return f"the station file was read again; changed: {', '.join(changed) or 'nothing'}"
+
+
+def not_reloaded(error: str) -> str:
+    return f"the station file was not taken, and what was recorded goes on: {error}"
+
+
 def one_of_several(units: Sequence[str], buses: Sequence[str], output: Path) -> str:
     """Where a single file is to hold what a station records."""
     there = [f"{len(units)} unit{'s' * (len(units) != 1)}"] if units else []

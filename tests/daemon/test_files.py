@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from triaxcald.errors import InputError
-from triaxcald.files import new_beside, new_file, write_text
+from triaxcald.files import new_beside, new_file, unused, write_text
 
 
 def test_a_file_is_written_as_utf8_and_readable_by_all(tmp_path: Path) -> None:
@@ -110,3 +110,10 @@ def test_a_pipe_or_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
         pass
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["pipe.csv"]
+
+
+def test_a_name_that_is_taken_gets_the_next_number(tmp_path: Path) -> None:
+    for name in ("a.mcap", "a-2.mcap"):
+        (tmp_path / name).touch()
+    assert unused(tmp_path / "a.mcap") == tmp_path / "a-3.mcap"
+    assert unused(tmp_path / "b.mcap") == tmp_path / "b.mcap"

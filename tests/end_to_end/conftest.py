@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import socket
 import struct
@@ -22,7 +23,8 @@ MULTICAST = "239.74.163.2"
 
 
 def _heed_interrupts() -> None:
-    """Also where the tests themselves run in the background of a shell."""
+    """Also where the tests themselves run in the background of a shell; without its terminal."""
+    os.setsid()
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 

@@ -3,90 +3,165 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AsyncExitStack, nullcontext
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from triaxcal_drivers.errors import DriverError
 from triaxcald import text
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import Bars, say
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
-from triaxcald.errors import InputError
+from triaxcald.errors import DaemonError, InputError
 from triaxcald.exit_codes import severest
+from triaxcald.files import unused
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
 from triaxcald.station.buses import BusPlace
+from triaxcald.station.changes import changed
 from triaxcald.station.config import Place, Station, load_station
 from triaxcald.station.lines import check_lines
 
 if TYPE_CHECKING:  # matplotlib and all come once the file is known to be good
-    from triaxcald.run.recording import AtRecording, Kept, UnitStatus
+    from triaxcald.run.recording import AtRecording, Kept
+    from triaxcald.run.roster import Roster
     from triaxcald.run.session import Segments, UnitSession
+    from triaxcald.station.serials import SerialsSeen
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """What is to be recorded of a station."""
+
+    station: Station
+    places: Sequence[Place]
+    buses: Sequence[BusPlace]
+
+    def without(self, names: Collection[str]) -> _Chosen:
+        places = [place for place in self.places if place.unit.name not in names]
+        return replace(self, places=places, buses=[bus for bus in self.buses if bus.name not in names])
 
 
 def record_command(a: argparse.Namespace) -> int:
     folder = a.output.is_dir()
     if not folder:
         writable(a.output)
-    station = load_station(a.station)
-    places, buses = _chosen(station, a.unit, a.output, folder)
-    check_lines(places, buses, where=str(station.path))
+    chosen, hangup = _load(a), asyncio.Event()
     with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
-        kept = run_interruptible(_record(a, station, places, buses, progress))
+        # A single file is one recording, which cannot begin anew.
+        kept = run_interruptible(_record(a, chosen, progress, hangup), hangup.set if folder else None)
     return severest(k.exit_code for k in kept)
 
 
+def _load(a: argparse.Namespace) -> _Chosen:
+    """Raises InputError, ProfileError, DriverMissing."""
+    station = load_station(a.station)
+    chosen = _Chosen(station, *_of_station(station, a.unit, a.output, a.output.is_dir()))
+    check_lines(chosen.places, chosen.buses, where=str(station.path))
+    return chosen
+
+
 async def _record(
-    a: argparse.Namespace,
-    station: Station,
-    places: Sequence[Place],
-    buses: Sequence[BusPlace],
-    progress: Bars | JsonLines,
+    a: argparse.Namespace, chosen: _Chosen, progress: Bars | JsonLines, hangup: asyncio.Event
 ) -> list[Kept]:
-    from triaxcald.run.recording import State, record_units
+    from triaxcald.run.recording import State
+    from triaxcald.run.roster import Roster
     from triaxcald.service.supervisor import Supervisor
     from triaxcald.station.coming_back import Patience
+    from triaxcald.station.serials import SerialsSeen
 
-    folder = a.output.is_dir()
-    recordings = [*_of_units(a, station, places, progress), *_of_buses(a, station, buses, progress)]
-
-    def statuses() -> list[UnitStatus]:
-        return [recording.status for recording in recordings]
+    roster = Roster(a.seconds, Patience(most_s=a.give_up_after), lambda kept: _ended(kept, progress))
+    serials = SerialsSeen()
 
     def in_a_line() -> str:
-        there = statuses()
-        lost = [u.unit for u in there if u.state is State.WAITING]
-        return text.recorded(len(places), len(buses), lost, sum(u.records for u in there))
+        there = roster.statuses()
+        lost = [one.unit for one in there if one.state is State.WAITING]
+        buses = sum(one.kind == "bus" for one in there)
+        return text.recorded(len(there) - buses, buses, lost, sum(one.records for one in there))
 
     async with AsyncExitStack() as stack:
         if a.metrics is not None:
             from triaxcald.service.metrics import served
 
-            port = stack.enter_context(served(a.metrics, statuses, a.output if folder else a.output.parent))
+            folder = a.output if a.output.is_dir() else a.output.parent
+            port = stack.enter_context(served(a.metrics, roster.statuses, folder))
             progress.stage("record", text.metrics_at(port))
         await stack.enter_async_context(Supervisor().kept_informed(in_a_line))
-        patience = Patience(most_s=a.give_up_after)
-        return await record_units(recordings, a.seconds, patience, lambda kept: _ended(kept, progress))
+        roster.begin(_recordings(a, chosen, progress, serials))
+        reloading = asyncio.ensure_future(_reload(a, chosen, roster, progress, serials, hangup))
+        stack.callback(reloading.cancel)
+        return await roster.finish()
+
+
+async def _reload(
+    a: argparse.Namespace,
+    chosen: _Chosen,
+    roster: Roster,
+    progress: Bars | JsonLines,
+    serials: SerialsSeen,
+    hangup: asyncio.Event,
+) -> None:
+    """The station file, each time that it is asked for. What is as it was goes
+    on; what ended, for whatever reason, begins again."""
+    while True:
+        await hangup.wait()
+        hangup.clear()
+        try:
+            new = await asyncio.to_thread(_load, a)
+        except (DaemonError, DriverError) as e:
+            _tell(progress, "error", text.not_reloaded(str(e)))
+            continue
+        leaving = changed(chosen.station, new.station)
+        _tell(progress, "info", text.reloaded(sorted(leaving)))
+        chosen = new
+        await roster.change(leaving, partial(_recordings, a, chosen, progress, serials))
+
+
+def _tell(progress: Bars | JsonLines, level: str, message: str) -> None:
+    if isinstance(progress, JsonLines):
+        progress.say(level, "reload", message=message)
+    else:
+        progress.stage("record", message)
+
+
+def _recordings(
+    a: argparse.Namespace,
+    chosen: _Chosen,
+    progress: Bars | JsonLines,
+    serials: SerialsSeen,
+    at_work: Collection[str] = (),
+) -> list[AtRecording]:
+    """Of all that is not ``at_work``."""
+    chosen = chosen.without(at_work)
+    return [
+        *_of_units(a, chosen.station, chosen.places, progress, serials),
+        *_of_buses(a, chosen.station, chosen.buses, progress),
+    ]
 
 
 def _of_units(
-    a: argparse.Namespace, station: Station, places: Sequence[Place], progress: Bars | JsonLines
+    a: argparse.Namespace,
+    station: Station,
+    places: Sequence[Place],
+    progress: Bars | JsonLines,
+    serials: SerialsSeen,
 ) -> list[AtRecording]:
-    from triaxcald.run.recording import UnitRecording
     from triaxcald.run.session import UnitSession
-    from triaxcald.station.serials import SerialsSeen
+    from triaxcald.run.unit_recording import UnitRecording
 
     def path_of(session: UnitSession) -> Callable[[IdentityRead], Path]:
         if not a.output.is_dir():
             return lambda _: Path(a.output)
         if segments is not None:  # the next start goes on behind it
             return lambda identity: Path(a.output) / f"{session.name}-{identity.serial or 'unknown'}{SUFFIX}"
-        return lambda identity: Path(a.output) / session.recording_name(identity)
+        return lambda identity: unused(Path(a.output) / session.recording_name(identity))
 
     def identified(session: UnitSession, identity: IdentityRead) -> None:
         if not isinstance(progress, JsonLines):
@@ -94,7 +169,7 @@ def _of_units(
         elif warning := of_a_journal(session.station, session.name, identity.serial):
             progress.say("warning", "journal", unit=session.name, message=warning)
 
-    segments, serials = _segments(a), SerialsSeen()
+    segments = _segments(a)
     sessions = [UnitSession(station, place, progress, serials=serials) for place in places]
     return [UnitRecording(session, path_of(session), identified, segments) for session in sessions]
 
@@ -107,8 +182,9 @@ def _of_buses(
     def path_of(bus: BusPlace) -> Path:
         if not a.output.is_dir():
             return Path(a.output)
-        name = f"{bus.name}{SUFFIX}" if segments is not None else bus_recording_name(bus.name, time.time_ns())
-        return Path(a.output) / name
+        if segments is not None:
+            return Path(a.output) / f"{bus.name}{SUFFIX}"
+        return unused(Path(a.output) / bus_recording_name(bus.name, time.time_ns()))
 
     segments = _segments(a)
     return [BusRecording(station, bus, progress, partial(path_of, bus), segments) for bus in buses]
@@ -126,7 +202,7 @@ def _segments(a: argparse.Namespace) -> Segments | None:
     return Segments(a.segment_size or SEGMENT_BYTES, a.segment_time or SEGMENT_S, retention)
 
 
-def _chosen(
+def _of_station(
     station: Station, name: str | None, output: Path, folder: bool
 ) -> tuple[Sequence[Place], Sequence[BusPlace]]:
     """What is to be recorded. Raises InputError."""

@@ -1,30 +1,25 @@
-"""Units that are recorded and nothing else, for as long as anybody likes; they
-may be lost meanwhile, and come back."""
+"""Recordings of units and of buses, and nothing else, for as long as anybody
+likes; they may be lost meanwhile, and come back."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
-from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import READINGS
 from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import DONE, exit_code_of
-from triaxcald.inputs import CALIBRATION
-from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.ending import ended_because
 from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.endings import aborted
-from triaxcald.run.session import Segments, UnitSession
-from triaxcald.run.together import side_by_side, whole_on_a_thread
-from triaxcald.station.collection import Recorded
+from triaxcald.run.together import whole_on_a_thread
 from triaxcald.station.coming_back import Patience
 
 Kind = Literal["unit", "bus"]
@@ -74,146 +69,78 @@ class UnitStatus:
     kind: Kind = "unit"
 
 
-class AtRecording(Protocol):
-    """One of the recordings that a process makes side by side."""
+class AtRecording(ABC):
+    """One of the recordings that a process makes side by side, of a unit or a
+    bus of that ``name``."""
 
-    @property
-    def status(self) -> UnitStatus: ...
+    kind: Kind
 
-    async def run(self, seconds: float | None, patience: Patience) -> Kept: ...
-
-
-class UnitRecording:
-    """One unit's recording, at ``path_of`` its identity, in ``segments`` where
-    they are given; ``identified`` is told who it is, once it is there."""
-
-    def __init__(
-        self,
-        session: UnitSession,
-        path_of: Callable[[IdentityRead], Path],
-        identified: Callable[[UnitSession, IdentityRead], None] = lambda *_: None,
-        segments: Segments | None = None,
-    ) -> None:
-        self._session, self._path_of, self._identified, self._segments = session, path_of, identified, segments
-        self._recorded = Recorded(CALIBRATION, session.place.bundle, session.place.address)
+    def __init__(self, name: str) -> None:
+        self.name = name
         self._path: Path | None = None
         self._writer: RecordingWriter | None = None
         self._lost = 0
         self._state = State.WAITING
         self._trouble: str | None = None
+        self._leaves = False
 
     @property
+    @abstractmethod
     def status(self) -> UnitStatus:
         """From any thread."""
-        recorded, writer = self._recorded, self._writer
-        return UnitStatus(
-            self._session.name,
-            self._state,
-            self._trouble,
-            self._path if writer is None else writer.current,
-            recorded.digest.records,
-            dict(recorded.streams[READINGS].counts),
-            recorded.gaps,
-            recorded.gaps_s,
-            writer.losses.get(RAW, 0) if writer is not None else self._lost,
-            recorded.last_ns,
-            dict(recorded.latest),
-        )
 
-    def _waits(self, trouble: Exception) -> None:
-        self._is_lost(str(trouble))
-        self._session.waits(trouble)
+    @abstractmethod
+    async def _work(self, seconds: float | None, patience: Patience) -> None:
+        """As `run`, but for what it raises."""
 
-    def _is_lost(self, trouble: str | None) -> None:
-        self._state = State.RECORDING if trouble is None else State.WAITING
-        self._trouble = trouble
+    @abstractmethod
+    def _result(self) -> Kept:
+        """What it has come to so far."""
+
+    def leave(self) -> None:
+        """Nobody wants it any more: a cancellation from now on ends it as one
+        that has been asked to end."""
+        self._leaves = True
 
     async def run(self, seconds: float | None, patience: Patience) -> Kept:
-        """Until there are so many ``seconds`` of samples, for ever where None,
-        or until the unit is given up. Raises nothing, not even when it is
-        cancelled."""
-        session, found = self._session, list[IdentityRead]()
-
-        async def identify(device: Device) -> None:
-            found[:] = [await session.identify(device)]
-
+        """Until there are so many ``seconds``, for ever where None, or until it
+        is given up. Raises nothing, not even when it is cancelled."""
         try:
-            async with session.place.opened(patience, self._waits, identify) as device:
-                (identity,) = found
-                self._identified(session, identity)
-                self._path = self._path_of(identity)
-                # Finding the end of a segment that was cut off may take a while.
-                with await whole_on_a_thread(
-                    partial(session.writer, self._path, identity, segments=self._segments)
-                ) as writer:
-                    await self._record(device, identity, writer, seconds, patience)
-        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a unit
-            return self._kept(e)
+            await self._work(seconds, patience)
+        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a recording
+            if self._asked(e):
+                return self._result()
+            error = f"{self.kind} {self.name}: {aborted(e, None).reason}"
+            return replace(self._result(), exit_code=exit_code_of(e), error=error)
         else:
-            return self._kept(None)
+            return self._result()
         finally:
             self._state = State.ENDED
 
-    async def _record(
-        self,
-        device: Device,
-        identity: IdentityRead,
-        writer: RecordingWriter,
-        seconds: float | None,
-        patience: Patience,
+    async def _recorded_by(
+        self, make: Callable[[], RecordingWriter], record: Callable[[RecordingWriter], Awaitable[None]]
     ) -> None:
-        session, self._writer = self._session, writer
-        try:
-            session.progress.stage(session.name, "recording")
-            self._is_lost(None)
-            returning = session.returning(device, identity, patience, self._is_lost)
-            await self._recorded.for_seconds(returning, writer, seconds)
-        except (Exception, asyncio.CancelledError) as e:
-            await self._end(writer, e)
-            raise
-        else:
-            await whole_on_a_thread(partial(writer.close, "asked"))
-        finally:
-            self._lost, self._writer = writer.losses.get(RAW, 0), None
+        """Has a writer made and ``record`` work with it; the file is whole in
+        the end, and says why it ended. To find the end of a segment that was
+        cut off, and to write an end, may take a while."""
+        with await whole_on_a_thread(make) as writer:
+            self._writer, self._state, self._trouble = writer, State.RECORDING, None
+            try:
+                await record(writer)
+            except (Exception, asyncio.CancelledError) as e:
+                await self._end(writer, e)
+                raise
+            else:
+                await whole_on_a_thread(partial(writer.close, ended_because(None)))
+            finally:
+                self._lost, self._writer = writer.losses.get(RAW, 0), None
 
     async def _end(self, writer: RecordingWriter, e: BaseException) -> None:
-        """Says why, and finishes the file; where the disk has failed, that is
-        on its way already."""
+        """Where the disk has failed, that is on its way already."""
         with suppress(RecordingError):
             if not isinstance(e, asyncio.CancelledError):
                 writer.event("failed", {"error": aborted(e, None).reason})
-            await whole_on_a_thread(partial(writer.close, ended_because(e)))
+            await whole_on_a_thread(partial(writer.close, ended_because(None if self._asked(e) else e)))
 
-    def _kept(self, e: BaseException | None) -> Kept:
-        readings, unit = self._recorded.streams[READINGS], self._session.name
-        kept = Kept(
-            unit,
-            self._path,
-            dict(readings.counts),
-            readings.seconds,
-            self._recorded.gaps,
-            self._recorded.gaps_s,
-            self._lost,
-        )
-        if e is None:
-            return kept
-        ending = aborted(e, None)
-        return replace(kept, exit_code=exit_code_of(e), error=f"unit {unit}: {ending.reason}")
-
-
-async def record_units(
-    recordings: Sequence[AtRecording],
-    seconds: float | None,
-    patience: Patience,
-    ended: Callable[[Kept], None] = lambda _: None,
-) -> list[Kept]:
-    """All units and buses at once; one that ends does not stop the others, and
-    ``ended`` is told of each. When it is cancelled every one is; what was
-    recorded is whole."""
-
-    async def work(recording: AtRecording) -> Kept:
-        kept = await recording.run(seconds, patience)
-        ended(kept)
-        return kept
-
-    return await side_by_side(map(work, recordings))
+    def _asked(self, e: BaseException) -> bool:
+        return self._leaves and isinstance(e, asyncio.CancelledError)

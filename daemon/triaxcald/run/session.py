@@ -58,6 +58,10 @@ class UnitSession:
         self.name = place.unit.name
         self.profile = place.bundle.profile
 
+    def leave(self) -> None:
+        """Its serial number may be that of another unit of the station."""
+        self.serials.discard(self.name)
+
     def waits(self, trouble: Exception) -> None:
         """The unit is not there, for now."""
         self.progress.lost(self.name, str(trouble))

@@ -10,12 +10,17 @@ from triaxcald.errors import StationError
 
 @dataclass
 class SerialsSeen:
-    _places: dict[str, str] = field(default_factory=dict)
+    _places: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     def add(self, serial: str | None, unit: str, address: str) -> None:
         """Raises StationError where another place has reported it before. None
         is a serial that nobody can read."""
-        place = f"unit {unit} ({address})"
-        other = place if serial is None else self._places.setdefault(serial, place)
-        if other != place:
-            raise StationError(f"serial {serial} answers in two places: {other}, and {place}")
+        here = unit, address
+        other = here if serial is None else self._places.setdefault(serial, here)
+        if other != here:
+            places = ", and ".join(f"unit {name} ({where})" for name, where in (other, here))
+            raise StationError(f"serial {serial} answers in two places: {places}")
+
+    def discard(self, unit: str) -> None:
+        """What this unit has reported."""
+        self._places = {serial: place for serial, place in self._places.items() if place[0] != unit}

@@ -14,8 +14,10 @@ from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.reader import Recording
-from triaxcald.run.recording import Kept, UnitRecording, record_units
+from triaxcald.run.recording import Kept
+from triaxcald.run.roster import Roster
 from triaxcald.run.session import UnitSession
+from triaxcald.run.unit_recording import UnitRecording
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station, load_station
@@ -69,7 +71,9 @@ def recorded(station: Station, folder: Path, told: Told, *, seconds: float | Non
     for place in station.places:
         session = UnitSession(station, place, told)
         recordings.append(UnitRecording(session, lambda _, name=session.name: folder / f"{name}.mcap"))
-    return asyncio.ensure_future(record_units(recordings, seconds, patience))
+    roster = Roster(seconds, patience)
+    roster.begin(recordings)
+    return asyncio.ensure_future(roster.finish())
 
 
 def told_by(path: Path) -> tuple[list[tuple[str, Any]], DecodedStream, np.ndarray]:

@@ -20,6 +20,13 @@ def test_a_serial_number_is_of_one_place() -> None:
         seen.add("4711", "right", "port=2")
 
 
+def test_the_serial_number_of_a_unit_that_has_left_is_free() -> None:
+    seen = SerialsSeen()
+    seen.add("4711", "left", "port=1")
+    seen.discard("left")
+    seen.add("4711", "right", "port=2")
+
+
 def test_a_serial_number_that_cannot_be_read_is_nobodys() -> None:
     seen = SerialsSeen()
     seen.add(None, "left", "port=1")

@@ -22,8 +22,9 @@ from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.reader import Recording
-from triaxcald.run.recording import State, UnitRecording
+from triaxcald.run.recording import State
 from triaxcald.run.session import UnitSession
+from triaxcald.run.unit_recording import UnitRecording
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import load_station
 from triaxcald.station.lock import FOLDER_VARIABLE

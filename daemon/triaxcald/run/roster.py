@@ -1,0 +1,77 @@
+"""Which recordings a process makes side by side; that may change meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Iterable
+
+from triaxcald.run.recording import AtRecording, Kept, UnitStatus
+from triaxcald.station.coming_back import Patience
+
+
+class Roster:
+    """Each records for so many ``seconds``, for ever where None, or until it is
+    given up; one that ends does not stop the others, and ``ended`` is told of
+    it."""
+
+    def __init__(
+        self, seconds: float | None, patience: Patience, ended: Callable[[Kept], None] = lambda _: None
+    ) -> None:
+        self._seconds, self._patience, self._ended = seconds, patience, ended
+        self._work: dict[AtRecording, asyncio.Task[Kept]] = {}
+        self._changes = 0
+        self._changed = asyncio.Event()
+        self._stopped = False
+
+    def statuses(self) -> list[UnitStatus]:
+        """Of the last recording of each name. From any thread."""
+        return list({one.name: one.status for one in tuple(self._work)}.values())
+
+    def at_work(self) -> set[str]:
+        return {one.name for one, task in self._work.items() if not task.done()}
+
+    def begin(self, recordings: Iterable[AtRecording]) -> None:
+        for one in recordings:
+            self._work[one] = asyncio.ensure_future(self._record(one))
+        self._changed.set()
+
+    async def change(self, leaving: Collection[str], make: Callable[[set[str]], Iterable[AtRecording]]) -> None:
+        """Those of the names ``leaving`` end as if asked to; then those begin
+        that ``make`` gives for the names that are still at work."""
+        self._changes += 1
+        try:
+            going = {one: task for one, task in self._work.items() if one.name in leaving and not task.done()}
+            for one, task in going.items():
+                one.leave()
+                task.cancel()
+            if going:
+                await asyncio.wait(going.values())
+            if not self._stopped:
+                self.begin(make(self.at_work()))
+        finally:
+            self._changes -= 1
+            self._changed.set()
+
+    async def finish(self) -> list[Kept]:
+        """What they have all come to, once none is at work. When this is
+        cancelled every one of them is, again each time, and waited for; what
+        was recorded is whole."""
+        while True:
+            pending = [task for task in self._work.values() if not task.done()]
+            if not pending and not self._changes:
+                return [task.result() for task in self._work.values()]
+            self._changed.clear()
+            changed = asyncio.ensure_future(self._changed.wait())
+            try:
+                await asyncio.wait([*pending, changed], return_when=asyncio.FIRST_COMPLETED)
+            except asyncio.CancelledError:
+                self._stopped = True
+                for task in pending:
+                    task.cancel()
+            finally:
+                changed.cancel()
+
+    async def _record(self, one: AtRecording) -> Kept:
+        kept = await one.run(self._seconds, self._patience)
+        self._ended(kept)
+        return kept
