@@ -32,6 +32,15 @@ from triaxcald.station.lock import FOLDER_VARIABLE
 hypothesis.settings.register_profile("patient", deadline=None)  # a busy machine is no fault of the code
 hypothesis.settings.load_profile("patient")
 
+SLOW_FIXTURES = {"finished_run"}
+"""Each worker that runs a test with one of these makes it once, which takes half a minute."""
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    if SLOW_FIXTURES.intersection(getattr(item, "fixturenames", ())):
+        item.add_marker(pytest.mark.slow)
+
+
 FIXTURE = {"poses": 14, "hold_s": 2.0, "move_s": 0.8}
 PLAN = {"poses": 14, "hold_s": 1.0, "check_poses": 3}
 SERIAL = 4711

@@ -84,6 +84,7 @@ def test_the_hidden_effect_is_named_and_nothing_else(name: str) -> None:
     assert not loop.found.unexplained.significant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_every_coefficient_comes_back_within_its_stated_error(name: str) -> None:
     truth = truth_of(name)

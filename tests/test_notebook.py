@@ -11,6 +11,8 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow
+
 NOTEBOOK = Path(__file__).parents[1] / "docs" / "tutorial" / "fifty-units.ipynb"
 UNITS = "UNITS = 50"
 
@@ -33,7 +35,6 @@ def run(cells: list[dict[str, Any]]) -> dict[str, Any]:
     return names
 
 
-@pytest.mark.slow
 def test_the_units_are_calibrated_to_the_noise_of_their_poses(run: dict[str, Any]) -> None:
     assert list(run["table"]["poses"]) == [27] * 5
     assert run["errors"]["with effects"].max() < 60

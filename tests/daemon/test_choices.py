@@ -47,6 +47,7 @@ def test_without_registers_the_host_corrects_the_effect_or_nobody_does() -> None
     assert (alone.residual, whole.residual) == (loop.before.residual, loop.after.residual)
 
 
+@pytest.mark.slow
 def test_what_the_registers_lack_is_left_to_the_host() -> None:
     loop = closed("second_order_nonlinearity")
     held = fit([p.pose for p in loop.after.poses])

@@ -123,6 +123,7 @@ def test_a_driver_whose_packages_are_not_there_is_listed_with_what_brings_them(e
     ]
 
 
+@pytest.mark.slow
 def test_asking_for_one_driver_imports_no_other(elsewhere):
     elsewhere("their_drivers", "raise RuntimeError", "their-serial = their_drivers:SerialDriver")
     said = elsewhere.python(

@@ -70,6 +70,7 @@ def test_any_bytes_come_back_as_they_were(name, data, order):
         assert number(name, bytes_of(name, value, order), order) == value
 
 
+@pytest.mark.slow
 @each_type
 @given(data=st.data())
 def test_a_number_goes_to_the_nearest_that_the_type_holds(name, data):

@@ -23,6 +23,7 @@ def test_the_committed_schema_is_what_the_command_prints(driver):
     assert json.loads(printed) == committed, "the schema is stale; run make docs"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(BUILT_IN.glob("*.toml")), ids=lambda p: p.stem)
 def test_built_in_profiles_fit_the_schema_of_their_driver(path):
     profile = tomllib.loads(path.read_text("utf-8"))

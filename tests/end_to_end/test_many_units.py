@@ -20,6 +20,8 @@ from triaxcald.simulation.serial_pair import pty_pair
 from triaxcald.station.config import load_station
 from triaxcald.station.lines import check_lines
 
+pytestmark = pytest.mark.slow
+
 ON_CAN, ON_RS485 = range(1, 4), range(1, 3)
 SPEED, BAUDRATE = 4.0, 460_800
 FIXTURE = {"poses": 10, "hold_s": 1.4, "move_s": 0.6}
@@ -111,7 +113,6 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return bench, told, {outcome.unit: outcome for outcome in outcomes}, ended
 
 
-@pytest.mark.slow
 def test_all_but_the_dead_one_are_calibrated(ran: Any) -> None:
     bench, _, outcomes, _ = ran
     assert set(outcomes) == set(bench.units)
@@ -133,7 +134,6 @@ def test_the_dead_one_is_told_at_once_and_given_up_when_the_others_are_done(ran:
     assert waits < max(i for i, (unit, _) in enumerate(told.said) if unit != DIES)
 
 
-@pytest.mark.slow
 def test_a_recording_with_gaps_agrees_with_itself(ran: Any) -> None:
     _, _, outcomes, _ = ran
     assert audit(outcomes[RESTARTS].recording).differences == ()

@@ -156,6 +156,7 @@ def _gateway(ports: dict[int, int]) -> Iterator[int]:
         loop.close()
 
 
+@pytest.mark.slow
 def test_two_commands_at_two_units_of_one_gateway_both_go_on(workshop: Any, triaxcal: Run, start: Run) -> None:
     buses = [{"host": "127.0.0.1", "port": 0, "unit_id": i} for i in (1, 2)]
     devices = [workshop.device(f"{b['unit_id']}.toml", serial=4710 + b["unit_id"], bus=b) for b in buses]

@@ -128,6 +128,7 @@ def test_a_data_frame_gives_the_same_poses(recorded: Recorded, poses: Any, libra
     assert found[0].channels == poses[0].channels
 
 
+@pytest.mark.slow
 def test_what_a_stream_is_to_be_blamed_for_is_said(recorded: Recorded) -> None:
     u = recorded.u.copy()
     u[1000:1300, 1] = u[1000, 1]
@@ -179,6 +180,7 @@ def test_the_truth_is_recovered_and_the_linear_one_is_beside_it(recorded: Record
     assert diagnosed.before.residual == found.linear_only.residual
 
 
+@pytest.mark.slow
 def test_poses_samples_and_tables_give_the_same_calibration(recorded: Recorded, poses: Any) -> None:
     by_poses = tc.calibrate(poses, signs=MINUS)
     by_samples = tc.calibrate(recorded.t, recorded.u, signs=MINUS, channels={"temp_c": recorded.temp_c})
@@ -199,6 +201,7 @@ def test_poses_that_cannot_carry_it_are_refused(poses: Any) -> None:
     assert caught.value.wanted
 
 
+@pytest.mark.slow
 def test_a_calibration_is_verified_on_poses_that_no_fit_saw(recorded: Recorded, diagnosed: tc.Diagnosis) -> None:
     t = recorded.t + 200.0
     u, temp_c = recorded.unit.sample(t)

@@ -150,6 +150,7 @@ def test_what_poses_cannot_show_is_told_with_the_reason(poses_with: Poses) -> No
     assert loop.after.blind_to == tuple(loop.not_identifiable)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [10, 12])
 def test_poses_with_hardly_anything_to_spare_correct_nothing_that_nobody_knows(poses_with: Poses, count: int) -> None:
     loop = closed(poses_with(6)[:count])

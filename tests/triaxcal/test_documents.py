@@ -321,6 +321,7 @@ def test_names_in_html_are_no_markup(paper_unit: Sensor) -> None:
     assert "<b>" not in c._repr_html_()
 
 
+@pytest.mark.slow
 def test_residuals_are_plotted_loaded_or_not_and_without_a_window(calibration: tc.Calibration, tmp_path: Path) -> None:
     calibration.save(tmp_path / "cal.json")
     for c in (calibration, tc.Calibration.load(tmp_path / "cal.json")):

@@ -79,6 +79,7 @@ def test_every_sensor_of_the_array_shows_its_21_poses(run: int, sensor: int, pos
     assert all(p.end_s - p.start_s > 20 for p in found[:20])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "count"), [("xsens/acc", 38), ("mpu9150/unit0", 22), ("mpu9150/unit1", 22)])
 def test_the_other_units_show_all_their_poses(name: str, count: int, poses: Poses) -> None:
     assert len(poses(name)) == count
@@ -94,6 +95,7 @@ def test_six_directions_are_refused_and_counted(poses: Poses) -> None:
 NEIGHBOURHOOD = 1.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "outside"),
     [
@@ -176,6 +178,7 @@ def test_no_recording_of_the_array_shows_a_nonlinearity(
     assert max((p for name, p in loop.probabilities.items() if "nonlinearity" in name), default=0.0) < 0.1
 
 
+@pytest.mark.slow
 def test_the_drift_is_reported_by_axis_with_its_units(diagnosed: Callable[[str], Loop]) -> None:
     (finding,) = diagnosed("mimu4444/run6_sensor1").findings
     assert {finding.effect, *finding.alternatives} == OF_TIME

@@ -72,6 +72,7 @@ def test_pulls_of_all_nine_coefficients_have_mean_zero(trials: Trials) -> None:
     assert np.all(np.abs(pulls.mean(axis=0)) < limit), pulls.mean(axis=0)
 
 
+@pytest.mark.slow
 def test_pulls_of_all_nine_coefficients_have_variance_one(trials: Trials) -> None:
     pulls = trials.errors / (trials.standard_errors / trials.birge_ratio[:, None])
     low, high = stats.chi2.ppf([EACH / 2, 1 - EACH / 2], SEEDS - 1) / (SEEDS - 1)

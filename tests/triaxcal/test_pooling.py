@@ -18,6 +18,8 @@ from triaxcal.model.directions import directions
 from triaxcal.pooling import Answer, PooledAnalysis, PooledEffect, pooled_analysis
 from triaxcal.poses.pose import Pose
 
+pytestmark = pytest.mark.slow
+
 SIGMA_G, HOLD_S, COUNT = 1e-5, 10.0, 26
 GAP_S = 1.0
 FEW: tuple[Effect, ...] = (effect_named("second_order_nonlinearity"), BiasDrift(), WarmUp())
@@ -75,7 +77,6 @@ def slow() -> tuple[list[Loop], PooledAnalysis]:
     return units(2, *alike([250.0] * 6, 2e-4))
 
 
-@pytest.mark.slow
 def test_what_single_units_cannot_tell_apart_all_together_do(slow: tuple[list[Loop], PooledAnalysis]) -> None:
     loops, found = slow
     assert not any(f.verdict is Verdict.ADOPTED for loop in loops for f in loop.findings)
@@ -110,7 +111,6 @@ def test_the_shared_time_constant_is_better_known_than_the_units_own(slow: tuple
     assert np.median(own) > 1.5 * shape.shared.standard_error
 
 
-@pytest.mark.slow
 def test_a_step_that_units_share_lies_between_two_poses_as_far_as_its_standard_error_says() -> None:
     off = []
     for seed in range(3):
@@ -124,14 +124,12 @@ def test_a_step_that_units_share_lies_between_two_poses_as_far_as_its_standard_e
     assert np.max(np.abs(off)) < 2
 
 
-@pytest.mark.slow
 def test_units_with_different_effects_do_not_agree() -> None:
     _, found = units(7, squared, lambda rng: warming(rng, 60.0))
     assert found.answer is Answer.DISAGREE
     assert found.agreed == ()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_an_effect_that_one_unit_alone_shows_does_not_act_in_all(seed: int) -> None:
     _, found = units(20 + seed, squared, nothing, nothing)
@@ -141,7 +139,6 @@ def test_an_effect_that_one_unit_alone_shows_does_not_act_in_all(seed: int) -> N
     assert shown.probability < 0.01
 
 
-@pytest.mark.slow
 def test_an_effect_of_one_unit_beside_the_common_one_is_its_own() -> None:
     def both(rng: np.random.Generator) -> Added:
         first, second = warming(rng, 60.0), squared(rng)
@@ -152,7 +149,6 @@ def test_an_effect_of_one_unit_beside_the_common_one_is_its_own() -> None:
     assert named(found, "second_order_nonlinearity").units[2] > 0.9
 
 
-@pytest.mark.slow
 def test_two_effects_that_all_units_have_are_both_agreed_on() -> None:
     def both(rng: np.random.Generator) -> Added:
         first, second = warming(rng, 60.0, 6e-4), squared(rng, 2e-3)
@@ -162,7 +158,6 @@ def test_two_effects_that_all_units_have_are_both_agreed_on() -> None:
     assert set(found.agreed) == {("warm_up",), ("second_order_nonlinearity",)}
 
 
-@pytest.mark.slow
 def test_units_that_show_nothing_agree_on_nothing() -> None:
     _, found = units(11, *[nothing] * 3)
     assert found.answer is Answer.NOTHING
@@ -170,7 +165,6 @@ def test_units_that_show_nothing_agree_on_nothing() -> None:
     assert found.nothing > 0.5
 
 
-@pytest.mark.slow
 def test_one_unit_alone_has_nobody_to_agree_with() -> None:
     loops, _ = units(13, *alike([60.0] * 2))
     with pytest.raises(InvalidData, match="takes two"):

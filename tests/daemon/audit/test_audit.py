@@ -15,6 +15,8 @@ from triaxcald.audit.differences import differing
 from triaxcald.recording import schema
 from triaxcald.recording.raw_batch import decode_raw, encode_raw
 
+pytestmark = pytest.mark.slow
+
 CERTIFICATE, VERIFICATION, AFTER = "certificate.json", "verification.json", "registers-after.json"
 CHECKED = ("outcome.json", CERTIFICATE, "report.html", VERIFICATION, "registers-before.json", AFTER)
 Said = Callable[[Path], list[str]]
@@ -22,7 +24,6 @@ Change = Callable[[str, bytes], bytes]
 """Of an attachment's content, by its name."""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("unit", ["can", "modbus"])
 def test_an_unchanged_recording_gives_the_same_bytes(finished_run: Any, unit: str) -> None:
     found = audit(finished_run.recording(unit))
@@ -32,7 +33,6 @@ def test_an_unchanged_recording_gives_the_same_bytes(finished_run: Any, unit: st
     assert text.notes(found.notes) == []
 
 
-@pytest.mark.slow
 def test_a_recording_written_anew_without_a_change_passes(
     finished_run: Any, rewrite: Callable[..., Path], said: Said
 ) -> None:
@@ -61,7 +61,6 @@ def _other_byte(batch: RawBatch) -> RawBatch:
     return RawBatch(batch.time_ns, batch.source, batch.flags, batch.length, bytes(payload))
 
 
-@pytest.mark.slow
 def test_a_changed_raw_record_is_found_of_either_phase(
     finished_run: Any, rewrite: Callable[..., Path], said: Said
 ) -> None:
@@ -83,7 +82,6 @@ def _in(name: str, old: bytes, new: bytes) -> Change:
     return change
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("of_profile", "of_station", "named"),
     [
@@ -152,7 +150,6 @@ def test_changed_numbers_in_stored_results_are_found_and_named(
         assert any(d.startswith(line) for d in found), found
 
 
-@pytest.mark.slow
 def test_other_names_in_the_metadata_are_found(finished_run: Any, rewrite: Callable[..., Path], said: Said) -> None:
     others = {"unit": {"serial": "4799", "name": "other"}, "software": {"numpy": "0.0"}}
     found = said(rewrite(finished_run.can, metadata=lambda name, record: record | others.get(name, {})))
@@ -160,7 +157,6 @@ def test_other_names_in_the_metadata_are_found(finished_run: Any, rewrite: Calla
         assert any(d.startswith(f"{CERTIFICATE}: {path}: stored ") for d in found), found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("signs", ["1,1,1", "?"])
 def test_other_signs_in_the_metadata_are_found(
     finished_run: Any, rewrite: Callable[..., Path], said: Said, signs: str
@@ -199,7 +195,6 @@ def test_a_stored_result_that_is_something_else_is_a_difference(
     assert set(others) <= set(found)
 
 
-@pytest.mark.slow
 def test_a_profile_without_the_stream_that_was_verified_is_a_difference(
     finished_run: Any, rewrite: Callable[..., Path], said: Said
 ) -> None:

@@ -456,6 +456,7 @@ OLDER: list[tuple[str, Make, str]] = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "make", "says"), OLDER, ids=[name for name, _, _ in OLDER])
 def test_in_a_recording_from_before_there_were_outcomes_too(
     tmp_path: Path, auditor: Any, name: str, make: Make, says: str

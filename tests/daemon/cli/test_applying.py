@@ -62,6 +62,7 @@ def test_the_columns_of_the_input_stay_and_the_calibrated_ones_are_behind_them(
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1e-4, rel=0.1)  # the noise of the readings, and hardly more
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_of_a_foreign_table_every_column_stays_as_it_stood(folder: Path, triaxcal, tmp_path: Path, kind: str) -> None:
     given = pd.read_csv(folder / "rec.csv")

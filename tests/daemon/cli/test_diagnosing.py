@@ -160,6 +160,7 @@ def test_no_probability_is_said_to_be_nothing_or_certainty_and_no_error_has_an_e
     assert not re.search(r"(p|probability|\() ?[01](?![.\d])|e[+-]\d+ µg", said)
 
 
+@pytest.mark.slow
 def test_what_is_said_of_errors_and_probabilities_has_the_figures_of_the_tables(settling: Path, asked: Run) -> None:
     said = asked("diagnose", settling, "--verbose").out
     _, before, after = cells(said, "residual rms")
@@ -169,6 +170,7 @@ def test_what_is_said_of_errors_and_probabilities_has_the_figures_of_the_tables(
     assert f"\nadopted: warm_up (it acts with probability {likely})\n" in said
 
 
+@pytest.mark.slow
 def test_a_finding_has_its_probability_and_keys_that_mean_nothing_any_more_are_null(settling: Path, asked: Run) -> None:
     document = asked("diagnose", settling, "--json").json
     (finding,) = document["findings"]

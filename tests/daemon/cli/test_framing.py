@@ -169,6 +169,7 @@ def test_several_units_come_into_one_frame(
     assert done.json["agreement"]["p_value"] > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_units_on_two_fixtures_are_no_success(first: Path, seed: int, tmp_path: Path, triaxcal: Run) -> None:
     other = SyntheticFixture.drawn(np.random.default_rng(seed))
@@ -210,6 +211,7 @@ def test_a_calibration_from_a_file_gives_the_same_frame_and_its_uncertainty(
         assert unit["standard_error_rad"] == pytest.approx(own["standard_error_rad"], rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_recording_of_the_faces_alone_goes_with_a_calibration(
     calibration: str, fixture: SyntheticFixture, tmp_path: Path, triaxcal: Run
 ) -> None:

@@ -115,6 +115,7 @@ def test_an_imu_of_ros_2_goes_by_its_own_stamps(
     assert (info["imported"]["taken"], info["imported"]["remarks"]) == (20, [])
 
 
+@pytest.mark.slow
 def test_messages_need_no_chunks(tmp_path: Path, triaxcal: Run, imported: Run) -> None:
     log = log_of(tmp_path / "bag.mcap", drive(), IMU_SCHEMA, use_chunking=False)
     assert imported(log, profile(tmp_path)).code == 0

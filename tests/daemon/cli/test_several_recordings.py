@@ -120,6 +120,7 @@ def test_the_calibration_of_two_runs_serves_another(runs: list[Path], triaxcal: 
     assert verified.json["rms_g"] < 2 * verified.json["noise_floor_g"]  # the mean bias of the two is that of the third
 
 
+@pytest.mark.slow
 def test_a_person_sees_a_line_for_each_recording(runs: list[Path], asked: Run) -> None:
     said = asked("diagnose", *runs).out
     assert "by recording, µg rms" in said

@@ -101,6 +101,7 @@ def test_verify_marks_such_a_pose_and_says_what_spoils_it(folder: Path, cal: Pat
     assert "26 poses: rms " in clean.out
 
 
+@pytest.mark.slow
 def test_verify_refuses_a_recording_without_a_pose_that_can_be_trusted(folder: Path, cal: Path, triaxcal: Run) -> None:
     path = folder / "stuck.csv"
     done = triaxcal("verify", cal, path, "--limit", "1", "--json")

@@ -94,6 +94,7 @@ def valid_messages(draw: st.DrawFn) -> can.Message:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(st.lists(valid_messages(), max_size=12))
 def test_whatever_messages_come_each_channel_reads_back_in_its_order(

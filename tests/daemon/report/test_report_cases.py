@@ -108,6 +108,7 @@ def test_nothing_found_says_so_in_the_first_sentence(page_of_nothing: tuple[str,
     assert "The linear model, and the one with what is corrected" not in text
 
 
+@pytest.mark.slow
 def test_an_adopted_effect_has_words_formula_shape_and_what_to_change(words: dict[str, Any]) -> None:
     words["calibration"]["channel_reference"] = {"since_start_s": 0.0}
     add(words, "warm_up", {"x": (8.27e-4, 1.5e-5, "g"), "time_constant": (88.1, 2.2, "s")})
@@ -502,6 +503,7 @@ def test_notes_that_would_lie_on_each_other_are_left_out() -> None:
     assert ">pose 20</text>" not in drawing
 
 
+@pytest.mark.slow
 def test_no_table_hides_its_rows_in_a_box(page_of_nothing: tuple[str, str]) -> None:
     html, _ = page_of_nothing
     assert "max-height" not in html

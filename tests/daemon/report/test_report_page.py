@@ -116,6 +116,7 @@ def test_the_verdict_is_said_in_words_with_the_error_before_and_after(page: Page
     assert "held-out: 16.2 µg rms, 131 µg before; noise floor 14.9 µg" in page.text
 
 
+@pytest.mark.slow
 def test_limits_are_listed_with_what_was_measured(page: Page, loop: dict[str, Any]) -> None:
     measured_ug = loop["after"]["max_abs_g"] * 1e6
     assert page.row("Residual, largest") == ["Residual, largest", f"{measured_ug:.1f} µg", "100 µg", "✓ within"]
@@ -297,6 +298,7 @@ def test_a_limit_without_a_measurement_is_never_taken_as_kept(
     assert "Not assessed" in page.text
 
 
+@pytest.mark.slow
 def test_a_fit_alone_judges_by_its_lack_of_fit_and_claims_no_search(bare: dict[str, Any]) -> None:
     fit = bare["calibration"]
     assert render(fit).verdict == "within"

@@ -101,6 +101,7 @@ def test_each_recording_has_its_picture_over_time_and_the_moment_is_marked_in_it
     assert len(ids) == len(set(ids))
 
 
+@pytest.mark.slow
 def test_every_pose_and_every_residual_names_its_recording(shown: tuple[str, str]) -> None:
     _, text = shown
     assert "Of recordings 1: first.csv, 2: second.csv Pose | Of | Start, s" in text
@@ -114,6 +115,7 @@ def test_a_fault_of_a_recording_names_its_file_without_the_folders(bare: dict[st
     assert "Outputs creep while the pose is held | second.csv: 2 of 7, the first at 25.2 s" in page(bare)[1]
 
 
+@pytest.mark.slow
 def test_recordings_of_the_same_name_keep_their_folders(bare: dict[str, Any]) -> None:
     for pose in bare["calibration"]["poses"]:
         pose["recording"] = str(Path(pose["recording"]).with_name("run.csv"))
@@ -133,6 +135,7 @@ def test_a_single_recording_has_no_word_of_several(loop: dict[str, Any]) -> None
     assert "by its own clock" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [None, 3, "first.csv", [], [None, {}], [FIRST]])
 def test_damaged_names_of_recordings_still_give_a_page(loop: dict[str, Any], damage: object) -> None:
     if damage != [FIRST]:  # one of them with pictures

@@ -189,6 +189,7 @@ async def test_no_number_of_cancellations_stops_the_old_calibration_from_coming_
         _holds_old(bench.served)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "why"),
     [

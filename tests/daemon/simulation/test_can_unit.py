@@ -232,6 +232,7 @@ async def frames_of(device: CanDevice, count: int) -> list[RawBatch]:
     return batches
 
 
+@pytest.mark.slow
 async def test_the_driver_reads_a_fast_unit_without_a_loss(
     bundle: Bundle, settings: CanBus, unit: ReferenceUnit
 ) -> None:
@@ -252,6 +253,7 @@ async def test_the_driver_reads_a_fast_unit_without_a_loss(
     assert device.dropped == 0
 
 
+@pytest.mark.slow
 async def test_a_calibration_written_stored_and_restarted_is_there(
     bundle: Bundle, settings: CanBus, unit: ReferenceUnit
 ) -> None:

@@ -116,6 +116,7 @@ def test_rows_that_repeat_exactly_are_left_out_and_counted(monkeypatch: pytest.M
         assert found.duplicates == 3
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(*[st.floats(-1e6, 1e6)] * 3), min_size=1, max_size=30),
     st.integers(1, 100),
@@ -179,6 +180,7 @@ def test_the_measured_recordings_are_read() -> None:
         assert (np.diff(found.time_ns) > 0).all()
 
 
+@pytest.mark.slow
 def test_a_table_of_two_hundred_constant_columns_is_no_gzip_bomb(tmp_path: Path) -> None:
     path = tmp_path / "wide.csv.gz"
     names, rest = "".join(f",c{i}" for i in range(200)), ",0.000" * 200
@@ -190,6 +192,7 @@ def test_a_table_of_two_hundred_constant_columns_is_no_gzip_bomb(tmp_path: Path)
     assert len(read_csv(path).time_ns) == 5000
 
 
+@pytest.mark.slow
 def test_a_gzip_file_that_unpacks_to_a_thousand_times_its_size_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bomb.csv.gz"
     path.write_bytes(gzip.compress(b"t_s,ux,uy,uz\n" + b"0,1,2,3\n" * 2**20))

@@ -23,6 +23,7 @@ MINUS = (-1, -1, -1)
 TRUTH = [3e-3, -2e-3, 4e-3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(KINDS))
 @pytest.mark.parametrize("knee", [0.6, 0.85])
 def test_the_fit_gives_it_back_as_far_off_as_it_says(kind: str, knee: float, recovers: Callable[..., None]) -> None:

@@ -21,6 +21,8 @@ from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
 from triaxcal.synthetic import noisy_poses
 
+pytestmark = pytest.mark.slow
+
 Poses = Callable[..., list[Pose]]
 TRUTHS: list[tuple[int, str, list[float]]] = [
     (26, "second_order_nonlinearity", [6e-4, -4e-4, 5e-4]),  # as `scale_factor_asymmetry` on the cube's directions
@@ -105,7 +107,6 @@ def followed(with_effects: Callable[..., Sensor]) -> list[Followed]:
     return out
 
 
-@pytest.mark.slow
 def test_the_truth_becomes_likelier_than_by_poses_at_random(followed: list[Followed]) -> None:
     after, at_random, before = (
         np.log(np.maximum([getattr(f, which) for f in followed], 1e-4)) for which in ("after", "at_random", "before")
@@ -145,13 +146,11 @@ def test_functions_that_agree_on_the_cube_are_told_apart_in_directions_between(f
         assert "2" in made.actions[0].label
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("effects", [{}, {"temperature_bias": [5e-4, -4e-4, 6e-4]}], ids=["nothing", "a name"])
 def test_where_all_is_decided_nothing_is_to_be_done(poses_with: Poses, effects: dict[str, list[float]]) -> None:
     assert advice(seen_in(poses_with(11, **effects))).actions == ()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "by_g"), [(1, 4e-4), (2, 1.5e-4)])
 def test_a_pose_that_may_be_an_outlier_is_taken_again_and_then_is_one(
     paper_unit: Sensor, knocked: Callable[[list[Pose], int, float], list[Pose]], seed: int, by_g: float
@@ -170,7 +169,6 @@ def test_a_pose_that_may_be_an_outlier_is_taken_again_and_then_is_one(
     assert advice(seen_in(faulty)).actions[0].repeat_of == 6
 
 
-@pytest.mark.slow
 def test_a_pose_on_which_a_certain_name_hangs_is_taken_again(
     monkeypatch: pytest.MonkeyPatch, poses_with: Poses
 ) -> None:
@@ -188,7 +186,6 @@ def swinging(poses: list[Pose], unit: Sensor) -> list[Pose]:
     return [replace(p, mean=p.mean + unit.scale_factor * np.sin(2 * np.pi * p.t_s / 140) * way) for p in poses]
 
 
-@pytest.mark.slow
 def test_what_goes_with_time_goes_with_something_to_be_logged(poses_with: Poses, paper_unit: Sensor) -> None:
     poses = swinging(poses_with(3), paper_unit)
     for logged, channel in ((True, ""), (False, "temp_c")):
@@ -197,7 +194,6 @@ def test_what_goes_with_time_goes_with_something_to_be_logged(poses_with: Poses,
         assert (first.kind, first.channel) == (ActionKind.LOG, channel)
 
 
-@pytest.mark.slow
 def test_poses_with_an_error_of_their_own_are_held_longer(poses_with: Poses) -> None:
     off_g = 20 * SIGMA_G * np.random.default_rng(6).standard_normal(30)
     poses = [replace(p, mean=p.mean * (1 + d)) for p, d in zip(poses_with(6), off_g, strict=True)]
@@ -205,7 +201,6 @@ def test_poses_with_an_error_of_their_own_are_held_longer(poses_with: Poses) -> 
     assert (first.kind, first.hold_s) == (ActionKind.HOLD, 4 * HOLD_S)
 
 
-@pytest.mark.slow
 def test_a_temperature_that_went_with_time_is_moved_or_time_goes_without_it(
     poses_with: Poses, paper_unit: Sensor
 ) -> None:
@@ -221,14 +216,12 @@ def test_a_temperature_that_went_with_time_is_moved_or_time_goes_without_it(
     assert made.expected["temperature_bias"].if_it_acts > 0.8 > 0.4 > made.expected["temperature_bias"].now
 
 
-@pytest.mark.slow
 def test_no_more_poses_are_advised_than_were_asked_for(poses_with: Poses) -> None:
     posterior = seen_in(poses_with(4, warm_up=[4e-4, 3e-4, -5e-4])[:16])
     assert len(advice(posterior, most=1).actions) == 1
     assert len(advice(posterior, most=6).actions) > 3
 
 
-@pytest.mark.slow
 def test_poses_are_advised_where_nobody_knows_when_they_were_taken(with_effects: Callable[..., Sensor]) -> None:
     poses, _ = taken(with_effects(second_order_nonlinearity=[6e-4, -4e-4, 5e-4]), 26, 0)
     made = advice(seen_in([replace(p, start_s=0.0, end_s=0.0, channels={}) for p in poses]))
@@ -236,7 +229,6 @@ def test_poses_are_advised_where_nobody_knows_when_they_were_taken(with_effects:
     assert {action.kind for action in made.actions} <= {ActionKind.POSE, ActionKind.REPEAT}
 
 
-@pytest.mark.slow
 def test_slopes_inside_the_poses_count_in_what_is_to_come() -> None:
     recording = Case("warm_up", 1, (5.0, 10.0), 14, "white").make()
     poses = still_poses(recording.samples())

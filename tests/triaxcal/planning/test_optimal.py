@@ -56,11 +56,13 @@ def test_the_bound_for_a_bias_that_goes_with_temperature_is_what_theory_says() -
     assert bound(ask([WARM]), 21) == pytest.approx(3 * np.log(1 / 3), abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [15, 27])
 def test_the_bound_for_drift_counts_time_as_it_passes(n: int) -> None:
     assert bound(ask([DRIFT]), n) == pytest.approx(3 * np.log(np.mean(np.linspace(-1, 1, n) ** 2) / 3), abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("effects", "power"), [([SECOND], (3,)), ([THIRD], (4,)), ([SECOND, THIRD], (3, 4))])
 def test_the_bound_is_the_optimum_that_another_algorithm_finds(effects: list[Effect], power: tuple[int, ...]) -> None:
     """Fedorov's and Wynn's, one direction at a time, on directions of its own."""
@@ -263,6 +265,7 @@ def test_fewer_poses_than_parameters_are_refused_with_the_number_that_it_takes()
         optimal(22, [SECOND, THIRD, WARM, WARM_SCALE, DRIFT])
 
 
+@pytest.mark.slow
 def test_every_effect_of_the_catalogue_can_show_all_of_itself() -> None:
     for effect in CATALOGUE:
         assert ask([effect]).rank == len(effect.coefficients)

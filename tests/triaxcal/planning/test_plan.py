@@ -57,6 +57,7 @@ def test_a_plan_has_as_many_distinct_unit_vectors_as_asked_for(count: int) -> No
     assert distinct(v) == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [12, 18, 20, 33, 100])
 def test_a_spiral_is_spread_evenly_and_carries_nine_parameters(count: int) -> None:
     v = vectors(directions(count))
@@ -138,6 +139,7 @@ def test_from_nothing_a_whole_set_is_wanted() -> None:
     assert dilution(vectors(wanted)) <= 2.0
 
 
+@pytest.mark.slow
 def test_no_direction_is_wanted_twice() -> None:
     """Poses bunched on one side lack the same direction most, again and again."""
     for seed in range(30):

@@ -54,6 +54,7 @@ def test_tones_are_taken_out_and_the_noise_is_left(missing: list[int]) -> None:
     assert np.median(left) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_what_a_tone_adds_to_a_mean_is_known_over_its_phases_and_frequencies() -> None:
     rng = np.random.default_rng(0)
     stated, added = [], []
@@ -70,6 +71,7 @@ def test_a_tone_slower_than_four_cycles_a_pose_is_noise_of_the_mean() -> None:
     assert without_tones(slow).track.deviation.std() > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hertz", [12.4, 27.2, 31.7, 43.3])
 def test_poses_shaken_by_a_machine_have_the_standard_errors_of_the_quiet_ones(hertz: float) -> None:
     """Half of 26 poses of 6 s at 100 Hz are shaken by 5 mg beside 0.1 mg of noise."""

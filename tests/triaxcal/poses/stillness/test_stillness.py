@@ -73,6 +73,7 @@ def test_every_pose_is_found_once_and_inside_its_hold_at_any_rate(
     assert_each_once(stream, detect(stream.t_s, stream.u)[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_g", [1e-6, 2e-3, 1e-2])
 def test_every_pose_is_found_whatever_the_noise(
     noise_g: float, paper_unit: Sensor, twenty_six: np.ndarray, detect: Detect
@@ -275,6 +276,7 @@ def test_constant_readings_are_one_still_span_without_a_warning(detect: Detect) 
         assert np.isfinite(poses[0].covariance).all()
 
 
+@pytest.mark.slow
 def test_one_stuck_axis_hides_no_pose_of_the_others(plain: Tumbled, detect: Detect) -> None:
     u = plain.u.copy()
     u[:, 2] = 1.25

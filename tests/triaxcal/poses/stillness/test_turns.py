@@ -32,6 +32,7 @@ def holds_of(stream: Stood, w: Windows, spans: list[Span]) -> list[list[int]]:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", TILTS)
 @pytest.mark.parametrize("hand", HANDS)
 def test_each_orientation_is_a_span_of_its_own_however_the_hand_turns(
