@@ -20,7 +20,7 @@ from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
 from triaxcald.errors import DaemonError, InputError
-from triaxcald.exit_codes import severest
+from triaxcald.exit_codes import INTERRUPTED, severest
 from triaxcald.files import unused
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
@@ -57,7 +57,8 @@ def record_command(a: argparse.Namespace) -> int:
     with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
         # A single file is one recording, which cannot begin anew.
         kept = run_interruptible(_record(a, chosen, progress, hangup), hangup.set if folder else None)
-    return severest(k.exit_code for k in kept)
+    # None is left where it was stopped in the midst of a reload.
+    return severest(k.exit_code for k in kept) if kept else INTERRUPTED
 
 
 def _load(a: argparse.Namespace) -> _Chosen:

@@ -18,34 +18,38 @@ class Roster:
         self, seconds: float | None, patience: Patience, ended: Callable[[Kept], None] = lambda _: None
     ) -> None:
         self._seconds, self._patience, self._ended = seconds, patience, ended
-        self._work: dict[AtRecording, asyncio.Task[Kept]] = {}
+        self._work: dict[str, tuple[AtRecording, asyncio.Task[Kept]]] = {}
         self._changes = 0
         self._changed = asyncio.Event()
         self._stopped = False
 
     def statuses(self) -> list[UnitStatus]:
-        """Of the last recording of each name. From any thread."""
-        return list({one.name: one.status for one in tuple(self._work)}.values())
+        """Of the last recording of each name that is on it. From any thread."""
+        return [one.status for one, _ in tuple(self._work.values())]
 
     def at_work(self) -> set[str]:
-        return {one.name for one, task in self._work.items() if not task.done()}
+        return {name for name, (_, task) in self._work.items() if not task.done()}
 
     def begin(self, recordings: Iterable[AtRecording]) -> None:
+        """None of a name that is at work."""
         for one in recordings:
-            self._work[one] = asyncio.ensure_future(self._record(one))
+            self._work[one.name] = one, asyncio.ensure_future(self._record(one))
         self._changed.set()
 
     async def change(self, leaving: Collection[str], make: Callable[[set[str]], Iterable[AtRecording]]) -> None:
-        """Those of the names ``leaving`` end as if asked to; then those begin
-        that ``make`` gives for the names that are still at work."""
+        """Those of the names ``leaving`` end as if asked to, and are on it no
+        more; then those begin that ``make`` gives for the names that are still
+        at work."""
         self._changes += 1
         try:
-            going = {one: task for one, task in self._work.items() if one.name in leaving and not task.done()}
-            for one, task in going.items():
+            going = [self._work[name] for name in leaving if name in self._work]
+            for one, task in going:
                 one.leave()
                 task.cancel()
             if going:
-                await asyncio.wait(going.values())
+                await asyncio.wait([task for _, task in going])
+            for one, _ in going:
+                del self._work[one.name]
             if not self._stopped:
                 self.begin(make(self.at_work()))
         finally:
@@ -53,13 +57,13 @@ class Roster:
             self._changed.set()
 
     async def finish(self) -> list[Kept]:
-        """What they have all come to, once none is at work. When this is
+        """What those on it have come to, once none is at work. When this is
         cancelled every one of them is, again each time, and waited for; what
         was recorded is whole."""
         while True:
-            pending = [task for task in self._work.values() if not task.done()]
+            pending = [task for _, task in self._work.values() if not task.done()]
             if not pending and not self._changes:
-                return [task.result() for task in self._work.values()]
+                return [task.result() for _, task in self._work.values()]
             self._changed.clear()
             changed = asyncio.ensure_future(self._changed.wait())
             try:

@@ -1,0 +1,116 @@
+"""Recordings side by side, some of which leave and others begin."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from triaxcald.errors import RecordingError
+from triaxcald.exit_codes import INTERRUPTED
+from triaxcald.run.recording import AtRecording, Kept, State, UnitStatus
+from triaxcald.run.roster import Roster
+from triaxcald.station.coming_back import Patience
+
+
+class Played(AtRecording):
+    """Records until it is told to end, or to fail."""
+
+    kind = "unit"
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.ends = asyncio.Event()
+        self.fault: Exception | None = None
+
+    @property
+    def status(self) -> UnitStatus:
+        return UnitStatus(self.name, self._state, None, None, 0, {}, 0, 0.0, 0, None, {})
+
+    async def _work(self, seconds: float | None, patience: Patience) -> None:
+        self._state = State.RECORDING
+        await self.ends.wait()
+        if self.fault is not None:
+            raise self.fault
+
+    def _result(self) -> Kept:
+        return Kept(self.name, None, {})
+
+
+@pytest.fixture
+def told() -> list[Kept]:
+    return []
+
+
+@pytest.fixture
+def roster(told: list[Kept]) -> Roster:
+    return Roster(None, Patience(), told.append)
+
+
+def states(roster: Roster) -> dict[str, State]:
+    return {one.unit: one.state for one in roster.statuses()}
+
+
+async def turned() -> None:
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
+async def test_who_leaves_ends_as_asked_and_is_on_the_roster_no_more(roster: Roster, told: list[Kept]) -> None:
+    first, second = Played("a"), Played("b")
+    roster.begin([first, second])
+    finished = asyncio.ensure_future(roster.finish())
+    await turned()
+    seen: list[set[str]] = []
+
+    def make(at_work: set[str]) -> list[AtRecording]:
+        seen.append(at_work)
+        return [Played("c")]
+
+    await roster.change({"a", "unknown"}, make)
+    await turned()
+    assert seen == [{"b"}]
+    assert [(kept.unit, kept.error) for kept in told] == [("a", None)]
+    assert states(roster) == {"b": State.RECORDING, "c": State.RECORDING}
+    finished.cancel()
+    assert [(kept.unit, kept.exit_code) for kept in await finished] == [("b", INTERRUPTED), ("c", INTERRUPTED)]
+
+
+async def test_a_name_that_failed_may_begin_again_and_its_last_recording_counts(roster: Roster) -> None:
+    first, other, again = Played("a"), Played("b"), Played("a")
+    roster.begin([first, other])
+    finished = asyncio.ensure_future(roster.finish())
+    first.fault = RecordingError("the disk is gone")
+    first.ends.set()
+    await turned()
+    assert states(roster) == {"a": State.ENDED, "b": State.RECORDING}
+    assert roster.at_work() == {"b"}
+    await roster.change((), lambda _: [again])
+    await turned()
+    assert states(roster) == {"a": State.RECORDING, "b": State.RECORDING}
+    for one in (other, again):
+        one.ends.set()
+    assert [kept.error for kept in await finished] == [None, None]
+
+
+async def test_it_is_not_at_its_end_while_those_that_left_give_way_to_others(roster: Roster) -> None:
+    roster.begin([Played("a")])
+    finished = asyncio.ensure_future(roster.finish())
+    await turned()
+    later = Played("b")
+    await roster.change({"a"}, lambda _: [later])
+    await turned()
+    assert not finished.done()
+    later.ends.set()
+    assert [kept.unit for kept in await finished] == ["b"]
+
+
+async def test_one_that_fails_says_so_with_its_exit_code_and_stops_no_other(roster: Roster) -> None:
+    failing, other = Played("a"), Played("b")
+    roster.begin([failing, other])
+    failing.fault = RecordingError("the recording is closed")
+    failing.ends.set()
+    other.ends.set()
+    failed, kept = await roster.finish()
+    assert (failed.error, failed.exit_code != 0) == ("unit a: the recording is closed", True)
+    assert (kept.error, kept.exit_code) == (None, 0)
