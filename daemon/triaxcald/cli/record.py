@@ -44,19 +44,23 @@ class _Chosen:
     places: Sequence[Place]
     buses: Sequence[BusPlace]
 
+    @property
+    def names(self) -> set[str]:
+        return {place.unit.name for place in self.places} | {bus.name for bus in self.buses}
+
     def without(self, names: Collection[str]) -> _Chosen:
         places = [place for place in self.places if place.unit.name not in names]
         return replace(self, places=places, buses=[bus for bus in self.buses if bus.name not in names])
 
 
 def record_command(a: argparse.Namespace) -> int:
-    folder = a.output.is_dir()
-    if not folder:
+    a.folder = a.output.is_dir()
+    if not a.folder:
         writable(a.output)
     chosen, hangup = _load(a), asyncio.Event()
     with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
         # A single file is one recording, which cannot begin anew.
-        kept = run_interruptible(_record(a, chosen, progress, hangup), hangup.set if folder else None)
+        kept = run_interruptible(_record(a, chosen, progress, hangup), hangup.set if a.folder else None)
     # None is left where it was stopped in the midst of a reload.
     return severest(k.exit_code for k in kept) if kept else INTERRUPTED
 
@@ -64,7 +68,7 @@ def record_command(a: argparse.Namespace) -> int:
 def _load(a: argparse.Namespace) -> _Chosen:
     """Raises InputError, ProfileError, DriverMissing."""
     station = load_station(a.station)
-    chosen = _Chosen(station, *_of_station(station, a.unit, a.output, a.output.is_dir()))
+    chosen = _Chosen(station, *_of_station(station, a.unit, a.output, a.folder))
     check_lines(chosen.places, chosen.buses, where=str(station.path))
     return chosen
 
@@ -91,7 +95,7 @@ async def _record(
         if a.metrics is not None:
             from triaxcald.service.metrics import served
 
-            folder = a.output if a.output.is_dir() else a.output.parent
+            folder = a.output if a.folder else a.output.parent
             port = stack.enter_context(served(a.metrics, roster.statuses, folder))
             progress.stage("record", text.metrics_at(port))
         await stack.enter_async_context(Supervisor().kept_informed(in_a_line))
@@ -116,20 +120,22 @@ async def _reload(
         hangup.clear()
         try:
             new = await asyncio.to_thread(_load, a)
-        except (DaemonError, DriverError) as e:
-            _tell(progress, "error", text.not_reloaded(str(e)))
+            leaving = changed(chosen.station, new.station) & (chosen.names | new.names)
+            beginning = _recordings(a, new, progress, serials, roster.at_work() - leaving)
+        except Exception as e:  # noqa: BLE001 - a driver of anybody's reads its part; what is recorded goes on
+            known = isinstance(e, (DaemonError, DriverError))
+            _tell(progress, "error", text.not_reloaded(str(e) if known else f"internal error: {e!r}"))
             continue
-        leaving = changed(chosen.station, new.station)
         _tell(progress, "info", text.reloaded(sorted(leaving)))
         chosen = new
-        await roster.change(leaving, partial(_recordings, a, chosen, progress, serials))
+        await roster.change(leaving, beginning)
 
 
 def _tell(progress: Bars | JsonLines, level: str, message: str) -> None:
     if isinstance(progress, JsonLines):
         progress.say(level, "reload", message=message)
     else:
-        progress.stage("record", message)
+        say(f"record: {message}")
 
 
 def _recordings(
@@ -158,7 +164,7 @@ def _of_units(
     from triaxcald.run.unit_recording import UnitRecording
 
     def path_of(session: UnitSession) -> Callable[[IdentityRead], Path]:
-        if not a.output.is_dir():
+        if not a.folder:
             return lambda _: Path(a.output)
         if segments is not None:  # the next start goes on behind it
             return lambda identity: Path(a.output) / f"{session.name}-{identity.serial or 'unknown'}{SUFFIX}"
@@ -181,7 +187,7 @@ def _of_buses(
     from triaxcald.run.bus_recording import BusRecording, bus_recording_name
 
     def path_of(bus: BusPlace) -> Path:
-        if not a.output.is_dir():
+        if not a.folder:
             return Path(a.output)
         if segments is not None:
             return Path(a.output) / f"{bus.name}{SUFFIX}"

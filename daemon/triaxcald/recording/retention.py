@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -32,17 +32,23 @@ class Surplus(NamedTuple):
 
 
 def surplus(
-    segments: Sequence[Segment], retention: Retention, *, now_ns: int, free_bytes: int | None, kept: Collection[str]
+    segments: Sequence[Segment],
+    retention: Retention,
+    *,
+    age_ns: Callable[[Segment], int | None],
+    free_bytes: int | None,
+    kept: Collection[str],
 ) -> list[Surplus]:
     """What has to go, the oldest first. The one that is being written stays,
-    and so do the files ``kept``. ``free_bytes`` of the disk, None where that is
-    not known."""
+    and so do the files ``kept``. ``age_ns`` is None for one that does not say
+    from when it is: it is as old as any. ``free_bytes`` of the disk, None where
+    that is not known."""
     found: list[Surplus] = []
     free = retention.free_bytes if free_bytes is None else free_bytes
     for segment in segments:
         if segment.state == "open" or segment.file in kept:
             continue
-        if _too_old(segment, retention.keep_s, now_ns):
+        if retention.keep_s is not None and _too_old(age_ns(segment), retention.keep_s):
             found.append(Surplus(segment, "age"))
         elif free < retention.free_bytes:
             found.append(Surplus(segment, "disk"))
@@ -52,11 +58,8 @@ def surplus(
     return found
 
 
-def _too_old(segment: Segment, keep_s: float | None, now_ns: int) -> bool:
-    """One that does not say from when it is, is as old as any. Records' times
-    come second: they run on where the clock was set."""
-    closed_ns = segment.end_ns if segment.closed_ns is None else segment.closed_ns
-    return keep_s is not None and (closed_ns is None or now_ns - closed_ns > keep_s * 1e9)
+def _too_old(age_ns: int | None, keep_s: float) -> bool:
+    return age_ns is None or age_ns > keep_s * 1e9
 
 
 def evidence(manifest: Manifest) -> frozenset[str]:

@@ -56,7 +56,8 @@ class SegmentedWriter(RecordingWriter):
         self.manifest = manifest_path(path)
         self.deleted: list[Surplus] = []
         self._size_bytes, self._time_ns = size_bytes, round(time_s * 1e9)
-        self._retention, self._steady_ns = retention, steady_ns
+        self._retention, self._steady_ns, self._began_ns = retention, steady_ns, steady_ns()
+        self._closed_ns: dict[int, int] = {}  # by number, on the steady line
         self._kept: list[tuple[int, str, str, bytes]] = []
         self._recorded = self._told_low = False
         super().__init__(self.manifest, metadata=metadata, **options)
@@ -134,6 +135,7 @@ class SegmentedWriter(RecordingWriter):
             closed_ns=self._clock_ns(), bytes=file.size, sha256=digest_of(file.path),
             raw_sha256=file.digest.hexdigest(),
         )  # fmt: skip
+        self._closed_ns[last.number] = self._steady_ns()
         self._segments = self._segments.with_last(closed)
         self._segments.save()
 
@@ -147,12 +149,21 @@ class SegmentedWriter(RecordingWriter):
         free = disk.free_bytes(self.manifest.parent)
         return self._retention is not None and free is not None and free < self._retention.free_bytes
 
+    def _age_ns(self, segment: Segment) -> int | None:
+        """By the clock, or on the steady line where that is less: since it was
+        closed by this writer, at least since this writer began."""
+        closed_ns = segment.end_ns if segment.closed_ns is None else segment.closed_ns
+        if closed_ns is None:
+            return None
+        steadily_ns = self._closed_ns.get(segment.number, min(closed_ns, self._began_ns))
+        return min(self._clock_ns() - closed_ns, self._steady_ns() - steadily_ns)
+
     def _retain(self) -> list[Surplus]:
         """What it has taken away, also said in the file."""
         if self._retention is None:
             return []
         chosen = surplus(
-            self._segments.segments, self._retention, now_ns=min(self._clock_ns(), self._steady_ns()),
+            self._segments.segments, self._retention, age_ns=self._age_ns,
             free_bytes=disk.free_bytes(self.manifest.parent), kept=evidence(self._segments),
         )  # fmt: skip
         gone = delete(self._segments, chosen)

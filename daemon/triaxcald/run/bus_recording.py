@@ -72,7 +72,8 @@ class BusRecording(AtRecording):
                 self._progress.stage(self.name, "recording")
                 await self._listened.for_seconds(ReturningBus(listener, patience, self._is_lost), writer, seconds)
 
-            await self._recorded_by(partial(self._new_writer, self._path), record)
+            make = partial(self._new_writer, self._path)
+            await self._recorded_by(make, record, self._path if self._segments else None)
 
     def _is_lost(self, trouble: str | None) -> None:
         self._state = State.RECORDING if trouble is None else State.WAITING

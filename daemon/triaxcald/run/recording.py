@@ -6,13 +6,14 @@ from __future__ import annotations
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping
-from contextlib import suppress
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from triaxcal_drivers.claim import Claim
 from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import DONE, exit_code_of
 from triaxcald.recording.ending import ended_because
@@ -21,6 +22,7 @@ from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.endings import aborted
 from triaxcald.run.together import whole_on_a_thread
 from triaxcald.station.coming_back import Patience
+from triaxcald.station.lock import locked
 
 Kind = Literal["unit", "bus"]
 
@@ -118,11 +120,24 @@ class AtRecording(ABC):
             self._state = State.ENDED
 
     async def _recorded_by(
-        self, make: Callable[[], RecordingWriter], record: Callable[[RecordingWriter], Awaitable[None]]
+        self,
+        make: Callable[[], RecordingWriter],
+        record: Callable[[RecordingWriter], Awaitable[None]],
+        manifest: Path | None,
     ) -> None:
         """Has a writer made and ``record`` work with it; the file is whole in
-        the end, and says why it ended. To find the end of a segment that was
-        cut off, and to write an end, may take a while."""
+        the end, and says why it ended. A ``manifest`` is this process's alone
+        meanwhile. Raises DeviceInUse where it is another's."""
+        async with AsyncExitStack() as claimed:
+            if manifest is not None:
+                await claimed.enter_async_context(locked(Claim(f"recording {manifest.resolve()}")))
+            await self._written_by(make, record)
+
+    async def _written_by(
+        self, make: Callable[[], RecordingWriter], record: Callable[[RecordingWriter], Awaitable[None]]
+    ) -> None:
+        """To find the end of a segment that was cut off, and to write an end,
+        may take a while."""
         with await whole_on_a_thread(make) as writer:
             self._writer, self._state, self._trouble = writer, State.RECORDING, None
             try:

@@ -36,10 +36,9 @@ class Roster:
             self._work[one.name] = one, asyncio.ensure_future(self._record(one))
         self._changed.set()
 
-    async def change(self, leaving: Collection[str], make: Callable[[set[str]], Iterable[AtRecording]]) -> None:
+    async def change(self, leaving: Collection[str], beginning: Iterable[AtRecording]) -> None:
         """Those of the names ``leaving`` end as if asked to, and are on it no
-        more; then those begin that ``make`` gives for the names that are still
-        at work."""
+        more; then the others begin, unless all are to end by then."""
         self._changes += 1
         try:
             going = [self._work[name] for name in leaving if name in self._work]
@@ -51,7 +50,7 @@ class Roster:
             for one, _ in going:
                 del self._work[one.name]
             if not self._stopped:
-                self.begin(make(self.at_work()))
+                self.begin(beginning)
         finally:
             self._changes -= 1
             self._changed.set()
@@ -70,7 +69,7 @@ class Roster:
                 await asyncio.wait([*pending, changed], return_when=asyncio.FIRST_COMPLETED)
             except asyncio.CancelledError:
                 self._stopped = True
-                for task in pending:
+                for _, task in tuple(self._work.values()):  # a change may have begun some since
                     task.cancel()
             finally:
                 changed.cancel()

@@ -4,7 +4,10 @@ other up."""
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Callable, Coroutine, Iterable
+from contextlib import suppress
+from functools import partial
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -24,14 +27,33 @@ async def side_by_side(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
 
 
 async def whole_on_a_thread(work: Callable[[], T]) -> T:
-    """What ``work`` gives, which is waited for in any case: a cancellation
-    meanwhile strikes at the next await."""
-    thread, struck = asyncio.ensure_future(asyncio.to_thread(work)), False
-    while not thread.done():
+    """What ``work`` gives, which is waited for in any case, on a thread of its
+    own: those that the loop has may all be busy with devices that hang. A
+    cancellation meanwhile strikes at the next await, unless ``work`` raises."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[T] = loop.create_future()
+
+    def run() -> None:
         try:
-            await asyncio.wait([thread])
+            given = work()
+        except BaseException as e:  # noqa: BLE001 - whatever it is, it is raised where it is waited for
+            _soon(loop, partial(done.set_exception, e))
+        else:
+            _soon(loop, partial(done.set_result, given))
+
+    threading.Thread(target=run, name="whole", daemon=True).start()
+    struck = False
+    while not done.done():
+        try:
+            await asyncio.wait([done])
         except asyncio.CancelledError:
             struck = True
+    given = done.result()
     if struck and (task := asyncio.current_task()) is not None:
         task.cancel()
-    return thread.result()
+    return given
+
+
+def _soon(loop: asyncio.AbstractEventLoop, act: Callable[[], object]) -> None:
+    with suppress(RuntimeError):  # the loop has ended, and nobody waits any more
+        loop.call_soon_threadsafe(act)

@@ -80,7 +80,8 @@ class UnitRecording(AtRecording):
                 returning = session.returning(device, identity, patience, self._is_lost)
                 await self._recorded.for_seconds(returning, writer, seconds)
 
-            await self._recorded_by(partial(session.writer, self._path, identity, segments=self._segments), record)
+            make = partial(session.writer, self._path, identity, segments=self._segments)
+            await self._recorded_by(make, record, self._path if self._segments else None)
 
     def _result(self) -> Kept:
         readings, recorded = self._recorded.streams[READINGS], self._recorded

@@ -26,6 +26,9 @@ HOLE_S = 10.0
 """Nothing for so long is a gap, though nobody was told of a loss: a laptop
 slept, a process was stopped. Shorter holes leave a counter of 16 bits at 1 kHz
 in no doubt, and a busy machine makes them."""
+AGAIN_S = 60.0
+"""A complaint so soon after an opening says that this has mended nothing, and
+the next one waits for longer; it comes within some silence time-outs."""
 UNHEARD = "nothing was received meanwhile"
 
 ABSENT = (BusError, DeviceAbsent, DeviceSilent, RegisterRefused)
@@ -195,6 +198,7 @@ class Returning:
         opens meanwhile. A hole of more than `HOLE_S` is a gap too. Raises what
         the device's stream does once patience ends."""
         last_ns: int | None = None
+        returned_ns = self._now_ns()
         gap: Gap | None = None
         waiting = self._waiting()
         with ExitStack() as at_rest:
@@ -218,16 +222,16 @@ class Returning:
                     return
                 except LOST as e:
                     trouble: Exception = e
-                complaint, self._complaint = self._complaint, None
                 if gap is None:
                     gap = Gap(self._now_ns() if last_ns is None else last_ns, None, str(trouble))
-                    if complaint is None:  # of which there may be one after each opening
+                    if self._complaint is None or self._now_ns() - returned_ns > AGAIN_S * 1e9:
                         waiting = self._waiting()
                     waiting.told = ""
                     at_rest.enter_context(self._patience.waiting())
                     waiting.say(trouble)
                     yield RawBatch.of([]).after(gap)
                 await waiting.until(self._again, LOST, trouble)
+                self._complaint, returned_ns = None, self._now_ns()  # what was said meanwhile was of the one before
 
     def _waiting(self) -> _Waiting:
         return _Waiting(self._patience, lambda trouble: self._tell(str(trouble)))

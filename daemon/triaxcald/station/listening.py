@@ -51,6 +51,7 @@ class ReturningBus:
     ) -> None:
         self._listener, self._patience, self._tell = listener, patience, tell
         self._now_ns, self._slept_ns = now_ns, slept_ns
+        self._opened_ns = 0
 
     async def stream(self) -> AsyncGenerator[RawBatch, None]:
         """As the listener's own. A batch without records tells of an
@@ -62,10 +63,12 @@ class ReturningBus:
             try:
                 async with aclosing(self._listener.stream()) as stream:
                     async for batch in stream:
-                        before_ns, asleep_ns = asleep_ns, self._slept_ns()
+                        # A thread that is kept between its two clocks reads too little.
+                        before_ns, asleep_ns = asleep_ns, max(asleep_ns, self._slept_ns())
                         if asleep_ns - before_ns > SLEPT_S * 1e9:
                             yield RawBatch.of([]).after(Gap(heard_ns, heard_ns + asleep_ns - before_ns, SLEPT))
                             lost = True
+                        lost = lost or (batch.gap is not None and not len(batch))
                         if lost and len(batch):
                             batch, lost = _after_a_loss(batch), False
                         yield batch
@@ -76,13 +79,14 @@ class ReturningBus:
             yield RawBatch.of([]).after(gap)
             self._tell(gap.cause)
             await until_open(self._again, self._patience, lambda trouble: self._tell(str(trouble)))
-            heard_ns, asleep_ns, lost = self._now_ns(), self._slept_ns(), True
+            heard_ns, asleep_ns, lost = self._opened_ns, self._slept_ns(), True
             yield RawBatch.of([]).after(replace(gap, to_ns=heard_ns))
             self._tell(None)
 
     async def _again(self) -> None:
         await self._listener.close()
         await self._listener.open()
+        self._opened_ns = self._now_ns()
         await self._listener.settled(SETTLED_S)
 
 

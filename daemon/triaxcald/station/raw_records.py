@@ -37,10 +37,18 @@ class RawRecords:
     ) -> AsyncGenerator[RawBatch]:
         """The batches of a stream, which is closed in the end, once they are on
         their way to disk, and without those that it had no room for."""
-        unwritten = None if writer is None else writer.resumes
+        unwritten: Gap | None = None
+        away = None if writer is None else writer.resumes
         stepped_ns = self.clock.steps_ns()
         async with aclosing(stream):
             async for batch in stream:
+                if away is not None and (len(batch) or batch.gap is not None):
+                    away = replace(away, to_ns=int(batch.time_ns[0]) if batch.gap is None else batch.gap.from_ns)
+                    if batch.gap is None:
+                        batch = batch.after(away)
+                    else:
+                        self._note(writer, away)
+                    away = None
                 self._note(writer, batch.gap)
                 if (steps_ns := self.clock.steps_ns()) != stepped_ns and writer is not None:
                     writer.event("clock_step", {"by_s": (steps_ns - stepped_ns) / 1e9})

@@ -32,6 +32,11 @@ class Adapter(Protocol):
         """Whether `receive` gives what `send` sends too, once all frames are
         asked for."""
 
+    @property
+    def socketcan_errors(self) -> bool:
+        """Whether the identifiers and data of error frames are SocketCAN's; else
+        they are of a layout of the adapter's own."""
+
     def receive(self, timeout_s: float) -> list[Frame]:
         """What has come, in order; nothing where nothing comes for
         ``timeout_s``. Raises BusError where the bus has failed: interface gone

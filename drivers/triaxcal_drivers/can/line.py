@@ -56,11 +56,11 @@ class CanLine:
         async with self._opening:
             if self._adapter is not None and self.attention.now_s() - self._heard_s < MUTE_S:
                 return
-            await self._close()
             try:
+                await self._close()
                 adapter = await opened(lambda: open_bus(self.settings), Adapter.close)
-            except BusError as e:  # who listened to the one before waits for nothing
-                self._fail(e)
+            except BaseException as e:  # who listened to the one before waits for nothing
+                self._fail(e if isinstance(e, BusError) else BusError(f"{self.name} is not open"))
                 raise
             self.openings += 1
             self._adapter, self._failure, self._heard_s = adapter, None, self.attention.now_s()
@@ -109,6 +109,8 @@ class CanLine:
     def hear(self, queue: FrameQueue) -> None:
         """``queue`` gets the frames that it has been opened for."""
         self._queues = [*(q for q in self._queues if q is not queue), queue]
+        if self._failure is not None:  # before it was among them
+            queue.fail(self._failure)
         self._filter()
 
     def unhear(self, queue: FrameQueue) -> None:
@@ -152,12 +154,13 @@ class CanLine:
                     adapter.close()
                 return
             if frames:
-                self._heard_s = self.attention.now_s()
+                if not all(frame.flags & RawFlag.SENT for frame in frames):
+                    self._heard_s = self.attention.now_s()
                 HOST.steps_ns()
                 if HOST.stepped:
                     frames = [frame._replace(time_ns=HOST.steady_ns(frame.time_ns)) for frame in frames]
                 for queue in self._queues:
-                    queue.put(frames)
+                    queue.put(frames, adapter.socketcan_errors)
                 listeners = self._listeners
                 for frame in frames:
                     extended = bool(frame.flags & RawFlag.EXTENDED_ID)

@@ -9,6 +9,7 @@ from triaxcal_drivers.can.line import MUTE_S, CanLine, join, leave
 from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.can.receive import FrameQueue
 from triaxcal_drivers.errors import BusError
+from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Gap, RawBatch
 
 LOOK_S = 0.2
@@ -79,7 +80,11 @@ class BusListener:
             if batch is None:
                 batch = await frames.batch(LOOK_S)
             if batch is None:
-                yield RawBatch.of([])
+                now_ns, look = HOST.now_ns(), RawBatch.of([])
+                if line.openings != openings:
+                    look = look.after(Gap(now_ns if last_ns is None else last_ns, now_ns, REOPENED))
+                openings, last_ns = line.openings, now_ns
+                yield look
                 continue
             if not batch:
                 continue

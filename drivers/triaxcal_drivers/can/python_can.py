@@ -63,6 +63,11 @@ def open_python_can(settings: BusSettings) -> can.BusABC:
         raise BusError(f"cannot open {settings.interface} {settings.channel}: {_reason(e)}") from e
 
 
+_SOCKETCAN_ERRORS = frozenset({"socketcan", "gs_usb", "socketcand", "udp_multicast", "virtual"})
+"""Whose error frames come as the kernel or its like made them; pcan, for one,
+puts codes of its own there."""
+
+
 class PythonCan:
     """An `Adapter`. Raises BusError where the bus cannot be opened."""
 
@@ -70,6 +75,7 @@ class PythonCan:
         self._where = f"{settings.interface} {settings.channel}"
         self._clock = HostClock()
         self.echoes = settings.interface in _ECHO or bool(settings.options.get("receive_own_messages"))
+        self.socketcan_errors = settings.interface in _SOCKETCAN_ERRORS
         self._bus = open_python_can(settings)
 
     def receive(self, timeout_s: float) -> list[Frame]:

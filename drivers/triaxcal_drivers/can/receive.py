@@ -91,8 +91,9 @@ class FrameQueue:
                 return True
         return False
 
-    def put(self, frames: Sequence[Frame]) -> None:
-        """From the receive thread."""
+    def put(self, frames: Sequence[Frame], socketcan_errors: bool = True) -> None:
+        """From the receive thread. What error frames say is read where they are
+        SocketCAN's."""
         wanted = self._identifiers
         if wanted is None or self._failure is not None:
             return
@@ -103,7 +104,10 @@ class FrameQueue:
                     self._lose(_Loss(frame.lost, OVERFLOW))
                 if frame.flags & RawFlag.ERROR:
                     self._keep(frame)
-                    if ErrorClass.RECEIVE_OVERFLOW in error_frame(frame.source, frame.data).classes:
+                    if (
+                        socketcan_errors
+                        and ErrorClass.RECEIVE_OVERFLOW in error_frame(frame.source, frame.data).classes
+                    ):
                         self._lose(_Loss(None, CONTROLLER_OVERFLOW))
                 elif (frame.source, bool(frame.flags & RawFlag.EXTENDED_ID)) in wanted:
                     self._keep(frame)

@@ -70,6 +70,10 @@ class SocketCan:
         return self._options.local_loopback
 
     @property
+    def socketcan_errors(self) -> bool:
+        return True
+
+    @property
     def buffer_frames(self) -> int:
         return self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // raw_socket.FRAME_BYTES
 

@@ -36,7 +36,7 @@ def new(tmp_path: Path, clock: Any) -> Iterator[NewWriter]:
     writers: list[SegmentedWriter] = []
 
     def make(**options: Any) -> SegmentedWriter:
-        settings = {"metadata": METADATA, "clock_ns": clock, "time_s": 60.0}
+        settings = {"metadata": METADATA, "clock_ns": clock, "steady_ns": clock, "time_s": 60.0}
         writers.append(SegmentedWriter(tmp_path / "rec.mcap", **{**settings, **options}))
         return writers[-1]
 
@@ -235,6 +235,21 @@ def test_a_clock_that_is_set_takes_no_fresh_segment_away(
         minutes(writer, 2, first=20)
     assert writer.deleted == []
     assert clock.now_ns - stepped_ns - begun_ns == 240 * S
+
+
+def test_a_clock_that_was_years_behind_at_the_start_keeps_no_segment_for_ever(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], clock: Any
+) -> None:
+    with new() as writer:
+        minutes(writer, 2)
+    right_ns, behind_ns = clock.now_ns, 10 * 365 * 86_400 * S
+    clock.now_ns -= behind_ns
+    steady = {"steady_ns": lambda: clock.now_ns - right_ns, "retention": Retention(keep_s=150.0)}
+    with new(**steady) as writer:
+        right_ns += behind_ns
+        clock.now_ns += behind_ns  # a first contact with a time server; the steady line does not move
+        minutes(writer, 6, first=20)
+    assert [one.segment.number for one in writer.deleted] == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_segment_is_as_old_as_its_file_whatever_its_records_say(

@@ -61,15 +61,8 @@ async def test_who_leaves_ends_as_asked_and_is_on_the_roster_no_more(roster: Ros
     roster.begin([first, second])
     finished = asyncio.ensure_future(roster.finish())
     await turned()
-    seen: list[set[str]] = []
-
-    def make(at_work: set[str]) -> list[AtRecording]:
-        seen.append(at_work)
-        return [Played("c")]
-
-    await roster.change({"a", "unknown"}, make)
+    await roster.change({"a", "unknown"}, [Played("c")])
     await turned()
-    assert seen == [{"b"}]
     assert [(kept.unit, kept.error) for kept in told] == [("a", None)]
     assert states(roster) == {"b": State.RECORDING, "c": State.RECORDING}
     finished.cancel()
@@ -85,7 +78,7 @@ async def test_a_name_that_failed_may_begin_again_and_its_last_recording_counts(
     await turned()
     assert states(roster) == {"a": State.ENDED, "b": State.RECORDING}
     assert roster.at_work() == {"b"}
-    await roster.change((), lambda _: [again])
+    await roster.change((), [again])
     await turned()
     assert states(roster) == {"a": State.RECORDING, "b": State.RECORDING}
     for one in (other, again):
@@ -98,7 +91,7 @@ async def test_it_is_not_at_its_end_while_those_that_left_give_way_to_others(ros
     finished = asyncio.ensure_future(roster.finish())
     await turned()
     later = Played("b")
-    await roster.change({"a"}, lambda _: [later])
+    await roster.change({"a"}, [later])
     await turned()
     assert not finished.done()
     later.ends.set()
@@ -114,3 +107,12 @@ async def test_one_that_fails_says_so_with_its_exit_code_and_stops_no_other(rost
     failed, kept = await roster.finish()
     assert (failed.error, failed.exit_code != 0) == ("unit a: the recording is closed", True)
     assert (kept.error, kept.exit_code) == (None, 0)
+
+
+async def test_who_begins_as_all_are_stopped_is_stopped_too(roster: Roster) -> None:
+    roster.begin([Played("a")])
+    finished = asyncio.ensure_future(roster.finish())
+    await turned()
+    asyncio.get_running_loop().call_soon(finished.cancel)
+    roster.begin([Played("b")])
+    assert [kept.exit_code for kept in await finished] == [INTERRUPTED, INTERRUPTED]

@@ -20,6 +20,7 @@ class Played:
     sent: list[tuple[int, str]] = field(default_factory=list)
     closed: bool = False
     echoes: bool = False
+    socketcan_errors: bool = True
 
     def receive(self, timeout_s: float) -> list[Frame]:
         try:
