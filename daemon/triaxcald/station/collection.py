@@ -102,7 +102,9 @@ class Recorded(RawRecords):
         readings = self.streams[READINGS]
         watch = self._watch(READINGS, clock_s)
         async with aclosing(self.records(device, writer)) as records:
-            async for _ in records:
+            async for batch in records:
+                if _interrupted(batch):
+                    watch = self._watch(READINGS, clock_s)
                 try:
                     watch.look()
                 except DeviceSilent as e:
@@ -151,7 +153,9 @@ class Collection(Recorded):
             directions(wanted)  # put in order once, before there are samples to lose
         watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:
-            async for _ in records:
+            async for batch in records:
+                if _interrupted(batch):
+                    watch = self._watch(stream, clock_s)
                 watch.look()
                 now_s, host_s = pipeline.seconds, clock_s()
                 if now_s - looked_s < LOOK_SAMPLES_S or host_s < next_host_s:
@@ -185,6 +189,12 @@ class Collection(Recorded):
                         f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there",
                         wanted=state.missing,
                     )
+
+
+def _interrupted(batch: RawBatch) -> bool:
+    """Whether an interruption begins: what comes after it is another stream,
+    which has its own time to bring a sample."""
+    return batch.gap is not None and batch.gap.to_ns is None
 
 
 class _Watch:

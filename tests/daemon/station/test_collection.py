@@ -39,13 +39,14 @@ class Bus:
     """A Device that sends a still unit's frames as fast as they are taken; from 5 s on not those of ``stopped``.
 
     They come back at ``again_s``. Its own time is the host's. Before the first
-    batch ``discarding_s`` go by.
+    batch ``discarding_s`` go by. At ``interrupted_s`` an interruption begins.
     """
 
     stopped: Sequence[int]
     again_s: float = float("inf")
     now_s: float = 0.0
     discarding_s: float = 0.0
+    interrupted_s: float = float("inf")
 
     def clock_s(self) -> float:
         return self.now_s
@@ -59,6 +60,9 @@ class Bus:
         self.now_s += self.discarding_s
         while self.now_s < END_S:
             self.now_s += BATCH_S
+            if self.now_s >= self.interrupted_s:
+                self.interrupted_s = float("inf")
+                yield RawBatch.of([]).after(Gap(round(self.now_s * 1e9), None, "the link is down"))
             silent = self.stopped if STOP_S <= self.now_s < self.again_s else ()
             records = []
             for frames in zip(*tpdos(unit.advance(self.now_s)), strict=True):
@@ -129,6 +133,19 @@ async def test_a_pause_shorter_than_the_time_out_ends_nothing(bundle: Bundle, ti
         await collection.for_seconds(device, writer, 20.0, bus.clock_s)
     assert 20.0 <= collection.pipelines[READINGS].seconds < 20.0 + 2 * BATCH_S
     assert collection.pipelines[READINGS].counts["missing"] > 0
+
+
+async def test_after_an_interruption_a_stream_has_its_whole_time_to_bring_a_sample(
+    bundle: Bundle, timeout_s: float, tmp_path: Path
+) -> None:
+    """It was nearly over when the device was lost."""
+    lost_s = STOP_S + timeout_s - 2 * BATCH_S
+    bus = Bus(OF_READINGS, again_s=lost_s + timeout_s - 2 * BATCH_S, interrupted_s=lost_s)
+    device: Any = bus
+    collection = Collection(CALIBRATION, bundle, "node 5")
+    with RecordingWriter(tmp_path / "rec.mcap", metadata={}, preview_channels=["temp_c", "status"]) as writer:
+        await collection.for_seconds(device, writer, 20.0, bus.clock_s)
+    assert collection.pipelines[READINGS].seconds >= 20.0
 
 
 async def test_the_time_that_a_driver_spends_on_discarding_is_no_silence(
