@@ -44,6 +44,11 @@ class ModbusClient:
         return self._line.owed_s(self._unit_id)
 
     @property
+    def attention_s(self) -> float:
+        """Time [s] that goes on while this process looks at the line."""
+        return self._line.attention.now_s()
+
+    @property
     def own_s(self) -> float:
         """Time [s] that goes on while this unit has the line or could have it:
         the line's attention, less what other units took while a request of this

@@ -197,8 +197,9 @@ class ModbusDevice:
         ever."""
         records: list[Record] = []
         for _ in range(_BATCH_REPLIES):
+            asked_ns, asked_s = self._now_ns(), self._connected().attention_s
             flags, data = await self._request(p)
-            records.append((self._now_ns(), p.source, flags, data))
+            records.append((self._came_ns(asked_ns, asked_s), p.source, flags, data))
             taken, remaining = self._held(p.stream, data) if not flags else (0, 0)
             if taken:
                 p.heard_s = self._connected().own_s
@@ -208,6 +209,14 @@ class ModbusDevice:
                 return records
         p.due_s = 0.0  # more is waiting: come back at once
         return records
+
+    def _came_ns(self, asked_ns: int, asked_s: float) -> int:
+        """When the reply came, for all that is known. Where this process was
+        kept from looking it has waited unread: what the unit did meanwhile is
+        later than the reply."""
+        waited_s = self._connected().attention_s - asked_s
+        now_ns = self._now_ns()
+        return min(now_ns, asked_ns + round(waited_s * 1e9)) if math.isfinite(waited_s) else now_ns
 
     async def _request(self, p: _Polled) -> tuple[RawFlag, bytes]:
         unanswered, p.unanswered = p.unanswered, 0

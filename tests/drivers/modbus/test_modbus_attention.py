@@ -129,3 +129,31 @@ def test_polls_that_all_fail_are_a_silence_in_its_time(bundle: Callable[..., Any
     came, took_s = _stream(bundle, _refused, lambda: None, batches=1_000_000)
     assert came > 50
     assert 10.0 <= took_s <= 10.1
+
+
+def test_a_reply_that_waits_unread_has_come_when_it_was_asked_for(bundle: Callable[..., Any]) -> None:
+    """What the unit did while this process was stopped comes after it, and not before."""
+
+    async def work() -> tuple[list[float], list[float]]:
+        asked_s: list[float] = []
+
+        def reply(request: bytes) -> bytes:
+            asked_s.append(virtual().time())
+            virtual().now_s += HELD_UP_S
+            return _refused(request)
+
+        async with served(reply) as port:
+            bus = ModbusBus(host="127.0.0.1", port=port, unit_id=17)
+            device = ModbusDevice(bundle().profile, bus, now_ns=lambda: round(virtual().time() * 1e9))
+            await device.open()
+            probes, came_s = len(asked_s), list[float]()
+            async for batch in device.stream(["readings"]):
+                came_s += (batch.time_ns / 1e9).tolist()
+                if len(came_s) == 5:
+                    break
+            await device.close()
+        return asked_s[probes : probes + 5], came_s
+
+    asked_s, came_s = run(work())
+    assert len(came_s) == 5
+    assert all(0 <= came - asked < 0.1 for asked, came in zip(asked_s, came_s, strict=True))
