@@ -7,7 +7,7 @@ TOOLS = $(VENV)/.tools
 # The matrices are small: threads of linear algebra would only wait for each other.
 ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: demo test test-slow check format bench docs clean
+.PHONY: demo test test-slow check format bench soak docs clean
 
 # An environment; the extras of $(1) in it, and $(2) says what for.
 define environment
@@ -41,6 +41,10 @@ test-slow: $(TOOLS)  ## many seeds, whole processes, a CAN kernel: half an hour 
 
 bench: $(TOOLS)  ## the tables of docs/benchmarks.md, some minutes; BENCH=quick for fewer runs, within one
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)
+
+SOAK ?= 20m
+soak: $(TOOLS)  ## a recorder while everything fails at random, 20 minutes; SOAK=2m for less, SEED=7 for the same faults again
+	$(ONE_THREAD) $(BIN)/python -m benchmarks.soak --time $(SOAK) $(if $(SEED),--seed $(SEED))
 
 docs: $(TOOLS)  ## pages made from the code, and the notebook with its outputs
 	$(BIN)/python docs/reference/python.py

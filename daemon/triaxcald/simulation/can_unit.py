@@ -121,6 +121,11 @@ class CanUnit:
         self._reader_behind = False
         time_base.wait_for_reader(lambda: self._reader_behind)
 
+    @property
+    def operational(self) -> bool:
+        """Whether the samples that come due go onto the bus."""
+        return self._state == _OPERATIONAL
+
     async def __aenter__(self) -> Self:
         self._bus = await opened(lambda: open_python_can(self._settings), can.BusABC.shutdown)
         node = self._node_id
