@@ -33,7 +33,7 @@ demo: $(READY)  ## the whole line on two simulated units
 WORKERS = $(shell $(BIN)/python -c 'import os; print(min(os.cpu_count(), 8) + 2)')
 PYTEST = $(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 test: $(TOOLS)  ## the tests, in some minutes
-	@echo "Testing: some five minutes on two cores; make test-slow runs the rest"
+	@echo "Testing: some four minutes on two cores; make test-slow runs the rest"
 	$(PYTEST) -m "not slow"
 
 test-slow: $(TOOLS)  ## many seeds, whole processes, a CAN kernel: half an hour on two cores
