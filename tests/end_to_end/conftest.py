@@ -23,9 +23,10 @@ MULTICAST = "239.74.163.2"
 
 
 def _heed_interrupts() -> None:
-    """Also where the tests themselves run in the background of a shell; without its terminal."""
+    """Also where the tests themselves run in the background of a shell, or under nohup; without its terminal."""
     os.setsid()
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 class Process:
