@@ -33,6 +33,10 @@ class RawFlag(IntFlag):
     SENT = 128  # this host sent it
 
 
+EXTENDED_KEY = 1 << 32
+"""Added to an extended identifier: a standard one may have the same number."""
+
+
 @dataclass(frozen=True)
 class Gap:
     """Records that were sent, or would have been, and are not in a stream.
@@ -79,8 +83,15 @@ class RawBatch:
     def __len__(self) -> int:
         return len(self.time_ns)
 
-    def after(self, gap: Gap) -> RawBatch:
-        """The same records, with a gap before the first of them."""
+    @property
+    def identifiers(self) -> NDArray[np.int64]:
+        """(n,) CAN identifiers, extended ones apart by `EXTENDED_KEY`."""
+        extended = (self.flags & RawFlag.EXTENDED_ID) != 0
+        return np.asarray(self.source.astype(np.int64) + extended * EXTENDED_KEY)
+
+    def after(self, gap: Gap | None) -> RawBatch:
+        """The same records, with a gap before the first of them; None where
+        that was told before them."""
         flags = self.flags.copy()
         flags[:1] |= np.uint8(RawFlag.LOST_BEFORE)
         return replace(self, flags=flags, gap=gap)

@@ -7,11 +7,12 @@ import signal
 import socket
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
 from triaxcald.cli.signals import StopSignals, stop_signals
+from triaxcald.run.together import soon
 
 T = TypeVar("T")
 
@@ -42,24 +43,19 @@ async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: C
     task = asyncio.ensure_future(work)
 
     def cancel() -> bool:
-        _soon(loop, task.cancel)
+        soon(loop, task.cancel)
         return not task.done()
 
     with _woken(loop):
         signals.cancel_by(cancel)
         if reload is not None:
-            signals.reload_by(partial(_soon, loop, reload))
+            signals.reload_by(partial(soon, loop, reload))
         try:
             return await task
         except asyncio.CancelledError as e:
             if signals.caught:
                 raise Interrupted(signals.caught[0], _notes(e)) from None
             raise
-
-
-def _soon(loop: asyncio.AbstractEventLoop, act: Callable[[], object]) -> None:
-    with suppress(RuntimeError):  # the loop has ended, and the work with it
-        loop.call_soon_threadsafe(act)
 
 
 class _Unawaited(ThreadPoolExecutor):

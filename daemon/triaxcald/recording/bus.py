@@ -19,7 +19,6 @@ from triaxcald.recording.schema import BUS_PHASE, BUS_RECORD, RAW
 Channel = str | int | None
 """As python-can names them; None where a bus has but one, of no name."""
 _NUMBER = re.compile(r"-?[0-9]{1,9}")
-_EXTENDED_KEY = 1 << 32
 
 
 def bus_record(interface: str, channel: Channel = None, **settings: str) -> dict[str, str]:
@@ -113,8 +112,7 @@ class _Channel:
     def feed(self, batch: RawBatch) -> None:
         error = (batch.flags & RawFlag.ERROR) != 0
         fd = (batch.flags & RawFlag.FD) != 0
-        key = batch.source.astype(np.int64) + ((batch.flags & RawFlag.EXTENDED_ID) != 0) * _EXTENDED_KEY
-        self._identifiers = np.union1d(self._identifiers, key[~error])
+        self._identifiers = np.union1d(self._identifiers, batch.identifiers[~error])
         seen: Mapping[str, Any] = {
             "frames": ~error,
             "remote": ((batch.flags & RawFlag.REMOTE) != 0) & ~fd & ~error,

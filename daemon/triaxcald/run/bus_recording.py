@@ -13,10 +13,9 @@ from triaxcald.certificate import software
 from triaxcald.inputs import STATION_FILE
 from triaxcald.recording.bus import bus_record, phase_of
 from triaxcald.recording.schema import BUS_RECORD, RAW
-from triaxcald.recording.segments import SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.recording import AtRecording, Kept, State, UnitStatus
-from triaxcald.run.session import Segments, stamp
+from triaxcald.run.session import Segments, new_writer, stamp
 from triaxcald.station.buses import BusPlace
 from triaxcald.station.collection import Progress
 from triaxcald.station.coming_back import Patience
@@ -96,10 +95,7 @@ class BusRecording(AtRecording):
             "preview_channels": None,
             "clock_ns": self._clock_ns,
         }
-        if self._segments is None:
-            writer = RecordingWriter(path, **settings)
-        else:
-            writer = SegmentedWriter(path, **settings, **vars(self._segments))
+        writer = new_writer(path, self._segments, **settings)
         writer.attach(STATION_FILE, "application/toml", self._station.text)
         return writer
 

@@ -35,6 +35,14 @@ class Segments:
     retention: Retention | None = None
 
 
+def new_writer(path: Path, segments: Segments | None, **settings: Any) -> RecordingWriter:
+    """With ``settings`` of a `RecordingWriter`, in segments where they are
+    given. Raises RecordingError."""
+    return (
+        RecordingWriter(path, **settings) if segments is None else SegmentedWriter(path, **settings, **vars(segments))
+    )
+
+
 def stamp(time_ns: int) -> str:
     """A time in UTC for the name of a file."""
     return time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(time_ns / 1e9))
@@ -124,9 +132,8 @@ class UnitSession:
             "clock_ns": self.clock_ns,
         }
         if segments is None:
-            writer = RecordingWriter(path, **settings, ends_with=ends_with)
-        else:
-            writer = SegmentedWriter(path, **settings, **vars(segments))
+            settings["ends_with"] = ends_with
+        writer = new_writer(path, segments, **settings)
         writer.attach(STATION_FILE, "application/toml", self.station.text)
         writer.attach(PROFILE, "application/toml", self.place.bundle.text)
         for name, data in self.place.bundle.files.items():

@@ -37,9 +37,9 @@ async def whole_on_a_thread(work: Callable[[], T]) -> T:
         try:
             given = work()
         except BaseException as e:  # noqa: BLE001 - whatever it is, it is raised where it is waited for
-            _soon(loop, partial(done.set_exception, e))
+            soon(loop, partial(done.set_exception, e))
         else:
-            _soon(loop, partial(done.set_result, given))
+            soon(loop, partial(done.set_result, given))
 
     threading.Thread(target=run, name="whole", daemon=True).start()
     struck = False
@@ -54,6 +54,7 @@ async def whole_on_a_thread(work: Callable[[], T]) -> T:
     return given
 
 
-def _soon(loop: asyncio.AbstractEventLoop, act: Callable[[], object]) -> None:
+def soon(loop: asyncio.AbstractEventLoop, act: Callable[[], object]) -> None:
+    """In the loop, from any thread or a signal's handler."""
     with suppress(RuntimeError):  # the loop has ended, and nobody waits any more
         loop.call_soon_threadsafe(act)

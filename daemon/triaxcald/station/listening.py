@@ -27,7 +27,6 @@ SLEPT = "this machine slept"
 IDENTIFIERS_MOST = 1 << 16
 """So many different ones are told apart; a bus in use has some hundred, and one
 of random identifiers is to take no memory."""
-_EXTENDED_KEY = 1 << 32
 
 
 class ReturningBus:
@@ -70,7 +69,7 @@ class ReturningBus:
                             lost = True
                         lost = lost or (batch.gap is not None and not len(batch))
                         if lost and len(batch):
-                            batch, lost = _after_a_loss(batch), False
+                            batch, lost = batch.after(batch.gap), False
                         yield batch
                         heard_ns = int(batch.time_ns[-1]) if len(batch) else self._now_ns()
                 return
@@ -88,12 +87,6 @@ class ReturningBus:
         await self._listener.open()
         self._opened_ns = self._now_ns()
         await self._listener.settled(SETTLED_S)
-
-
-def _after_a_loss(batch: RawBatch) -> RawBatch:
-    flags = batch.flags.copy()
-    flags[0] |= np.uint8(RawFlag.LOST_BEFORE)
-    return replace(batch, flags=flags)
 
 
 @dataclass
@@ -132,6 +125,5 @@ class Listened(RawRecords):
         errors = int(np.count_nonzero(error))
         self.errors += errors
         self.frames += len(batch) - errors
-        key = batch.source.astype(np.int64) + ((batch.flags & RawFlag.EXTENDED_ID) != 0) * _EXTENDED_KEY
         if len(self._seen) < IDENTIFIERS_MOST:
-            self._seen.update(np.unique(key[~error]).tolist()[: IDENTIFIERS_MOST - len(self._seen)])
+            self._seen.update(np.unique(batch.identifiers[~error]).tolist()[: IDENTIFIERS_MOST - len(self._seen)])

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from triaxcal_drivers.can.layout import NODES, Layout
 from triaxcal_drivers.can.model import READING_CHANNELS
 from triaxcal_drivers.can.together import TogetherInTime
-from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
+from triaxcal_drivers.interface import EXTENDED_KEY, RawBatch, RawFlag, SampleBlock
 
 Ints = NDArray[np.int64]
 
-_EXTENDED_KEY = 1 << 32
 LATEST = 8
 """A message may come this many samples late; an unfinished sample is waited for
 so long."""
@@ -168,12 +167,11 @@ class CanDecoder:
 
     def _messages(self, batch: RawBatch, usable: NDArray[np.bool_]) -> Ints:
         """Which message of the stream each record is; -1 for none."""
-        extended = (batch.flags & RawFlag.EXTENDED_ID) != 0
-        key = batch.source.astype(np.int64) + extended * _EXTENDED_KEY
+        key = batch.identifiers
         found = np.full(len(batch), -1, dtype=np.int64)
         node = np.zeros(len(batch), dtype=np.int64)
         for number, message in enumerate(self._layout.messages):
-            above = key - message.identifier - message.extended * _EXTENDED_KEY
+            above = key - message.identifier - message.extended * EXTENDED_KEY
             match = (above >= 1) & (above <= NODES) if message.per_node else above == 0
             found[match & usable] = number
             node[match] = above[match]
