@@ -35,6 +35,7 @@ _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
 
 IS_BACK = "the unit is back"
 BUS_IS_BACK = "the bus is back"
+NOTHING_YET = "nothing has come yet"
 
 
 def waits(trouble: str) -> str:

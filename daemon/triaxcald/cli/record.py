@@ -12,14 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from triaxcal_drivers.errors import DriverError
 from triaxcald import text
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import Bars, say
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
-from triaxcald.errors import DaemonError, InputError
+from triaxcald.errors import InputError
 from triaxcald.exit_codes import INTERRUPTED, severest
 from triaxcald.files import unused
 from triaxcald.provision.identity import IdentityRead
@@ -115,6 +114,8 @@ async def _reload(
 ) -> None:
     """The station file, each time that it is asked for. What is as it was goes
     on; what ended, for whatever reason, begins again."""
+    from triaxcald.run.endings import reason_of, trace_of
+
     while True:
         await hangup.wait()
         hangup.clear()
@@ -123,19 +124,28 @@ async def _reload(
             leaving = changed(chosen.station, new.station) & (chosen.names | new.names)
             beginning = _recordings(a, new, progress, serials, roster.at_work() - leaving)
         except Exception as e:  # noqa: BLE001 - a driver of anybody's reads its part; what is recorded goes on
-            known = isinstance(e, (DaemonError, DriverError))
-            _tell(progress, "error", text.not_reloaded(str(e) if known else f"internal error: {e!r}"))
+            _tell(progress, "error", text.not_reloaded(reason_of(e)), trace_of(e))
             continue
         _tell(progress, "info", text.reloaded(sorted(leaving)))
         chosen = new
         await roster.change(leaving, beginning)
 
 
-def _tell(progress: Bars | JsonLines, level: str, message: str) -> None:
+def _tell(progress: Bars | JsonLines, level: str, message: str, trace: str | None = None) -> None:
     if isinstance(progress, JsonLines):
-        progress.say(level, "reload", message=message)
+        progress.say(level, "reload", message=message, **_traced(trace))
     else:
         say(f"record: {message}")
+        _show(trace)
+
+
+def _traced(trace: str | None) -> dict[str, str]:
+    return {} if trace is None else {"trace": trace}
+
+
+def _show(trace: str | None) -> None:
+    if trace is not None:
+        say(trace.rstrip())
 
 
 def _recordings(
@@ -231,12 +241,13 @@ def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
         counts = {name: n for name, n in kept.counts.items() if n}
         path = str(kept.path) if kept.path else None
         level = "info" if kept.error is None else "error"
-        told = {"message": kept.error, **counts, "lost": kept.lost}
+        told = {"message": kept.error, **_traced(kept.trace), **counts, "lost": kept.lost}
         progress.say(level, "ended", unit=kept.unit, kind=kept.kind, recording=path, **told)
         return
     if kept.path is not None:
         say(_summary(kept))
     if kept.error is not None:
+        _show(kept.trace)
         say(f"triaxcal: {kept.error}")
 
 

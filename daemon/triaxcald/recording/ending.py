@@ -9,11 +9,13 @@ from triaxcal_drivers.errors import DriverError
 from triaxcald.errors import DiskError, ProvisionError
 
 ENDED = "ended"
-EndedBecause = Literal["asked", "signal", "disk", "unit gave up", "failed"]
+EndedBecause = Literal["asked", "signal", "disk", "unit gave up", "bus gave up", "failed"]
+Kind = Literal["unit", "bus"]
 
 
-def ended_because(error: BaseException | None) -> EndedBecause:
-    """``error`` is what the recording was left with, None where it was to end."""
+def ended_because(error: BaseException | None, of: Kind = "unit") -> EndedBecause:
+    """``error`` is what the recording was left with, None where it was to end;
+    ``of`` what was recorded."""
     match error:
         case None:
             return "asked"
@@ -22,6 +24,6 @@ def ended_because(error: BaseException | None) -> EndedBecause:
         case asyncio.CancelledError() | KeyboardInterrupt():
             return "signal"
         case DriverError() | ProvisionError():
-            return "unit gave up"
+            return "unit gave up" if of == "unit" else "bus gave up"
         case _:
             return "failed"

@@ -81,11 +81,6 @@ class RecordingFile:
                 path.unlink()
             raise disk.not_created(path, e) from e
 
-    @property
-    def waits(self) -> bool:
-        """Whether anything has not been flushed."""
-        return self._waiting_ns is not None
-
     def raw(self, phase: str, first: int, batch: RawBatch) -> None:
         for piece in schema.cut(batch):
             time_ns = int(piece.time_ns[-1]) if len(piece) else self._clock_ns()
@@ -121,7 +116,7 @@ class RecordingFile:
     def flush(self) -> None:
         """The operating system has everything; now and then, the disk too."""
         self._mcap.flush()  # type: ignore[no-untyped-call]
-        disk.require_there(self._file.fileno())
+        self.require_there()
         now_ns = self._clock_ns()
         if not 0 <= now_ns - self._synced_ns < self._sync_ns:
             os.fsync(self._file.fileno())
@@ -129,6 +124,9 @@ class RecordingFile:
         self._chunks += self._waiting_ns is not None
         self._waiting_ns = None
         self.size, self.sound_ns, self.sound_end = self._file.tell(), now_ns, self.raw_end
+
+    def require_there(self) -> None:
+        disk.require_there(self._file.fileno())
 
     def flush_when_due(self) -> bool:
         """Whether it was."""

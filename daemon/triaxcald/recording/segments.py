@@ -56,7 +56,8 @@ class SegmentedWriter(RecordingWriter):
         self.manifest = manifest_path(path)
         self.deleted: list[Surplus] = []
         self._size_bytes, self._time_ns = size_bytes, round(time_s * 1e9)
-        self._retention, self._steady_ns, self._began_ns = retention, steady_ns, steady_ns()
+        self._retention, self._steady_ns = retention, steady_ns
+        self._began_ns = self._retained_ns = steady_ns()
         self._closed_ns: dict[int, int] = {}  # by number, on the steady line
         self._kept: list[tuple[int, str, str, bytes]] = []
         self._recorded = self._told_low = False
@@ -120,8 +121,18 @@ class SegmentedWriter(RecordingWriter):
             self._told_low = False
             self._retain()
 
+    def _idle(self) -> None:
+        """Nothing comes: earlier segments grow old, and others fill the disk."""
+        super()._idle()
+        if not 0 <= self._steady_ns() - self._retained_ns < self._time_ns:
+            self._retain()
+        self._make_room_on_disk()
+
     def _flushed(self) -> None:
         super()._flushed()
+        self._make_room_on_disk()
+
+    def _make_room_on_disk(self) -> None:
         if not self._told_low and self._lacks() and not self._retain():
             self._told_low = True
             self._say("disk_low", {"wanted_bytes": self._retention.free_bytes if self._retention else 0})
@@ -160,6 +171,7 @@ class SegmentedWriter(RecordingWriter):
 
     def _retain(self) -> list[Surplus]:
         """What it has taken away, also said in the file."""
+        self._retained_ns = self._steady_ns()
         if self._retention is None:
             return []
         chosen = surplus(

@@ -18,8 +18,12 @@ from triaxcald.abort import Left, add_action, discard_action
 from triaxcald.errors import RecordingError
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ENDED, EndedBecause
-from triaxcald.recording.file import CHUNK_NS, SYNC_S, Head, RecordingFile
+from triaxcald.recording.file import SYNC_S, Head, RecordingFile
 from triaxcald.recording.inventory import Document
+
+LOOK_S = 1.0
+"""A writer that is given nothing looks about so often: what was written is due
+to the operating system by then, and a segment grows old in silence too."""
 
 
 class RecordingWriter:
@@ -86,6 +90,11 @@ class RecordingWriter:
         return self._file.path
 
     @property
+    def queued(self) -> int:
+        """How much waits for the disk: batches, blocks and events."""
+        return self._jobs.qsize()
+
+    @property
     def resumes(self) -> Gap | None:
         """What was not recorded before this writer began, where it goes on
         behind earlier records; not over yet."""
@@ -93,7 +102,7 @@ class RecordingWriter:
 
     def raw(self, phase: str, batch: RawBatch) -> bool:
         """Whether there was room for the batch."""
-        self._check()
+        self.check()
         with self._order:
             first = self._offered
             self._offered += len(batch)
@@ -102,7 +111,7 @@ class RecordingWriter:
     def preview(self, topic: schema.PreviewTopic, block: SampleBlock) -> bool:
         """Keeps the block's samples at the preview rate; whether there was room
         for them."""
-        self._check()
+        self.check()
         with self._order:
             picked = self._decimators[topic].pick(block)
             if not picked:
@@ -112,18 +121,18 @@ class RecordingWriter:
     def register(
         self, name: str, operation: schema.Operation, raw: bytes, error: str = "", *, unanswered: bool = False
     ) -> None:
-        self._check()
+        self.check()
         access = schema.RegisterAccess(self._clock_ns(), name, operation, raw, error, unanswered)
         self._jobs.put(partial(self._write, schema.REGISTERS, access))
 
     def event(self, kind: str, detail: Mapping[str, Any] | None = None) -> None:
         """``detail`` goes in as JSON."""
-        self._check()
+        self.check()
         event = schema.Event(self._clock_ns(), kind, json.dumps(dict(detail or {}), sort_keys=True))
         self._jobs.put(partial(self._write, schema.EVENTS, event))
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
-        self._check()
+        self.check()
         if name in self._attached:
             raise RecordingError(f"{self.path}: there is an attachment '{name}' already")
         self._attached.add(name)
@@ -132,7 +141,7 @@ class RecordingWriter:
     def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
         """The last attachment, made from the inventory of all that is in the
         file before it; closes the recording."""
-        self._check()
+        self.check()
         time_ns = self._clock_ns()
 
         def write() -> None:
@@ -144,12 +153,12 @@ class RecordingWriter:
 
     def drain(self) -> None:
         """Waits until the operating system has all that was given before."""
-        self._check()
+        self.check()
         done = threading.Event()
         self._jobs.put(self._flush)
         self._jobs.put(done.set)
         while not done.wait(0.05):
-            self._check()
+            self.check()
 
     @property
     def raw_sha256(self) -> str:
@@ -209,7 +218,7 @@ class RecordingWriter:
         """Closes it, left as a context manager with ``error``."""
         self.close()
 
-    def _check(self) -> None:
+    def check(self) -> None:
         if self._failure is not None:
             raise self._failure
         if self._closed:
@@ -229,7 +238,7 @@ class RecordingWriter:
 
     def _wait_for_room(self) -> bool:
         while not self._room.acquire(timeout=0.05):
-            self._check()
+            self.check()
         return True
 
     # What follows runs on the writer's thread.
@@ -258,9 +267,14 @@ class RecordingWriter:
     def _next_job(self) -> Callable[[], None] | None:
         while True:
             try:
-                return self._jobs.get(timeout=CHUNK_NS / 1e9 if self._file.waits else None)
+                return self._jobs.get(timeout=LOOK_S)
             except queue.Empty:
-                self._look_after()
+                self._idle()
+
+    def _idle(self) -> None:
+        """Nothing has come for `LOOK_S`."""
+        self._file.require_there()
+        self._look_after()
 
     def _look_after(self) -> None:
         if self._file.flush_when_due():

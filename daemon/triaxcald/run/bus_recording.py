@@ -12,9 +12,9 @@ from triaxcald import text
 from triaxcald.certificate import software
 from triaxcald.inputs import STATION_FILE
 from triaxcald.recording.bus import bus_record, phase_of
-from triaxcald.recording.schema import BUS_RECORD, RAW
+from triaxcald.recording.schema import BUS_RECORD
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run.recording import AtRecording, Kept, State, UnitStatus
+from triaxcald.run.recording import AtRecording, State
 from triaxcald.run.session import Segments, new_writer, stamp
 from triaxcald.station.buses import BusPlace
 from triaxcald.station.collection import Progress
@@ -40,28 +40,19 @@ class BusRecording(AtRecording):
         *,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        super().__init__(place.name)
+        listened = Listened(phase_of(place.settings.channel))
+        super().__init__(place.name, listened)
         self._station, self._place, self._progress = station, place, progress
         self._path_of, self._segments, self._clock_ns = path_of, segments, clock_ns
-        self._listened = Listened(phase_of(place.settings.channel))
+        self._listened = listened
 
     @property
-    def status(self) -> UnitStatus:
-        listened, writer = self._listened, self._writer
-        return UnitStatus(
-            self.name,
-            self._state,
-            self._trouble,
-            self._path if writer is None else writer.current,
-            listened.digest.records,
-            listened.counts,
-            listened.gaps,
-            listened.gaps_s,
-            writer.losses.get(RAW, 0) if writer is not None else self._lost,
-            listened.last_ns,
-            {},
-            kind="bus",
-        )
+    def _counts(self) -> dict[str, int]:
+        return self._listened.counts
+
+    @property
+    def _seconds(self) -> float:
+        return self._listened.seconds
 
     async def _work(self, seconds: float | None, patience: Patience) -> None:
         async with self._place.opened(patience, lambda trouble: self._is_lost(str(trouble))) as listener:
@@ -98,13 +89,6 @@ class BusRecording(AtRecording):
         writer = new_writer(path, self._segments, **settings)
         writer.attach(STATION_FILE, "application/toml", self._station.text)
         return writer
-
-    def _result(self) -> Kept:
-        listened = self._listened
-        return Kept(
-            self.name, self._path, listened.counts, listened.seconds, listened.gaps, listened.gaps_s, self._lost,
-            kind=self.kind,
-        )  # fmt: skip
 
 
 def bus_recording_name(bus: str, time_ns: int) -> str:

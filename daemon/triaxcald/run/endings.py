@@ -40,14 +40,27 @@ def judged(outside: Sequence[str], verification: Mapping[str, Any] | None, limit
 def aborted(e: BaseException, p: Provisioning | None) -> Ending:
     """Once registers were written any error is one of the device, unless it is
     settled and only the disk failed or somebody interrupted."""
-    code, reason = exit_code_of(e), str(e) or type(e).__name__
-    if isinstance(e, asyncio.CancelledError):
-        reason = "interrupted"
-    elif not isinstance(e, (TriaxcalError, DriverError, DaemonError)):
-        reason = f"internal error: {e!r}"
+    code = exit_code_of(e)
+    if (trace := trace_of(e)) is not None:
         with suppress(OSError, ValueError):  # a closed standard error
-            traceback.print_exception(e, file=sys.stderr)
+            sys.stderr.write(trace)
     written = p is not None and p.held.state is not DeviceState.UNTOUCHED
     if p is not None and written and not (p.settled and code in (INTERRUPTED, DISK)):
         code = DEVICE
-    return Ending(Verdict.ABORTED, reason, code, getattr(e, "wanted", ()))
+    return Ending(Verdict.ABORTED, reason_of(e), code, getattr(e, "wanted", ()))
+
+
+def reason_of(e: BaseException) -> str:
+    """Of an end before its time, in one line."""
+    if isinstance(e, asyncio.CancelledError):
+        return "interrupted"
+    return f"internal error: {e!r}" if _internal(e) else str(e) or type(e).__name__
+
+
+def trace_of(e: BaseException) -> str | None:
+    """Where an internal error came from, for who mends it; None of any other."""
+    return "".join(traceback.format_exception(e)) if _internal(e) else None
+
+
+def _internal(e: BaseException) -> bool:
+    return not isinstance(e, (TriaxcalError, DriverError, DaemonError, asyncio.CancelledError))

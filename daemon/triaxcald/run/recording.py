@@ -11,20 +11,18 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 from triaxcal_drivers.claim import Claim
 from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import DONE, exit_code_of
-from triaxcald.recording.ending import ended_because
+from triaxcald.recording.ending import Kind, ended_because
 from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run.endings import aborted
+from triaxcald.run.endings import reason_of, trace_of
 from triaxcald.run.together import whole_on_a_thread
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.lock import locked
-
-Kind = Literal["unit", "bus"]
+from triaxcald.station.raw_records import RawRecords
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,8 @@ class Kept:
     """What the recording of a unit, or of a bus, has come to. ``counts`` are of
     the unit's readings, which span ``seconds``, or of the bus's frames; in
     ``gaps`` gaps it was lost for ``gaps_s``, and ``lost`` raw records did not
-    get to the disk. ``error`` is one line where it failed."""
+    get to the disk. ``error`` is one line where it failed, and ``trace`` says where
+    in this program, where the fault is its own."""
 
     unit: str
     path: Path | None
@@ -44,6 +43,7 @@ class Kept:
     exit_code: int = DONE
     error: str | None = None
     kind: Kind = "unit"
+    trace: str | None = None
 
 
 class State(Enum):
@@ -54,8 +54,8 @@ class State(Enum):
 class UnitStatus:
     """How the recording of a unit, or of a bus, stands. ``trouble`` is what is
     the matter with one that is waited for; ``last_ns`` host time of the last
-    record, ``latest`` the last values of its other channels; the rest as in
-    `Kept`."""
+    record, ``latest`` the last values of its other channels; ``queued`` batches
+    wait for the disk; the rest as in `Kept`."""
 
     unit: str
     state: State
@@ -69,16 +69,17 @@ class UnitStatus:
     last_ns: int | None
     latest: Mapping[str, float]
     kind: Kind = "unit"
+    queued: int = 0
 
 
 class AtRecording(ABC):
     """One of the recordings that a process makes side by side, of a unit or a
-    bus of that ``name``."""
+    bus of that ``name``, whose records go through ``records``."""
 
     kind: Kind
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, records: RawRecords) -> None:
+        self.name, self._records = name, records
         self._path: Path | None = None
         self._writer: RecordingWriter | None = None
         self._lost = 0
@@ -87,17 +88,50 @@ class AtRecording(ABC):
         self._leaves = False
 
     @property
-    @abstractmethod
     def status(self) -> UnitStatus:
         """From any thread."""
+        records, writer = self._records, self._writer
+        return UnitStatus(
+            self.name,
+            self._state,
+            self._trouble,
+            self._path if writer is None else writer.current,
+            records.digest.records,
+            self._counts,
+            records.gaps,
+            records.gaps_s,
+            self._lost if writer is None else writer.losses.get(RAW, 0),
+            records.last_ns,
+            self._latest,
+            self.kind,
+            0 if writer is None else writer.queued,
+        )
+
+    @property
+    @abstractmethod
+    def _counts(self) -> dict[str, int]:
+        """As of `Kept`."""
+
+    @property
+    @abstractmethod
+    def _seconds(self) -> float:
+        """As of `Kept`."""
+
+    @property
+    def _latest(self) -> dict[str, float]:
+        return {}
 
     @abstractmethod
     async def _work(self, seconds: float | None, patience: Patience) -> None:
         """As `run`, but for what it raises."""
 
-    @abstractmethod
     def _result(self) -> Kept:
         """What it has come to so far."""
+        records = self._records
+        return Kept(
+            self.name, self._path, self._counts, self._seconds, records.gaps, records.gaps_s, self._lost,
+            kind=self.kind,
+        )  # fmt: skip
 
     def leave(self) -> None:
         """Nobody wants it any more: a cancellation from now on ends it as one
@@ -112,8 +146,8 @@ class AtRecording(ABC):
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a recording
             if self._asked(e):
                 return self._result()
-            error = f"{self.kind} {self.name}: {aborted(e, None).reason}"
-            return replace(self._result(), exit_code=exit_code_of(e), error=error)
+            error = f"{self.kind} {self.name}: {reason_of(e)}"
+            return replace(self._result(), exit_code=exit_code_of(e), error=error, trace=trace_of(e))
         else:
             return self._result()
         finally:
@@ -146,7 +180,7 @@ class AtRecording(ABC):
                 await self._end(writer, e)
                 raise
             else:
-                await whole_on_a_thread(partial(writer.close, ended_because(None)))
+                await whole_on_a_thread(partial(writer.close, ended_because(None, self.kind)))
             finally:
                 self._lost, self._writer = writer.losses.get(RAW, 0), None
 
@@ -154,8 +188,9 @@ class AtRecording(ABC):
         """Where the disk has failed, that is on its way already."""
         with suppress(RecordingError):
             if not isinstance(e, asyncio.CancelledError):
-                writer.event("failed", {"error": aborted(e, None).reason})
-            await whole_on_a_thread(partial(writer.close, ended_because(None if self._asked(e) else e)))
+                writer.event("failed", {"error": reason_of(e)})
+            because = ended_because(None if self._asked(e) else e, self.kind)
+            await whole_on_a_thread(partial(writer.close, because))
 
     def _asked(self, e: BaseException) -> bool:
         return self._leaves and isinstance(e, asyncio.CancelledError)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -10,12 +11,12 @@ from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION
 from triaxcald.provision.identity import IdentityRead
-from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.run.recording import AtRecording, Kept, State, UnitStatus
+from triaxcald.run.recording import AtRecording, State, UnitStatus
 from triaxcald.run.session import Segments, UnitSession
 from triaxcald.station.collection import Recorded
 from triaxcald.station.coming_back import Patience
+from triaxcald.text import NOTHING_YET
 
 
 class UnitRecording(AtRecording):
@@ -31,26 +32,30 @@ class UnitRecording(AtRecording):
         identified: Callable[[UnitSession, IdentityRead], None] = lambda *_: None,
         segments: Segments | None = None,
     ) -> None:
-        super().__init__(session.name)
-        self._session, self._path_of, self._identified, self._segments = session, path_of, identified, segments
         self._recorded = Recorded(CALIBRATION, session.place.bundle, session.place.address)
+        super().__init__(session.name, self._recorded)
+        self._session, self._path_of, self._identified, self._segments = session, path_of, identified, segments
 
     @property
     def status(self) -> UnitStatus:
-        recorded, writer = self._recorded, self._writer
-        return UnitStatus(
-            self.name,
-            self._state,
-            self._trouble,
-            self._path if writer is None else writer.current,
-            recorded.digest.records,
-            dict(recorded.streams[READINGS].counts),
-            recorded.gaps,
-            recorded.gaps_s,
-            writer.losses.get(RAW, 0) if writer is not None else self._lost,
-            recorded.last_ns,
-            dict(recorded.latest),
-        )
+        """Recorded is a unit of which something comes: what its FIFO held
+        before is discarded meanwhile, which may take a minute."""
+        status = super().status
+        if status.state is State.RECORDING and status.last_ns is None:
+            return replace(status, state=State.WAITING, trouble=NOTHING_YET)
+        return status
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        return dict(self._recorded.streams[READINGS].counts)
+
+    @property
+    def _seconds(self) -> float:
+        return self._recorded.streams[READINGS].seconds
+
+    @property
+    def _latest(self) -> dict[str, float]:
+        return dict(self._recorded.latest)
 
     def _waits(self, trouble: Exception) -> None:
         self._is_lost(str(trouble))
@@ -82,9 +87,3 @@ class UnitRecording(AtRecording):
 
             make = partial(session.writer, self._path, identity, segments=self._segments)
             await self._recorded_by(make, record, self._path if self._segments else None)
-
-    def _result(self) -> Kept:
-        readings, recorded = self._recorded.streams[READINGS], self._recorded
-        return Kept(
-            self.name, self._path, dict(readings.counts), readings.seconds, recorded.gaps, recorded.gaps_s, self._lost
-        )

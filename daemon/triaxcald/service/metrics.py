@@ -51,6 +51,7 @@ class UnitMetrics(Collector):
         last = GaugeMetricFamily(
             "triaxcal_last_record_timestamp_seconds", "Host time of the last record", labels=["unit"]
         )
+        queued = GaugeMetricFamily("triaxcal_queued_batches", "Batches that wait for the disk", labels=["unit"])
         size = GaugeMetricFamily("triaxcal_recording_bytes", "Size of the recording's file", labels=["unit"])
         channel = GaugeMetricFamily(
             "triaxcal_channel", "Last value of another channel, the temperature among them", labels=["unit", "channel"]
@@ -65,6 +66,7 @@ class UnitMetrics(Collector):
             lost.add_metric([u.unit], u.lost)
             gaps.add_metric([u.unit], u.gaps)
             gaps_s.add_metric([u.unit], u.gaps_s)
+            queued.add_metric([u.unit], u.queued)
             if u.last_ns is not None:
                 last.add_metric([u.unit], (u.last_ns + HOST.steps_ns()) / 1e9)  # as the host's clock has it
             if u.path is not None:
@@ -77,7 +79,9 @@ class UnitMetrics(Collector):
             for name, family in counted.items():
                 if u.kind == "unit" or name in _OF_A_BUS:
                     family.add_metric([u.unit], u.counts.get(name, 0))
-        yield from (recording, records, lost, gaps, gaps_s, last, size, channel, identifiers, *counted.values())
+        yield from (
+            recording, records, lost, gaps, gaps_s, queued, last, size, channel, identifiers, *counted.values(),
+        )  # fmt: skip
         free = GaugeMetricFamily("triaxcal_disk_free_bytes", "Where recordings go")
         with suppress(OSError):
             free.add_metric([], shutil.disk_usage(self._folder).free)

@@ -17,6 +17,7 @@ import pytest
 from triaxcald.recording.reader import Recording
 from triaxcald.simulation.memory import CALIBRATION, TABLE, Stored, factory_calibration
 from triaxcald.simulation.unit import Faults
+from triaxcald.station.collection import Recorded
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())
@@ -301,6 +302,28 @@ def test_progress_may_be_json_and_the_numbers_are_served(workshop: Any, triaxcal
     assert "http://127.0.0.1:" in lines[0]["message"]
     assert (lines[-1]["event"], lines[-1]["level"], lines[-1]["recording"]) == ("ended", "info", str(rec))
     assert lines[-1]["samples"] >= 500
+
+
+@pytest.mark.parametrize("form", ["json", "text"])
+def test_a_fault_of_the_program_is_told_with_its_trace(
+    workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    def broken(*_: object) -> None:
+        raise ValueError("a fault of the program")
+
+    monkeypatch.setattr(Recorded, "for_seconds", broken)
+    with workshop.serve(workshop.device()) as served:
+        station = workshop.station({"bus": served.bus})
+        done = triaxcal("record", station, "-o", workshop.folder / "rec.mcap", "--log-format", form)
+    assert done.code == 4
+    error = "unit unit0: internal error: ValueError('a fault of the program')"
+    if form == "json":
+        *_, last = [json.loads(line) for line in done.err.splitlines()]
+        assert (last["event"], last["message"]) == ("ended", error)
+        assert "in broken" in last["trace"]
+    else:
+        assert done.err.splitlines()[-1] == f"triaxcal: {error}"
+        assert "in broken" in done.err
 
 
 @pytest.mark.parametrize(

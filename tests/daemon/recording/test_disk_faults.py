@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,13 @@ import pytest
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import DiskError
 from triaxcald.exit_codes import DISK
+from triaxcald.recording import writer as writer_module
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
 from triaxcald.recording.retention import Retention
 from triaxcald.recording.segments import SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.station.raw_records import RawRecords
 
 S, MIB = 1_000_000_000, 2**20
 T0_NS = 1_700_000_000_000_000_000
@@ -142,6 +145,31 @@ def test_a_folder_that_is_removed_is_said_within_a_second_of_the_clock(
     clock.now_ns += S
     with pytest.raises(DiskError, match="writing failed: the file, or its folder, was removed; sound up to 2023"):
         writer.drain()
+    with pytest.raises(DiskError):
+        writer.close()
+
+
+async def test_a_folder_that_is_removed_while_a_bus_is_silent_is_said_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer_module, "LOOK_S", 0.001)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    writer = RecordingWriter(folder / "rec.mcap", metadata={"bus": {}}, preview_channels=None)
+
+    async def silence() -> AsyncGenerator[RawBatch, None]:
+        while True:
+            await asyncio.sleep(0)
+            yield RawBatch.of([])
+
+    async def record() -> None:
+        async for _ in RawRecords("bus/0").written(silence(), writer):
+            if folder.exists():
+                shutil.rmtree(folder)
+
+    with pytest.raises(DiskError, match="the file, or its folder, was removed"):
+        async with asyncio.timeout(20):
+            await record()
     with pytest.raises(DiskError):
         writer.close()
 

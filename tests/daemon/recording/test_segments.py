@@ -15,6 +15,7 @@ from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.audit import audit_each
 from triaxcald.errors import RecordingError
 from triaxcald.recording import disk, schema
+from triaxcald.recording import writer as writer_module
 from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
@@ -85,6 +86,46 @@ def test_a_segment_begins_when_the_last_is_old_enough(
     for segment in listed:
         path = tmp_path / segment.file
         assert (path.stat().st_size, digest_of(path)) == (segment.bytes, segment.sha256)
+
+
+def test_a_segment_ends_in_silence_too_and_an_empty_one_goes_on(
+    tmp_path: Path, new: NewWriter, batch_of: BatchOf, clock: Any, wait_until: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer_module, "LOOK_S", 0.001)
+    with new() as writer:
+        writer.raw("calibration", batch_of(0, 10))
+        writer.drain()
+        for _ in range(3):
+            clock.now_ns += 60 * S
+            wait_until(lambda: len(files(tmp_path)) == 2)
+    assert files(tmp_path) == ["rec-000001.mcap", "rec-000002.mcap"]
+
+
+def test_segments_grow_too_old_while_nothing_comes(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], clock: Any, wait_until: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(writer_module, "LOOK_S", 0.001)
+    with new(retention=Retention(keep_s=150.0)) as writer:
+        minutes(writer, 2)
+        for _ in range(3):
+            clock.now_ns += 60 * S
+            writer.drain()
+        wait_until(lambda: files(tmp_path) == ["rec-000003.mcap"])
+    assert [one.reason for one in writer.deleted] == ["age", "age"]
+
+
+def test_the_disk_is_watched_while_nothing_comes(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], wait_until: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer_module, "LOOK_S", 0.001)
+    others = [0]
+    monkeypatch.setattr(disk, "free_bytes", lambda _: 100_000_000 - others[0])
+    with new(retention=Retention(free_bytes=50_000_000)) as writer:
+        minutes(writer, 2)
+        others[0] = 60_000_000
+        wait_until(lambda: files(tmp_path) == ["rec-000003.mcap"])
+    assert {one.reason for one in writer.deleted} == {"disk"}
 
 
 def test_a_segment_begins_when_the_last_is_large_enough(tmp_path: Path, new: NewWriter, batch_of: BatchOf) -> None:

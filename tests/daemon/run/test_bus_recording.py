@@ -226,6 +226,20 @@ async def test_a_bus_that_vanishes_comes_back_in_one_recording_with_the_gap(work
     assert kept.gaps_s == pytest.approx((gap.detail["to_ns"] - gap.detail["from_ns"]) * 1e-9)
 
 
+async def test_a_bus_that_does_not_come_back_is_given_up_and_the_recording_says_so(workshop: Any, port: Path) -> None:
+    bus = {"interface": "slcan", "channel": str(port)}
+    station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))
+    told, path, dongle = Told(), workshop.folder / "bus.mcap", Dongle(port)
+    work = asyncio.ensure_future(listening(station, told, path).run(None, Patience(most_s=0.0)))
+    await told.until("dongle", lambda text: text == "recording")
+    dongle.unplug()
+    kept = await work
+    assert kept.exit_code == 4
+    with Recording.open(path) as held:
+        *_, ended = held.events()
+    assert (ended.kind, ended.detail) == ("ended", {"reason": "bus gave up"})
+
+
 async def test_a_bus_that_is_not_there_is_waited_for_and_given_up(workshop: Any, port: Path) -> None:
     bus = {"interface": "slcan", "channel": str(port)}
     station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))

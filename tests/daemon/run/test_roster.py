@@ -8,9 +8,10 @@ import pytest
 
 from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import INTERRUPTED
-from triaxcald.run.recording import AtRecording, Kept, State, UnitStatus
+from triaxcald.run.recording import AtRecording, Kept, State
 from triaxcald.run.roster import Roster
 from triaxcald.station.coming_back import Patience
+from triaxcald.station.raw_records import RawRecords
 
 
 class Played(AtRecording):
@@ -19,22 +20,23 @@ class Played(AtRecording):
     kind = "unit"
 
     def __init__(self, name: str) -> None:
-        super().__init__(name)
+        super().__init__(name, RawRecords("calibration"))
         self.ends = asyncio.Event()
         self.fault: Exception | None = None
 
     @property
-    def status(self) -> UnitStatus:
-        return UnitStatus(self.name, self._state, None, None, 0, {}, 0, 0.0, 0, None, {})
+    def _counts(self) -> dict[str, int]:
+        return {}
+
+    @property
+    def _seconds(self) -> float:
+        return 0.0
 
     async def _work(self, seconds: float | None, patience: Patience) -> None:
         self._state = State.RECORDING
         await self.ends.wait()
         if self.fault is not None:
             raise self.fault
-
-    def _result(self) -> Kept:
-        return Kept(self.name, None, {})
 
 
 @pytest.fixture
@@ -96,6 +98,20 @@ async def test_it_is_not_at_its_end_while_those_that_left_give_way_to_others(ros
     assert not finished.done()
     later.ends.set()
     assert [kept.unit for kept in await finished] == ["b"]
+
+
+async def test_a_fault_of_the_program_says_where_it_came_from(
+    roster: Roster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failing = Played("a")
+    roster.begin([failing])
+    failing.fault = ValueError("a fault of the program")
+    failing.ends.set()
+    (failed,) = await roster.finish()
+    assert failed.error == "unit a: internal error: ValueError('a fault of the program')"
+    assert failed.trace is not None
+    assert "in _work" in failed.trace
+    assert capsys.readouterr().err == "", "standard error may be read by a machine"
 
 
 async def test_one_that_fails_says_so_with_its_exit_code_and_stops_no_other(roster: Roster) -> None:

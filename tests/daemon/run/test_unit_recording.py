@@ -14,7 +14,7 @@ from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.reader import Recording
-from triaxcald.run.recording import Kept
+from triaxcald.run.recording import Kept, State
 from triaxcald.run.roster import Roster
 from triaxcald.run.session import UnitSession
 from triaxcald.run.unit_recording import UnitRecording
@@ -119,6 +119,30 @@ async def test_a_unit_that_goes_and_comes_back_is_in_one_recording_with_the_gap(
     heard_late_s = (gap["from_ns"] - times[longest]) * 1e-9, (gap["to_ns"] - times[longest + 1]) * 1e-9
     assert all(-0.2 < late_s < 2.0 for late_s in heard_late_s), "as late as a busy machine hears a frame"
     assert decoded.seconds >= 3.0
+
+
+async def test_a_unit_of_which_nothing_has_come_is_not_said_to_be_recorded(workshop: Any) -> None:
+    """It answers, and its FIFO is being emptied of what is old."""
+    bench, told = Bench(workshop, [MODBUS]), Told()
+    station = load_station(workshop.station({"bus": await bench.put(0), "profile": "triax-ref-modbus"}))
+    session = UnitSession(station, station.places[0], told)
+    recording = UnitRecording(session, lambda _: workshop.folder / "unit0.mcap")
+    seen: list[tuple[State, str | None, int | None]] = []
+
+    def look() -> bool:
+        status = recording.status
+        seen.append((status.state, status.trouble, status.last_ns))
+        return status.last_ns is not None
+
+    work = asyncio.ensure_future(recording.run(None, Patience()))
+    while not look():
+        await asyncio.sleep(0.001)
+    work.cancel()
+    await work
+    await bench.take(0)
+    assert seen[-1][:2] == (State.RECORDING, None)
+    assert (State.WAITING, "nothing has come yet", None) in seen
+    assert {state for state, _, last_ns in seen if last_ns is None} == {State.WAITING}
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ def status(
     unit: str, state: State = State.RECORDING, trouble: str | None = None, path: Path | None = None
 ) -> UnitStatus:
     last_ns = 1_700_000_000_500_000_000
-    return UnitStatus(unit, state, trouble, path, 2000, COUNTS, 3, 4.5, 6, last_ns, {"temp_c": 24.5})
+    return UnitStatus(unit, state, trouble, path, 2000, COUNTS, 3, 4.5, 6, last_ns, {"temp_c": 24.5}, queued=8)
 
 
 def fetched(port: int, path: str) -> tuple[int, str]:
@@ -55,6 +55,7 @@ def test_each_unit_has_its_numbers(tmp_path: Path) -> None:
         "triaxcal_lost_records_total": 6.0,
         "triaxcal_gaps_total": 3.0,
         "triaxcal_gap_seconds_total": 4.5,
+        "triaxcal_queued_batches": 8.0,
         "triaxcal_last_record_timestamp_seconds": 1_700_000_000.5,
         "triaxcal_recording_bytes": 123.0,
         "triaxcal_samples_total": 1000.0,
@@ -82,6 +83,7 @@ def test_a_bus_has_its_numbers_and_none_of_a_unit_s(tmp_path: Path) -> None:
         "triaxcal_lost_records_total": 6.0,
         "triaxcal_gaps_total": 3.0,
         "triaxcal_gap_seconds_total": 4.5,
+        "triaxcal_queued_batches": 8.0,
         "triaxcal_last_record_timestamp_seconds": 1_700_000_000.5,
         "triaxcal_identifiers": 12.0,
         "triaxcal_errors_total": 2.0,
