@@ -15,7 +15,7 @@ models share the answer is decided by the Bayesian information criterion
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +41,9 @@ STEPS = 12
 everywhere; each step costs as much as the first."""
 FLICKER = 0.3
 """Odds, before the data, of 1/f noise strong enough to matter (decision 0022)."""
+PART = 2**22
+"""Numbers that are held at once for each of the few arrays that a long pose
+takes: 32 MiB."""
 MISFIT = 1e-3
 """Probability below which the model is fitted to lower frequencies only."""
 
@@ -114,7 +117,10 @@ class Components:
         constants = np.geomspace(0.4, max(typical / 5, 0.8), TIME_CONSTANTS)
         lengths = np.geomspace(0.5, max(typical / 8, 1.0), LENGTHS)
         mixture = np.geomspace(0.03, max(recording / (2 * np.pi * SLOWEST), 1.0), 160)
-        many = np.array([first_order_windows(t, lags) for t in mixture]).mean(axis=0) * np.log(mixture[-1] / mixture[0])
+        many = np.zeros(lags)
+        for constant in mixture:  # one by one: a pose may last for a day
+            many += first_order_windows(constant, lags)
+        many = many / len(mixture) * np.log(mixture[-1] / mixture[0])
         rows = [np.eye(1, lags)[0], many, *(first_order_windows(t, lags) for t in constants)]
         rows += [*(moving_average_windows(t, lags) for t in lengths), np.zeros(lags)]
         return cls(np.array(rows))
@@ -127,6 +133,13 @@ class Components:
         orders = range(2, none)
         rows = [(0, none, none), (0, 1, none), *((0, none, i) for i in orders), *((0, 1, i) for i in orders)]
         return np.array(rows, dtype=np.int64)
+
+    def parts(self, lags: int) -> Iterator[Floats]:
+        """(·, lags) of the autocovariances, so many at once as take little
+        memory; by eights, so that no part changes another's last bits."""
+        at_once = max(PART // (8 * lags), 1) * 8
+        for first in range(0, len(self.autocovariance), at_once):
+            yield self.autocovariance[first : first + at_once, :lags]
 
     def variance_of_mean(self, n: int) -> Floats:
         """(c,) over n windows."""
@@ -161,8 +174,6 @@ def periodogram(tracks: Sequence[Track], components: Components, lowest: int = 1
         filled = np.zeros((n, track.deviation.shape[1]))
         filled[track.place - track.place[0]] = track.deviation
         power = np.abs(fft.rfft(filled, axis=0)) ** 2 / len(track)
-        weighted = components.autocovariance[:, :n] * track.pairs()
-        expected = (2 * fft.rfft(weighted, axis=1).real - weighted[:, :1]).T / len(track)
         j = np.arange(lowest, n // 2 + 1)
         if not len(j):
             continue
@@ -170,9 +181,14 @@ def periodogram(tracks: Sequence[Track], components: Components, lowest: int = 1
         band = np.where(j < 8, j, 8 + np.floor(np.log(np.maximum(j, 8) / 8) / np.log(BANDS)).astype(int))
         first = np.flatnonzero(np.diff(band, prepend=-1))
         total = np.add.reduceat(weight, first)
-        gathered = [np.add.reduceat(v[j] * weight[:, None], first, axis=0) / total[:, None] for v in (power, expected)]
+        pairs, sums = track.pairs(), [np.add.reduceat(power[j] * weight[:, None], first, axis=0)]
+        for part in components.parts(n):
+            weighted = part * pairs
+            expected = (2 * fft.rfft(weighted, axis=1).real - weighted[:, :1]).T / len(track)
+            sums.append(np.add.reduceat(expected[j] * weight[:, None], first, axis=0))
+        means = [np.asarray(s / total[:, None]) for s in (sums[0], np.concatenate(sums[1:], axis=1))]
         centre = np.add.reduceat(j * weight, first) / total / n
-        rows.append((gathered[0], gathered[1], total, centre, np.full(len(first), number)))
+        rows.append((means[0], means[1], total, centre, np.full(len(first), number)))
     return Periodogram(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 

@@ -9,6 +9,7 @@ import pytest
 from scipy import integrate, linalg, stats
 
 from benchmarks.noise import first_order, flicker, moving_average, white
+from triaxcal.poses import noise_spectrum
 from triaxcal.poses.noise_mixture import NoiseLevels
 from triaxcal.poses.noise_spectrum import SLOWEST, Components, Spectrum, Track, periodogram
 from triaxcal.poses.pose import Pose, poses_of
@@ -50,6 +51,19 @@ def test_variances_of_mean_and_slope_are_those_of_the_whole_covariance_matrix(pl
         x = place - place.mean()
         assert spectrum.variance_of_mean(track) == pytest.approx(matrix.mean(), rel=1e-9)
         assert spectrum.variance_of_slope(track) == pytest.approx(x @ matrix @ x / (x @ x) ** 2, rel=1e-9)
+
+
+def test_the_expected_periodogram_has_the_same_bits_where_a_long_pose_takes_it_in_parts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tracks = [Track(np.arange(n), np.random.default_rng(n).standard_normal((n, 3))) for n in (600, 90)]
+    c = Components.of(600, 90.0, 3000.0)
+    whole = periodogram(tracks, c)
+    assert len(list(c.parts(600))) == 1
+    monkeypatch.setattr(noise_spectrum, "PART", 8 * 600)
+    assert [len(part) for part in c.parts(600)] == [8, 8, 8, 3]
+    assert np.array_equal(periodogram(tracks, c).expected, whole.expected)
+    assert np.array_equal(periodogram(tracks, c).power, whole.power)
 
 
 def test_the_expected_periodogram_is_that_of_the_whole_covariance_matrix() -> None:

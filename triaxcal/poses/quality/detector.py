@@ -3,8 +3,8 @@ data quality need.
 
 The stream is cut anew into chunks that depend on the samples alone, so that
 live and replayed streams are judged alike. Memory grows with time, not with the
-sample rate: about a hundred bytes for each tenth of a second, and three
-thousand for a second of spectra.
+sample rate: about a hundred bytes for each tenth of a second, and for the first
+hours three thousand for a second of spectra.
 """
 
 from __future__ import annotations

@@ -32,6 +32,9 @@ not part a line from the noise beside it."""
 SEGMENT_LEAST = 16
 """Samples in a segment where the rate is low; no band of the mains has room in
 so few bins."""
+SEGMENTS_MOST = 2**15
+"""Segments that are kept, of four and a half hours: at 1 kHz they take 60 MB.
+Of a longer stream it is every second one, every fourth and so on."""
 SEGMENTS_LEAST = 8
 """Segments of still poses below which their mean spectrum is too rough to
 judge."""
@@ -112,12 +115,14 @@ def bands(rate_hz: float, size: int) -> list[Band]:
 
 @dataclass
 class Spectra:
-    """Power of segments of the stream, in the bins of `bands`. Fed chunks in
-    order."""
+    """Power of segments of the stream, in the bins of `bands`; of one in
+    ``every`` of them. Fed chunks in order."""
 
     period_ns: float
     size: int = 0
     bands: list[Band] = field(default_factory=list)
+    every: int = 1
+    _count: int = 0
     _held: Floats = field(default_factory=lambda: np.zeros((3, 0)))
     _held_ns: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     _start_ns: list[int] = field(default_factory=list)
@@ -148,6 +153,13 @@ class Spectra:
     def _take(self, time_ns: Ints, u: Floats) -> None:
         """One at a time, so that the figures do not depend on how many come at
         once."""
+        self._count += 1
+        if (self._count - 1) % self.every:
+            return
+        if len(self._power) == SEGMENTS_MOST:
+            self.every *= 2
+            for kept in (self._power, self._start_ns, self._end_ns):
+                del kept[1::2]
         rest = (u - u.mean(axis=1, keepdims=True)) * self._taper
         spectrum = fft.rfft(rest, axis=1)[:, self._kept]
         self._power.append((spectrum.real**2 + spectrum.imag**2).astype(np.float32))

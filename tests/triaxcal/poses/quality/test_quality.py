@@ -11,7 +11,7 @@ from scipy import stats
 
 from benchmarks.noise import first_order, flicker, white
 from triaxcal.arrays import Floats, Ints
-from triaxcal.poses.quality import Finding, QualityDetector
+from triaxcal.poses.quality import Finding, QualityDetector, mains
 from triaxcal.poses.quality.faults import coarse_quantization
 from triaxcal.poses.quality.finding import (
     AtRail,
@@ -295,6 +295,21 @@ def test_a_line_of_the_mains_is_named_with_its_frequency_and_amplitude(hz: float
     limit = 4 * NOISE * np.sqrt(2 / (POSES * HOLD_S * rate_hz)) + 0.05 * 3 * NOISE
     assert abs(x - 3 * NOISE) < limit
     assert abs(y - 1.5 * NOISE) < limit
+
+
+def test_a_line_is_found_in_a_long_stream_of_which_few_segments_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mains, "SEGMENTS_MOST", 32)
+    time_ns, u = stream(13, 500.0)
+    spectra = mains.Spectra(2e6)
+    spectra.feed(time_ns, u.T)
+    assert spectra.every == 4, "of about 120 segments a quarter, of 60 a half would be too many"
+    kept = np.array(spectra._start_ns) / 0.5e9
+    assert kept == pytest.approx(np.arange(0, 4 * len(kept), 4))
+    (found,) = judged(time_ns, u + hum(time_ns, 50.0, 3 * NOISE))
+    assert isinstance(found, MainsPickup)
+    (tone,) = found.tones
+    assert tone.frequency_hz == pytest.approx(50.0, abs=0.1)
+    assert tone.amplitude[0] == pytest.approx(3 * NOISE, rel=0.1)
 
 
 @pytest.mark.parametrize(("hz", "rate_hz", "at"), [(60.0, 100.0, 40.0), (50.0, 62.5, 12.5), (50.0, 70.0, 20.0)])
