@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from types import TracebackType
 from typing import NamedTuple, Self, TypeVar
 
@@ -12,7 +13,7 @@ from mcap.records import Message
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
-from triaxcald.recording.raw_batch import decode_raw
+from triaxcald.recording.raw_batch import Fields, batch_of, decode_raw, fields_of
 
 T = TypeVar("T")
 JOINED = 1 << 15
@@ -57,17 +58,25 @@ class Contents(ABC):
     def raw(self, phase: str) -> Iterator[RawBatch]:
         """The phase's raw records in the order in which they came, some
         `JOINED` at a time: a live bus hands out few."""
-        waiting: list[RawBatch] = []
-        records = 0
-        for found, batch in self.raw_batches():
-            if found == phase:
-                waiting.append(batch)
-                records += len(batch)
+        name, waiting, records = phase.encode(), list[tuple[int, Fields]](), 0
+        for message, fields in self._read(schema.RAW, fields_of):
+            if fields.phase == name:
+                waiting.append((message.log_time, fields))
+                records += len(fields.flags)
                 if records >= JOINED:
-                    yield RawBatch.joined(waiting)
+                    yield self._joined(waiting)
                     waiting, records = [], 0
         if waiting:
-            yield RawBatch.joined(waiting)
+            yield self._joined(waiting)
+
+    def _joined(self, waiting: Sequence[tuple[int, Fields]]) -> RawBatch:
+        """Raises RecordingError, which names the message at fault."""
+        try:
+            return batch_of([fields for _, fields in waiting])
+        except ValueError:
+            for time_ns, fields in waiting:
+                self._decode(schema.RAW, time_ns, partial(batch_of, [fields]))
+            raise
 
     def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
         """All raw records with their phase."""
@@ -97,9 +106,16 @@ class Contents(ABC):
         return self._decoded(schema.LOSS, schema.decode_loss)
 
     def _decoded(self, topic: str, decode: Callable[[bytes], T]) -> Iterator[T]:
+        return (value for _, value in self._read(topic, decode))
+
+    def _read(self, topic: str, decode: Callable[[bytes], T]) -> Iterator[tuple[Message, T]]:
         for found, message in self.messages():
             if found == topic:
-                try:
-                    yield decode(message.data)
-                except ValueError as e:
-                    raise RecordingError(f"{self.name}: {topic} at {message.log_time} ns: {e}") from e
+                yield message, self._decode(topic, message.log_time, partial(decode, message.data))
+
+    def _decode(self, topic: str, time_ns: int, decode: Callable[[], T]) -> T:
+        """Raises RecordingError."""
+        try:
+            return decode()
+        except ValueError as e:
+            raise RecordingError(f"{self.name}: {topic} at {time_ns} ns: {e}") from e

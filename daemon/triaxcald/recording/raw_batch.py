@@ -8,7 +8,7 @@ written and read here.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -74,21 +74,52 @@ def encode_raw(first: int, phase: str, batch: RawBatch) -> bytes:
 def decode_raw(data: bytes) -> tuple[int, str, RawBatch]:
     """(running index of the first record, phase, batch). Raises ValueError
     where ``data`` is none."""
-    fields = unpack(data) or _by_protobuf(data)
-    time_ns = _times_ns(fields)
-    if len(time_ns) > schema.MAX_RECORDS:
-        raise ValueError(f"{len(time_ns)} records in one message, expected at most {schema.MAX_RECORDS}")
-    length = np.frombuffer(fields.length, dtype="<u4")
+    fields = fields_of(data)
+    return fields.first, fields.phase.decode(), batch_of([fields])
+
+
+def fields_of(data: bytes) -> Fields:
+    """Raises ValueError where ``data`` is no message."""
+    return unpack(data) or _by_protobuf(data)
+
+
+def batch_of(messages: Sequence[Fields]) -> RawBatch:
+    """The records of messages, one after the other. Raises ValueError where one
+    of them does not hold what it should."""
+    time_ns = _times_ns(messages[0]) if len(messages) == 1 else _all_times_ns(messages)
+    counts = np.array([len(m.flags) for m in messages])
+    if counts.max() > schema.MAX_RECORDS:
+        raise ValueError(f"{counts.max()} records in one message, expected at most {schema.MAX_RECORDS}")
+    length = np.frombuffer(b"".join(m.length for m in messages), dtype="<u4")
     if np.any(length > np.iinfo(np.uint16).max):
         raise ValueError(f"a record of {length.max()} bytes, expected at most {np.iinfo(np.uint16).max}")
     batch = RawBatch(
         time_ns,
-        np.frombuffer(fields.source, dtype="<u4").astype(np.uint32),
-        np.frombuffer(fields.flags, dtype=np.uint8),
+        np.frombuffer(b"".join(m.source for m in messages), dtype="<u4").astype(np.uint32),
+        np.frombuffer(b"".join(m.flags for m in messages), dtype=np.uint8),
         length.astype(np.uint16),
-        fields.payload,
+        b"".join(m.payload for m in messages),
     )
-    return fields.first, fields.phase.decode(), batch
+    if not _each_is_whole(messages, counts, length):
+        raise ValueError("columns of a message differ in length")
+    return batch
+
+
+def _each_is_whole(messages: Sequence[Fields], counts: NDArray[np.int64], length: NDArray[np.uint32]) -> bool:
+    """Whether no message lacks what another has too much."""
+    whole = all(len(m.source) == len(m.length) == 4 * len(m.flags) for m in messages)
+    ends = np.concatenate([[0], np.cumsum(length, dtype=np.int64)])[np.concatenate([[0], np.cumsum(counts)])]
+    return whole and np.array_equal(np.diff(ends), [len(m.payload) for m in messages])
+
+
+def _all_times_ns(messages: Sequence[Fields]) -> NDArray[np.int64]:
+    """Raises ValueError where a message has not as many as records."""
+    if all(not m.start_ns and len(m.time_ns) == 8 * len(m.flags) for m in messages):
+        return np.frombuffer(b"".join(m.time_ns for m in messages), dtype="<u8").astype(np.int64)
+    each = [_times_ns(m) for m in messages]
+    if any(len(times) != len(m.flags) for times, m in zip(each, messages, strict=True)):
+        raise ValueError("columns of a message differ in length")
+    return np.concatenate(each)
 
 
 def _times_ns(fields: Fields) -> NDArray[np.int64]:

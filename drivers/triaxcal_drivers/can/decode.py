@@ -35,12 +35,12 @@ class _Parts:
     time_ns: Ints
     message: Ints
     counter: Ints
-    values: NDArray[np.float64]  # (n, columns), nan where the message does not hold the column
+    values: NDArray[np.float64]  # (columns, n), nan where the message does not hold the column
     after_gap: NDArray[np.bool_]
 
     def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _Parts:
         return _Parts(
-            self.time_ns[rows], self.message[rows], self.counter[rows], self.values[rows], self.after_gap[rows]
+            self.time_ns[rows], self.message[rows], self.counter[rows], self.values[:, rows], self.after_gap[rows]
         )
 
     def __len__(self) -> int:
@@ -51,7 +51,7 @@ class _Parts:
             np.concatenate([self.time_ns, other.time_ns]),
             np.concatenate([self.message, other.message]),
             np.concatenate([self.counter, other.counter]),
-            np.concatenate([self.values, other.values]),
+            np.concatenate([self.values, other.values], axis=1),
             np.concatenate([self.after_gap, other.after_gap]),
         )
 
@@ -107,7 +107,7 @@ class CanDecoder:
         self._settled = 0  # every sample below is delivered or given up
         empty = np.zeros(0, dtype=np.int64)
         self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
-        self._held = _Parts(empty, empty, empty, np.zeros((0, len(self._columns))), empty.astype(bool))
+        self._held = _Parts(empty, empty, empty, np.zeros((len(self._columns), 0)), empty.astype(bool))
         self._together = TogetherInTime(len(layout.messages), self._period_ns)
 
     def feed(self, batch: RawBatch) -> SampleBlock:
@@ -141,7 +141,7 @@ class CanDecoder:
         starts = (np.cumsum(length) - length)[rows]
         octets = np.frombuffer(batch.payload, dtype=np.uint8)
         counter = np.zeros(len(rows), dtype=np.int64)
-        values = np.full((len(rows), len(self._columns)), np.nan)
+        values = np.full((len(self._columns), len(rows)), np.nan)
         for number, size in enumerate(self._sizes):
             mine = np.flatnonzero(message == number)
             data = octets[starts[mine, None] + np.arange(size)]
@@ -149,9 +149,9 @@ class CanDecoder:
                 if at != number:
                     continue
                 if column < len(self._names):
-                    values[mine, column] = signal.values(data)
+                    values[column, mine] = signal.values(data)
                 else:
-                    values[mine, column] = np.isin(signal.raw(data).astype(np.int64), self._layout.valid_values)
+                    values[column, mine] = np.isin(signal.raw(data).astype(np.int64), self._layout.valid_values)
             if self._layout.counters:
                 counter[mine] = self._layout.counters[number].raw(data).astype(np.int64) % self._range
         after_gap = self._after_gap(batch, rows)
@@ -200,7 +200,7 @@ class CanDecoder:
         settled = last if self._together.open else last + 1
         self._held = parts[sample >= settled]
         complete = np.bincount(sample)[:settled] == len(self._layout.messages)
-        values = self._rows(parts, sample, last + 1)[:settled][complete]
+        values = self._rows(parts, sample, last + 1)[:, :settled][:, complete]
         first = parts.time_ns[np.searchsorted(sample, np.arange(settled))]
         time_ns = np.maximum.accumulate(np.concatenate([[self._last_ns], first]))[1:]
         counter = self._settled + np.arange(settled)
@@ -210,11 +210,14 @@ class CanDecoder:
         return replace(block, incomplete=settled - int(complete.sum()))
 
     def _rows(self, parts: _Parts, row: Ints, rows: int) -> NDArray[np.float64]:
-        """The values (rows, columns) of parts that belong to samples ``row``."""
-        values = np.full((rows, len(self._columns)), np.nan)
-        for column, (number, _) in enumerate(self._columns):
-            mine = parts.message == number
-            values[row[mine], column] = parts.values[mine, column]
+        """The values (columns, rows) of parts that belong to samples ``row``."""
+        values = np.full((len(self._columns), rows), np.nan)
+        for number in range(len(self._layout.messages)):
+            mine = np.flatnonzero(parts.message == number)
+            to = row[mine]
+            for column, (at, _) in enumerate(self._columns):
+                if at == number:
+                    values[column, to] = parts.values[column, mine]
         return values
 
     def _unwrap(self, parts: _Parts) -> Ints:
@@ -244,18 +247,22 @@ class CanDecoder:
         parts = replace(raw, counter=self._unwrap(raw))
         highest = np.maximum.accumulate(np.concatenate([[self._top], parts.counter]))
         in_time = (parts.counter >= highest[:-1] - self._latest) & (parts.counter >= self._origin)
-        fresh = np.flatnonzero(in_time)
-        fresh = fresh[~np.isin(self._key(parts[fresh]), self._key(self._held))]
-        fresh = fresh[np.unique(self._key(parts[fresh]), return_index=True)[1]]
+        key, held = self._key(parts), self._key(self._held)
+        duplicates = 0
+        if not (in_time.all() and np.all(np.diff(key, prepend=held.max(initial=-1)) > 0)):
+            fresh = np.flatnonzero(in_time)
+            fresh = fresh[~np.isin(key[fresh], held)]
+            fresh = fresh[np.unique(key[fresh], return_index=True)[1]]
+            duplicates, parts = len(parts) - len(fresh), parts[fresh]
         self._top = int(highest[-1])
-        return replace(self._settle(self._held.followed_by(parts[fresh])), duplicates=len(parts) - len(fresh))
+        return replace(self._settle(self._held.followed_by(parts)), duplicates=duplicates)
 
     def _key(self, parts: _Parts) -> Ints:
         return parts.counter * len(self._layout.messages) + parts.message
 
     def _settle(self, parts: _Parts) -> SampleBlock:
         """Deliver and give up what can be, hold the rest."""
-        samples, row, came = np.unique(parts.counter, return_inverse=True, return_counts=True)
+        samples, row, came = _samples_of(parts.counter)
         complete = came == len(self._layout.messages)
         given_up = max(self._settled, self._top - self._latest)
         ahead = np.searchsorted(samples, given_up)
@@ -266,7 +273,7 @@ class CanDecoder:
         counter = samples[new & complete]
         time_ns = self._origin_ns + np.rint((counter - self._origin) * self._period_ns).astype(np.int64)
         block = replace(
-            self._block(time_ns, counter, values[new & complete]),
+            self._block(time_ns, counter, values[:, new & complete]),
             missing=settled - self._settled - int(new.sum()),
             incomplete=int((new & ~complete).sum()),
         )
@@ -275,9 +282,21 @@ class CanDecoder:
         return block
 
     def _block(self, time_ns: Ints, counter: Ints, values: NDArray[np.float64]) -> SampleBlock:
-        valid = (values[:, len(self._names) :] == 1).all(axis=1)
-        values = values[valid]
+        valid = (values[len(self._names) :] == 1).all(axis=0)
+        if not valid.all():
+            time_ns, counter, values = time_ns[valid], counter[valid], values[:, valid]
         columns = [self._names.index(name) for name in READING_CHANNELS]
-        auxiliary = {n: values[:, i] for i, n in enumerate(self._names) if n not in READING_CHANNELS}
-        invalid = len(valid) - len(values)
-        return SampleBlock(time_ns[valid], counter[valid], values[:, columns], auxiliary, invalid=invalid)
+        auxiliary = {n: values[i] for i, n in enumerate(self._names) if n not in READING_CHANNELS}
+        readings = np.ascontiguousarray(values[columns].T)
+        return SampleBlock(time_ns, counter, readings, auxiliary, invalid=len(valid) - int(valid.sum()))
+
+
+def _samples_of(counter: Ints) -> tuple[Ints, Ints, Ints]:
+    """The counts that there are, which of them each part has, and how many
+    parts have it."""
+    step = np.diff(counter)
+    if len(counter) and np.all(step >= 0):
+        begins = np.concatenate([[True], step > 0])
+        first = np.flatnonzero(begins)
+        return counter[first], np.cumsum(begins) - 1, np.diff(first, append=len(counter))
+    return np.unique(counter, return_inverse=True, return_counts=True)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.recording import schema
-from triaxcald.recording.raw_batch import decode_raw, encode_raw
+from triaxcald.recording.raw_batch import batch_of, decode_raw, encode_raw, fields_of
 
 TWO = RawBatch.of([(256, 0x181, 0, b"\x01\x02"), (512, 0x281, 16, b"\xff")])
 
@@ -105,3 +105,21 @@ def test_more_records_than_one_message_may_have_are_a_value_error() -> None:
 def test_a_record_longer_than_any_is_a_value_error() -> None:
     with pytest.raises(ValueError, match="a record of 65536 bytes, expected at most 65535"):
         decode_raw(by_protobuf(time_ns=[1], source=[0], flags=b"\0", length=[65536], payload=bytes(65536)))
+
+
+def test_messages_that_are_read_together_are_their_batches_one_after_the_other() -> None:
+    unit, bus = encode_raw(7, "calibration", TWO), encode_raw(9, "bus/0", TWO)
+    for messages in ([unit, unit], [bus, unit, bus], [encode_raw(0, "calibration", RawBatch.of([])), unit]):
+        together = batch_of([fields_of(data) for data in messages])
+        apart = RawBatch.joined([decode_raw(data)[2] for data in messages])
+        for name in ("time_ns", "source", "flags", "length", "payload"):
+            assert np.array_equal(getattr(together, name), getattr(apart, name)), name
+            assert getattr(together, name).dtype == getattr(apart, name).dtype if name != "payload" else True
+
+
+@pytest.mark.parametrize("column", ["time_ns", "source", "length", "payload"])
+def test_a_message_that_lacks_what_the_next_has_too_much_is_a_value_error(column: str) -> None:
+    columns = {"time_ns": [1, 2], "source": [1, 1], "flags": bytes(2), "length": [1, 1], "payload": b"ab"}
+    less, more = ({**columns, column: columns[column][:n] + columns[column][:m]} for n, m in ((1, 0), (2, 1)))  # type: ignore[index]
+    with pytest.raises(ValueError, match="differ in length"):
+        batch_of([fields_of(by_protobuf(**less)), fields_of(by_protobuf(**more))])

@@ -10,7 +10,8 @@ from mcap.writer import Writer as McapWriter
 
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
-from triaxcald.recording import schema
+from triaxcald.recording import contents, schema
+from triaxcald.recording.raw_batch import Fields
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 
@@ -60,6 +61,21 @@ def test_records_of_a_phase_come_many_at_a_time_however_few_a_message_has(
         np.testing.assert_array_equal(getattr(joined, column), whole)
         np.testing.assert_array_equal(np.concatenate([getattr(p, column) for p in parts]), whole)
     assert joined.payload == b"".join(b.payload for b in single) == b"".join(p.payload for p in parts)
+
+
+def test_of_messages_that_are_read_together_the_one_at_fault_is_named(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Recording.open(recording) as rec:
+        _, second, *_ = (message for topic, message in rec.messages() if topic == schema.RAW)
+    read = contents.fields_of
+
+    def spoilt(data: bytes) -> Fields:
+        return read(data)._replace(payload=b"") if data == second.data else read(data)
+
+    monkeypatch.setattr(contents, "fields_of", spoilt)
+    with Recording.open(recording) as rec, pytest.raises(RecordingError, match=f"/raw at {second.log_time} ns: "):
+        list(rec.raw("calibration"))
 
 
 class Frugal(io.BytesIO):
