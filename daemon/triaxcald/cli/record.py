@@ -81,7 +81,7 @@ async def _record(
     from triaxcald.station.coming_back import Patience
     from triaxcald.station.serials import SerialsSeen
 
-    roster = Roster(a.seconds, Patience(most_s=a.give_up_after), lambda kept: _ended(kept, progress))
+    roster = Roster(a.seconds, Patience(most_s=a.give_up_after, in_use=a.folder), lambda kept: _ended(kept, progress))
     serials = SerialsSeen()
 
     def in_a_line() -> str:

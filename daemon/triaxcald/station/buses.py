@@ -15,8 +15,7 @@ from triaxcal_drivers.can.model import BusSettings
 from triaxcal_drivers.profile import Strict
 from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
-from triaxcald.station.coming_back import Patience, until_open
-from triaxcald.station.lock import locked
+from triaxcald.station.coming_back import Patience, claimed, until_open
 
 if TYPE_CHECKING:
     from triaxcal_drivers.can.listener import BusListener
@@ -52,14 +51,14 @@ class BusPlace:
     @asynccontextmanager
     async def opened(self, patience: Patience, tell: Callable[[Exception], None]) -> AsyncIterator[BusListener]:
         """The bus, listened to until the context ends. Raises DeviceInUse where
-        another process has its serial port; BusError once patience ends
+        another process has its serial port, BusError once patience ends
         (``tell`` is told meanwhile)."""
         listener, claim = self.listener(), self.settings.claim_to_listen()
         if claim is None:
             async with _open(listener, patience, tell):
                 yield listener
         else:
-            async with locked(claim), _open(listener, patience, tell):
+            async with claimed(claim, patience, tell), _open(listener, patience, tell):
                 yield listener
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, Sequence
-from contextlib import ExitStack, aclosing, contextmanager
+from contextlib import AsyncExitStack, ExitStack, aclosing, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol, cast
@@ -13,10 +13,13 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from triaxcal_drivers.claim import Claim
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Device, Gap, RawBatch, RawFlag
+from triaxcald.errors import DeviceInUse
 from triaxcald.provision.identity import WrongUnit
+from triaxcald.station.lock import locked
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 """Between attempts, doubled each time: a unit that restarts is there again in a
@@ -74,12 +77,14 @@ class Patience:
     """How long a lost unit is waited for.
 
     At least ``least_s``; then until ``most_s``, or until no other unit is at
-    work, for ever where neither is given.
+    work, for ever where neither is given. ``in_use``: also where another
+    process has it.
     """
 
     least_s: float = 0.0
     most_s: float | None = None
     others: AtWork | None = None
+    in_use: bool = False
 
     async def rest(self, pause_s: float, waited_s: float) -> float | None:
         """Waits ``pause_s``, or less; so long did it, or None where the unit is
@@ -156,15 +161,35 @@ class _Waiting:
 
 
 async def until_open(
-    attempt: Callable[[], Awaitable[None]], patience: Patience, tell: Callable[[Exception], None]
+    attempt: Callable[[], Awaitable[None]],
+    patience: Patience,
+    tell: Callable[[Exception], None],
+    mended: tuple[type[Exception], ...] = ABSENT,
 ) -> None:
-    """Attempts again until it works. Raises the last trouble of `ABSENT` once
-    patience ends; ``tell`` is told each one that is new."""
+    """Attempts again until it works. Raises the last trouble of those that an
+    attempt may have ``mended`` once patience ends; ``tell`` is told each one
+    that is new."""
     try:
         await attempt()
-    except ABSENT as e:
+    except mended as e:
         with patience.waiting():
-            await _Waiting(patience, tell, attempted=True).until(attempt, ABSENT, e)
+            await _Waiting(patience, tell, attempted=True).until(attempt, mended, e)
+
+
+@asynccontextmanager
+async def claimed(claim: Claim, patience: Patience | None, tell: Callable[[Exception], None]) -> AsyncIterator[None]:
+    """Has what is claimed until the context ends. Raises DeviceInUse; once
+    ``patience`` ends where that is for such too."""
+    async with AsyncExitStack() as stack:
+
+        async def attempt() -> None:
+            await stack.enter_async_context(locked(claim))
+
+        if patience is not None and patience.in_use:
+            await until_open(attempt, patience, tell, (DeviceInUse,))
+        else:
+            await attempt()
+        yield
 
 
 class Returning:

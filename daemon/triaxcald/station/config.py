@@ -32,8 +32,7 @@ from triaxcal_drivers.validation import validate
 from triaxcald.errors import InputError
 from triaxcald.provision.identity import same_serial
 from triaxcald.station.buses import BUSES_MOST, NAME, Bus, BusPlace, bus_places, taken_for
-from triaxcald.station.coming_back import Patience, until_open
-from triaxcald.station.lock import locked
+from triaxcald.station.coming_back import Patience, claimed, until_open
 
 PathText = Annotated[str, Field(pattern=r"^[^\x00]+$")]
 UNITS_MOST = 128  # as many nodes as a CAN bus has
@@ -229,7 +228,8 @@ class Place:
     ) -> AsyncIterator[Device]:
         """The device, open and nobody else's until the context ends. Raises
         DeviceInUse; BusError, DeviceAbsent and what ``identify`` does, with
-        ``patience`` once that ends (``tell`` is told meanwhile).
+        ``patience`` once that ends (``tell`` is told meanwhile), as that is for
+        DeviceInUse too.
 
         Whoever closes it and opens it again in between, as a reset does, keeps
         it.
@@ -241,7 +241,7 @@ class Place:
             if identify is not None:
                 await identify(device)
 
-        async with locked(claim_of(self.bus)):
+        async with claimed(claim_of(self.bus), patience, tell):
             try:
                 await (attempt() if patience is None else until_open(attempt, patience, tell))
                 yield device

@@ -125,7 +125,8 @@ class ModbusDevice:
     async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
         """Replies of the named streams, polled in turn. A failed request is a
         record too: an exception's code, a malformed reply as it came, nothing
-        for a missing reply. What FIFOs hold by now is discarded first.
+        for a missing reply. A reply from an empty FIFO is none: the unit
+        answers, and brings nothing. What FIFOs hold by now is discarded first.
 
         Raises DeviceSilent, BusError; ProfileError where the profile has no
         such stream.
@@ -199,8 +200,9 @@ class ModbusDevice:
         for _ in range(_BATCH_REPLIES):
             asked_ns, asked_s = self._now_ns(), self._connected().attention_s
             flags, data = await self._request(p)
-            records.append((self._came_ns(asked_ns, asked_s), p.source, flags, data))
             taken, remaining = self._held(p.stream, data) if not flags else (0, 0)
+            if flags or taken:
+                records.append((self._came_ns(asked_ns, asked_s), p.source, flags, data))
             if taken:
                 p.heard_s = self._connected().own_s
             elif not flags:

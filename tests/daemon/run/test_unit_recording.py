@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import DecodedStream
@@ -21,6 +22,7 @@ from triaxcald.run.unit_recording import UnitRecording
 from triaxcald.simulation.bench import load_device, simulate
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import Station, load_station
+from triaxcald.station.lock import locked
 
 
 class Told:
@@ -143,6 +145,22 @@ async def test_a_unit_of_which_nothing_has_come_is_not_said_to_be_recorded(works
     assert seen[-1][:2] == (State.RECORDING, None)
     assert (State.WAITING, "nothing has come yet", None) in seen
     assert {state for state, _, last_ns in seen if last_ns is None} == {State.WAITING}
+
+
+@pytest.mark.parametrize("given_up", [False, True])
+async def test_a_unit_that_another_command_works_with_is_waited_for(workshop: Any, given_up: bool) -> None:
+    bench, told = Bench(workshop, [MODBUS]), Told()
+    station = load_station(workshop.station({"bus": await bench.put(0), "profile": "triax-ref-modbus"}))
+    patience = Patience(most_s=0.0 if given_up else None, in_use=True)
+    async with locked(claim_of(station.places[0].bus)):
+        work = recorded(station, workshop.folder, told, seconds=0.2, patience=patience)
+        await told.until("unit0", lambda text: " is in use by `" in text)
+        if given_up:
+            await work
+    (kept,) = await work
+    await bench.take(0)
+    assert kept.exit_code == (4 if given_up else 0)
+    assert (kept.error is not None and " is in use by `" in kept.error) == given_up
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from triaxcal_drivers.errors import (
     RegisterRefused,
     RegisterValueError,
 )
-from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.modbus import stack
 from triaxcal_drivers.modbus.device import ModbusDevice
 from triaxcal_drivers.modbus.model import ModbusBus
@@ -389,8 +389,10 @@ async def test_a_fifo_that_stays_empty_is_silent(bundle, tcp_device):
     ]
     async with tcp_device(PROBE, *empty) as heard:
         device = await opened(bundle(hasty=True), heard)
+        batches: list[RawBatch] = []
         with pytest.raises(DeviceSilent, match="its FIFO stays empty"):
-            await collect(device, "queue", [])
+            await collect(device, "queue", batches)
+        assert sum(map(len, batches)) == 0, "a unit that answers, and brings nothing, is not back"
         await device.close()
 
 
