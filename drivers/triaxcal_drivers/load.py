@@ -1,5 +1,5 @@
-"""What a unit takes of a line on which it is asked: the arithmetic of whether a
-line can carry its units."""
+"""What a unit takes of a line that it shares: the arithmetic of whether the line
+can carry its units."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 class LineLoad:
     """``line`` names what units share, ``settings`` how it is driven, which
     must be the same for all of them. A unit's stream takes ``reads_per_s``
-    reads, each of which keeps the line for ``read_s`` at least."""
+    reads, or frames, each of which keeps the line for ``read_s`` at least."""
 
     line: str
     settings: str

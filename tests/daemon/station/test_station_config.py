@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -160,8 +161,28 @@ def test_a_line_that_cannot_carry_its_units_is_refused_with_the_arithmetic(works
     words = (
         f"a.toml: /dev/ttyUSB0 at 115200 baud, parity N, 1 stop bits cannot carry its units at their rates: {each} = "
     )
-    with pytest.raises(InputError, match=f"^{re.escape(words)}130% of its time; raise the baud rate"):
+    with pytest.raises(InputError, match=f"^{re.escape(words)}130% of its time; raise the bit rate"):
         check_lines(on_one_line(workshop, RTU, RTU, RTU).places, where="a.toml")
+
+
+def on_one_bus(workshop: Any, count: int, **settings: Any) -> Station:
+    bus = {"interface": "virtual", "channel": "busy", **settings}
+    units = [
+        {"name": f"u{i}", "profile": "triax-ref-can", "bus": {**bus, "node_id": i}, "serial": str(i)}
+        for i in range(1, count + 1)
+    ]
+    return load_station(workshop.station(*units))
+
+
+def test_a_bus_that_cannot_carry_its_units_is_refused_with_the_arithmetic(workshop: Any) -> None:
+    """Two frames a sample and stream, 100 times a second, of 8 bytes and 47 bits beside: 22.2 kbit/s."""
+    check_lines(on_one_bus(workshop, 2, bitrate=125_000).places, where="a.toml")
+    check_lines(on_one_bus(workshop, 8).places, where="a.toml")  # who knows how fast it is
+    each = " + ".join(f"u{i} {stream} 200/s × 0.888 ms" for i in (1, 2, 3) for stream in ("readings", "corrected"))
+    bus = f"virtual busy of process {os.getpid()} at 125000 bit/s"
+    words = f"a.toml: {bus} cannot carry its units at their rates: {each} = 107% of its time"
+    with pytest.raises(InputError, match=f"^{re.escape(words)}"):
+        check_lines(on_one_bus(workshop, 3, bitrate=125_000).places, where="a.toml")
 
 
 def test_a_station_is_read_whatever_its_lines_carry_and_one_unit_of_it_is_recorded(workshop: Any) -> None:
