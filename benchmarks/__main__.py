@@ -8,6 +8,7 @@ from benchmarks import (
     coverage,
     efficiency,
     frame,
+    long_recordings,
     outliers,
     peers,
     raw_rotation,
@@ -22,7 +23,7 @@ from benchmarks.table import chosen
 
 def main(arguments: list[str] | None = None) -> int:
     quick = chosen(__doc__, arguments)
-    for module in (efficiency, coverage, outliers, peers, raw_rotation, speed, ways_in, recorder):
+    for module in (efficiency, coverage, outliers, peers, raw_rotation, speed, ways_in, recorder, long_recordings):
         module.main(["--quick"] if quick else [])
         sys.stdout.flush()
     print("\n### The frame of the mounting faces\n")
