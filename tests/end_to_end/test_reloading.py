@@ -54,6 +54,7 @@ def test_at_a_hangup_the_station_file_is_read_again_and_what_it_leaves_alone_goe
         assert said("reload")[-1]["message"].endswith("changed: b, b2, c"), process.err
         process.send(signal.SIGTERM)
         assert process.wait() == 130, process.err
+        assert {line["level"] for line in said("ended")} == {"info"}, "all of them were asked to end"
     found = {path.name.split("-")[0]: ended(path) for path in folder.iterdir()}
     assert found == {
         "a": (True, "signal", []), "b": (True, "asked", []), "b2": (True, "signal", []), "c": (True, "signal", []),

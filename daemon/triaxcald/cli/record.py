@@ -240,7 +240,8 @@ def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
     if isinstance(progress, JsonLines):
         counts = {name: n for name, n in kept.counts.items() if n}
         path = str(kept.path) if kept.path else None
-        level = "info" if kept.error is None else "error"
+        asked_to = kept.error is None or kept.exit_code == INTERRUPTED
+        level = "info" if asked_to else "error"
         told = {"message": kept.error, **_traced(kept.trace), **counts, "lost": kept.lost}
         progress.say(level, "ended", unit=kept.unit, kind=kept.kind, recording=path, **told)
         return

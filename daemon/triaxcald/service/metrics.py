@@ -3,6 +3,7 @@ stand."""
 
 from __future__ import annotations
 
+import errno
 import html
 import json
 import shutil
@@ -19,7 +20,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.registry import Collector
 
 from triaxcal_drivers.host_clock import HOST
-from triaxcald.errors import InputError
+from triaxcald.errors import InputError, StationError
 from triaxcald.run.recording import State, UnitStatus
 
 Statuses = Callable[[], Sequence[UnitStatus]]
@@ -113,7 +114,8 @@ def health(units: Sequence[UnitStatus]) -> dict[str, Any]:
 def served(port: int, statuses: Statuses, folder: Path) -> Iterator[int]:
     """``/metrics``, ``/health`` (503 where a unit is lost) and ``/`` on the
     loopback; the port, which the system chooses where ``port`` is 0. Raises
-    InputError where it is taken."""
+    StationError where it is taken, which may pass, InputError where this user
+    may never have it."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(UnitMetrics(statuses, folder))
 
@@ -144,7 +146,8 @@ def served(port: int, statuses: Statuses, folder: Path) -> Iterator[int]:
     try:
         server = ThreadingHTTPServer(("127.0.0.1", port), Page)
     except OSError as e:
-        raise InputError(f"--metrics {port}: cannot listen on 127.0.0.1: {e.strerror}") from e
+        kind = StationError if e.errno == errno.EADDRINUSE else InputError
+        raise kind(f"--metrics {port}: cannot listen on 127.0.0.1: {e.strerror}") from e
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, name="metrics", daemon=True).start()
     try:

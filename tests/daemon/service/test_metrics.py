@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import urllib.error
 import urllib.request
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from triaxcald.errors import InputError
+from triaxcald.errors import InputError, StationError
 from triaxcald.run.recording import State, UnitStatus
 from triaxcald.service.metrics import served
 
@@ -121,10 +122,20 @@ def test_the_page_shows_what_is_the_matter_and_runs_no_script_of_it(tmp_path: Pa
     assert "<script>" not in text
 
 
-def test_a_port_that_is_taken_is_said_in_a_line(tmp_path: Path) -> None:
+def test_a_port_that_is_taken_is_said_in_a_line_and_tried_again_by_a_service(tmp_path: Path) -> None:
     with (
         served(0, list, tmp_path) as port,
-        pytest.raises(InputError, match=rf"^--metrics {port}: cannot listen on "),
+        pytest.raises(StationError, match=rf"^--metrics {port}: cannot listen on ") as taken,
         served(port, list, tmp_path),
     ):
+        pass
+    assert taken.value.exit_code == 4, "the unit of systemd starts 2 no second time"
+
+
+def test_a_port_that_this_user_may_not_have_is_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr("triaxcald.service.metrics.ThreadingHTTPServer", refused)
+    with pytest.raises(InputError, match="^--metrics 80: "), served(80, list, tmp_path):
         pass
