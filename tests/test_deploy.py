@@ -6,8 +6,10 @@ import configparser
 import json
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -52,6 +54,16 @@ def test_the_container_starts_the_same_command(unit: configparser.ConfigParser) 
     assert command == shlex.split(unit["Service"]["ExecStart"])[1:]
 
 
+def test_the_image_is_built_from_what_the_package_is_and_nothing_else() -> None:
+    """An environment and the history would make it ten times as large, since each step of it stays."""
+    ignored, *rules = [line for line in (DEPLOY.parent / ".dockerignore").read_text().splitlines() if line[0] != "#"]
+    project = tomllib.loads((DEPLOY.parent / "pyproject.toml").read_text())
+    packages = project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    wanted = {Path(package).parts[0] for package in packages} | {project["project"]["readme"], "pyproject.toml"}
+    assert ignored == "*"
+    assert {rule[1:] for rule in rules if rule[0] == "!"} == wanted | set(project["project"]["license-files"])
+
+
 def test_bad_files_are_not_started_again_and_an_interruption_is_no_failure(unit: configparser.ConfigParser) -> None:
     service = unit["Service"]
     assert (service["RestartPreventExitStatus"], service["SuccessExitStatus"]) == ("2", "130")
@@ -70,5 +82,16 @@ def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     assert about_it == []
 
 
-def test_a_reload_is_the_signal_that_the_command_takes_for_one(unit: configparser.ConfigParser) -> None:
-    assert shlex.split(unit["Service"]["ExecReload"])[1:] == ["-HUP", "$MAINPID"]
+def test_a_reload_is_the_signal_that_the_command_takes_for_one_and_needs_no_other_program(
+    unit: configparser.ConfigParser, tmp_path: Path
+) -> None:
+    waiting = "from signal import *; signal(SIGHUP, SIG_DFL); print(flush=True); pause()"  # nohup has it ignored
+    with subprocess.Popen([sys.executable, "-c", waiting], text=True, stdout=subprocess.PIPE) as recorder:
+        try:
+            assert recorder.stdout is not None
+            recorder.stdout.readline()
+            without_programs = {"MAINPID": str(recorder.pid), "PATH": str(tmp_path)}
+            subprocess.run(shlex.split(unit["Service"]["ExecReload"]), env=without_programs, check=True, timeout=60)
+            assert recorder.wait(60) == -signal.SIGHUP
+        finally:
+            recorder.kill()
