@@ -137,5 +137,5 @@ def test_a_port_that_this_user_may_not_have_is_bad_input(tmp_path: Path, monkeyp
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr("triaxcald.service.metrics.ThreadingHTTPServer", refused)
-    with pytest.raises(InputError, match="^--metrics 80: "), served(80, list, tmp_path):
+    with pytest.raises(InputError, match=r"^--metrics 80: "), served(80, list, tmp_path):
         pass
