@@ -55,6 +55,7 @@ fifth or a tenth."""
 INDEX_ENTRY, UNINDEXED_MOST = 16, 4096
 """Bytes of the file that each message has in an index, uncompressed. Those of a
 last chunk may have none."""
+_BLOCK = 2**16
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _KNOWN = frozenset(int(code) for code in Opcode)
@@ -110,6 +111,19 @@ def check_magic(stream: BinaryIO, name: str) -> None:
 
 def size_of(stream: BinaryIO) -> int:
     return stream.seek(0, os.SEEK_END)
+
+
+def written_to(stream: BinaryIO, size: int) -> int:
+    """Where the zeros begin that a file of ``size`` bytes ends with. After a
+    power failure a file may be longer than what of it reached the disk."""
+    end = size
+    while end:
+        begin = max(0, end - _BLOCK)
+        stream.seek(begin)
+        if kept := stream.read(end - begin).rstrip(b"\0"):
+            return begin + len(kept)
+        end = begin
+    return 0
 
 
 def frame_at(stream: BinaryIO, name: str, offset: int, size: int) -> Frame:

@@ -16,6 +16,7 @@ from triaxcald.errors import RecordingError
 from triaxcald.recording import schema
 from triaxcald.recording.contents import Contents, TopicMessage
 from triaxcald.recording.frames import (
+    HEAD,
     MAGIC,
     CutShort,
     Damage,
@@ -29,6 +30,7 @@ from triaxcald.recording.frames import (
     parse,
     size_of,
     walk,
+    written_to,
 )
 
 METADATA_MOST = 2**20  # bytes; ours has some hundred
@@ -66,8 +68,9 @@ class Recording(Contents):
 
     Opening reads the whole file once and checks it: every byte of a finished
     recording is under a CRC. ``unfinished`` also takes one that is still being
-    written or was cut short, up to its last whole record. Raises
-    RecordingError, from opening and from every iterator.
+    written or was cut short, up to its last whole record; what would come after
+    it may be zeros, as power failures leave them. Raises RecordingError, from
+    opening and from every iterator.
     """
 
     def __init__(self, stream: BinaryIO, name: str, *, unfinished: bool = False) -> None:
@@ -82,11 +85,12 @@ class Recording(Contents):
         self.size = size_of(stream)
         if not self.size:
             raise RecordingError(f"{name}: the file is empty; nothing was recorded")
+        self._written = written_to(stream, self.size) if unfinished else self.size
         check_magic(stream, name)
         try:
             self._survey()
-        except CutShort:
-            if not unfinished:
+        except Damage as e:
+            if not unfinished or not (isinstance(e, CutShort) or self._reaches_zeros(e.offset)):
                 raise
             self.finished = False
         found = self.metadata.get(schema.FORMAT_RECORD, {}).get("format")
@@ -151,6 +155,8 @@ class Recording(Contents):
         for frame in walk(self._stream, self.name, self.size):
             if frame.opcode == Opcode.CHUNK:
                 unpacked.chunk(frame)
+                if frame.end > self._written:
+                    chunk_data(frame, self.name)
             self._note(frame)
             if frame.opcode == Opcode.DATA_END:
                 self._check_data(frame, crc)
@@ -159,6 +165,13 @@ class Recording(Contents):
                 self._check_end(frame, crc)
             else:
                 crc = zlib.crc32(frame.body, zlib.crc32(frame.head, crc))
+
+    def _reaches_zeros(self, offset: int) -> bool:
+        """Whether the record that begins there was not wholly written before
+        the zeros that the file ends with."""
+        if self._written == self.size:
+            return False
+        return offset + HEAD.size > self._written or self.frame(offset).end > self._written
 
     def _note(self, frame: Frame) -> None:
         if frame.opcode == Opcode.CHUNK:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from triaxcal_drivers.files import open_file
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ended_because
 from triaxcald.recording.file import Head, RecordingFile
+from triaxcald.recording.frames import size_of, written_to
 from triaxcald.recording.inventory import Document
 from triaxcald.recording.manifest import Manifest, Segment, State, load_manifest, manifest_path
 from triaxcald.recording.reader import Recording
@@ -204,6 +207,13 @@ def _told(one: Surplus) -> dict[str, Any]:
     return {"file": s.file, "because": one.reason, "bytes": s.bytes, "start_ns": s.start_ns, "end_ns": s.end_ns}
 
 
+def _nothing_reached(path: Path) -> bool:
+    """Whether of this file the disk has its name alone: the power failed right
+    after it was created."""
+    with open_file(path) as stream:
+        return written_to(stream, size_of(stream)) == 0
+
+
 def _settled(manifest: Manifest) -> Manifest:
     """Its last segment as it lies on the disk, where it was not closed. Raises
     OSError, RecordingError."""
@@ -211,7 +221,9 @@ def _settled(manifest: Manifest) -> Manifest:
         return manifest
     last = manifest.segments[-1]
     path = manifest.path_of(last)
-    if not os.path.lexists(path):
+    if not os.path.lexists(path) or _nothing_reached(path):
+        with suppress(FileNotFoundError):
+            path.unlink()
         return replace(manifest, segments=manifest.segments[:-1])
     with Recording.open(path, unfinished=True) as recording:
         digest, span = schema.RawDigest(), list[int]()

@@ -11,6 +11,7 @@ from mcap.writer import Writer as McapWriter
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
 from triaxcald.recording import contents, schema
+from triaxcald.recording.frames import MAGIC
 from triaxcald.recording.raw_batch import Fields
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
@@ -155,6 +156,37 @@ def test_an_unfinished_recording_can_be_read_up_to_where_it_is(
         assert [len(b) for b in rec.raw("calibration")] == [30]
     with pytest.raises(RecordingError, match="the file ends, not finished"):
         Recording.open(tmp_path / "rec.mcap")
+
+
+def test_what_a_power_failure_left_as_zeros_is_the_end_of_an_unfinished_recording(
+    tmp_path: Path, new_writer: Callable[..., RecordingWriter], batch_of: Callable[..., RawBatch]
+) -> None:
+    """From any byte on: a file may be longer than what of it reached the disk."""
+    writer = new_writer()
+    for i in range(3):
+        writer.raw("calibration", batch_of(10 * i, 10))
+        writer.drain()
+    whole = (tmp_path / "rec.mcap").read_bytes()
+    first = next(iter(_chunk_offsets(whole)))
+    kept = set()
+    for length in range(first, len(whole) + 1):
+        cut = whole[:length] + bytes(len(whole) - length + 4096)
+        with Recording(io.BytesIO(cut), "rec", unfinished=True) as rec:
+            assert not rec.finished
+            kept.add(sum(len(batch) for batch in rec.raw("calibration")))
+        with pytest.raises(RecordingError):
+            Recording(io.BytesIO(cut), "rec")
+    assert kept == {0, 10, 20, 30}
+
+
+def test_damage_before_the_zeros_of_a_power_failure_is_damage(
+    tmp_path: Path, new_writer: Callable[..., RecordingWriter]
+) -> None:
+    new_writer().drain()
+    whole = bytearray((tmp_path / "rec.mcap").read_bytes())
+    whole[len(MAGIC)] = 0xFF  # the first record's type
+    with pytest.raises(RecordingError, match="unknown record type 0xff at byte 8"):
+        Recording(io.BytesIO(bytes(whole) + bytes(4096)), "rec", unfinished=True)
 
 
 def test_what_is_not_mcap_is_called_that(tmp_path: Path) -> None:

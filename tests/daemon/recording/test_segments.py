@@ -227,6 +227,26 @@ def test_after_a_kill_the_segment_that_was_being_written_is_taken_as_it_lies(
         assert series.raw_digest().records == 20
 
 
+@pytest.mark.parametrize(("kept", "records"), [(1.0, 10), (0.9, 0), (0.0, 0)])
+def test_after_a_power_failure_recording_goes_on_behind_what_reached_the_disk(
+    tmp_path: Path, new: NewWriter, batch_of: BatchOf, kept: float, records: int
+) -> None:
+    """The rest of the file is zeros; where it is nothing else, nothing was recorded in it."""
+    killed = new()
+    killed.raw("calibration", batch_of(0, 10))
+    killed.drain()
+    path, manifest = tmp_path / "rec-000001.mcap", tmp_path / "rec.segments.json"
+    before = path.read_bytes(), manifest.read_text()
+    killed.close()
+    path.write_bytes(before[0][: round(kept * len(before[0]))].ljust(len(before[0]) + 4096 if kept else 0, b"\0"))
+    manifest.write_text(before[1])
+    with new() as writer:
+        writer.raw("calibration", batch_of(10, 10))
+    assert [s.state for s in load_manifest(manifest).segments] == (["cut_short"] if kept else []) + ["closed"]
+    with Series(manifest) as series:
+        assert series.raw_digest().records == records + 10
+
+
 def test_what_the_queue_had_no_room_for_has_its_running_index_in_the_series(
     tmp_path: Path, new: NewWriter, batch_of: BatchOf, clock: Any
 ) -> None:
