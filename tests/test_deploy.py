@@ -71,6 +71,11 @@ def test_bad_files_are_not_started_again_and_an_interruption_is_no_failure(unit:
     assert float(service["WatchdogSec"]) > 0
 
 
+def test_the_service_may_write_locks_where_there_is_a_folder_for_them(unit: configparser.ConfigParser) -> None:
+    """systemd starts nothing (226) where a path without the dash is not there."""
+    assert unit["Service"]["ReadWritePaths"].split() == ["-/run/lock", "/tmp"]
+
+
 def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     systemd = shutil.which("systemd-analyze")
     if systemd is None:
