@@ -55,7 +55,7 @@ fifth or a tenth."""
 INDEX_ENTRY, UNINDEXED_MOST = 16, 4096
 """Bytes of the file that each message has in an index, uncompressed. Those of a
 last chunk may have none."""
-_BLOCK = 2**16
+_BLOCK = 2**16  # bytes that are looked at at once
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _KNOWN = frozenset(int(code) for code in Opcode)

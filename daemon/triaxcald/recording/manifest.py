@@ -17,7 +17,7 @@ from triaxcald.files import write_durably
 FORMAT = "triaxcal.segments/1"
 SUFFIX = ".segments.json"
 MANIFEST_MOST = 64 * 2**20  # bytes; an entry has some 400: 18 years of hours, four months of minutes
-State = Literal["open", "closed", "cut_short"]
+State = Literal["open", "closed", "cut_short", "damaged"]
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class Segment:
     None in manifests of old. ``bytes`` and ``sha256`` are of the whole file,
     ``raw_sha256`` is the digest of its raw records. ``open``: it is being
     written, or was when the power failed; ``cut_short``: it was not
-    finished."""
+    finished; ``damaged``: nor can it be read, so that nobody knows how many
+    records are in it."""
 
     file: str
     number: int

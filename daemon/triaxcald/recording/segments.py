@@ -29,6 +29,7 @@ SEGMENT_BYTES, SEGMENT_S = 256 * 2**20, 3600.0
 """What damage to one file costs at most, and the least that retention takes: an
 hour of a busy bus is some hundred MiB."""
 AWAY = "nothing was being recorded meanwhile"
+DAMAGED = "what was recorded before is damaged, and nothing was being recorded meanwhile"
 
 
 class SegmentedWriter(RecordingWriter):
@@ -86,7 +87,8 @@ class SegmentedWriter(RecordingWriter):
         try:
             self._segments = _settled(self._segments)
             ends = [s.end_ns for s in self._segments.segments if s.end_ns is not None]
-            self._resumes = Gap(ends[-1], None, AWAY) if ends else None
+            damaged = bool(self._segments.segments) and self._segments.segments[-1].state == "damaged"
+            self._resumes = Gap(ends[-1], None, DAMAGED if damaged else AWAY) if ends else None
             return self._next()
         except OSError as e:
             raise disk.not_created(self.manifest, e) from e
@@ -215,8 +217,8 @@ def _nothing_reached(path: Path) -> bool:
 
 
 def _settled(manifest: Manifest) -> Manifest:
-    """Its last segment as it lies on the disk, where it was not closed. Raises
-    OSError, RecordingError."""
+    """Its last segment as it lies on the disk, where it was not closed: what
+    became of it is no reason not to record. Raises OSError."""
     if not manifest.segments or manifest.segments[-1].state != "open":
         return manifest
     last = manifest.segments[-1]
@@ -225,6 +227,18 @@ def _settled(manifest: Manifest) -> Manifest:
         with suppress(FileNotFoundError):
             path.unlink()
         return replace(manifest, segments=manifest.segments[:-1])
+    try:
+        found = _as_it_lies(path, last)
+    except RecordingError:
+        found = replace(last, state="damaged", end=last.first)
+    with suppress(RecordingError):
+        found = replace(found, sha256=digest_of(path))
+    status = path.stat()
+    return manifest.with_last(replace(found, bytes=status.st_size, closed_ns=status.st_mtime_ns))
+
+
+def _as_it_lies(path: Path, segment: Segment) -> Segment:
+    """What is in it, of one that was not closed. Raises RecordingError."""
     with Recording.open(path, unfinished=True) as recording:
         digest, span = schema.RawDigest(), list[int]()
         for phase, batch in recording.raw_batches():
@@ -233,11 +247,7 @@ def _settled(manifest: Manifest) -> Manifest:
                 span = [min([*span, int(batch.time_ns.min())]), max([*span, int(batch.time_ns.max())])]
         lost = sum(loss.records for loss in recording.losses() if loss.where == schema.RAW)
         state: State = "closed" if recording.finished else "cut_short"
-        size = recording.size
-    return manifest.with_last(
-        replace(
-            last, state=state, end=last.first + digest.records + lost, records=digest.records,
-            start_ns=span[0] if span else None, end_ns=span[1] if span else None,
-            closed_ns=path.stat().st_mtime_ns, bytes=size, sha256=digest_of(path), raw_sha256=digest.hexdigest(),
-        )
+    return replace(
+        segment, state=state, end=segment.first + digest.records + lost, records=digest.records,
+        start_ns=span[0] if span else None, end_ns=span[1] if span else None, raw_sha256=digest.hexdigest(),
     )  # fmt: skip

@@ -247,6 +247,31 @@ def test_after_a_power_failure_recording_goes_on_behind_what_reached_the_disk(
         assert series.raw_digest().records == records + 10
 
 
+def test_a_last_segment_that_is_damaged_is_no_reason_not_to_record(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], batch_of: BatchOf
+) -> None:
+    killed, path, manifest = new(), tmp_path / "rec-000002.mcap", tmp_path / "rec.segments.json"
+    minutes(killed, 1)
+    killed.raw("calibration", batch_of(10, 10))
+    killed.drain()
+    spoilt, listed = bytearray(path.read_bytes()), manifest.read_text()
+    killed.close()
+    spoilt[len(spoilt) // 2] ^= 0xFF
+    path.write_bytes(spoilt)  # as a kill would have left them, and the disk
+    manifest.write_text(listed)
+    with new() as writer:
+        assert writer.resumes is not None
+        assert "damaged" in writer.resumes.cause
+        writer.raw("calibration", batch_of(20, 10))
+    *_, second, third = load_manifest(manifest).segments
+    assert (second.state, second.records, third.state, third.records) == ("damaged", 0, "closed", 10)
+    assert second.sha256 == digest_of(path)
+    with pytest.raises(RecordingError, match=r"rec-000002\.mcap: "), Series(manifest) as series:
+        list(series.messages())
+    with Recording.open(tmp_path / "rec-000003.mcap") as recording:
+        assert sum(len(batch) for batch in recording.raw("calibration")) == 10
+
+
 def test_what_the_queue_had_no_room_for_has_its_running_index_in_the_series(
     tmp_path: Path, new: NewWriter, batch_of: BatchOf, clock: Any
 ) -> None:
