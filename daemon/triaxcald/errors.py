@@ -40,6 +40,10 @@ class DeviceInUse(StationError):
     on; the message says which."""
 
 
+class DeviceInUseElsewhere(DeviceInUse):
+    """The command is another process, which comes to its end."""
+
+
 class ProvisionError(StationError):
     """Writing to the device failed."""
 

@@ -144,8 +144,8 @@ def _traced(trace: str | None) -> dict[str, str]:
 
 
 def _show(trace: str | None) -> None:
-    if trace is not None:
-        say(trace.rstrip())
+    for line in trace.rstrip().splitlines() if trace is not None else ():
+        say(line)
 
 
 def _recordings(

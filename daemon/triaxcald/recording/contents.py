@@ -19,6 +19,9 @@ T = TypeVar("T")
 JOINED = 1 << 15
 """Raw records that are decoded at once: so many that the cost of a call no
 longer counts, and less than a MiB."""
+JOINED_BYTES = 8 * 2**20
+"""So much is held at most, whatever the messages say of their records: those of
+64 bytes, twice over."""
 
 
 class TopicMessage(NamedTuple):
@@ -58,14 +61,14 @@ class Contents(ABC):
     def raw(self, phase: str) -> Iterator[RawBatch]:
         """The phase's raw records in the order in which they came, some
         `JOINED` at a time: a live bus hands out few."""
-        name, waiting, records = phase.encode(), list[tuple[int, Fields]](), 0
+        name, waiting, records, size = phase.encode(), list[tuple[int, Fields]](), 0, 0
         for message, fields in self._read(schema.RAW, fields_of):
             if fields.phase == name:
                 waiting.append((message.log_time, fields))
-                records += len(fields.flags)
-                if records >= JOINED:
+                records, size = records + len(fields.flags), size + len(message.data)
+                if records >= JOINED or size >= JOINED_BYTES:
                     yield self._joined(waiting)
-                    waiting, records = [], 0
+                    waiting, records, size = [], 0, 0
         if waiting:
             yield self._joined(waiting)
 

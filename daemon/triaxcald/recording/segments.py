@@ -111,15 +111,14 @@ class SegmentedWriter(RecordingWriter):
         self._segments = self._segments.with_last(segment)
         self._segments.save()
         file = RecordingFile(path, head, clock_ns=self._clock_ns, sync_s=self._sync_s, first=first)
-        self._begun_ns = self._clock_ns()
         for attachment in self._kept:
             file.attach(*attachment)
         return file
 
     def _look_after(self) -> None:
         super()._look_after()
-        old = not 0 <= self._clock_ns() - self._begun_ns < self._time_ns
-        if (old and self._file.digest.records) or self._file.size >= self._size_bytes:
+        old = self._file.digest.records and not 0 <= self._clock_ns() - self._begun_ns < self._time_ns
+        if old or self._file.size >= self._size_bytes:
             self._finish()
             self._finished = False
             self._file = self._next()
@@ -131,13 +130,9 @@ class SegmentedWriter(RecordingWriter):
         super()._idle()
         if not 0 <= self._steady_ns() - self._retained_ns < self._time_ns:
             self._retain()
-        self._make_room_on_disk()
 
     def _flushed(self) -> None:
         super()._flushed()
-        self._make_room_on_disk()
-
-    def _make_room_on_disk(self) -> None:
         if not self._told_low and self._lacks() and not self._retain():
             self._told_low = True
             self._say("disk_low", {"wanted_bytes": self._retention.free_bytes if self._retention else 0})
@@ -201,6 +196,8 @@ class SegmentedWriter(RecordingWriter):
 
     def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:
         self._recorded = True
+        if not self._file.digest.records:  # the age of a segment counts from here: before was silence
+            self._begun_ns = self._clock_ns()
         super()._write_raw(phase, first, batch)
 
 

@@ -275,6 +275,7 @@ class RecordingWriter:
         """Nothing has come for `LOOK_S`."""
         self._file.require_there()
         self._look_after()
+        self._flushed()
 
     def _look_after(self) -> None:
         if self._file.flush_when_due():

@@ -17,9 +17,9 @@ from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import DONE, exit_code_of
 from triaxcald.recording.ending import Kind, ended_because
 from triaxcald.recording.schema import RAW
-from triaxcald.recording.writer import RecordingWriter
+from triaxcald.recording.writer import LOOK_S, RecordingWriter
 from triaxcald.run.endings import reason_of, trace_of
-from triaxcald.run.together import whole_on_a_thread
+from triaxcald.run.together import while_sound, whole_on_a_thread
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.lock import locked
 from triaxcald.station.raw_records import RawRecords
@@ -175,7 +175,8 @@ class AtRecording(ABC):
         with await whole_on_a_thread(make) as writer:
             self._writer, self._state, self._trouble = writer, State.RECORDING, None
             try:
-                await record(writer)
+                # A disk fails while a unit is lost, and nothing comes, too.
+                await while_sound(record(writer), writer.check, LOOK_S)
             except (Exception, asyncio.CancelledError) as e:
                 await self._end(writer, e)
                 raise

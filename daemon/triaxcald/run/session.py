@@ -20,7 +20,7 @@ from triaxcald.recording.retention import Retention
 from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.collection import Progress
-from triaxcald.station.coming_back import Patience, Returning
+from triaxcald.station.coming_back import HOLE_S, Patience, Returning
 from triaxcald.station.config import Place, Station
 from triaxcald.station.serials import SerialsSeen
 
@@ -96,7 +96,9 @@ class UnitSession:
             else:
                 self.progress.lost(self.name, trouble)
 
-        return Returning(device, identify, patience, tell)
+        # A unit of which a sample is rare is not silent before its profile says so.
+        hole_s = max(HOLE_S, self.profile.sampling.silence_timeout_s)
+        return Returning(device, identify, patience, tell, hole_s=hole_s)
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
@@ -24,6 +24,22 @@ async def side_by_side(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
             for unit in units:
                 unit.cancel()
     return [unit.result() for unit in units]
+
+
+async def while_sound(work: Awaitable[None], check: Callable[[], None], every_s: float) -> None:
+    """Until the work ends, or ``check`` raises, which looks every so many
+    seconds; the work is cancelled then, and waited for."""
+    task = asyncio.ensure_future(work)
+    try:
+        while not (await asyncio.wait([task], timeout=every_s))[0]:
+            check()
+    except BaseException:
+        task.cancel()
+        await asyncio.wait([task])
+        if not task.cancelled():
+            task.exception()  # what is on its way already weighs more
+        raise
+    await task
 
 
 async def whole_on_a_thread(work: Callable[[], T]) -> T:

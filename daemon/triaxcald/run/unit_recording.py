@@ -38,10 +38,10 @@ class UnitRecording(AtRecording):
 
     @property
     def status(self) -> UnitStatus:
-        """Recorded is a unit of which something comes: what its FIFO held
-        before is discarded meanwhile, which may take a minute."""
+        """Recorded is a unit of which samples come: what its FIFO held before is
+        discarded meanwhile, which may take a minute."""
         status = super().status
-        if status.state is State.RECORDING and status.last_ns is None:
+        if status.state is State.RECORDING and not status.counts["samples"]:
             return replace(status, state=State.WAITING, trouble=NOTHING_YET)
         return status
 

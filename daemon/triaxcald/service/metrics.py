@@ -44,7 +44,9 @@ class UnitMetrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         units = self._statuses()
-        recording = GaugeMetricFamily("triaxcal_unit_recording", "1 while the unit or bus is there", labels=["unit"])
+        recording = GaugeMetricFamily(
+            "triaxcal_unit_recording", "1 while samples come, or the bus is there", labels=["unit"]
+        )
         records = CounterMetricFamily("triaxcal_records", "Raw records taken from the bus", labels=["unit"])
         lost = CounterMetricFamily("triaxcal_lost_records", "Records lost between bus and disk", labels=["unit"])
         gaps = CounterMetricFamily("triaxcal_gaps", "Interruptions and losses on the bus", labels=["unit"])
@@ -52,7 +54,7 @@ class UnitMetrics(Collector):
         last = GaugeMetricFamily(
             "triaxcal_last_record_timestamp_seconds", "Host time of the last record", labels=["unit"]
         )
-        queued = GaugeMetricFamily("triaxcal_queued_batches", "Batches that wait for the disk", labels=["unit"])
+        queued = GaugeMetricFamily("triaxcal_queued_batches", "What waits for the disk", labels=["unit"])
         size = GaugeMetricFamily("triaxcal_recording_bytes", "Size of the recording's file", labels=["unit"])
         channel = GaugeMetricFamily(
             "triaxcal_channel", "Last value of another channel, the temperature among them", labels=["unit", "channel"]

@@ -17,7 +17,7 @@ from triaxcal_drivers.claim import Claim
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Device, Gap, RawBatch, RawFlag
-from triaxcald.errors import DeviceInUse
+from triaxcald.errors import DeviceInUseElsewhere
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.station.lock import locked
 
@@ -186,7 +186,7 @@ async def claimed(claim: Claim, patience: Patience | None, tell: Callable[[Excep
             await stack.enter_async_context(locked(claim))
 
         if patience is not None and patience.in_use:
-            await until_open(attempt, patience, tell, (DeviceInUse,))
+            await until_open(attempt, patience, tell, (DeviceInUseElsewhere,))
         else:
             await attempt()
         yield
@@ -197,6 +197,7 @@ class Returning:
 
     ``identify`` is asked after each return, and raises WrongUnit where another
     unit answers; ``tell`` is told what is the matter, and None when it is over.
+    More than ``hole_s`` without a record is a gap.
     """
 
     def __init__(
@@ -206,9 +207,11 @@ class Returning:
         patience: Patience,
         tell: Callable[[str | None], None],
         now_ns: Callable[[], int] = HOST.now_ns,
+        *,
+        hole_s: float = HOLE_S,
     ) -> None:
         self._device, self._identify, self._patience, self._tell = device, identify, patience, tell
-        self._now_ns = now_ns
+        self._now_ns, self._hole_s = now_ns, hole_s
         self._complaint: Exception | None = None
 
     def complain(self, trouble: Exception) -> None:
@@ -220,8 +223,8 @@ class Returning:
         """As the device's own. An interruption begins with a batch without
         records whose gap is not over; the first record after it that is no
         error ends the gap. Until then the unit is waited for, however often it
-        opens meanwhile. A hole of more than `HOLE_S` is a gap too. Raises what
-        the device's stream does once patience ends."""
+        opens meanwhile. A hole is a gap too. Raises what the device's stream
+        does once patience ends."""
         last_ns: int | None = None
         returned_ns = self._now_ns()
         gap: Gap | None = None
@@ -238,7 +241,7 @@ class Returning:
                                 batch, gap = batch.after(gap), None
                                 at_rest.close()
                                 self._tell(None)
-                            for part in _parted(batch, good, last_ns):
+                            for part in _parted(batch, good, last_ns, self._hole_s):
                                 yield part
                             if len(good):
                                 last_ns = int(batch.time_ns[good[-1]])
@@ -272,14 +275,14 @@ def _good(batch: RawBatch) -> NDArray[np.intp]:
     return np.flatnonzero((batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) == 0)
 
 
-def _parted(batch: RawBatch, good: NDArray[np.intp], last_ns: int | None) -> Iterator[RawBatch]:
+def _parted(batch: RawBatch, good: NDArray[np.intp], last_ns: int | None, hole_s: float) -> Iterator[RawBatch]:
     """The batch in parts, from each hole to the next."""
     if not len(good):
         yield batch
         return
     times = batch.time_ns[good]
     before = np.concatenate([[times[0] if last_ns is None else last_ns], times[:-1]])
-    holes = np.flatnonzero((times - before > HOLE_S * 1e9) & ((batch.flags[good] & RawFlag.LOST_BEFORE) == 0))
+    holes = np.flatnonzero((times - before > hole_s * 1e9) & ((batch.flags[good] & RawFlag.LOST_BEFORE) == 0))
     gaps = {int(good[i]): Gap(int(before[i]), int(times[i]), UNHEARD) for i in holes}
     for start, stop in pairwise(sorted({0, *gaps, len(batch)})):
         part = batch.part(start, stop)

@@ -42,7 +42,7 @@ def check_lines(places: Sequence[Place], buses: Sequence[BusPlace] = (), *, wher
             )
             raise InputError(
                 f"{where}: {line} at {first.settings} cannot carry its units at their rates: "
-                f"{each} = {total:.0%} of its time; raise the bit rate, or lower sampling.rate_hz of the profiles"
+                f"{each} = {total:.0%} of its time; drive it faster, or lower sampling.rate_hz of the profiles"
             )
 
 

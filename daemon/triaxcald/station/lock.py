@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal_drivers.claim import Claim, canonical_host, is_name
-from triaxcald.errors import DeviceInUse, StationError
+from triaxcald.errors import DeviceInUse, DeviceInUseElsewhere, StationError
 
 try:
     import fcntl
@@ -113,7 +113,7 @@ async def _lock(name: str, stack: ExitStack, *, shared: bool = False) -> None:
             stack.callback(_release, name)
             return
         await asyncio.sleep(_PAUSE_S)
-    raise DeviceInUse(f"{name} is in use by another process")
+    raise DeviceInUseElsewhere(f"{name} is in use by another process")
 
 
 def _taken(name: str, shared: bool) -> bool:
@@ -135,7 +135,7 @@ def _taken(name: str, shared: bool) -> bool:
         except _Locked as e:
             if e.holder is None:
                 return False
-            raise DeviceInUse(f"{name} is in use by {e.holder}") from None
+            raise DeviceInUseElsewhere(f"{name} is in use by {e.holder}") from None
     _held[name] = _Held(descriptor, holder)
     return True
 

@@ -42,8 +42,6 @@ class RawRecords:
         stepped_ns = self.clock.steps_ns()
         async with aclosing(stream):
             async for batch in stream:
-                if writer is not None:
-                    writer.check()  # a disk fails while nothing comes too
                 if away is not None and (len(batch) or batch.gap is not None):
                     away = replace(away, to_ns=int(batch.time_ns[0]) if batch.gap is None else batch.gap.from_ns)
                     if batch.gap is None:

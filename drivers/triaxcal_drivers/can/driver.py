@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, cast
 
+from triaxcal_drivers.can.adapter import Identifier
 from triaxcal_drivers.can.decode import CanDecoder
 from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.layout import Layout
@@ -17,7 +18,6 @@ from triaxcal_drivers.profile import Bundle
 if TYPE_CHECKING:
     from triaxcal_drivers.can.device import CanDevice
 
-CLASSIC_BYTES = 8
 STANDARD_BITS, EXTENDED_BITS = 47, 67
 """Of a classic frame beside its data, with the three bits to the next and
 without stuffed ones (ISO 11898-1): a bus carries no more than by these."""
@@ -40,23 +40,25 @@ class CanDriver:
         return CanDevice(profile, bus, {name: _layout(bundle, name) for name in profile.streams})
 
     def loads(self, bundle: Bundle, bus: CanBus) -> Mapping[str, LineLoad]:
-        """By stream; nothing where no bit rate says how fast the bus is, and
-        for frames that are longer than classic ones."""
-        if bus.bitrate is None:
+        """By stream, a message of several in the first of them alone; nothing
+        where no bit rate says how fast the bus is, or where frames of CAN FD may
+        be on it, whose data is faster."""
+        if bus.bitrate is None or not bus.classic:
             return {}
         found: dict[str, LineLoad] = {}
+        counted: set[Identifier] = set()
         for name in bundle.profile.streams:
             layout = _layout(bundle, name)
-            sizes = [layout.size(number) for number in range(len(layout.messages))]
-            if max(sizes) > CLASSIC_BYTES:
-                continue
-            bits = sum(
-                8 * size + (EXTENDED_BITS if message.extended else STANDARD_BITS)
-                for size, message in zip(sizes, layout.messages, strict=True)
-            )
-            frames_per_s = len(sizes) * bundle.profile.sampling.rate_hz
-            frame_s = bits / len(sizes) / bus.bitrate
-            found[name] = LineLoad(bus.name, f"{bus.bitrate} bit/s", frames_per_s, frame_s)
+            bits = []
+            for number, message in enumerate(layout.messages):
+                key = message.identifier_of(bus.node_id), message.extended
+                if key not in counted:
+                    bits.append(8 * layout.size(number) + (EXTENDED_BITS if message.extended else STANDARD_BITS))
+                counted.add(key)
+            if bits:
+                frames_per_s = len(bits) * bundle.profile.sampling.rate_hz
+                frame_s = sum(bits) / len(bits) / bus.bitrate
+                found[name] = LineLoad(bus.name, f"{bus.bitrate} bit/s", frames_per_s, frame_s)
         return found
 
     def decoder(self, bundle: Bundle, stream: str) -> CanDecoder:

@@ -259,6 +259,13 @@ class BusSettings(Strict):
         return bus_name(self.interface, self.channel, self.options)
 
     @property
+    def classic(self) -> bool:
+        """Whether no frames of CAN FD can be on it, by what is said here: a
+        socket takes them where its interface has them."""
+        fast = any("data" in key or "dbit" in key for key in self.options)
+        return not fast and not self.options.get("fd", self.interface == "socketcan")
+
+    @property
     def driven(self) -> str:
         """How the bus is driven, which all who are on it must agree on."""
         given = {"bitrate": self.bitrate, **self.options}

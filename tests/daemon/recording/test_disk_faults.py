@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import AsyncGenerator, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,13 @@ import pytest
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import DiskError
 from triaxcald.exit_codes import DISK
+from triaxcald.recording import disk
 from triaxcald.recording import writer as writer_module
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
 from triaxcald.recording.retention import Retention
 from triaxcald.recording.segments import SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.raw_records import RawRecords
 
 S, MIB = 1_000_000_000, 2**20
 T0_NS = 1_700_000_000_000_000_000
@@ -149,29 +148,44 @@ def test_a_folder_that_is_removed_is_said_within_a_second_of_the_clock(
         writer.close()
 
 
-async def test_a_folder_that_is_removed_while_a_bus_is_silent_is_said_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_folder_that_is_removed_in_silence_is_said_at_once(
+    tmp_path: Path, wait_until: Callable[[Callable[[], bool]], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writer_module, "LOOK_S", 0.001)
     folder = tmp_path / "folder"
     folder.mkdir()
     writer = RecordingWriter(folder / "rec.mcap", metadata={"bus": {}}, preview_channels=None)
+    shutil.rmtree(folder)
 
-    async def silence() -> AsyncGenerator[RawBatch, None]:
-        while True:
-            await asyncio.sleep(0)
-            yield RawBatch.of([])
+    def told() -> bool:
+        try:
+            writer.check()
+        except DiskError as e:
+            return "the file, or its folder, was removed" in str(e)
+        return False
 
-    async def record() -> None:
-        async for _ in RawRecords("bus/0").written(silence(), writer):
-            if folder.exists():
-                shutil.rmtree(folder)
-
-    with pytest.raises(DiskError, match="the file, or its folder, was removed"):
-        async with asyncio.timeout(20):
-            await record()
+    wait_until(told)
     with pytest.raises(DiskError):
         writer.close()
+
+
+def test_a_disk_that_others_fill_in_silence_ends_the_file_while_there_is_room_for_its_end(
+    tmp_path: Path, wait_until: Callable[[Callable[[], bool]], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer_module, "LOOK_S", 0.001)
+    free = [10**12]
+    monkeypatch.setattr(disk, "free_bytes", lambda _: free[0])
+    path = tmp_path / "rec.mcap"
+    writer = RecordingWriter(path, metadata={"bus": {}}, preview_channels=None)
+    writer.raw("bus/0", noise(0))
+    writer.drain()
+    free[0] = 1000
+    wait_until(lambda: not writer._thread.is_alive())
+    with pytest.raises(DiskError, match="ended, as 1000 bytes are free"):
+        writer.close()
+    with Recording.open(path) as recording:
+        *_, last = recording.events()
+    assert (last.kind, last.detail["reason"]) == ("ended", "disk")
 
 
 def test_the_oldest_segments_make_room_on_a_disk_that_is_nearly_full(

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +77,24 @@ def test_of_messages_that_are_read_together_the_one_at_fault_is_named(
     monkeypatch.setattr(contents, "fields_of", spoilt)
     with Recording.open(recording) as rec, pytest.raises(RecordingError, match=f"/raw at {second.log_time} ns: "):
         list(rec.raw("calibration"))
+
+
+def test_messages_without_records_are_not_held_to_the_end_of_the_file(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[int] = []
+
+    def of_nothing(messages: Sequence[Fields]) -> RawBatch:
+        held.append(len(messages))
+        return RawBatch.of([])
+
+    monkeypatch.setattr(contents, "fields_of", lambda _: Fields(phase=b"calibration", payload=bytes(500)))
+    monkeypatch.setattr(contents, "batch_of", of_nothing)
+    with Recording.open(recording) as rec:
+        shortest = min(len(message.data) for topic, message in rec.messages() if topic == schema.RAW)
+        monkeypatch.setattr(contents, "JOINED_BYTES", 2 * shortest)
+        list(rec.raw("calibration"))
+    assert max(held) <= 2
 
 
 class Frugal(io.BytesIO):

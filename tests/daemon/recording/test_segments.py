@@ -101,6 +101,19 @@ def test_a_segment_ends_in_silence_too_and_an_empty_one_goes_on(
     assert files(tmp_path) == ["rec-000001.mcap", "rec-000002.mcap"]
 
 
+def test_the_age_of_a_segment_counts_from_its_first_record(
+    tmp_path: Path, new: NewWriter, batch_of: BatchOf, clock: Any
+) -> None:
+    with new() as writer:
+        for first in (0, 10, 20):
+            writer.raw("calibration", batch_of(first, 10))
+            writer.drain()
+            clock.now_ns += (90 if first == 0 else 30) * S
+            writer.event("silence")
+            writer.drain()
+    assert [s.records for s in load_manifest(tmp_path / "rec.segments.json").segments] == [10, 20, 0]
+
+
 def test_segments_grow_too_old_while_nothing_comes(
     tmp_path: Path, new: NewWriter, minutes: Callable[..., None], clock: Any, wait_until: Any,
     monkeypatch: pytest.MonkeyPatch,

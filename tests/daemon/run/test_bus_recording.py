@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import tty
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,9 +20,11 @@ from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of
 from triaxcald.pipeline import DecodedStream
+from triaxcald.recording import writer as writer_module
 from triaxcald.recording.bus import frame_rows
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import BUS_RECORD
+from triaxcald.run import recording as recording_module
 from triaxcald.run.bus_recording import BusRecording
 from triaxcald.run.recording import State
 from triaxcald.station.coming_back import Patience
@@ -238,6 +241,30 @@ async def test_a_bus_that_does_not_come_back_is_given_up_and_the_recording_says_
     with Recording.open(path) as held:
         *_, ended = held.events()
     assert (ended.kind, ended.detail) == ("ended", {"reason": "bus gave up"})
+
+
+@pytest.mark.parametrize("lost", [False, True], ids=["silent", "lost"])
+async def test_a_folder_that_is_removed_ends_the_recording_of_a_bus_that_brings_nothing(
+    workshop: Any, port: Path, lost: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer_module, "LOOK_S", 0.01)
+    monkeypatch.setattr(recording_module, "LOOK_S", 0.01)
+    bus = {"interface": "slcan", "channel": str(port)}
+    station = load_station(workshop.station(buses=[{"name": "dongle", "bus": bus}]))
+    told, folder, dongle = Told(), workshop.folder / "recordings", Dongle(port)
+    folder.mkdir()
+    work = asyncio.ensure_future(listening(station, told, folder / "bus.mcap").run(None, Patience()))
+    await told.until("dongle", lambda text: text == "recording")
+    if lost:
+        dongle.unplug()
+        await told.until("dongle", lambda text: text.startswith("lost: "))
+    shutil.rmtree(folder)
+    kept = await work
+    if not lost:
+        dongle.unplug()
+    assert kept.exit_code == 5
+    assert kept.error is not None
+    assert "the file, or its folder, was removed" in kept.error
 
 
 async def test_a_bus_that_is_not_there_is_waited_for_and_given_up(workshop: Any, port: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.daemon.station.test_lock import another_process
 from triaxcal_drivers.claim import claim_of
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of
@@ -148,11 +149,12 @@ async def test_a_unit_of_which_nothing_has_come_is_not_said_to_be_recorded(works
 
 
 @pytest.mark.parametrize("given_up", [False, True])
-async def test_a_unit_that_another_command_works_with_is_waited_for(workshop: Any, given_up: bool) -> None:
+async def test_a_unit_that_another_process_works_with_is_waited_for(workshop: Any, given_up: bool) -> None:
     bench, told = Bench(workshop, [MODBUS]), Told()
     station = load_station(workshop.station({"bus": await bench.put(0), "profile": "triax-ref-modbus"}))
     patience = Patience(most_s=0.0 if given_up else None, in_use=True)
-    async with locked(claim_of(station.places[0].bus)):
+    claim = claim_of(station.places[0].bus)
+    with another_process(device=claim.device, host=claim.host):
         work = recorded(station, workshop.folder, told, seconds=0.2, patience=patience)
         await told.until("unit0", lambda text: " is in use by `" in text)
         if given_up:
@@ -161,6 +163,19 @@ async def test_a_unit_that_another_command_works_with_is_waited_for(workshop: An
     await bench.take(0)
     assert kept.exit_code == (4 if given_up else 0)
     assert (kept.error is not None and " is in use by `" in kept.error) == given_up
+
+
+async def test_a_unit_that_this_process_works_with_already_is_not_waited_for(workshop: Any) -> None:
+    """By another name of its host, say: only the process itself could end that."""
+    bench, told = Bench(workshop, [MODBUS]), Told()
+    station = load_station(workshop.station({"bus": await bench.put(0), "profile": "triax-ref-modbus"}))
+    async with locked(claim_of(station.places[0].bus)):
+        work = recorded(station, workshop.folder, told, seconds=None, patience=Patience(in_use=True))
+        (kept,) = await work
+    await bench.take(0)
+    assert kept.exit_code == 4
+    assert kept.error is not None
+    assert "which is this process" in kept.error
 
 
 @pytest.mark.slow

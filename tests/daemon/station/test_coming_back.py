@@ -53,8 +53,8 @@ class Played:
                 raise step
             yield RawBatch.of([(BEGUN_NS + t, 0x185, flags, b"") for t, flags in step])
 
-    async def all(self, patience: Patience) -> list[RawBatch]:
-        returning = Returning(cast(Any, self), self.identify, patience, self.told.append, lambda: BEGUN_NS - 1)
+    async def all(self, patience: Patience, **more: float) -> list[RawBatch]:
+        returning = Returning(cast(Any, self), self.identify, patience, self.told.append, lambda: BEGUN_NS - 1, **more)
         async with aclosing(returning.stream(["readings"])) as stream:
             return [batch async for batch in stream]
 
@@ -188,6 +188,13 @@ def test_a_hole_that_nobody_was_told_of_is_a_gap_too() -> None:
         ([3 + 2 * hour], [RawFlag.ERROR], None),
         ([4 + 2 * hour], [RawFlag.LOST_BEFORE], gap(3 + hour, 4 + 2 * hour, UNHEARD)),
     ]
+
+
+@pytest.mark.parametrize(("hole_s", "gaps"), [(10.0, 1), (30.0, 0)])
+def test_a_unit_of_which_a_sample_is_rare_has_no_hole_before_it_counts_as_silent(hole_s: float, gaps: int) -> None:
+    device = Played([[records(1), records(12 * 10**9)]])
+    batches = run(device.all(Patience(), hole_s=hole_s))
+    assert sum(batch.gap is not None for batch in batches) == gaps
 
 
 def test_a_count_of_the_kernels_that_comes_with_the_return_is_kept() -> None:

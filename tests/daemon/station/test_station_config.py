@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from triaxcal_drivers.can.driver import CanDriver
+from triaxcal_drivers.can.model import CanBus
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.loading import load_bundle
 from triaxcald.errors import InputError
@@ -161,7 +164,7 @@ def test_a_line_that_cannot_carry_its_units_is_refused_with_the_arithmetic(works
     words = (
         f"a.toml: /dev/ttyUSB0 at 115200 baud, parity N, 1 stop bits cannot carry its units at their rates: {each} = "
     )
-    with pytest.raises(InputError, match=f"^{re.escape(words)}130% of its time; raise the bit rate"):
+    with pytest.raises(InputError, match=f"^{re.escape(words)}130% of its time; drive it faster, or lower"):
         check_lines(on_one_line(workshop, RTU, RTU, RTU).places, where="a.toml")
 
 
@@ -183,6 +186,25 @@ def test_a_bus_that_cannot_carry_its_units_is_refused_with_the_arithmetic(worksh
     words = f"a.toml: {bus} cannot carry its units at their rates: {each} = 107% of its time"
     with pytest.raises(InputError, match=f"^{re.escape(words)}"):
         check_lines(on_one_bus(workshop, 3, bitrate=125_000).places, where="a.toml")
+
+
+@pytest.mark.parametrize("options", [{"fd": True}, {"data_bitrate": 2_000_000}])
+def test_a_bus_on_which_frames_may_be_fast_is_not_judged_by_its_bit_rate(
+    workshop: Any, options: dict[str, Any]
+) -> None:
+    check_lines(on_one_bus(workshop, 3, bitrate=125_000, options=options).places, where="a.toml")
+    check_lines(on_one_bus(workshop, 3, bitrate=125_000, interface="socketcan").places, where="a.toml")
+    classic = on_one_bus(workshop, 3, bitrate=125_000, interface="socketcan", options={"fd": False})
+    with pytest.raises(InputError, match="cannot carry its units"):
+        check_lines(classic.places, where="a.toml")
+
+
+def test_a_frame_that_two_streams_take_is_sent_once() -> None:
+    bundle = load_bundle(Path("triax-ref-can"))
+    streams = {"readings": bundle.profile.streams["readings"], "corrected": bundle.profile.streams["readings"]}
+    twice = replace(bundle, profile=bundle.profile.model_copy(update={"streams": streams}))
+    bus = CanBus(interface="virtual", channel="busy", node_id=5, bitrate=125_000)
+    assert list(CanDriver().loads(twice, bus)) == ["readings"]
 
 
 def test_a_station_is_read_whatever_its_lines_carry_and_one_unit_of_it_is_recorded(workshop: Any) -> None:
