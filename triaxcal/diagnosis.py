@@ -124,8 +124,8 @@ class Loop:
     @cached_property
     def too_uncertain(self) -> bool:
         """Whether more poses would make the next recording better, whatever
-        acts: the calibration's own uncertainty is more than half of what is
-        expected there of a usual unit."""
+        acts: the variance of its error that the calibration itself adds is more
+        than that from start to start, which no pose lessens."""
         known = max(self.next_recording.start_to_start, START_TO_START * self.after.reference)
         return bool(self.next_recording.standard > np.sqrt(2) * known)
 

@@ -25,7 +25,7 @@ class Residual:
 
     ``noise_floor_g`` is the rms of the standard errors of the pose means along
     the measured vector, from the scatter inside the poses alone;
-    ``lack_of_fit_p`` the probability of residuals as large as these if the
+    ``lack_of_fit_p`` the probability of residuals at least as large as these if the
     model were complete and that noise were all.
     """
 

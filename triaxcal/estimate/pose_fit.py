@@ -12,8 +12,8 @@ from triaxcal.effects.contract import Effect, lag_in
 from triaxcal.effects.plugins import EffectFault
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration, Exclusion, HoldsAt
-from triaxcal.estimate.conclusion import concluded
 from triaxcal.estimate.exclusion import outliers_among, with_excluded, with_faulty, with_tied_sets, with_unknown_history
+from triaxcal.estimate.fit_assessment import concluded
 from triaxcal.estimate.initial_estimate import started_problem
 from triaxcal.estimate.likelihood import Problem, State, solve
 from triaxcal.estimate.outliers import OutlierSet

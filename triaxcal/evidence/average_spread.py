@@ -12,13 +12,13 @@ from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE, TEMPERATURE
 from triaxcal.evidence.mixture_components import Components
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.projection import Projection
+from triaxcal.evidence.reported_parameters import Projection
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.sensor import LINEAR
 
 BIAS = slice(3, 6)
-"""Of the nine parameters as the fit has them: to one of these a bias adds as it
-is."""
+"""Of the nine parameters as the fit has them: those to which a bias adds
+unscaled."""
 THERMAL = frozenset(effect.name for effect in CATALOGUE if TEMPERATURE in effect.needs)
 
 

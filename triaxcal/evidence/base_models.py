@@ -14,9 +14,9 @@ from triaxcal.distributions import log_sum_exp
 from triaxcal.evidence.marginal_likelihood import SetEvidence
 from triaxcal.evidence.posterior import Posterior
 
-LIKELY = 3
+BASE_SETS = 3
 """Sets of a unit, the likeliest, beside which an effect is asked about."""
-NEGLIGIBLE = 14.0
+NEGLIGIBLE_LOG_RATIO = 14.0
 """In the logarithm: parts that are less likely by more add nothing."""
 
 
@@ -38,16 +38,20 @@ def base_models(unit: Posterior, acting: frozenset[str]) -> list[BaseModel]:
     evidence = unit.evidence
     best = unit.sets[0].members
     less = [kept for k in range(len(best) + 1) for kept in itertools.combinations(best, k)]
-    some = [*less, *(found.members for found in unit.sets[:LIKELY])]
+    some = [*less, *(found.members for found in unit.sets[:BASE_SETS])]
     sets = [m for m in dict.fromkeys(some) if acting <= {evidence.terms[i].name for i in m}]
     known = {found.members: found for found in unit.sets}
     # Whatever part is likely beside some set: an effect may take the place of a
     # part.
-    likely = [row for row, part in enumerate(unit.sets[0].parts) if unit.part_probabilities[part] > np.exp(-NEGLIGIBLE)]
+    likely = [
+        row
+        for row, part in enumerate(unit.sets[0].parts)
+        if unit.part_probabilities[part] > np.exp(-NEGLIGIBLE_LOG_RATIO)
+    ]
     out = []
     for members in sets:
         found = known.get(members) or evidence.of_set(members, unit.sets[0].parts)
-        rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE).tolist()}
+        rows = {*likely, *np.flatnonzero(found.by_part >= found.by_part.max() - NEGLIGIBLE_LOG_RATIO).tolist()}
         whole = log_sum_exp([evidence.with_each_further(found, row) for row in sorted(rows)], axis=0)
         whole = whole + np.log(len(evidence.sizes))
         out.append(BaseModel(found, unit.names_of(found), np.asarray(whole)))

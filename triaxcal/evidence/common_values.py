@@ -54,10 +54,11 @@ def _explained(information: Floats, score: Floats) -> float:
 
 
 def of_common_values(units: Sequence[Posterior], equations: Sequence[TermEquations], index: Sequence[int]) -> Floats:
-    """(R,) the same ratio, where all have the coefficients of the first: by
-    Laplace's method about the coefficients that explain most, as the noise of
-    no unit is known beforehand. Two such points are looked for, since a unit
-    may as well lack the effect and be noisy."""
+    """(R,) log evidence with a term over that without, one for each size, where
+    the coefficients are common to all units: by Laplace's method about the
+    coefficients that explain most, as the noise of no unit is known beforehand.
+    Two such points are looked for, since a unit may as well lack the effect and
+    be noisy."""
     first = units[0].evidence.terms[index[0]]
     scaled = []
     for unit, of_unit, i in zip(units, equations, index, strict=True):

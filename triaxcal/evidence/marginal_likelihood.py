@@ -19,10 +19,10 @@ import numpy as np
 
 from triaxcal.arrays import Floats, Ints
 from triaxcal.distributions import log_sum_exp, softmax
+from triaxcal.evidence.covariance_hypotheses import ConditionalData, diagonalised, parts_of
 from triaxcal.evidence.linearised_data import LinearisedData
 from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import Term
-from triaxcal.evidence.unmodelled_parts import ConditionalData, diagonalised, parts_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from triaxcal.evidence.marginal_likelihood import SetEvidence
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.model.sensor import LINEAR
 
-NEGLIGIBLE = 1e-6
+NEGLIGIBLE_PROBABILITY = 1e-6
 """The probability of a set that moves no average."""
 CELLS = 400
 """Sets, with one part and one choice of sizes each, whose covariances are
@@ -84,7 +84,7 @@ def _likely_cells(posterior: Posterior, share: float) -> list[tuple[float, SetEv
     total = float(log_sum_exp([found.total for found in posterior.sets]))
     log, of_set, where = [], [], []
     for k, found in enumerate(posterior.sets):
-        if found.total - total < np.log(NEGLIGIBLE):
+        if found.total - total < np.log(NEGLIGIBLE_PROBABILITY):
             break
         flat = found.log.ravel()
         few = np.argpartition(-flat, CELLS // 4)[: CELLS // 4] if len(flat) > CELLS // 4 else np.arange(len(flat))

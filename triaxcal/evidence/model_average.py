@@ -20,9 +20,9 @@ from triaxcal.effects.contract import Effect
 from triaxcal.estimate.calibration import HoldsAt
 from triaxcal.estimate.likelihood import State, linearise_all, parameters_by_theta
 from triaxcal.evidence.average_spread import Spread
-from triaxcal.evidence.mixture_components import NEGLIGIBLE, Components, components
+from triaxcal.evidence.mixture_components import NEGLIGIBLE_PROBABILITY, Components, components
 from triaxcal.evidence.posterior import Posterior
-from triaxcal.evidence.projection import Projection
+from triaxcal.evidence.reported_parameters import Projection
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.sensor import LINEAR, Sensor
 
@@ -174,7 +174,7 @@ def _mean(posterior: Posterior, projection: Projection) -> tuple[Floats, dict[in
     scaled = np.zeros(evidence.columns.shape[1])
     by_part: dict[int, Floats] = defaultdict(lambda: np.zeros(len(rows.y)))
     for found, weight in zip(posterior.sets, posterior.set_probabilities, strict=True):
-        if weight < NEGLIGIBLE:
+        if weight < NEGLIGIBLE_PROBABILITY:
             continue
         share = found.part_probabilities * weight
         mean = share[:, None] * found.mean

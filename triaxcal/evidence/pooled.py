@@ -17,7 +17,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import log_sum_exp
-from triaxcal.evidence.base_models import NEGLIGIBLE, BaseModel, base_models, log_ratios
+from triaxcal.evidence.base_models import NEGLIGIBLE_LOG_RATIO, BaseModel, base_models, log_ratios
 from triaxcal.evidence.common_values import of_common_values, term_equations
 from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.posterior import Posterior
@@ -58,7 +58,7 @@ class Pooled:
         for other, p in self.shared.items():
             if other in names:
                 total += p
-            elif p > np.exp(-NEGLIGIBLE):
+            elif p > np.exp(-NEGLIGIBLE_LOG_RATIO):
                 total += p * max(_product(_acts_beside(unit, name, other) for unit in self.units) for name in names)
         return total
 

@@ -1,4 +1,5 @@
-"""The prior, in one table: all constants there are, each with its reason."""
+"""The prior, and from which probability on something is said or done: the
+settings of a diagnosis in one table, each with its reason."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """The posterior of what acts in some poses: linearised anew, and with finer
-shapes, until neither changes it."""
+shapes, until neither changes it, or `ROUNDS` times."""
 
 from __future__ import annotations
 
@@ -109,8 +109,8 @@ def _divided(of_shapes: Sequence[tuple[Effect, float]], odds: Odds) -> Finer:
 
 
 def _point_of(posterior: Posterior) -> State | None:
-    """Where the likeliest set says that the unit is; None where the
-    linearisation holds there, or nothing does."""
+    """The parameters of the likeliest model; None where the linearisation holds
+    for them, or where that model has no effect."""
     evidence, best = posterior.evidence, posterior.sets[0]
     rows, terms = evidence.rows, [evidence.terms[i] for i in best.members]
     if any(term.change_point >= 0 for term in terms) or not posterior.names_of(best):

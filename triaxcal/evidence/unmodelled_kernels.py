@@ -50,7 +50,7 @@ class UnmodelledKind(StrEnum):
     POSE_BEFORE = "pose_before"
     TIME = "time"
     WITHIN_POSE = "inside_poses"
-    """The slopes alone: noise of a logged channel does that."""
+    """The slopes alone, as by noise of a logged channel."""
 
 
 @dataclass(frozen=True, eq=False)

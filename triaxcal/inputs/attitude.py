@@ -50,7 +50,7 @@ from triaxcal.inputs.turntable_parameters import parameters_by_entries, second_o
 from triaxcal.model.directions import most_wanted
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pose_labels import the_poses
+from triaxcal.poses.pose_in_words import the_poses
 from triaxcal.poses.pure_error import LACK_OF_FIT, pure_error_dof
 
 DILUTION_MOST = 100.0

@@ -82,8 +82,8 @@ def _lags(channels: Mapping[str, Floats], poses: Sequence[Pose], wanted: Iterabl
             rows = np.flatnonzero(runs == run)
             rows = rows[np.argsort(t_s[rows], kind="stable")]
             first, values = poses[rows[0]], channels[lag[0]][rows]
-            started_problem = values[0] - (first.t_s - first.start_s) * first.rates.get(channel_of(lag[0]), 0.0)
-            since = lag_deviation(np.insert(t_s[rows], 0, first.start_s), np.insert(values, 0, started_problem), lag[1])
+            at_start = values[0] - (first.t_s - first.start_s) * first.rates.get(channel_of(lag[0]), 0.0)
+            since = lag_deviation(np.insert(t_s[rows], 0, first.start_s), np.insert(values, 0, at_start), lag[1])
             out[name][rows] = since[1:]
     return out
 

@@ -25,7 +25,7 @@ improbable levels to count, not so far that only they do."""
 DOF_GRID = np.geomspace(1.0, 1e5, 200)
 """Degrees of freedom between which it is interpolated, 6 % apart; beyond the
 last Student's t is the normal distribution."""
-LIKELY = 1e-6
+LEAST_WEIGHT = 1e-6
 """Models less probable than this are none."""
 GRID = 4000
 """Places at which the likelihood is reckoned, between which it is interpolated:
@@ -47,7 +47,7 @@ class NoiseLevels:
     @classmethod
     def of(cls, share: Floats, variance: Floats, dof: Floats) -> NoiseLevels:
         """Of models (m,) with these weights and variances in any unit."""
-        kept = (share > LIKELY) & (variance > 0)
+        kept = (share > LEAST_WEIGHT) & (variance > 0)
         if not kept.any():
             return cls.known_by(1.0)
         share, variance = share[kept] / share[kept].sum(), variance[kept]

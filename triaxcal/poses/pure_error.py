@@ -27,7 +27,7 @@ SIGNIFICANT = 0.05
 of its own, a factor on the errors that is kept. It is larger than `LACK_OF_FIT`
 since the mistakes cost otherwise: to widen the intervals of one recording in
 twenty for nothing costs little, to leave them too short is not seen."""
-BEYOND_DOUBT = 0.2
+RESIDUALS_ONLY_P = 0.2
 """Where residuals like these have less than this probability, the residuals
 alone say how large the noise is."""
 
@@ -74,7 +74,7 @@ def noise_levels(poses: Sequence[Pose]) -> NoiseLevels:
 
 
 def lack_of_fit_p(chi2: float, left: float, pure_dof: float) -> float | None:
-    """Probability of a sum of squares this large in ``left`` degrees of
+    """Probability of a sum of squares at least this large in ``left`` degrees of
     freedom, from the poses' own noise.
 
     None where nothing is left, or where the noise is not known.
@@ -100,5 +100,5 @@ def raised_dof(chi2: float, left: int, pure_dof: float) -> float:
     if ratio <= 1:
         return pure_dof + left
     p, at_one = float(f_sf(ratio, left, pure_dof)), float(f_sf(1.0, left, pure_dof))
-    doubt = max(0.0, (p - BEYOND_DOUBT) / (at_one - BEYOND_DOUBT))
+    doubt = max(0.0, (p - RESIDUALS_ONLY_P) / (at_one - RESIDUALS_ONLY_P))
     return float(1 / (doubt / (pure_dof + left) + (1 - doubt) / left))

@@ -13,7 +13,7 @@ from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.figures import plain
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pose_labels import moment, the_poses
+from triaxcal.poses.pose_in_words import moment, the_poses
 from triaxcal.units import ErrorUnit
 
 ALMOST = 0.999

@@ -13,7 +13,7 @@ from triaxcal.frames import faces, frames, orientations, standing
 from triaxcal.inputs import attitude_cautions as attitude
 from triaxcal.inputs import datasheet
 from triaxcal.inputs.turning import rotation
-from triaxcal.poses.pose_labels import moment, the_poses
+from triaxcal.poses.pose_in_words import moment, the_poses
 from triaxcal.uncertainty import extrapolation
 
 RAISED = "the standard errors are raised by that"

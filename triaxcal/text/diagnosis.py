@@ -10,7 +10,7 @@ from triaxcal.evidence.findings import Findings, Unexplained
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.prior import Odds
 from triaxcal.poses.pose import PoseStart
-from triaxcal.poses.pose_labels import moment
+from triaxcal.poses.pose_in_words import moment
 from triaxcal.text.advice import GOES_WITH, REFUSED, advice, chance, to_do
 from triaxcal.uncertainty.next_recording import NextRecording, Source
 from triaxcal.units import ErrorUnit

@@ -34,7 +34,7 @@ from triaxcal.estimate.likelihood import (
     residual_chi2,
     solve,
 )
-from triaxcal.estimate.shape_errors import shape_errors
+from triaxcal.estimate.nonlinear_parameter_errors import shape_errors
 from triaxcal.model.directions import dilution, in_range, linear_design, most_wanted
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pure_error import SIGNIFICANT, lack_of_fit_p, pure_error_dof, raised_dof
