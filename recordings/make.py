@@ -114,7 +114,7 @@ def make_paper_unit() -> None:
         strict=False,
     )
     physics: SyntheticPhysics = physics_of(device)
-    t_s = np.arange(0, physics.unit.path.round_s, 0.01)
+    t_s = np.arange(0, 14 * (5.0 + 1.0), 0.01)
     volts, temperature_c = physics.sample(t_s)
     with gzip.GzipFile(HERE / "paper-unit.csv.gz", "wb", mtime=0) as out:
         out.write(b"t_s,ux,uy,uz,temp_c\n")
@@ -124,6 +124,9 @@ def make_paper_unit() -> None:
 
 
 if __name__ == "__main__":
-    make_paper_unit()
+    wanted = sys.argv[1:] or ["paper-unit", *UNITS]
+    if "paper-unit" in wanted:
+        make_paper_unit()
     for each in UNITS:
-        asyncio.run(make(each))
+        if each in wanted:
+            asyncio.run(make(each))

@@ -171,7 +171,8 @@ class ModbusRegister(Register):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if not in_words(self.type):
-            raise ValueError(f"type {self.type} is none of Modbus: use {next_in_words(self.type)}")
+            longer = next_in_words(self.type)
+            raise ValueError(f"type {self.type} is none of Modbus" + (f": use {longer}" if longer else ""))
         if self.address + words_of(self.type) > 0x10000:
             raise ValueError(f"address {self.address} leaves no room for {self.type}")
         if self.table == "input" and self.access != "ro":

@@ -130,12 +130,12 @@ async def test_a_unit_of_which_nothing_has_come_is_not_said_to_be_recorded(works
     station = load_station(workshop.station({"bus": await bench.put(0), "profile": "triax-ref-modbus"}))
     session = UnitSession(station, station.places[0], told)
     recording = UnitRecording(session, lambda _: workshop.folder / "unit0.mcap")
-    seen: list[tuple[State, str | None, int | None]] = []
+    seen: list[tuple[State, str | None, int]] = []
 
     def look() -> bool:
         status = recording.status
-        seen.append((status.state, status.trouble, status.last_ns))
-        return status.last_ns is not None
+        seen.append((status.state, status.trouble, status.counts["samples"]))
+        return status.state is State.RECORDING
 
     work = asyncio.ensure_future(recording.run(None, Patience()))
     while not look():
@@ -143,9 +143,9 @@ async def test_a_unit_of_which_nothing_has_come_is_not_said_to_be_recorded(works
     work.cancel()
     await work
     await bench.take(0)
-    assert seen[-1][:2] == (State.RECORDING, None)
-    assert (State.WAITING, "nothing has come yet", None) in seen
-    assert {state for state, _, last_ns in seen if last_ns is None} == {State.WAITING}
+    assert (seen[-1][1], seen[-1][2] > 0) == (None, True)
+    assert (State.WAITING, "nothing has come yet", 0) in seen
+    assert {state for state, _, samples in seen if not samples} == {State.WAITING}
 
 
 @pytest.mark.parametrize("given_up", [False, True])
