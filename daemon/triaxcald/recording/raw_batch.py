@@ -88,8 +88,9 @@ def batch_of(messages: Sequence[Fields]) -> RawBatch:
     of them does not hold what it should."""
     time_ns = _times_ns(messages[0]) if len(messages) == 1 else _all_times_ns(messages)
     counts = np.array([len(m.flags) for m in messages])
-    if counts.max() > schema.MAX_RECORDS:
-        raise ValueError(f"{counts.max()} records in one message, expected at most {schema.MAX_RECORDS}")
+    most = max(max(len(m.flags), len(m.time_ns) // 8, len(m.step_ns) // 4) for m in messages)
+    if most > schema.MAX_RECORDS:
+        raise ValueError(f"{most} records in one message, expected at most {schema.MAX_RECORDS}")
     length = np.frombuffer(b"".join(m.length for m in messages), dtype="<u4")
     if np.any(length > np.iinfo(np.uint16).max):
         raise ValueError(f"a record of {length.max()} bytes, expected at most {np.iinfo(np.uint16).max}")

@@ -34,8 +34,10 @@ async def while_sound(work: Awaitable[None], check: Callable[[], None], every_s:
         while not (await asyncio.wait([task], timeout=every_s))[0]:
             check()
     except BaseException:
-        task.cancel()
-        await asyncio.wait([task])
+        while not task.done():  # as often as this is cancelled
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await asyncio.wait([task])
         if not task.cancelled():
             task.exception()  # what is on its way already weighs more
         raise
