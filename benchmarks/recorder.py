@@ -108,8 +108,9 @@ def recorded(path: Path, batches: Sequence[tuple[str, RawBatch]]) -> float:
 
 def writing(count: int, runs: int, folder: Path) -> Table:
     messages = frames(count)
-    rows = [row_of(m) for m in messages]
-    batches = [piece for i in range(0, count, BATCH // 4) for piece in batches_of(rows[i : i + BATCH // 4])]
+    step = BATCH // 4
+    rows = [[value for m in messages[i : i + step] for value in row_of(m)] for i in range(0, count, step)]
+    batches = [piece for values in rows for piece in batches_of(values)]
     least: dict[str, float] = {}
     size: dict[str, int] = {}
     for _ in range(runs):

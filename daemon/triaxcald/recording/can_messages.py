@@ -23,6 +23,7 @@ _LATEST_S = 2**63 // 10**9  # what fits into nanoseconds of 64 bits: the year 22
 
 Row = tuple[float, int, int, bytes, Any]
 """Time in s, identifier, flags, data, channel."""
+FIELDS = 5
 
 
 def row_of(message: can.Message) -> Row:
@@ -46,21 +47,28 @@ def row_of(message: can.Message) -> Row:
     return message.timestamp, message.arbitration_id, flags, data, message.channel
 
 
-def batches_of(rows: Sequence[Row]) -> Iterator[tuple[str, RawBatch]]:
-    """One batch for each channel, with its phase. Raises ValueError where a
-    message has no time or no identifier that a recording can hold."""
-    by_phase: dict[str, list[Row]] = {}
-    last, held = object(), list[Row]()
-    for row in rows:
-        if row[4] is not last:  # mostly the very same object
-            last, held = row[4], by_phase.setdefault(phase_of(row[4]), [])
-        held.append(row)
-    for phase, those in by_phase.items():
-        yield phase, _batch_of(those)
+def batches_of(values: Sequence[Any]) -> Iterator[tuple[str, RawBatch]]:
+    """One batch for each channel, with its phase, of the values of all rows one
+    after the other. Raises ValueError where a message has no time or no
+    identifier that a recording can hold.
+
+    Whoever holds messages holds bare values: a thousand tuples that outlive a
+    pass of the garbage collector bring on the next one of everything.
+    """
+    *columns, channels = (values[field::FIELDS] for field in range(FIELDS))
+    by_phase: dict[str, list[int]] = {}
+    last, places = object(), list[int]()
+    for place, channel in enumerate(channels):
+        if channel is not last:  # mostly the very same object
+            last, places = channel, by_phase.setdefault(phase_of(channel), [])
+        places.append(place)
+    for phase, places in by_phase.items():
+        yield phase, _batch_of(*(columns if len(by_phase) == 1 else ([c[i] for i in places] for c in columns)))
 
 
-def _batch_of(rows: Sequence[Row]) -> RawBatch:
-    seconds, sources, flags, data, _ = zip(*rows, strict=True)
+def _batch_of(
+    seconds: Sequence[float], sources: Sequence[int], flags: Sequence[int], data: Sequence[bytes]
+) -> RawBatch:
     time_s = np.array(seconds, dtype=np.float64)
     if not np.all((time_s >= 0) & (time_s < _LATEST_S)):
         raise ValueError("a message without a time, expected seconds from 0 on")

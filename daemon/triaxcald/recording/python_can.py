@@ -21,8 +21,6 @@ from triaxcald.errors import DaemonError
 if TYPE_CHECKING:
     from can import Message
 
-    from triaxcald.recording.can_messages import Row
-
 BATCH = 1024  # messages; what a batch costs by itself is little beside them
 LATEST_S = 1.0  # so long a message waits for others at most
 
@@ -40,7 +38,7 @@ class RecordingMessageWriter(SizedMessageWriter):
         import can
 
         from triaxcald.recording.bus import bus_record
-        from triaxcald.recording.can_messages import batches_of, row_of
+        from triaxcald.recording.can_messages import FIELDS, batches_of, row_of
         from triaxcald.recording.schema import BUS_RECORD
         from triaxcald.recording.writer import RecordingWriter
 
@@ -53,8 +51,8 @@ class RecordingMessageWriter(SizedMessageWriter):
         self._writer = RecordingWriter(
             path, metadata={BUS_RECORD: bus_record("", recorded_by=by)}, preview_channels=None, waits=True
         )
-        self._row_of, self._batches_of = row_of, batches_of
-        self._held: deque[Row] = deque()
+        self._row_of, self._batches_of, self._most = row_of, batches_of, BATCH * FIELDS
+        self._held: deque[Any] = deque()
         self._order = threading.Lock()
         self._stopped = threading.Event()
         self._failure: Exception | None = None
@@ -62,8 +60,8 @@ class RecordingMessageWriter(SizedMessageWriter):
         self._clock.start()
 
     def on_message_received(self, msg: Message) -> None:
-        self._held.append(self._row_of(msg))
-        if len(self._held) >= BATCH:
+        self._held.extend(self._row_of(msg))  # at once: the clock's thread never sees a part of a message
+        if len(self._held) >= self._most:
             self._pass_on()
 
     def file_size(self) -> int:
@@ -89,8 +87,8 @@ class RecordingMessageWriter(SizedMessageWriter):
         with self._order:
             if self._failure is not None:
                 raise self._failure
-            rows = [self._held.popleft() for _ in range(len(self._held))]
-            for phase, batch in self._batches_of(rows):
+            values = [self._held.popleft() for _ in range(len(self._held))]
+            for phase, batch in self._batches_of(values):
                 self._writer.raw(phase, batch)
 
 
