@@ -1,8 +1,8 @@
-"""Names of array types, and the root mean square."""
+"""Names of array types, and what is done to arrays in several rooms."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,13 @@ Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+Numbers = TypeVar("Numbers", Floats, Ints)
+
 
 def rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def evenly_spread(values: Numbers, most: int) -> Numbers:
+    """All values, or ``most`` of them, the first and the last among these."""
+    return values if len(values) <= most else values[np.linspace(0, len(values) - 1, most).astype(np.int64)]

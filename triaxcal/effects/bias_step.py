@@ -9,8 +9,12 @@ from typing import Self
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, evenly_spread
 from triaxcal.effects.contract import DURATION, SINCE_START, Coefficient, Effect, Meaning, no_slope, on_each_axis, xyz
+
+MOMENTS = 200
+"""At most: between the poses and in them, up to 101 poses. Of longer recordings
+a diagnosis divides the likeliest moments afterwards."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +61,12 @@ class BiasStep(Effect):
 
     def variants(self, covariates: Mapping[str, Floats]) -> Sequence[Effect]:
         """Between any two poses, and in the middle of any but the first and the
-        last."""
+        last; `MOMENTS` of these, evenly spread, where they are more."""
         t, held = covariates[SINCE_START], covariates[DURATION]
         order = np.argsort(t)
         begin, end = (t - held / 2)[order], (t + held / 2)[order]
-        moments = [*(end[:-1] + begin[1:]) / 2, *t[order][1:-1]]
-        return tuple(self.shaped({"at": float(m)}) for m in sorted(moments))
+        moments = np.sort([*(end[:-1] + begin[1:]) / 2, *t[order][1:-1]])
+        return tuple(self.shaped({"at": float(m)}) for m in evenly_spread(moments, MOMENTS))
 
     def shaped(self, values: Mapping[str, float]) -> Self:
         return replace(self, at_s=values["at"])

@@ -166,6 +166,12 @@ class LinearisedData:
         return float(np.median(self.error[: self.n]))
 
     @property
+    def order(self) -> Ints:
+        """(n,) the places of the poses as they were taken, recording by
+        recording."""
+        return np.lexsort((self.t_s, self.run))
+
+    @property
     def t_s(self) -> Floats:
         """(n,)"""
         return np.array([p.t_s for p in self.poses])

@@ -20,7 +20,7 @@ from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.model_search import likely_sets
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.prior import Odds
-from triaxcal.evidence.terms import Finer, Variant, terms_of, variant_of
+from triaxcal.evidence.terms import Finer, Variant, change_points, terms_of, variant_of
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
 
@@ -50,14 +50,32 @@ def posterior_of(
     odds = odds or Odds()
     effects = considered(poses, catalogue)
     rows, finer = LinearisedData.of(poses, linear, signs, effects), list[Finer]()
-    for _ in range(ROUNDS):
-        evidence = Evidence(rows, terms_of(rows, effects, odds, finer), odds)
-        posterior = Posterior(evidence, likely_sets(evidence))
+    near: int | None = None
+    done = 0
+    while True:
+        posterior = _likely(Evidence(rows, terms_of(rows, effects, odds, finer, near), odds))
+        done += 1
         point, split = _point_of(posterior), finer_shapes(posterior)
-        if point is None and not split:
-            break
+        seen, near = near, coarse_change_point(posterior, near)
+        if done == ROUNDS or (point is None and not split and near == seen):
+            return posterior
+        del posterior  # of a thousand poses it holds a gigabyte, and so will the next
         rows, finer = rows if point is None else rows.relinearised_at(point), [*finer, split]
-    return posterior
+
+
+def _likely(evidence: Evidence) -> Posterior:
+    return Posterior(evidence, likely_sets(evidence))
+
+
+def coarse_change_point(posterior: Posterior, near: int | None) -> int | None:
+    """How many poses are before the likeliest change, if one is likely and not
+    all poses about it are looked at; else the one that was ``near`` before."""
+    rows, p = posterior.evidence.rows, posterior.change_point_probabilities
+    if p.sum() < posterior.evidence.odds.reported:
+        return near
+    cut = int(np.argmax(p[rows.order]))
+    coarse = change_points(rows.n)
+    return cut if cut in coarse and np.ptp(coarse) >= len(coarse) else near
 
 
 def finer_shapes(posterior: Posterior) -> Finer:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from triaxcal.arrays import Floats
+from triaxcal.arrays import Floats, Ints, evenly_spread
 from triaxcal.effects.contract import SINCE_START, TIME, Effect
 from triaxcal.effects.plugins import EffectFault, is_foreign
 from triaxcal.errors import Refused
@@ -21,6 +21,9 @@ from triaxcal.poses.covariates import static_covariates
 
 FEWEST = 4
 """Poses that another unit or mounting has at least: fewer are outliers."""
+CHANGE_POINTS = 100
+"""At most, evenly spread over the poses. Of more poses, those about the
+likeliest are looked at afterwards."""
 SPHERE = 48
 """Directions over which the size of an effect is reckoned."""
 NOTHING_G = 1e-12
@@ -69,11 +72,13 @@ def variant_of(effect: Effect) -> Variant:
     return effect.name, tuple(c.name for c in effect.coefficients), tuple(v for v, _ in effect.shape.values())
 
 
-def terms_of(rows: LinearisedData, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = ()) -> list[Term]:
+def terms_of(
+    rows: LinearisedData, catalogue: Sequence[Effect], odds: Odds, finer: Sequence[Finer] = (), near: int | None = None
+) -> list[Term]:
     """Every form, shape and choice of axes of every effect that can act in
-    these poses, every pose as an outlier, and every pose as the first of
-    another unit or mounting. ``finer`` are divisions of shapes, one after the
-    other."""
+    these poses, every pose as an outlier, and the poses of `change_points` as
+    the first of another unit or mounting. ``finer`` are divisions of shapes,
+    one after the other."""
     still = static_covariates(rows.poses)
     known = rows.problem.channel_reference
     if not np.ptp(rows.t_s) > 0:  # means whose times nobody knows
@@ -81,7 +86,7 @@ def terms_of(rows: LinearisedData, catalogue: Sequence[Effect], odds: Odds, fine
     able = [e for e in catalogue if all(name in known and name not in still for name in e.needs)]
     share = np.log(odds.effect_odds / max(len(able), 1))
     terms = [term for effect in able for term in _of_effect(rows, effect, share, odds, finer)]
-    return [*terms, *(_outlier(rows, i, odds) for i in range(rows.n)), *_another(rows, odds)]
+    return [*terms, *(_outlier(rows, i, odds) for i in range(rows.n)), *_another(rows, odds, near)]
 
 
 def faults_of(rows: LinearisedData, catalogue: Sequence[Effect]) -> dict[str, str]:
@@ -192,16 +197,34 @@ def _outlier(rows: LinearisedData, pose: int, odds: Odds) -> Term:
     return Term("", f"outlier {pose}", columns * combination, combination, float(np.log(odds.outlier_odds)), pose=pose)
 
 
-def _another(rows: LinearisedData, odds: Odds) -> Iterator[Term]:
+def change_points(n: int) -> Ints:
+    """How many of n poses are before each change that is looked at."""
+    return evenly_spread(np.arange(FEWEST, n - FEWEST + 1), CHANGE_POINTS)
+
+
+def _change_points(n: int, near: int | None) -> Mapping[int, int]:
+    """Change points, each with the number of those that would share the prior
+    if all were like it. Those between the neighbours of the one that is
+    ``near`` have its share together."""
+    coarse = change_points(n).tolist()
+    out = dict.fromkeys(coarse, len(coarse))
+    if near is not None:
+        at = coarse.index(near)
+        before = coarse[at - 1] if at else near - 1
+        after = coarse[at + 1] if at + 1 < len(coarse) else near + 1
+        out |= dict.fromkeys(range(before + 1, after), len(coarse) * (after - before - 1))
+    return out
+
+
+def _another(rows: LinearisedData, odds: Odds, near: int | None) -> Iterator[Term]:
     """From a pose on all nine parameters are others: another unit, channels
     that were exchanged."""
-    order = np.lexsort((rows.t_s, rows.run))
-    cuts = range(FEWEST, rows.n - FEWEST + 1)
+    order = rows.order
     size = np.sqrt(np.mean((rows.linear[: rows.n] * rows.error[: rows.n, None]) ** 2, axis=0))
     combination = 1 / (np.maximum(size, NOTHING_G) * np.sqrt(len(size)))
-    for cut in cuts:
+    for cut, sharing in _change_points(rows.n, near).items():
         late = np.zeros(rows.n, dtype=bool)
         late[order[cut:]] = True
         columns = rows.linear * np.resize(late, len(rows.y))[:, None] * combination
-        prior = float(np.log(odds.change_point_odds / len(cuts)))
+        prior = float(np.log(odds.change_point_odds / sharing))
         yield Term("", "another", columns, combination, prior, change_point=int(order[cut]))
