@@ -174,11 +174,12 @@ class Spectra:
         chosen = np.flatnonzero(still)
         if len(chosen) < SEGMENTS_LEAST:
             return []
-        power = np.array([self._power[i] for i in chosen], dtype=float)
         tests = 3 * sum(int(b.inside.sum()) for b in self.bands)
         found: list[Line] = []
         for band in self.bands:
-            line = self._judged(band, power[:, :, np.searchsorted(self._kept, band.bins)], FALSE_ALARM / tests)
+            first = int(np.searchsorted(self._kept, band.bins[0]))
+            power = np.array([self._power[i][:, first : first + len(band.bins)] for i in chosen], dtype=float)
+            line = self._judged(band, power, FALSE_ALARM / tests)
             if line is not None and not any(abs(line.frequency_hz - f.frequency_hz) < 1.0 for f in found):
                 found.append(line)
         return found
