@@ -27,7 +27,16 @@ class DeviceAbsent(DriverError):
 
 class DeviceSilent(DriverError):
     """The device answered before and does not any more, or its stream has
-    stopped."""
+    stopped.
+
+    ``source`` is that of the records of a stream which alone is silent, for
+    ``silent_s``; None where nothing comes.
+    """
+
+    def __init__(self, message: str, *, source: int | None = None, silent_s: float = 0.0) -> None:
+        super().__init__(message)
+        self.source = source
+        self.silent_s = silent_s
 
 
 class DeviceRestarted(DeviceSilent):

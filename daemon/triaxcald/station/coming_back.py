@@ -222,12 +222,14 @@ class Returning:
     async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
         """As the device's own. An interruption begins with a batch without
         records whose gap is not over; the first record after it that is no
-        error ends the gap. Until then the unit is waited for, however often it
+        error ends the gap, of the silent stream where the device told which.
+        Until then the unit is waited for, however often it
         opens meanwhile. A hole is a gap too. Raises what the device's stream
         does once patience ends."""
         last_ns: int | None = None
         returned_ns = self._now_ns()
         gap: Gap | None = None
+        awaited: int | None = None
         waiting = self._waiting()
         with ExitStack() as at_rest:
             while True:
@@ -235,10 +237,11 @@ class Returning:
                     async with aclosing(cast(Any, self._device.stream(names))) as stream:
                         async for batch in stream:
                             good = _good(batch)
-                            if gap is not None and len(good):
+                            back = good if awaited is None else good[batch.source[good] == awaited]
+                            if gap is not None and len(back):
                                 lost = batch.gap.lost if batch.gap is not None else None
-                                gap = Gap(gap.from_ns, int(batch.time_ns[good[0]]), gap.cause, lost)
-                                batch, gap = batch.after(gap), None
+                                gap = Gap(gap.from_ns, int(batch.time_ns[back[0]]), gap.cause, lost)
+                                batch, gap, awaited = batch.after(gap), None, None
                                 at_rest.close()
                                 self._tell(None)
                             for part in _parted(batch, good, last_ns, self._hole_s):
@@ -250,8 +253,10 @@ class Returning:
                     return
                 except LOST as e:
                     trouble: Exception = e
+                if isinstance(trouble, DeviceSilent) and trouble.source is not None:
+                    awaited = trouble.source
                 if gap is None:
-                    gap = Gap(self._now_ns() if last_ns is None else last_ns, None, str(trouble))
+                    gap = Gap(self._since_ns(trouble, last_ns), None, str(trouble))
                     if self._complaint is None or self._now_ns() - returned_ns > AGAIN_S * 1e9:
                         waiting = self._waiting()
                     waiting.told = ""
@@ -260,6 +265,14 @@ class Returning:
                     yield RawBatch.of([]).after(gap)
                 await waiting.until(self._again, LOST, trouble)
                 self._complaint, returned_ns = None, self._now_ns()  # what was said meanwhile was of the one before
+
+    def _since_ns(self, trouble: Exception, last_ns: int | None) -> int:
+        """Since when nothing has come, or nothing of the stream that is silent
+        while others bring their records."""
+        since_ns = self._now_ns() if last_ns is None else last_ns
+        if isinstance(trouble, DeviceSilent) and trouble.source is not None:
+            return min(since_ns, self._now_ns() - round(trouble.silent_s * 1e9))
+        return since_ns
 
     def _waiting(self) -> _Waiting:
         return _Waiting(self._patience, lambda trouble: self._tell(str(trouble)))

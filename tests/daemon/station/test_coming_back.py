@@ -17,17 +17,21 @@ from triaxcald.provision.identity import WrongUnit
 from triaxcald.station.coming_back import LONGEST_PAUSE_S, UNHEARD, AtWork, Patience, Returning, until_open
 
 BEGUN_NS = 1_700_000_000_000_000_000
-Step = list[tuple[int, int]] | Exception
+Step = list[tuple[int, int]] | RawBatch | Exception
 
 
 def records(*times: int, flags: int = 0) -> list[tuple[int, int]]:
     return [(t, flags) for t in times]
 
 
+def of_source(source: int, *times: int, flags: int = 0) -> RawBatch:
+    return RawBatch.of([(BEGUN_NS + t, source, flags, b"") for t in times])
+
+
 @dataclass
 class Played:
-    """A device whose streams and openings go as they are written: batches of
-    (time, flags), or what is raised."""
+    """A device whose streams and openings go as they are written: batches,
+    those of one source by (time, flags), or what is raised."""
 
     streams: list[list[Step]]
     openings: list[Exception | None] = field(default_factory=list)
@@ -51,7 +55,7 @@ class Played:
         for step in self.streams.pop(0):
             if isinstance(step, Exception):
                 raise step
-            yield RawBatch.of([(BEGUN_NS + t, 0x185, flags, b"") for t, flags in step])
+            yield step if isinstance(step, RawBatch) else of_source(0x185, *(t for t, _ in step), flags=step[0][1])
 
     async def all(self, patience: Patience, **more: float) -> list[RawBatch]:
         returning = Returning(cast(Any, self), self.identify, patience, self.told.append, lambda: BEGUN_NS - 1, **more)
@@ -99,6 +103,24 @@ def test_a_gap_ends_with_the_first_record_that_is_no_error_however_often_the_uni
         ([10], [0], None),
     ]
     assert device.told == ["the link is down", "no such interface", "still nothing", None]
+
+
+def test_a_stream_that_is_silent_beside_another_is_back_with_a_record_of_its_own() -> None:
+    """And is given up where none comes, however many the other stream brings."""
+    missing = DeviceSilent("readings: illegal data address", source=7, silent_s=5e-9)
+    device = Played([[of_source(9, 1), missing], [of_source(9, 12), of_source(7, 13)]])
+    assert shown(run(device.all(Patience()))) == [
+        ([1], [0], None),
+        ([], [], gap(-6, None, str(missing))),
+        ([12], [0], None),
+        ([13], [RawFlag.LOST_BEFORE], gap(-6, 13, str(missing))),
+    ]
+    assert device.told == [str(missing), None]
+    device = Played([[of_source(9, 10 * i), missing] for i in range(9)])
+    with pytest.raises(DeviceSilent, match="illegal data address"):
+        run(device.all(Patience(most_s=5.0)))
+    assert device.told == [str(missing)]
+    assert device.opened_s == [0.0, 0.5, 1.5, 3.5, 5.0]
 
 
 def test_a_unit_that_was_never_heard_is_lost_from_the_moment_it_was_missed() -> None:
