@@ -11,6 +11,7 @@ from triaxcal_drivers.profile import Profile, WriteStep
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import snapshot
+from triaxcald.provision.identity import raw_number
 from triaxcald.provision.image import RegisterImage, calibration_registers
 from triaxcald.provision.plausible import doubts
 from triaxcald.provision.power import MISSED
@@ -151,8 +152,9 @@ def _identity(traffic: Traffic, serial: str | None) -> list[Difference]:
     for a in traffic.accesses:
         if a.operation == "read" and not a.error and a.register in meant:
             register = traffic.profile.registers[a.register]
-            number = round((traffic.profile.decode(a.register, a.raw) - register.offset) / register.scale)
-            answered: object = f"{number:04d}" if a.register == identity.serial_register else number
+            number = raw_number(register, traffic.profile.decode(a.register, a.raw))
+            is_serial = number is not None and a.register == identity.serial_register
+            answered: object = f"{number:04d}" if is_serial else number
             if answered != meant[a.register]:
                 found[a.register] = Difference(REGISTERS, Kind.NOT_READ, a.register, meant[a.register], answered)
     return list(found.values())

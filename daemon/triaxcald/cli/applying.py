@@ -18,6 +18,7 @@ from triaxcald.inputs import CALIBRATION, read_document
 from triaxcald.recording.export import write_csv
 from triaxcald.tables.arrow import write_parquet
 
+FRAME = "in the sensor's own frame (triaxcal frame turns it into a housing's)"
 KINDS = (".csv", ".csv.gz", ".parquet")
 
 
@@ -42,7 +43,7 @@ def apply_command(a: argparse.Namespace) -> int:
     with new_beside(a.output) as path:
         samples = _written(found, path, a.output.name)
     warn(found.cautions)
-    say(f"{a.output}: {samples} samples, {', '.join(calibration.terms)}, in {calibration.reference_unit}")
+    say(f"{a.output}: {samples} samples, {', '.join(calibration.terms)}, in {calibration.reference_unit}, {FRAME}")
     return 0
 
 

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from triaxcal.model.gravity import HEIGHTS_M
 from triaxcal.model.moment import Moment
+from triaxcal_drivers.nearest import closest
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
 from triaxcald.tables.naming import TIME_UNITS, parse_columns
@@ -30,9 +31,15 @@ class OneLineParser(argparse.ArgumentParser):
             return super().parse_known_args(args, namespace)
         self._mixing = True
         try:
-            return self.parse_known_intermixed_args(args, namespace)
+            found, left = self.parse_known_intermixed_args(args, namespace)
         finally:
             self._mixing = False
+        if left:
+            unknown = next((word for word in left if word.startswith("--")), "").partition("=")[0]
+            close = closest(unknown.lstrip("-"), (o[2:] for o in self._option_string_actions if o.startswith("--")))
+            hint = f"; did you mean --{close}?" if close else ""
+            self.error(f"unrecognized arguments: {' '.join(left)}{hint}")
+        return found, left
 
     def error(self, message: str) -> NoReturn:
         for option, example in (("--sign", "-,-,-"), ("--faces", "-X,-X"), ("--datum", "-Z,-X")):

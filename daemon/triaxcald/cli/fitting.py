@@ -18,7 +18,7 @@ from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit
-from triaxcald.cli.methods import Way, chosen_way, telling_default_signs
+from triaxcald.cli.methods import Way, chosen_way, default_signs, telling_default_signs
 from triaxcald.cli.results import show_calibration, show_loop, show_summary, text_of_held_out
 from triaxcald.cli.several import (
     as_one_unit,
@@ -57,7 +57,7 @@ def fit_command(a: argparse.Namespace) -> int:
         emit(document)
     else:
         show_calibration(calibration, choice)
-        warn([*map(text.caution, calibration.cautions), *measured.data_quality])
+        warn([*map(text.caution, calibration.cautions), *measured.data_quality, *default_signs(a, measured)])
     return judge(a.limit, calibration.residual.rms_g)
 
 
@@ -106,7 +106,7 @@ def diagnose_command(a: argparse.Namespace) -> int:
             show_calibration(loop.after, choice)
         elif loop.held_out:
             print(text_of_held_out(loop.held_out, choice.small))
-        warn([*document["calibration"]["warnings"], *measured.data_quality])
+        warn([*document["calibration"]["warnings"], *measured.data_quality, *default_signs(a, measured)])
     return judge(a.limit, loop.after.residual.rms_g)
 
 

@@ -27,6 +27,10 @@ from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, read_document, require_unit
 
 POSES_ENOUGH = 9
+DEFAULT_SIGNS = (
+    "no --sign was given, so +,+,+ is taken: an output that falls where its axis points up needs a minus, "
+    "and nothing in the data tells"
+)
 Way = tuple[Measured, Document, Calibration, Callable[[], None]]
 """What was measured, the document, the calibration, and how it is shown at the
 console."""
@@ -44,6 +48,12 @@ def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | N
         if way and getattr(a, option) is not None:
             raise InputError(f"--{option.replace('_', '-')}: with {way} there is no budget that it would count in")
     return _turning if a.turning else _attitudes if a.attitudes else _datasheet if a.datasheet else None
+
+
+def default_signs(a: argparse.Namespace, measured: Measured) -> list[str]:
+    """A warning where nobody gave the signs: no residual shows that they are
+    wrong."""
+    return [DEFAULT_SIGNS] if a.sign is None and measured.signs is None else []
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -46,21 +47,31 @@ async def check_identity(
             )
     serial = await read_serial(device, bundle)
     if expected_serial is not None and not same_serial(serial, expected_serial):
-        raise WrongUnit(f"the unit on {where} is serial {serial or 'unknown'}, expected {expected_serial}")
+        answers = f"is serial {serial}" if serial else "tells no serial (its profile has no serial_register)"
+        raise WrongUnit(f"the unit on {where} {answers}, expected {expected_serial}")
     return IdentityRead(serial, values)
 
 
 async def read_serial(device: Device, bundle: Bundle) -> str | None:
     """The serial number as `IdentityRead` has it. Raises RegisterRefused,
-    DeviceSilent."""
+    DeviceSilent; WrongUnit where the register holds no number."""
     name = bundle.profile.identity.serial_register
     return f"{await _read_raw_number(device, bundle, name):04d}" if name else None
 
 
 async def _read_raw_number(device: Device, bundle: Bundle, name: str) -> int:
     register: Register = bundle.profile.registers[name]
-    value = bundle.profile.decode(name, await device.read(name))
-    return round((value - register.offset) / register.scale)
+    raw = await device.read(name)
+    number = raw_number(register, bundle.profile.decode(name, raw))
+    if number is None:
+        raise WrongUnit(f"register {name} holds {raw.hex()}, which is no {register.type} number")
+    return number
+
+
+def raw_number(register: Register, value: float) -> int | None:
+    """As the device counts, of what a register was decoded to; None of no
+    number, as an erased EEPROM holds it."""
+    return round((value - register.offset) / register.scale) if math.isfinite(value) else None
 
 
 def same_serial(serial: str | None, expected: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Literal
@@ -78,7 +79,7 @@ async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollSt
     while True:
         try:
             held = profile.decode(step.poll, await link.read_once(step.poll))
-            value = held if step.mask is None else int(held) & step.mask
+            value = held if step.mask is None or not math.isfinite(held) else int(held) & step.mask
             late: Exception = SequenceStalled(
                 f"{label}: register {step.poll} holds {value:g} after {step.timeout_s:g} s, expected {step.until:g}"
             )

@@ -3,7 +3,6 @@ what is good enough."""
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
@@ -26,6 +25,7 @@ from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.loading import load_bundle
+from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.profile import CORRECTED, Bundle, Profile, Strict
 from triaxcal_drivers.toml_text import SIZE_MOST, parse_toml
 from triaxcal_drivers.validation import validate
@@ -349,8 +349,7 @@ def _check_roles(bundle: Bundle, *, where: str) -> None:
     known += _OTHER_ROLES
     for name, register in bundle.profile.registers.items():
         if register.role is not None and register.role not in known:
-            close = difflib.get_close_matches(register.role, known, n=1)
-            hint = f"; did you mean '{close[0]}'?" if close else ""
             raise InputError(
-                f"{where}: {bundle.profile.name}: registers.{name}.role: unknown role '{register.role}'{hint}"
+                f"{where}: {bundle.profile.name}: registers.{name}.role: "
+                f"unknown role '{register.role}'{nearest(register.role, known)}"
             )

@@ -102,12 +102,16 @@ def test_options_may_stand_between_recordings(runs: list[Path], triaxcal: Run) -
 
 @pytest.mark.parametrize(
     ("arguments", "left"),
-    [(["diagnose", "a.csv", "--odd", "b.csv"], "--odd b.csv"), (["fit", "a.csv", "--json", "b.csv"], "b.csv")],
+    [
+        (["diagnose", "a.csv", "--odd", "b.csv"], "--odd b.csv"),
+        (["fit", "a.csv", "--json", "b.csv"], "b.csv"),
+        (["fit", "a.csv", "--sgn=+,-,+"], "--sgn=+,-,+; did you mean --sign?"),
+    ],
 )
 def test_what_no_command_knows_is_told(triaxcal: Run, arguments: list[str], left: str) -> None:
     done = triaxcal(*arguments)
     done.failed(2)
-    assert done.err == f"triaxcal: unrecognized arguments: {left}\n"
+    assert done.err == f"triaxcal {arguments[0]}: unrecognized arguments: {left}\n"
 
 
 @pytest.mark.slow

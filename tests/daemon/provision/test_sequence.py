@@ -1,7 +1,9 @@
+"""Sequences of a profile, and whose unit it is."""
+
 import pytest
 
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
-from triaxcal_drivers.profile import PollStep, ReconnectStep, Sequences, WaitStep, WriteStep
+from triaxcal_drivers.profile import PollStep, ReconnectStep, Register, Sequences, WaitStep, WriteStep
 from triaxcald.provision.identity import WrongUnit, check_identity
 from triaxcald.provision.sequence import SequenceStalled, reconnect, run_sequence
 
@@ -130,6 +132,22 @@ async def test_another_serial_number_is_refused(bench, expected: str) -> None:
 async def test_a_serial_number_cannot_be_expected_of_a_device_that_has_none(bench) -> None:
     nameless = bench.profile.identity.model_copy(update={"serial_register": None})
     bundle = bench.bundle.__class__(bench.profile.model_copy(update={"identity": nameless}), b"")
-    with pytest.raises(WrongUnit, match="is serial unknown, expected 0007"):
+    with pytest.raises(WrongUnit, match=r"tells no serial \(its profile has no serial_register\), expected 0007"):
         await check_identity(bench.link, bundle, "0007")
     assert (await check_identity(bench.link, bundle, None)).serial is None
+
+
+async def test_a_serial_number_of_bits_that_are_no_number_is_refused_in_words(
+    bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As an erased EEPROM holds them where the register is a float."""
+    registers = {**bench.profile.registers, "serial_number": Register(type="float32")}
+    bundle = bench.bundle.__class__(bench.profile.model_copy(update={"registers": registers}), b"")
+    held = bench.link.read
+
+    async def read(name: str) -> bytes:
+        return b"\xff" * 4 if name == "serial_number" else await held(name)
+
+    monkeypatch.setattr(bench.link, "read", read)
+    with pytest.raises(WrongUnit, match="register serial_number holds ffffffff, which is no float32 number"):
+        await check_identity(bench.link, bundle, None)
