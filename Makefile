@@ -51,7 +51,7 @@ docs: $(TOOLS)  ## pages made from the code, and the notebook with its outputs
 	$(BIN)/python docs/reference/profile.py
 	$(BIN)/python docs/reference/effects.py
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
-	$(BIN)/jupyter execute --inplace docs/tutorial/*.ipynb
+	$(BIN)/python docs/tutorial/execute.py
 
 check: $(TOOLS)  ## lint, format, types, import contracts
 	$(BIN)/ruff check .
