@@ -25,9 +25,9 @@ from benchmarks.table import Table
 from triaxcal.arrays import Floats
 from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.estimate.recordings import together
-from triaxcal.pooling import PooledEffect, pooled_analysis
+from triaxcal.pooled_units import PooledEffect, pooled_analysis
 from triaxcal.text.diagnosis import chance
-from triaxcal.text.pooling import verdict
+from triaxcal.text.pooled_units import verdict
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import next_recording
 

@@ -7,7 +7,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from triaxcal.figures import micro_g, plain
+from triaxcal.number_format import micro_g, plain
 
 SMALLEST = 1e-250
 """Of references: beyond it powers of ten end."""

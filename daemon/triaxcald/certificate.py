@@ -24,10 +24,10 @@ from triaxcal.diagnosis import Loop, diagnose
 from triaxcal.effects import Effect
 from triaxcal.effects.in_run import of_clocks
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.reduced_calibration import Reduced, reduced
-from triaxcal.figures import micro_g
+from triaxcal.estimate.projected_calibration import Reduced, reduced
 from triaxcal.interchange.calibration_document import Document, budget_document, holds_of
 from triaxcal.model.sensor import Sensor
+from triaxcal.number_format import micro_g
 from triaxcal.poses.covariates import channels_of, with_scale
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import error, number
@@ -174,7 +174,7 @@ def held_by_device(
     profile: Profile, full: Calibration, logged: Mapping[str, Floats] | None = None
 ) -> HeldByDevice | None:
     """None where the device cannot take a calibration at all. ``logged`` as
-    `triaxcal.estimate.reduced_calibration.reduced` has it."""
+    `triaxcal.estimate.projected_calibration.reduced` has it."""
     if why_not_written(profile):
         return None
 

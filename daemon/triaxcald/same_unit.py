@@ -19,7 +19,7 @@ from triaxcal.distributions import f_sf
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.figures import plain
+from triaxcal.number_format import plain
 from triaxcal.poses.covariates import covariates_elsewhere
 from triaxcal.poses.pose import Pose
 

@@ -10,9 +10,9 @@ from triaxcal.diagnosis import Loop
 from triaxcal.estimate.recordings import residuals_by_run
 from triaxcal.evidence.shape_posterior import Shape
 from triaxcal.interchange.calibration_document import Document
-from triaxcal.pooling import Answer, PooledAnalysis, PooledEffect, SharedShape
+from triaxcal.pooled_units import Answer, PooledAnalysis, PooledEffect, SharedShape
 from triaxcal.rounding import chance, error, number, uncertainty
-from triaxcal.text.pooling import verdict
+from triaxcal.text.pooled_units import verdict
 from triaxcal.units import in_units_of
 
 NO_LONGER_OF_AN_EFFECT = ("worse", "gain", "units_gain", "shown_by")

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from triaxcal.figures import micro_g
+from triaxcal.number_format import micro_g
 from triaxcald.provision.plausible import Doubt
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState, Evidence, Held

@@ -15,8 +15,8 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import f_sf
-from triaxcal.figures import plain
 from triaxcal.interchange.calibration_document import Document
+from triaxcal.number_format import plain
 from triaxcal.poses.pose import Pose
 from triaxcal.rounding import error, number, uncertainty
 from triaxcald.pipeline import Pipeline, creeping

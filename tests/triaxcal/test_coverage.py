@@ -10,8 +10,8 @@ from benchmarks.coverage import Knowledge, covered, known, own, pooled, unknown
 from benchmarks.truth import PAPER_UNIT, Condition, plan
 from triaxcal.errors import InvalidData
 from triaxcal.estimate.pose_fit import fit
+from triaxcal.poses.degrees_of_freedom import raised_dof, within_pose_dof
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import pure_error_dof, raised_dof
 
 SEEDS = 220
 CERTAIN = stats.norm.isf(1e-4)
@@ -59,14 +59,14 @@ def test_normal_quantiles_would_not_cover_at_five_degrees_of_freedom() -> None:
 def test_effective_degrees_of_freedom_are_those_of_the_gum_s_example() -> None:
     # JCGM 100, G.4.2: relative standard uncertainties of 0.25, 0.57 and 0.82 % with 9, 4 and 14 degrees of freedom.
     part = np.array([0.25, 0.57, 0.82]) ** 2
-    assert pure_error_dof([pose(9), pose(4), pose(14)], part / part.sum()) == pytest.approx(19.0, abs=0.05)
+    assert within_pose_dof([pose(9), pose(4), pose(14)], part / part.sum()) == pytest.approx(19.0, abs=0.05)
 
 
 def test_what_all_poses_have_in_common_does_not_average_out() -> None:
-    assert pure_error_dof([pose(28)] * 14) == pytest.approx(14 * 28)
-    assert pure_error_dof([pose(28, shared_dof=28)] * 14) == pytest.approx(28)
-    assert pure_error_dof([pose(28, shared_dof=56)] * 14) == pytest.approx(1 / (1 / 56 + 1 / (14 * 56)))
-    assert pure_error_dof([pose(28), pose(0)]) == 0
+    assert within_pose_dof([pose(28)] * 14) == pytest.approx(14 * 28)
+    assert within_pose_dof([pose(28, shared_dof=28)] * 14) == pytest.approx(28)
+    assert within_pose_dof([pose(28, shared_dof=56)] * 14) == pytest.approx(1 / (1 / 56 + 1 / (14 * 56)))
+    assert within_pose_dof([pose(28), pose(0)]) == 0
 
 
 def test_coverage_factors_are_those_of_the_gum_s_table() -> None:

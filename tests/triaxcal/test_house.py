@@ -86,7 +86,7 @@ def test_the_metrology_says_that_it_is_typed() -> None:
 
 WORDS_LEAST = 4
 """A string of fewer is a name."""
-SAYS = ("text", "figures", "units")
+SAYS = ("text", "number_format", "units")
 EFFECTS = "effects"
 """An effect's file says what a person should do about it, as its contract has it."""
 

@@ -17,7 +17,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from triaxcal.arrays import Floats
-from triaxcal.figures import plain
+from triaxcal.number_format import plain
 
 TIME = "t_s"
 """The name under which time stands among the covariates, in seconds."""

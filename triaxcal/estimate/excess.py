@@ -21,7 +21,7 @@ import scipy
 from triaxcal.arrays import Floats
 from triaxcal.errors import NotStill
 from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise, residual_chi2
-from triaxcal.poses.pure_error import lack_of_fit_p
+from triaxcal.poses.degrees_of_freedom import lack_of_fit_p
 
 NO_CHANCE = 1e-4
 """Lack-of-fit p below which an excess variance is added, which changes the

@@ -23,8 +23,8 @@ from triaxcal.estimate.excess import Excess
 from triaxcal.estimate.likelihood import Problem, State, linearise, solve
 from triaxcal.estimate.outliers import OutlierSet, not_as_predicted, outlier_set
 from triaxcal.poses.covariates import of_unknown_history
+from triaxcal.poses.degrees_of_freedom import combined_dof, pose_dof, within_pose_dof
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import combined_dof, pose_dof, pure_error_dof
 
 OUTLIER_ROUNDS = 4
 """The search is repeated without the outliers found, since large ones bend the
@@ -40,7 +40,7 @@ def outliers_among(problem: Problem, state: State, poses: Sequence[Pose]) -> Out
     What the others show beside their noise, all are taken to have: by the noise
     alone the quietest would look like outliers.
     """
-    own, together = pose_dof(poses), pure_error_dof(poses)
+    own, together = pose_dof(poses), within_pose_dof(poses)
     dof, pure, judged, found = own, together, problem, OutlierSet()
     for _ in range(OUTLIER_ROUNDS):
         r, J, s = linearise(judged, state)
@@ -68,7 +68,7 @@ def with_unknown_history(
     problem = problem.only(rest)
     r, J, s = linearise(problem, solve(problem, state, state.effects))
     rows = [k for k, i in enumerate(rest) if i in unknown]
-    found = not_as_predicted(r / s, J / s[:, None], pure_error_dof([poses[i] for i in rest]), rows)
+    found = not_as_predicted(r / s, J / s[:, None], within_pose_dof([poses[i] for i in rest]), rows)
     return tuple(int(rest[k]) for k in found)
 
 

@@ -36,8 +36,8 @@ from triaxcal.estimate.likelihood import (
 )
 from triaxcal.estimate.nonlinear_parameter_errors import shape_errors
 from triaxcal.model.directions import dilution, in_range, linear_design, most_wanted
+from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, lack_of_fit_p, raised_dof, within_pose_dof
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import SIGNIFICANT, lack_of_fit_p, pure_error_dof, raised_dof
 
 DILUTION_WARNING = 10.0
 """A tenth of `DILUTION_LIMIT`, at which a fit is refused: errors still hold,
@@ -56,7 +56,7 @@ def concluded(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
     """Of a fit at its minimum; ``judged`` as `_ResidualChi2` has it. Raises
     NotStill where the fit ran away."""
     linearised, n = _linearised(problem, state), len(poses)
-    found = _ResidualChi2.of(linearised, problem, state, judged, pure_error_dof(poses))
+    found = _ResidualChi2.of(linearised, problem, state, judged, within_pose_dof(poses))
     noise, birge_ratio = linearised[2][:n], found.excess.birge_ratio
     if found.excess.excess_g:
         problem = found.excess.added_to(problem, state)
@@ -80,14 +80,14 @@ def concluded(problem: Problem, state: State, poses: Sequence[Pose], judged: Pro
             r,
             noise,
             cross_validated_rms_g=cross_validated(problem, state),
-            lack_of_fit_p=lack_of_fit_p(found.chi2, found.dof, pure_error_dof(poses)),
+            lack_of_fit_p=lack_of_fit_p(found.chi2, found.dof, within_pose_dof(poses)),
         ),
         poses=pose_results(poses, up, r, noise, studentized(r, s, leverage), leverage, total=s * birge_ratio),
         condition=_condition(weighted),
         dilution=spread,
         birge_ratio=birge_ratio,
         excess_g=found.excess.excess_g,
-        dof=raised_dof(*found.with_doubtful, pure_error_dof(poses, leverage / leverage.sum())),
+        dof=raised_dof(*found.with_doubtful, within_pose_dof(poses, leverage / leverage.sum())),
         shape_errors=shape_errors(problem, state, shapes, np.sqrt(np.diag(covariance)[p:]), birge_ratio),
         slopes=problem.slopes is not None,
     )

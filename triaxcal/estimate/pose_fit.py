@@ -19,8 +19,8 @@ from triaxcal.estimate.likelihood import Problem, State, solve
 from triaxcal.estimate.outliers import OutlierSet
 from triaxcal.estimate.pose_slopes import slopes_p, with_slopes
 from triaxcal.poses.covariates import of_unknown_history
+from triaxcal.poses.degrees_of_freedom import within_pose_dof
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import pure_error_dof
 
 CONTRADICTED = 0.01
 """p of the slopes within the poses below which the coefficients are left to the
@@ -123,7 +123,7 @@ def _solved(
             state = solve(both, begin, tuple(effects))
         except (Refused, EffectFault):  # an effect may be known at the means alone
             state = None
-        contradicted = state is not None and slopes_p(both, state, pure_error_dof(poses)) < CONTRADICTED
+        contradicted = state is not None and slopes_p(both, state, within_pose_dof(poses)) < CONTRADICTED
         if state is not None and not contradicted:
             return both, state
     state = by_means or solve(problem, begin, tuple(effects))

@@ -16,7 +16,7 @@ from triaxcal.evidence.mixture_components import components
 from triaxcal.evidence.model_average import Average, average, linear_alone, refusal
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.shape_posterior import shapes_of
-from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof
+from triaxcal.poses.degrees_of_freedom import lack_of_fit_p, within_pose_dof
 from triaxcal.uncertainty.extrapolation import extrapolated
 from triaxcal.uncertainty.propagation import gain_given_prior
 
@@ -111,7 +111,7 @@ def _with_known_residuals(
         for i, p in enumerate(c.poses)
     )
     own, noise, left = r[of_used], error[of_used], len(used) - float(leverage.sum())
-    pure = pure_error_dof([poses[i] for i in of_used])
+    pure = within_pose_dof([poses[i] for i in of_used])
     residual = Residual.of(
         own,
         noise,

@@ -19,9 +19,9 @@ from triaxcal.estimate.likelihood import Problem, State, linearise_all
 from triaxcal.estimate.pose_slopes import PoseSlopes
 from triaxcal.model.sensor import LINEAR, Radius
 from triaxcal.poses.covariates import channels_of, with_scale
-from triaxcal.poses.noise_mixture import NoiseLevels
+from triaxcal.poses.degrees_of_freedom import noise_levels
+from triaxcal.poses.mean_variance_mixture import NoiseLevels
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import noise_levels
 
 QUIETEST = 0.1
 """Of the median: a pose without scatter (a logger's dead band) would weigh

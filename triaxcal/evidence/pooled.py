@@ -18,10 +18,10 @@ import numpy as np
 from triaxcal.arrays import Floats
 from triaxcal.distributions import log_sum_exp
 from triaxcal.evidence.base_models import NEGLIGIBLE_LOG_RATIO, BaseModel, base_models, log_ratios
-from triaxcal.evidence.common_values import of_common_values, term_equations
 from triaxcal.evidence.marginal_likelihood import Evidence
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.shape_posterior import Shape, shapes_by
+from triaxcal.evidence.shared_coefficients import of_common_values, term_equations
 from triaxcal.evidence.terms import Term
 
 Form = tuple[str, tuple[str, ...], tuple[int, ...]]

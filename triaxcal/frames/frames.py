@@ -24,7 +24,7 @@ from triaxcal.frames.faces import LABELS, axis_of, nearest_rotation, opposite
 from triaxcal.frames.fixture import Fixture, fixture_of
 from triaxcal.frames.orientations import LARGE_RAD
 from triaxcal.frames.standing import Standing, basis_of
-from triaxcal.poses.pure_error import LACK_OF_FIT
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 
 ROUNDS = 8
 """Steps of Gauss–Newton over small rotations, always all of them. Fewer may

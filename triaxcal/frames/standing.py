@@ -23,7 +23,7 @@ from triaxcal.estimate.caution import Caution
 from triaxcal.frames.faces import Labelling, axis_of
 from triaxcal.frames.orientations import FLOOR_RAD, LARGE_RAD, SHOWS, Assumed, Face, felt, tilt_of_others, turned
 from triaxcal.frames.verticals import Verticals
-from triaxcal.poses.pure_error import SIGNIFICANT
+from triaxcal.poses.degrees_of_freedom import SIGNIFICANT
 
 ROUNDS = 6
 """How often the axes follow the normals, so that no angle is taken for small;

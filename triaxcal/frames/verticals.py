@@ -13,8 +13,8 @@ from triaxcal.errors import InvalidData
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import covariates_elsewhere
+from triaxcal.poses.degrees_of_freedom import SIGNIFICANT
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import SIGNIFICANT
 
 
 @dataclass(frozen=True)

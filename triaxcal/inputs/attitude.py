@@ -49,9 +49,9 @@ from triaxcal.inputs.turntable import (
 from triaxcal.inputs.turntable_parameters import parameters_by_entries, second_order, sensor_and_rotation, signs_of
 from triaxcal.model.directions import most_wanted
 from triaxcal.model.sensor import Sensor
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT, within_pose_dof
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pose_in_words import the_poses
-from triaxcal.poses.pure_error import LACK_OF_FIT, pure_error_dof
 
 DILUTION_MOST = 100.0
 """Largest standard error of a combination of the twelve parameters, in errors
@@ -133,7 +133,7 @@ def fit_attitudes(
         np.array([p.covariance for p in poses]),
         ups,
         reference,
-        pure_error_dof(poses),
+        within_pose_dof(poses),
     )
     rows = np.arange(len(poses))
     wrong = wrong_by_magnitude(poses, ups, reference)

@@ -23,8 +23,8 @@ from triaxcal.estimate.likelihood import Problem, State, linearise, parameters_b
 from triaxcal.model.directions import dilution, linear_design
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.covariates import covariates_elsewhere
+from triaxcal.poses.degrees_of_freedom import lack_of_fit_p, within_pose_dof
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import lack_of_fit_p, pure_error_dof
 
 STEPS_MOST = 60
 """Bounds the search, which ends sooner where it converges and refuses where it
@@ -171,7 +171,7 @@ def refine(poses: Sequence[Pose], datasheet: Datasheet) -> Refinement:
     J = J @ _theta_by_parameters(problem, state)
     moved = p - datasheet.values
     chi2 = float(np.sum((r / s) ** 2) + z @ z)
-    pure = pure_error_dof(poses)
+    pure = within_pose_dof(poses)
     conflict_p = lack_of_fit_p(chi2, len(poses), pure if pure >= 1 else 1e6)
     raised = max(1.0, float(np.sqrt(chi2 / len(poses)))) if conflict_p is not None and conflict_p < CONFLICT else 1.0
     leverage = np.clip(np.einsum("ni,ij,nj->n", J, covariance, J) / s**2, 0.0, 1.0)

@@ -14,8 +14,8 @@ from triaxcal.distributions import f_sf
 from triaxcal.errors import Refused
 from triaxcal.estimate.initial_estimate import problem_of, start
 from triaxcal.frames.faces import nearest_rotation
+from triaxcal.poses.degrees_of_freedom import lack_of_fit_p
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import lack_of_fit_p
 
 PARAMETERS = 12
 """A matrix of nine and three offsets: the attitudes tell the rotation as well."""

@@ -18,8 +18,8 @@ from triaxcal.estimate.pose_fit import fit
 from triaxcal.model.sensor import LINEAR
 from triaxcal.planning.clock import OnPlansClock
 from triaxcal.planning.design import VISIBLE, combinations
+from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, within_pose_dof
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import SIGNIFICANT, pure_error_dof
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ def noise_of(calibration: Calibration) -> Floats | None:
     """
     used = [p for p in calibration.poses if p.used]
     error = np.array([p.error_g for p in used])
-    within = pure_error_dof([p.pose for p in used]) >= 1
+    within = within_pose_dof([p.pose for p in used]) >= 1
     if not within:
         return error if len(used) > len(calibration.parameters) else None
     p = calibration.residual.lack_of_fit_p

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from triaxcal.arrays import Bools, Floats
-from triaxcal.poses.noise_mixture import NoiseLevels
+from triaxcal.poses.mean_variance_mixture import NoiseLevels
 from triaxcal.poses.noise_spectrum import Track
 from triaxcal.poses.pose_noise import PoseNoise, pose_noise
 from triaxcal.poses.stillness.detector import Span

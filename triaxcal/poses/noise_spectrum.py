@@ -23,7 +23,7 @@ from scipy import fft
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_isf
-from triaxcal.poses.noise_mixture import NoiseLevels
+from triaxcal.poses.mean_variance_mixture import NoiseLevels
 
 BANDS = 1.25
 """Ordinates of a periodogram are gathered in bands whose edges rise by this

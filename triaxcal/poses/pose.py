@@ -12,7 +12,7 @@ from triaxcal.arrays import Floats
 from triaxcal.errors import InvalidData
 from triaxcal.poses.channel_course import courses_of
 from triaxcal.poses.mean_noise import noise_of_means
-from triaxcal.poses.noise_mixture import NoiseLevels
+from triaxcal.poses.mean_variance_mixture import NoiseLevels
 from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.windows import Windows
 

@@ -17,7 +17,7 @@ from scipy import special
 
 from triaxcal.arrays import Bools, Floats
 from triaxcal.distributions import normal_isf
-from triaxcal.poses.noise_mixture import NoiseLevels
+from triaxcal.poses.mean_variance_mixture import NoiseLevels
 from triaxcal.poses.noise_spectrum import Components, Spectrum, Track, fitted, periodogram
 from triaxcal.poses.tones import without_tones
 

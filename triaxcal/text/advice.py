@@ -11,7 +11,7 @@ from triaxcal.evidence.candidate_actions import Action, ActionKind
 from triaxcal.evidence.identifiability import NotIdentifiable, Why
 from triaxcal.evidence.model_average import Refusal
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
-from triaxcal.figures import plain
+from triaxcal.number_format import plain
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.pose_in_words import moment, the_poses
 from triaxcal.units import ErrorUnit

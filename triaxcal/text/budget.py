@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import singledispatch
 
-from triaxcal.figures import micro_g
+from triaxcal.number_format import micro_g
 from triaxcal.text.cautions import excess
 from triaxcal.uncertainty import budget_statements as of
 

@@ -8,11 +8,11 @@ from functools import singledispatch
 import numpy as np
 
 from triaxcal.estimate import caution as of_fit
-from triaxcal.figures import micro_g
 from triaxcal.frames import faces, frames, orientations, standing
 from triaxcal.inputs import attitude_cautions as attitude
 from triaxcal.inputs import datasheet
 from triaxcal.inputs.turning import rotation
+from triaxcal.number_format import micro_g
 from triaxcal.poses.pose_in_words import moment, the_poses
 from triaxcal.uncertainty import extrapolation
 

@@ -18,8 +18,8 @@ from triaxcal.effects.contract import (
     rate_of,
 )
 from triaxcal.estimate.calibration import HoldsAt
-from triaxcal.figures import plain
 from triaxcal.model.moment import Moment
+from triaxcal.number_format import plain
 
 
 def holds(effects: Iterable[Effect], reference: Mapping[str, float], *, several: bool = False) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from triaxcal.arrays import Floats
 from triaxcal.distributions import DOF_MOST, t_ppf
 from triaxcal.effects import TEMPERATURE
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.poses.pure_error import LACK_OF_FIT
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 from triaxcal.uncertainty.budget_statements import (
     NotEvaluated,
     PosesWithoutScatter,

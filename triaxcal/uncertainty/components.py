@@ -10,8 +10,8 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.estimate.calibration import Calibration
+from triaxcal.poses.degrees_of_freedom import within_pose_dof
 from triaxcal.poses.pose import Pose
-from triaxcal.poses.pure_error import pure_error_dof
 from triaxcal.uncertainty.budget_statements import (
     AveragedModels,
     Basis,
@@ -91,7 +91,7 @@ def statistical(calibration: Calibration, linearised: ErrorPropagation, share: f
             linearised,
             "noise",
             "A",
-            pure_error_dof(poses),
+            within_pose_dof(poses),
             (S * noise) @ S.T,
             WithinPoseScatter(len(poses), _median_duration_s(poses)),
             half_the_noise(poses),

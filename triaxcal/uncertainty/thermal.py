@@ -12,7 +12,7 @@ from triaxcal.arrays import Floats
 from triaxcal.effects import CATALOGUE, TEMPERATURE, Effect
 from triaxcal.estimate.calibration import Calibration
 from triaxcal.estimate.likelihood import linearise_all
-from triaxcal.poses.pure_error import LACK_OF_FIT
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 from triaxcal.uncertainty.budget_statements import (
     PosesAtOtherTemperatures,
     ProbableTemperature,

@@ -13,7 +13,7 @@ from triaxcal.errors import Refused
 from triaxcal.estimate.pose_fit import fit
 from triaxcal.interchange.calibration_document import Document, calibration_document
 from triaxcal.model.moment import Moment
-from triaxcal.pooling import pooled_analysis
+from triaxcal.pooled_units import pooled_analysis
 from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import writable

@@ -14,13 +14,13 @@ import numpy as np
 
 from triaxcal.errors import InvalidData, Refused
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.figures import probability
 from triaxcal.frames.faces import LABELS, Labelling, Miscounted, labelled, opposite, recognise
 from triaxcal.frames.frames import Datum, Frames, frames
 from triaxcal.frames.orientations import Assumed
 from triaxcal.frames.standing import Standing, stand
 from triaxcal.interchange.calibration_reading import sensor_of
 from triaxcal.model.directions import directions
+from triaxcal.number_format import probability
 from triaxcal.poses.stillness.detector import find_spans
 from triaxcal.poses.stillness.turns import TURN_S
 from triaxcal.units import reference_unit_of

@@ -12,12 +12,12 @@ import numpy as np
 
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.figures import probability
 from triaxcal.inputs.attitude import AttitudeFit, fit_attitudes
 from triaxcal.inputs.datasheet import Refinement, refine
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.inputs.turning.rotation import RotationFit, fit_rotation
 from triaxcal.interchange.calibration_document import Document
+from triaxcal.number_format import probability
 from triaxcald import methods
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import micro, table

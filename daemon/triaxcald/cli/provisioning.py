@@ -11,9 +11,9 @@ from triaxcal.arrays import Floats
 from triaxcal.effects.contract import is_derived
 from triaxcal.errors import Refused
 from triaxcal.estimate.calibration import Calibration
-from triaxcal.estimate.reduced_calibration import Reduced
-from triaxcal.figures import micro_g
+from triaxcal.estimate.projected_calibration import Reduced
 from triaxcal.interchange.calibration_reading import calibration_of, expanded_uncertainty_in, logged_in
+from triaxcal.number_format import micro_g
 from triaxcal.rounding import REGISTER_DIGITS, number
 from triaxcal_drivers.profile import Profile
 from triaxcald import text

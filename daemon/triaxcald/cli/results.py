@@ -11,8 +11,8 @@ from triaxcal.diagnosis import Loop
 from triaxcal.effects import TEMPERATURE
 from triaxcal.estimate.calibration import Calibration, Residual
 from triaxcal.estimate.hold_out import HoldOut
-from triaxcal.figures import probability
 from triaxcal.interchange.calibration_document import assumed_in, holds_of
+from triaxcal.number_format import probability
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcal.units import ErrorUnit, grouped, in_units_of

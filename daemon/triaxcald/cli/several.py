@@ -12,10 +12,10 @@ from pathlib import Path
 from triaxcal.diagnosis import Loop
 from triaxcal.errors import Refused
 from triaxcal.estimate.recordings import residuals_by_run, together
-from triaxcal.figures import plain
-from triaxcal.pooling import Answer, PooledAnalysis
+from triaxcal.number_format import plain
+from triaxcal.pooled_units import Answer, PooledAnalysis
 from triaxcal.text import diagnosis
-from triaxcal.text.pooling import verdict
+from triaxcal.text.pooled_units import verdict
 from triaxcald.cli.console import table
 from triaxcald.cli.results import WORTH_A_LINE
 from triaxcald.cli.showing import Choice, chosen, read_recording, warn

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from triaxcal.poses.pure_error import LACK_OF_FIT
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 from triaxcal.units import ErrorUnit
 from triaxcald.doubts import doubts_of
 from triaxcald.remarks import none_could_show

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal.figures import plain
+from triaxcal.number_format import plain
 from triaxcald.tables.arrow import Column
 from triaxcald.tables.naming import ISO, Name, Unclear
 from triaxcald.tables.naming import NANOSECONDS as UNITS

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from triaxcal.figures import plain
+from triaxcal.number_format import plain
 from triaxcal_drivers.nearest import clipped
 from triaxcald.tables import clock
 from triaxcald.tables.arrow import Column

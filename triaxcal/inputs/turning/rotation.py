@@ -42,7 +42,7 @@ from triaxcal.inputs.turning.adjusted import (
 from triaxcal.inputs.turning.moments import MONOMIALS, Moments, Summary, Temperature
 from triaxcal.model.directions import linear_design, most_wanted
 from triaxcal.model.sensor import Sensor
-from triaxcal.poses.pure_error import LACK_OF_FIT
+from triaxcal.poses.degrees_of_freedom import LACK_OF_FIT
 
 SAMPLES_LEAST = 100
 """Nine parameters and three noises by fewer samples would be chance. Errs on

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from triaxcal.pooling import Answer, PooledAnalysis
-from triaxcal.text.pooling import verdict
+from triaxcal.pooled_units import Answer, PooledAnalysis
+from triaxcal.text.pooled_units import verdict
 
 
 def found(answer: Answer, *agreed: tuple[str, ...], probability: float = 0.0) -> PooledAnalysis:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcal.figures import micro_g, plain, probability
+from triaxcal.number_format import micro_g, plain, probability
 
 
 @pytest.mark.parametrize(

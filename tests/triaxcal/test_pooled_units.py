@@ -15,7 +15,7 @@ from triaxcal.effects.bias_step import BiasStep
 from triaxcal.effects.warm_up import WarmUp
 from triaxcal.errors import InvalidData
 from triaxcal.model.directions import directions
-from triaxcal.pooling import Answer, PooledAnalysis, PooledEffect, pooled_analysis
+from triaxcal.pooled_units import Answer, PooledAnalysis, PooledEffect, pooled_analysis
 from triaxcal.poses.pose import Pose
 
 pytestmark = pytest.mark.slow

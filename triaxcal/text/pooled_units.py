@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from triaxcal.pooling import Answer, PooledAnalysis
+from triaxcal.pooled_units import Answer, PooledAnalysis
 from triaxcal.text.advice import chance
 
 

@@ -1,8 +1,8 @@
 """What the noise inside the poses counts beside the residuals: degrees of
 freedom, and which of the two to believe.
 
-The scatter inside a pose gives its standard error without any model (pure
-error). Residuals beyond it come from what is not the same in every pose: an
+The scatter inside a pose gives its standard error without any model of the
+sensor. Residuals beyond it come from what is not the same in every pose: an
 effect the model lacks, a stand that does not come back, a drift.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from triaxcal.arrays import Floats
 from triaxcal.distributions import DOF_MOST, f_sf
-from triaxcal.poses.noise_mixture import NoiseLevels
+from triaxcal.poses.mean_variance_mixture import NoiseLevels
 from triaxcal.poses.pose import Pose
 
 LACK_OF_FIT = 0.01
@@ -38,7 +38,7 @@ def pose_dof(poses: Sequence[Pose]) -> Floats:
     return np.array([min(p.dof, DOF_MOST) for p in poses])
 
 
-def pure_error_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
+def within_pose_dof(poses: Sequence[Pose], part: Floats | None = None) -> float:
     """Effective degrees of freedom of a variance of which pose i makes up
     ``part`` (n,), equal parts where None.
 
@@ -66,7 +66,7 @@ def combined_dof(share: Floats, left: int, dof: Floats | float) -> Floats:
 def noise_levels(poses: Sequence[Pose]) -> NoiseLevels:
     """How large the noise of all poses together may be: by the degrees of
     freedom alone where they are of several recordings."""
-    first, dof = poses[0], max(pure_error_dof(poses), 1.0)
+    first, dof = poses[0], max(within_pose_dof(poses), 1.0)
     common = first.noise_levels
     if common is None or any(p.noise_levels is not common for p in poses):
         return NoiseLevels.known_by(dof)

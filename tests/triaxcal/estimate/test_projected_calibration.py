@@ -11,7 +11,7 @@ import pytest
 from triaxcal.effects import TIME, effect_named
 from triaxcal.estimate.calibration import Calibration, HoldsAt
 from triaxcal.estimate.pose_fit import fit
-from triaxcal.estimate.reduced_calibration import reduced
+from triaxcal.estimate.projected_calibration import reduced
 from triaxcal.model.directions import directions
 from triaxcal.model.moment import Moment
 from triaxcal.model.sensor import Sensor
