@@ -111,11 +111,23 @@ def applied(
                 lengths.append(float(np.median(np.linalg.norm(values[:, :3], axis=1))))
             cells = {n: v[at : at + len(block)] for n, v in beside.items()}
             at += len(block)
-            held = {f"{n} (input)" if n in columns else n: v for n, v in {**Rows.of(block).columns, **cells}.items()}
+            held = _renamed({**Rows.of(block).columns, **cells}, columns)
             yield Rows(block.time_ns, held | dict(zip(columns, values.T, strict=True)))
         found.cautions += _of_another_unit(calibration, name, lengths)
 
     found.blocks = calibrated()
+    return found
+
+
+def _renamed(held: Mapping[str, Any], taken: tuple[str, ...]) -> dict[str, Any]:
+    """Columns of the input, those that are called as one of ours under a name
+    that is free: the input may be what an earlier `apply` wrote."""
+    found: dict[str, Any] = {}
+    for name, values in held.items():
+        free = name
+        while free in taken or free in found or (free != name and free in held):
+            free += " (input)"
+        found[free] = values
     return found
 
 

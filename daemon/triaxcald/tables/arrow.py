@@ -55,6 +55,11 @@ class Column:
     def usable(self) -> NDArray[np.bool_]:
         return ~(self.gaps | self.strange)
 
+    @property
+    def share(self) -> float:
+        """Of its cells those that hold a number."""
+        return float(self.usable.mean()) if len(self.numbers) and self.moments_ns is None else 0.0
+
     def equals(self, value: str) -> NDArray[np.bool_]:
         """(n,) whether a cell has this text, or in a file of typed columns this
         number."""

@@ -4,28 +4,36 @@ what it means."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
+import numpy as np
+
 from triaxcal_drivers.nearest import clipped
+from triaxcald.errors import InputError
 from triaxcald.tables import arrow
 from triaxcald.tables.arrow import Column
 from triaxcald.tables.layout import Layout, decoded, is_sample, layout_of
 from triaxcald.tables.naming import Unclear
-from triaxcald.tables.own_text import FIELDS_MOST
+from triaxcald.tables.own_text import FIELDS_MOST, REQUIRED, TIME_LIMIT_S, header_of, is_applied
 
 HEAD = 2**20
 """Characters in which the layout is looked for."""
+HALF = 0.5
+"""Of its cells a further column of our own layout has at least so many numbers:
+it is one of numbers that lacks some, which is a fault, else one of text."""
 _LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*)?(?:\n|\Z)"
+_NO_NUMBERS = re.compile(r"[^\d.,eE+\-\s]|,[ \t\r]*(?:[,\n]|\Z)")
+"""Of a text of our own layout, below its header."""
 
 
 @dataclass(frozen=True)
 class Grid:
     """Columns of n rows with their names. ``line_of`` says where a row stands,
     as in "line 17". ``head`` are the lines above, and ``ragged`` those that have
-    another number of fields: where, and how many."""
+    another number of fields: where, and how many. ``ours``: cells are parted
+    and numbers written as in our own layout."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -34,9 +42,20 @@ class Grid:
     line_of: Callable[[int], str]
     head: tuple[str, ...] = ()
     ragged: tuple[tuple[str, int], ...] = ()
+    ours: bool = True
 
     def called(self, column: int) -> str:
         return f"column {clipped(self.names[column])}" if self.named else f"column {column + 1}"
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it is of our own layout, as Parquet or as text: its columns
+        come first, each name once, and the times may be seconds."""
+        if not (self.ours and self.named and self.names[: len(REQUIRED)] == REQUIRED):
+            return False
+        time = self.columns[0]
+        in_seconds = time.moments_ns is None and np.abs(time.numbers[time.usable]).max(initial=0.0) < TIME_LIMIT_S
+        return bool(in_seconds) and all(self.names.count(name) == 1 for name in REQUIRED)
 
 
 def grid_of_parquet(path: Path) -> Grid:
@@ -45,10 +64,37 @@ def grid_of_parquet(path: Path) -> Grid:
     return Grid(tuple(names), ("",) * len(names), True, tuple(columns), lambda row: f"row {row + 1}")
 
 
-def grid_of_text(first: bytes, rest: Iterator[bytes]) -> Grid:
-    """Of the bytes of a file, the ``first`` block and the ``rest``. Raises
+def holds_text(lines: bytes) -> bool:
+    """Whether the first ``lines`` of a text of our own layout have further
+    columns that hold something else than numbers.
+
+    In what `triaxcal apply` wrote these may be any that were no channels of its
+    input. Anywhere else it is a column of which not even half the cells are
+    numbers: a cell without one among many that have one is a fault.
+    """
+    try:
+        text, names, at = header_of(lines, "")
+        body = re.sub(_LEFT, "", text[_offset(text, at) :], flags=re.MULTILINE)
+        if not _NO_NUMBERS.search(body):
+            return False
+        columns, _ = arrow.read_text(body, ",", ".", len(names))
+    except (InputError, ValueError):
+        return False  # it has a fault, which is told where all of it is read
+    least = 1.0 if is_applied(names) else HALF
+    return any(len(c.numbers) and c.share < least for c in columns[len(REQUIRED) :])
+
+
+def grid_of_own(whole: bytes, label: str) -> Grid:
+    """Of text of our own layout. Raises Unclear, InputError."""
+    text, names, first = header_of(whole, label)
+    return _grid(text, Layout(",", ".", names, None, first, len(names), ()))
+
+
+def grid_of_text(
+    whole: bytes, used: Callable[[tuple[str, ...] | None, int], Collection[int] | None] = lambda *_: None
+) -> Grid:
+    """Of the bytes of a file; ``used`` as `layout_of` takes it. Raises
     Unclear."""
-    whole = b"".join(chain((first,), rest))
     if whole.startswith((b"\x1f\x8b", b"\x89MCAP", b"PAR1", b"PK\x03\x04")):
         raise Unclear(f"binary data ({_kind_of_file(whole)}), expected a text table")
     try:
@@ -57,7 +103,10 @@ def grid_of_text(first: bytes, rest: Iterator[bytes]) -> Grid:
         raise Unclear("binary data, expected a text table") from None
     if not text.strip():
         raise Unclear("empty file, expected a text table")
-    layout = _layout(text)
+    return _grid(text, _layout(text, used))
+
+
+def _grid(text: str, layout: Layout) -> Grid:
     at = _offset(text, layout.first)
     left = re.compile(_LEFT.replace("//", "//" if layout.separator == ";" else "//|;"), re.MULTILINE)
     body = left.sub("", text[at:])
@@ -71,16 +120,16 @@ def grid_of_text(first: bytes, rest: Iterator[bytes]) -> Grid:
     every = _lines(text, layout.first, left, set())
     return Grid(
         names, units, layout.header is not None, tuple(columns), line_of, layout.remarks,
-        tuple((every(r.row), r.fields) for r in ragged),
+        tuple((every(r.row), r.fields) for r in ragged), (layout.separator, layout.decimal) == (",", "."),
     )  # fmt: skip
 
 
-def _layout(text: str) -> Layout:
+def _layout(text: str, used: Callable[[tuple[str, ...] | None, int], Collection[int] | None]) -> Layout:
     """Raises Unclear where there is none, or more than one."""
     head = text[:HEAD].split("\n")
     if len(text) > HEAD and len(head) > 1:
         head.pop()
-    layout = layout_of(head)
+    layout = layout_of(head, used)
     if layout is None:
         raise Unclear("no line with three numbers, expected a table of samples")
     if layout.unlike is not None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import codecs
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 LINES_LOOKED_AT = 500
@@ -100,8 +100,13 @@ def is_remark(line: str, separator: str) -> bool:
     return line.startswith(_REMARK) or (separator != ";" and line.startswith(";"))
 
 
-def layout_of(lines: Sequence[str]) -> Layout | None:
-    """Of the first lines of a table; None where no line has three numbers."""
+def layout_of(
+    lines: Sequence[str], used: Callable[[tuple[str, ...] | None, int], Collection[int] | None] = lambda *_: None
+) -> Layout | None:
+    """Of the first lines of a table; None where no line has three numbers.
+    ``used`` says by the header and the number of fields which columns will be
+    read, None where that is not known: where the columns of a table have not
+    one decimal mark, it is theirs."""
     lines = lines[:LINES_LOOKED_AT]
     stated = next((m for line in lines[:3] if (m := _SEPARATOR_LINE.fullmatch(line.strip()))), None)
     found = [run for s in ((stated[1],) if stated else SEPARATORS) if (run := _run(lines, s))]
@@ -112,11 +117,19 @@ def layout_of(lines: Sequence[str]) -> Layout | None:
         found = printed
     best = max(found, key=lambda run: (run.lines, run.numeric))
     rows = [split(line, best.separator) for line in lines[best.first :] if is_sample(line, best.separator)]
-    numbers = [f for row in rows for f in row if NUMBER.fullmatch(f) or THOUSANDS.fullmatch(f)]
+    found_layout = _above(lines, best, ".", _labelled(rows))
+    numbers = [f for row in rows for f in row if _may_be_number(f)]
+    fault = _marks(numbers)
+    if fault and (columns := used(found_layout.header, best.fields)) is not None:
+        numbers = [row[i] for row in rows for i in columns if i < len(row) and _may_be_number(row[i])]
+        fault = _marks(numbers)
     decimal = "," if any("," in f for f in numbers) else "."
-    found_layout = _above(lines, best, decimal, _labelled(rows))
-    fault = _marks(numbers) or _above_the_header(lines, best, found_layout)
-    return replace(found_layout, fault=fault)
+    fault = fault or _above_the_header(lines, best, found_layout)
+    return replace(found_layout, decimal=decimal, fault=fault)
+
+
+def _may_be_number(field: str) -> bool:
+    return bool(NUMBER.fullmatch(field) or THOUSANDS.fullmatch(field))
 
 
 def _marks(numbers: Sequence[str]) -> str:

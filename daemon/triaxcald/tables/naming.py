@@ -176,7 +176,7 @@ def parse_columns(text: str) -> dict[str, str]:
 def roles_of(names: Sequence[str], units: Sequence[str], said: Mapping[str, str], *, named: bool) -> Roles:
     """``named`` is False where the table has no header and ``names`` are
     numbers. Raises Unclear."""
-    given = {role: _column(names, column, named=named) for role, column in said.items()}
+    given = {role: column_of(names, column, named=named) for role, column in said.items()}
     by_column: dict[int, str] = {}
     for role, column in given.items():
         if column in by_column:
@@ -219,7 +219,8 @@ def seconds_and_rest(names: Sequence[str]) -> Iterator[tuple[int, int]]:
             yield i, rests[m[1]]
 
 
-def _column(names: Sequence[str], wanted: str, *, named: bool) -> int:
+def column_of(names: Sequence[str], wanted: str, *, named: bool) -> int:
+    """The column, 0-based, that ``wanted`` names. Raises Unclear."""
     bare = [bare_name(n) for n in names]
     for held, sought in ((list(names), wanted), (bare, bare_name(wanted)), (_folded(bare), bare_name(wanted).lower())):
         found = [i for i, n in enumerate(held) if n == sought] if named else []

@@ -3,9 +3,10 @@ about the first fault where it is not."""
 
 from __future__ import annotations
 
+import csv
 import io
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, NoReturn
@@ -13,6 +14,7 @@ from typing import BinaryIO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from triaxcal.documents import OUT, UNCERTAINTY
 from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables.source import blocks, label_of
@@ -20,7 +22,7 @@ from triaxcald.tables.source import blocks, label_of
 REQUIRED = ("t_s", "ux", "uy", "uz")
 _LINE_LIMIT = 2**20  # bytes; no line of numbers is that long
 _VALUE_LIMIT = 1e100  # squares of values, and sums of them, have to be numbers too
-_TIME_LIMIT_S = 9.2e9  # beyond, nanoseconds do not fit 64 bits
+TIME_LIMIT_S = 9.2e9  # beyond, nanoseconds do not fit 64 bits
 FIELDS_MOST = 1000  # a table of numbers has some ten
 _NUMBER_MOST = 400  # characters of a number; those of the longest are its zeros, 308 of them
 _SKIP = "--skip-bad leaves such lines out"
@@ -67,6 +69,29 @@ def is_own(head: bytes) -> bool:
     return [field.strip() for field in first.split(b",")][: len(REQUIRED)] == [n.encode() for n in REQUIRED]
 
 
+def _fields_of(line: str) -> list[str]:
+    """Of a header, as RFC 4180 has quotes."""
+    try:
+        return next(csv.reader([line], skipinitialspace=True)) if '"' in line else line.split(",")
+    except csv.Error:  # a name of more than 128 KiB
+        return line.split(",")
+
+
+def is_applied(names: Sequence[str]) -> bool:
+    """Whether a table of our own layout with these columns is what
+    `triaxcal apply` writes."""
+    return any(tuple(names[-len(behind) :]) == behind for behind in (OUT, OUT + UNCERTAINTY))
+
+
+def header_of(data: bytes, label: str) -> tuple[str, tuple[str, ...], int]:
+    """The text of a whole file, its names, and in which line, 0-based, its
+    samples begin. Raises InputError."""
+    parse = _Parse(label)
+    text = parse.decoded(data.removeprefix(b"\xef\xbb\xbf")).replace("\r\n", "\n")
+    names, first = parse.header(text)
+    return text, names, first
+
+
 class _Parse:
     """One reading of one file: where it is, and what it has found."""
 
@@ -111,11 +136,16 @@ class _Parse:
             if len(rest) > _LINE_LIMIT:
                 self._fail(self._line + block.count(b"\n") + 1, "no end of line, expected CSV text")
             if end:
-                yield self._decode(block[:end])
+                yield self.decoded(block[:end])
         if rest:
-            yield self._decode(rest)
+            yield self.decoded(rest)
 
-    def _decode(self, data: bytes) -> str:
+    def header(self, text: str) -> tuple[tuple[str, ...], int]:
+        """The names, and in which line, 0-based, the samples begin."""
+        self._header(text)
+        return tuple(self._fields), self._line
+
+    def decoded(self, data: bytes) -> str:
         nul = data.find(b"\0")
         if nul >= 0 or data.startswith((b"\x1f\x8b", b"\x89MCAP")):
             self._fail(self._line + data.count(b"\n", 0, max(nul, 0)) + 1, "binary data, expected CSV text")
@@ -146,7 +176,7 @@ class _Parse:
         line = text[at:end].strip()
         self._line += text.count("\n", 0, at) + (at < len(text))
         if line and not line.startswith("#"):
-            self._fields = self._check_header([field.strip() for field in line.split(",")])
+            self._fields = self._check_header([field.strip() for field in _fields_of(line)])
         return text[end:]
 
     def _check_header(self, fields: list[str]) -> list[str]:
@@ -177,7 +207,7 @@ class _Parse:
         except ValueError:
             return None
         usual = rows.shape[1] == len(self._fields) and (np.abs(rows) < _VALUE_LIMIT).all()
-        return rows if usual and (np.abs(rows[:, 0]) < _TIME_LIMIT_S).all() else None
+        return rows if usual and (np.abs(rows[:, 0]) < TIME_LIMIT_S).all() else None
 
     def _slow(self, text: str) -> tuple[NDArray[np.float64], list[int]]:
         """The rows and their line numbers, or the first fault."""
@@ -204,8 +234,8 @@ class _Parse:
             if not abs(value) < _VALUE_LIMIT:
                 self._fail(number, f"field {clipped(field)}: '{text[:40]}', expected a finite number; {_SKIP}")
             row.append(value)
-        if abs(row[0]) >= _TIME_LIMIT_S:
-            self._fail(number, f"field t_s: {texts[0].strip()[:40]}, expected seconds below {_TIME_LIMIT_S:g}")
+        if abs(row[0]) >= TIME_LIMIT_S:
+            self._fail(number, f"field t_s: {texts[0].strip()[:40]}, expected seconds below {TIME_LIMIT_S:g}")
         return row
 
     def _keep(self, rows: NDArray[np.float64], text: str, lines: list[int] | None) -> None:

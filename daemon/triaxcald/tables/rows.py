@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from triaxcal_drivers.nearest import clipped
 from triaxcald.tables.arrow import Column
 from triaxcald.tables.grid import Grid
+from triaxcald.tables.layout import NUMBER
 from triaxcald.tables.naming import OUTPUTS, Name, Unclear
 
 ROWS_LOOKED_AT = 10_000
 """For the words in a column: those that come in turn come early."""
 SENSORS = frozenset(("sensor", "sensors", "type", "id", "device", "source", "node", "side", "imu", "name"))
 """Words by which a column of numbers names the sensor that a row is of."""
+MOST = 0.5
+"""More cells than this share are no number: a column of texts."""
 VALUES_MOST, IN_TURN = 50, 0.2
 """Sensors are few, and their rows come in turn; a label of what was done
 changes rarely."""
@@ -52,13 +55,16 @@ def require_one_sensor(grid: Grid, chosen: NDArray[np.bool_]) -> None:
     """Rows of several sensors below each other, as some phones write them,
     would be read as one that jumps. Raises Unclear."""
     for i, column in enumerate(grid.columns):
-        values = _in_turn(column, chosen, by_number=bool(set(Name.of(grid.names[i]).words) & SENSORS) and grid.named)
+        by_number = bool(set(Name.of(grid.names[i]).words) & SENSORS) and grid.named
+        if column.strange[chosen].mean() > MOST and _of_quantities(column, by_number):
+            continue
+        values = _in_turn(column, chosen, by_number)
         if values:
             raise Unclear(
                 f"rows of several sensors in turn ({grid.called(i)}: {clipped(', '.join(values))}); choose those of "
                 f"one: --where {Name.of(grid.names[i]).text}={values[0]}"
             )
-        if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > 0.5:
+        if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > MOST:
             continue
         texts = {column.text(int(row)) for row in np.flatnonzero(chosen)[:ROWS_LOOKED_AT]}
         if 1 < len(texts) <= 50 and sum(bool(_SENSORS.search(t)) for t in texts) > 1:
@@ -69,12 +75,22 @@ def require_one_sensor(grid: Grid, chosen: NDArray[np.bool_]) -> None:
             )
 
 
+def _of_quantities(column: Column, by_number: bool) -> bool:
+    """Whether a column of texts holds numbers with the other decimal mark than
+    the table's. They name no sensor, unless the column's name says that its
+    numbers do, and they have no fraction."""
+    texts = [column.text(int(row)) for row in np.flatnonzero(column.strange)[:ROWS_LOOKED_AT]]
+    if not texts or not all(map(NUMBER.fullmatch, texts)):
+        return False
+    return not by_number or any(float(t.replace(",", ".")) % 1 for t in texts)
+
+
 def _in_turn(column: Column, chosen: NDArray[np.bool_], by_number: bool) -> list[str]:
     """The few values that a column of texts, or of numbers that name something,
     has in turn from row to row."""
     rows = np.flatnonzero(chosen)[:ROWS_LOOKED_AT]
-    numbered = by_number and column.whole is not None and column.usable[rows].mean() > 0.5
-    if column.moments_ns is not None or len(rows) < 4 or not (numbered or column.strange[rows].mean() > 0.5):
+    numbered = by_number and column.whole is not None and column.usable[rows].mean() > MOST
+    if column.moments_ns is not None or len(rows) < 4 or not (numbered or column.strange[rows].mean() > MOST):
         return []
     names = column.whole if numbered else None
     held = [column.text(int(r)) if names is None else str(names[r]) for r in rows]

@@ -44,6 +44,11 @@ def blocks(source: Path | str | BinaryIO, label: str) -> Iterator[bytes]:
             raise InputError(f"{label}: cannot be read: {e.strerror or e}") from e
 
 
+def whole_lines(first: bytes) -> bytes:
+    """Of the first block: it may end within a line, and within a letter."""
+    return first[: first.rfind(b"\n") + 1] or first if len(first) >= BLOCK else first
+
+
 def _of(stream: BinaryIO | gzip.GzipFile, label: str, packed: BinaryIO | None = None) -> Iterator[bytes]:
     unpacked = 0
     while block := _block(stream, label):
