@@ -26,6 +26,7 @@ it is one of numbers that lacks some, which is a fault, else one of text."""
 _LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*)?(?:\n|\Z)"
 _NO_NUMBERS = re.compile(r"[^\d.,eE+\-\s]|,[ \t\r]*(?:[,\n]|\Z)")
 """Of a text of our own layout, below its header."""
+_HTML = re.compile(r"\s*(?:<\?xml[^>]*>\s*)?<(?:!doctype\s+html|html|head|body|table)\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,8 @@ def grid_of_text(
         raise Unclear("binary data, expected a text table") from None
     if not text.strip():
         raise Unclear("empty file, expected a text table")
+    if _HTML.match(text):
+        raise Unclear("HTML, expected a text table")
     return _grid(text, _layout(text, used))
 
 

@@ -60,6 +60,8 @@ def test_a_table_with_two_readings_is_asked_about_and_read_as_the_option_says(tm
         (b"PK\x03\x04\x00\x00", "binary data (a ZIP archive or a spreadsheet; save it as CSV)"),
         (b"\x1f\x8b\x08\x00", "binary data (gzip; name it .gz)"),
         (b"PAR1\x00\x00", "binary data (Parquet; name it .parquet)"),
+        ("\n<!DOCTYPE html>\n<html><body>a, b, c\n0.1, 0.2, 0.3\n0.2, 0.3, 0.4\n</body></html>",
+         "HTML, expected a text table"),
         (b"\x00\x01\x02\x03" * 50, "binary data, expected a text table"),
         ("time,ax,ay,az\n0,01,0,98,0,03,-0,11\n0,02,0,97,0,03,-0,10\n", "line 1: 4 names, and 8 fields in the lines"),
         ("t,ax,ay,az,bx [µT],by [µT],bz [µT]\n0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n", None),
