@@ -29,12 +29,15 @@ class DeviceSilent(DriverError):
     """The device answered before and does not any more, or its stream has
     stopped.
 
-    ``source`` is that of the records of a stream which alone is silent, for
-    ``silent_s``; None where nothing comes.
+    ``stream`` is the one that has been silent for ``silent_s``, others may not
+    be, and ``source`` that of its records; None where nothing comes.
     """
 
-    def __init__(self, message: str, *, source: int | None = None, silent_s: float = 0.0) -> None:
+    def __init__(
+        self, message: str, *, stream: str | None = None, source: int | None = None, silent_s: float = 0.0
+    ) -> None:
         super().__init__(message)
+        self.stream = stream
         self.source = source
         self.silent_s = silent_s
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from triaxcal_drivers.claim import Claim
 from triaxcald.errors import RecordingError
-from triaxcald.exit_codes import DONE, exit_code_of
+from triaxcald.exit_codes import DEVICE, DONE, exit_code_of
 from triaxcald.recording.ending import Kind, ended_because
 from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import LOOK_S, RecordingWriter
@@ -149,7 +149,10 @@ class AtRecording(ABC):
             error = f"{self.kind} {self.name}: {reason_of(e)}"
             return replace(self._result(), exit_code=exit_code_of(e), error=error, trace=trace_of(e))
         else:
-            return self._result()
+            if self._trouble is None:
+                return self._result()
+            # One stream brought all that was asked for, another is not back.
+            return replace(self._result(), exit_code=DEVICE, error=f"{self.kind} {self.name}: {self._trouble}")
         finally:
             self._state = State.ENDED
 

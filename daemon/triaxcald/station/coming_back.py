@@ -4,6 +4,7 @@ gap in their stream told."""
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import AsyncExitStack, ExitStack, aclosing, asynccontextmanager, contextmanager
 from dataclasses import dataclass
@@ -150,6 +151,18 @@ class _Waiting:
             except mended as e:
                 trouble = e
 
+    async def beside(self, silent: DeviceSilent) -> float:
+        """So long the other streams go on without the ``silent`` one before
+        that is asked again. Raises it once patience ends."""
+        self.say(silent)
+        self.waited_s += silent.silent_s
+        if await self.patience.rest(0.0, self.waited_s) is None:
+            raise silent
+        pause_s = self.pause_s
+        self.waited_s += pause_s
+        self.pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+        return pause_s
+
     async def _rest(self) -> bool:
         """Until the next attempt; whether there is to be one."""
         rested_s = await self.patience.rest(self.pause_s, self.waited_s)
@@ -222,19 +235,21 @@ class Returning:
     async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
         """As the device's own. An interruption begins with a batch without
         records whose gap is not over; the first record after it that is no
-        error ends the gap, of the silent stream where the device told which.
-        Until then the unit is waited for, however often it
-        opens meanwhile. A hole is a gap too. Raises what the device's stream
-        does once patience ends."""
+        error ends the gap. Until then the unit is waited for, however often it
+        opens meanwhile. Where one stream is silent, the others go on, and the
+        first record of that one ends the gap. A hole is a gap too. Raises what
+        the device's stream does once patience ends."""
+        clock = asyncio.get_running_loop()
         last_ns: int | None = None
         returned_ns = self._now_ns()
         gap: Gap | None = None
         awaited: int | None = None
         waiting = self._waiting()
+        asked, until_s = list(names), math.inf
         with ExitStack() as at_rest:
             while True:
                 try:
-                    async with aclosing(cast(Any, self._device.stream(names))) as stream:
+                    async with aclosing(cast(Any, self._device.stream(asked))) as stream:
                         async for batch in stream:
                             good = _good(batch)
                             back = good if awaited is None else good[batch.source[good] == awaited]
@@ -248,13 +263,21 @@ class Returning:
                                 yield part
                             if len(good):
                                 last_ns = int(batch.time_ns[good[-1]])
-                            if self._complaint is not None:
+                            if awaited is not None:
+                                self._complaint = None  # the cause is known better
+                            elif self._complaint is not None:
                                 raise self._complaint
-                    return
+                            if clock.time() >= until_s:
+                                break
+                        else:
+                            return
+                    asked, until_s = list(names), math.inf
+                    continue
                 except LOST as e:
                     trouble: Exception = e
-                if isinstance(trouble, DeviceSilent) and trouble.source is not None:
-                    awaited = trouble.source
+                silent = trouble if isinstance(trouble, DeviceSilent) and trouble.stream in asked else None
+                awaited = awaited if silent is None else silent.source
+                asked = [name for name in asked if silent is not None and name != silent.stream]
                 if gap is None:
                     gap = Gap(self._since_ns(trouble, last_ns), None, str(trouble))
                     if self._complaint is None or self._now_ns() - returned_ns > AGAIN_S * 1e9:
@@ -263,6 +286,10 @@ class Returning:
                     at_rest.enter_context(self._patience.waiting())
                     waiting.say(trouble)
                     yield RawBatch.of([]).after(gap)
+                if silent is not None and asked:
+                    until_s = clock.time() + await waiting.beside(silent)
+                    continue
+                asked, until_s = list(names), math.inf
                 await waiting.until(self._again, LOST, trouble)
                 self._complaint, returned_ns = None, self._now_ns()  # what was said meanwhile was of the one before
 

@@ -153,7 +153,7 @@ class ModbusDevice:
         silent_s = self._connected().own_s - p.heard_s
         if silent_s >= self._profile.sampling.silence_timeout_s:
             said = f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
-            raise DeviceSilent(said, source=p.source, silent_s=silent_s)
+            raise DeviceSilent(said, stream=p.name, source=p.source, silent_s=silent_s)
 
     def _pause_s(self, p: _Polled) -> float:
         """Before a unit that does not answer is asked again: twice as long each

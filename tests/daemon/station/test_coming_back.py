@@ -17,7 +17,7 @@ from triaxcald.provision.identity import WrongUnit
 from triaxcald.station.coming_back import LONGEST_PAUSE_S, UNHEARD, AtWork, Patience, Returning, until_open
 
 BEGUN_NS = 1_700_000_000_000_000_000
-Step = list[tuple[int, int]] | RawBatch | Exception
+Step = list[tuple[int, int]] | RawBatch | Exception | float
 
 
 def records(*times: int, flags: int = 0) -> list[tuple[int, int]]:
@@ -31,13 +31,15 @@ def of_source(source: int, *times: int, flags: int = 0) -> RawBatch:
 @dataclass
 class Played:
     """A device whose streams and openings go as they are written: batches,
-    those of one source by (time, flags), or what is raised."""
+    those of one source by (time, flags), seconds that pass, or what is
+    raised."""
 
     streams: list[list[Step]]
     openings: list[Exception | None] = field(default_factory=list)
     identities: list[Exception | None] = field(default_factory=list)
     opened_s: list[float] = field(default_factory=list)
     told: list[str | None] = field(default_factory=list)
+    asked: list[list[str]] = field(default_factory=list)
 
     async def open(self) -> None:
         self.opened_s.append(virtual().time() - 1000.0)
@@ -51,16 +53,21 @@ class Played:
             raise trouble
 
     async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
-        assert list(names) == ["readings"]
+        self.asked.append(list(names))
         for step in self.streams.pop(0):
             if isinstance(step, Exception):
                 raise step
+            if isinstance(step, float):
+                await asyncio.sleep(step)
+                continue
             yield step if isinstance(step, RawBatch) else of_source(0x185, *(t for t, _ in step), flags=step[0][1])
 
-    async def all(self, patience: Patience, **more: float) -> list[RawBatch]:
+    async def all(self, patience: Patience, names: Sequence[str] = ("readings",), **more: float) -> list[RawBatch]:
         returning = Returning(cast(Any, self), self.identify, patience, self.told.append, lambda: BEGUN_NS - 1, **more)
-        async with aclosing(returning.stream(["readings"])) as stream:
-            return [batch async for batch in stream]
+        async with aclosing(returning.stream(names)) as stream:
+            found = [batch async for batch in stream]
+        assert all({*asked} <= {*names} for asked in self.asked)
+        return found
 
 
 def shown(batches: Sequence[RawBatch]) -> list[tuple[list[int], list[int], Gap | None]]:
@@ -105,22 +112,46 @@ def test_a_gap_ends_with_the_first_record_that_is_no_error_however_often_the_uni
     assert device.told == ["the link is down", "no such interface", "still nothing", None]
 
 
-def test_a_stream_that_is_silent_beside_another_is_back_with_a_record_of_its_own() -> None:
-    """And is given up where none comes, however many the other stream brings."""
-    missing = DeviceSilent("readings: illegal data address", source=7, silent_s=5e-9)
-    device = Played([[of_source(9, 1), missing], [of_source(9, 12), of_source(7, 13)]])
-    assert shown(run(device.all(Patience()))) == [
+BOTH = ("readings", "corrected")
+
+
+def test_where_one_stream_is_silent_the_others_go_on_until_it_is_back() -> None:
+    silent = DeviceSilent("readings: illegal data address", stream="readings", source=7, silent_s=5e-9)
+    device = Played(
+        [
+            [of_source(9, 1), silent],
+            [of_source(9, 12), 0.5, of_source(9, 13), of_source(9, 14)],
+            [of_source(9, 15), of_source(7, 16)],
+        ]
+    )
+    assert shown(run(device.all(Patience(), BOTH))) == [
         ([1], [0], None),
-        ([], [], gap(-6, None, str(missing))),
+        ([], [], gap(-6, None, str(silent))),
         ([12], [0], None),
-        ([13], [RawFlag.LOST_BEFORE], gap(-6, 13, str(missing))),
+        ([13], [0], None),
+        ([15], [0], None),
+        ([16], [RawFlag.LOST_BEFORE], gap(-6, 16, str(silent))),
     ]
-    assert device.told == [str(missing), None]
-    device = Played([[of_source(9, 10 * i), missing] for i in range(9)])
+    assert device.asked == [[*BOTH], ["corrected"], [*BOTH]]
+    assert (device.told, device.opened_s) == ([str(silent), None], [])
+
+
+def test_a_stream_that_stays_silent_is_asked_ever_more_rarely_and_given_up() -> None:
+    silent = DeviceSilent("readings: illegal data address", stream="readings", source=7, silent_s=2.0)
+    alone = [of_source(9, 2), 0.5, of_source(9, 3), 1.0, of_source(9, 4)]
+    device = Played([[of_source(9, 1), silent], alone, [2.0, silent], [*alone], [2.0, silent]])
     with pytest.raises(DeviceSilent, match="illegal data address"):
-        run(device.all(Patience(most_s=5.0)))
-    assert device.told == [str(missing)]
-    assert device.opened_s == [0.0, 0.5, 1.5, 3.5, 5.0]
+        run(device.all(Patience(most_s=6.0), BOTH))
+    assert device.asked == [[*BOTH], ["corrected"], [*BOTH], ["corrected"], [*BOTH]]
+    assert device.told == [str(silent)]
+
+
+def test_a_unit_of_which_the_other_streams_fall_silent_too_is_opened_anew() -> None:
+    silent = [DeviceSilent(name, stream=name, source=source) for name, source in zip(BOTH, (7, 9), strict=True)]
+    device = Played([[of_source(9, 1), silent[0]], [silent[1]], [of_source(9, 5)]])
+    assert len(run(device.all(Patience(), BOTH))) == 3
+    assert device.asked == [[*BOTH], ["corrected"], [*BOTH]]
+    assert device.opened_s == [0.0]
 
 
 def test_a_unit_that_was_never_heard_is_lost_from_the_moment_it_was_missed() -> None:
