@@ -128,7 +128,7 @@ def require_same_outputs(calibration: Calibration, name: str, unit: str) -> None
     if unit and calibration.output_unit and not same_unit(unit, calibration.output_unit):
         raise InputError(
             f"{name}: outputs in {unit}, and the calibration is of outputs in {calibration.output_unit}; "
-            "--output-unit says otherwise"
+            "nothing is converted; --output-unit is for a table that states a wrong unit"
         )
 
 

@@ -56,6 +56,8 @@ def record_command(a: argparse.Namespace) -> int:
     a.folder = a.output.is_dir()
     if not a.folder:
         writable(a.output)
+        if a.output.exists():  # before any device is asked
+            raise InputError(f"{a.output}: exists already; a recording is never overwritten")
     chosen, hangup = _load(a), asyncio.Event()
     with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
         # A single file is one recording, which cannot begin anew.
