@@ -62,7 +62,7 @@ class Posterior:
         likeliest first."""
         out: dict[str, float] = defaultdict(float)
         for w, found in zip(self.set_probabilities, self.sets, strict=True):
-            for name in self.names_of(found):
+            for name in sorted(self.names_of(found)):  # in one order in every process
                 out[name] += float(w)
         return dict(sorted(out.items(), key=lambda item: -item[1]))
 

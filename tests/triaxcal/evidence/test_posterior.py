@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -195,3 +197,13 @@ def test_a_repeat_that_contradicts_is_time_or_memory_and_no_outlier(
     )
     assert max(posterior.outlier_probabilities[3], posterior.outlier_probabilities[-1]) < 0.5
     assert all(posterior.least_leave_one_out(name) >= 0.99 for (name, *others) in posterior.certain if not others)
+
+
+def test_names_that_are_equally_probable_come_in_one_order_in_every_process() -> None:
+    """Sets of names have another order in each; documents are compared byte for byte."""
+    names = ["warm_up", "hysteresis", "cross_coupling", "bias_step", "remanence", "compression", "bias_drift"]
+    terms = [SimpleNamespace(name=name, effect=object()) for name in names]
+    one = SimpleNamespace(members=tuple(range(len(names))), total=0.0)
+    posterior = Posterior(cast(Any, SimpleNamespace(terms=terms)), [cast(Any, one)])
+    assert dict(posterior.effect_probabilities) == dict.fromkeys(names, 1.0)
+    assert list(posterior.effect_probabilities) == sorted(names)
