@@ -29,8 +29,8 @@ class DeviceSilent(DriverError):
     """The device answered before and does not any more, or its stream has
     stopped.
 
-    ``stream`` is the one that has been silent for ``silent_s``, others may not
-    be, and ``source`` that of its records; None where nothing comes.
+    ``stream`` is the one that has been silent for ``silent_s`` while another
+    goes on, and ``source`` that of its records; None where nothing comes.
     """
 
     def __init__(

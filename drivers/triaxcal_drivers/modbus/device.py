@@ -144,16 +144,21 @@ class ModbusDevice:
                 p.due_s = max(p.due_s + p.stream.poll_period_s, loop.time())
                 records = await self._drain(p)
                 yield RawBatch.of(records)
-                self._check_heard(p)
+                self._check_heard(p, polled)
                 if p.unanswered and not self._connected().alone:
                     p.due_s = max(p.due_s, loop.time() + self._pause_s(p))
 
-    def _check_heard(self, p: _Polled) -> None:
-        """Raises DeviceSilent."""
-        silent_s = self._connected().own_s - p.heard_s
-        if silent_s >= self._profile.sampling.silence_timeout_s:
-            said = f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
+    def _check_heard(self, p: _Polled, polled: Sequence[_Polled] = ()) -> None:
+        """Raises DeviceSilent, with the stream where another one of those
+        ``polled`` goes on."""
+        own_s, patience_s = self._connected().own_s, self._profile.sampling.silence_timeout_s
+        silent_s = own_s - p.heard_s
+        if silent_s < patience_s:
+            return
+        said = f"{self._connected().where}: stream {p.name} has been silent for {silent_s:.1f} s: {p.trouble}"
+        if any(own_s - q.heard_s < patience_s / 2 for q in polled):
             raise DeviceSilent(said, stream=p.name, source=p.source, silent_s=silent_s)
+        raise DeviceSilent(said)
 
     def _pause_s(self, p: _Polled) -> float:
         """Before a unit that does not answer is asked again: twice as long each

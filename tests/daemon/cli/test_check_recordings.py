@@ -101,9 +101,11 @@ def test_a_check_recording_that_cannot_be_of_this_unit_is_told_from_one_whose_un
     remark = f"{strange} does not look like this unit: |a| is off by 0.6 of the reference"
     (said,) = triaxcal("diagnose", main, "--check", strange, "--json").json["calibration"]["warnings"]
     assert said.startswith(remark)
-    done = triaxcal("diagnose", main, "--check", strange)
+    done = triaxcal("diagnose", main, "--sign=+,+,+", "--check", strange)
     assert (done.code, done.err) == (0, f"warning: {said}\n")
-    assert triaxcal("diagnose", main, "--check", aged).err == ""
+    assert triaxcal("diagnose", main, "--sign=+,+,+", "--check", aged).err == ""
+    (default,) = triaxcal("diagnose", main, "--check", aged).err.splitlines()
+    assert default.startswith("warning: no --sign was given, so +,+,+ is taken")
 
 
 @pytest.mark.slow

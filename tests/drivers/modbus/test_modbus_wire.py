@@ -6,7 +6,7 @@ function 4 at 8, functions 6 and 16 at 1).
 
 import asyncio
 import os
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 
 import numpy as np
 import pytest
@@ -50,8 +50,8 @@ async def first_batches(device, stream, number):
     return batches
 
 
-async def collect(device, stream, batches):
-    async for batch in device.stream([stream]):
+async def collect(device, streams, batches):
+    async for batch in device.stream([streams] if isinstance(streams, str) else streams):
         batches.append(batch)
 
 
@@ -377,9 +377,35 @@ async def test_a_stream_that_fails_for_long_is_silent_and_says_why(bundle, tcp_d
     async with tcp_device(PROBE, *refusals) as heard:
         device = await opened(bundle(hasty=True), heard)
         batches = []
-        with pytest.raises(DeviceSilent, match=r"stream readings has been silent .*exception 0x04"):
+        with pytest.raises(DeviceSilent, match=r"stream readings has been silent .*exception 0x04") as silent:
             await collect(device, "readings", batches)
+        assert silent.value.stream is None, "there is no other that goes on"
         assert sum(map(len, batches)) == len(heard) - 1
+        await device.close()
+
+
+async def test_a_stream_that_is_refused_beside_another_is_told_by_name(bundle):
+    """Function 3 is answered by exception 2, function 4 by 10 to the probe and by one record of the FIFO."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(asyncio.IncompleteReadError, ConnectionError):
+            while True:
+                request = await reader.readexactly(12)
+                record = "04 14 0001 0000" + "0001" * 8
+                reply = {b"\x03\x00": "83 02", b"\x04\x00": record}[request[7:9]]
+                reply = "04 02 000A" if request[7:] == bytes.fromhex("04 0008 0001") else reply
+                pdu = bytes.fromhex(reply)
+                writer.write(request[:4] + (1 + len(pdu)).to_bytes(2, "big") + request[6:7] + pdu)
+        writer.close()
+
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        bus = ModbusBus(host="127.0.0.1", port=server.sockets[0].getsockname()[1], unit_id=17)
+        device = ModbusDevice(bundle(hasty=True).profile, bus)
+        await device.open()
+        with pytest.raises(DeviceSilent, match=r"stream readings .*exception 0x02") as silent:
+            await collect(device, ["readings", "queue"], [])
+        assert silent.value.stream == "readings"
+        assert silent.value.source == 3 << 16 | 0x6B
         await device.close()
 
 
