@@ -14,7 +14,18 @@ from pathlib import Path
 from typing import BinaryIO
 
 from triaxcald.abort import at_abort
-from triaxcald.errors import InputError
+from triaxcald.errors import InputError, RecordingError
+
+
+def require_new(path: Path) -> None:
+    """For a recording. Raises RecordingError where anything is there, if only a
+    link to nothing."""
+    if os.path.lexists(path):
+        raise exists_already(path)
+
+
+def exists_already(path: Path) -> RecordingError:
+    return RecordingError(f"{path}: exists already; a recording is never overwritten")
 
 
 def write_text(path: Path, text: str) -> Path:

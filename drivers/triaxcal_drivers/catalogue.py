@@ -3,14 +3,13 @@ asked for."""
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, cast
 
 from triaxcal_drivers.errors import DriverMissing
 from triaxcal_drivers.extras import absent, lacking
-from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.nearest import clipped, closest
 
 if TYPE_CHECKING:
     from triaxcal_drivers.interface import Driver
@@ -39,8 +38,8 @@ def driver_named(name: str, *, where: str = "") -> Driver:
     lead = f"{where}: " if where else ""
     points = _points()
     if name not in points:
-        close = difflib.get_close_matches(name, points, n=1)
-        hint = f"; did you mean '{close[0]}'?" if close else f"; installed: {', '.join(sorted(points)) or 'none'}"
+        close = closest(name, points)
+        hint = f"; did you mean '{close}'?" if close else f"; installed: {', '.join(sorted(points)) or 'none'}"
         raise DriverMissing(f"{lead}no driver named '{clipped(name)}'{hint}")
     try:
         return cast("Driver", points[name].load()())

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import io
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
+from triaxcal_drivers.nearest import closest
 from triaxcald.cli.arguments import OneLineParser, keep_apart, parsed
 from triaxcald.cli.syntax import register
 
@@ -60,8 +60,8 @@ def _require_command(top: OneLineParser, word: str) -> None:
     known = next(a.choices for a in top._actions if isinstance(a, argparse._SubParsersAction))
     if word.startswith("-") or word in known:
         return
-    close = difflib.get_close_matches(word, known, n=1)
-    hint = f"did you mean '{close[0]}'?" if close else f"there are {', '.join(known)}"
+    close = closest(word, known)
+    hint = f"did you mean '{close}'?" if close else f"there are {', '.join(known)}"
     top.error(f"no command '{word}'; {hint}")
 
 

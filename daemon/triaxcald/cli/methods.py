@@ -50,10 +50,15 @@ def chosen_way(a: argparse.Namespace) -> Callable[[argparse.Namespace], Way] | N
     return _turning if a.turning else _attitudes if a.attitudes else _datasheet if a.datasheet else None
 
 
+def signs_given(a: argparse.Namespace, measured: Measured) -> bool:
+    """No residual shows that signs are wrong; where nobody gave them this is
+    said."""
+    return a.sign is not None or measured.signs is not None
+
+
 def default_signs(a: argparse.Namespace, measured: Measured) -> list[str]:
-    """A warning where nobody gave the signs: no residual shows that they are
-    wrong."""
-    return [DEFAULT_SIGNS] if a.sign is None and measured.signs is None else []
+    """The warning of signs that nobody gave."""
+    return [] if signs_given(a, measured) else [DEFAULT_SIGNS]
 
 
 @contextmanager
@@ -63,7 +68,7 @@ def telling_default_signs(a: argparse.Namespace, measured: Measured) -> Iterator
     try:
         yield
     except Refused as e:
-        if e.wanted and a.sign is None and measured.signs is None:
+        if e.wanted and not signs_given(a, measured):
             raise Refused(f"{e}; no --sign was given, so +,+,+ is taken", wanted=e.wanted) from e
         raise
 

@@ -15,8 +15,8 @@ from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import Decoder, RawBatch
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.certificate import software
-from triaxcald.errors import InputError, RecordingError
-from triaxcald.files import new_beside
+from triaxcald.errors import InputError
+from triaxcald.files import new_beside, require_new
 from triaxcald.inputs import CALIBRATION, PROFILE, preview_channels
 from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic
 from triaxcald.recording.writer import RecordingWriter
@@ -107,8 +107,7 @@ def write_recording(
     InputError where the log is not one unit's. Nothing is left then. Raises
     InputError, RecordingError, LogError.
     """
-    if os.path.lexists(out):
-        raise RecordingError(f"{out}: exists already; a recording is never overwritten")
+    require_new(out)
     try:
         with new_beside(out) as temporary:
             temporary.unlink()

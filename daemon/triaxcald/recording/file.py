@@ -14,8 +14,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer as McapWriter
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
-from triaxcald.errors import RecordingError
-from triaxcald.files import synchronise
+from triaxcald.files import exists_already, synchronise
 from triaxcald.recording import disk, schema
 from triaxcald.recording.inventory import Document, Inventory
 from triaxcald.recording.raw_batch import encode_raw
@@ -67,7 +66,7 @@ class RecordingFile:
         try:
             self._file = _create(path)
         except FileExistsError:
-            raise RecordingError(f"{path}: exists already; a recording is never overwritten") from None
+            raise exists_already(path) from None
         except OSError as e:
             raise disk.not_created(path, e) from e
         try:

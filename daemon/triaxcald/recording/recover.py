@@ -15,7 +15,7 @@ from mcap.writer import Writer as McapWriter
 from triaxcal.errors import Refused
 from triaxcal_drivers.files import open_file
 from triaxcald.errors import RecordingError
-from triaxcald.files import new_file
+from triaxcald.files import exists_already, new_file
 from triaxcald.recording import schema
 from triaxcald.recording.damaged import DamagedFile, Stretch
 from triaxcald.recording.frames import (
@@ -83,7 +83,7 @@ def recover(path: Path, out: Path) -> Recovery:
             damaged = DamagedFile(source, str(path))
             return _write(damaged, path.name, out)
     except FileExistsError:
-        raise RecordingError(f"{out}: exists already; a recording is never overwritten") from None
+        raise exists_already(out) from None
     except OSError as e:
         raise RecordingError(f"{e.filename or out}: {e.strerror}") from e
 

@@ -14,6 +14,7 @@ from triaxcal_drivers.files import open_file
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import RecordingError
+from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ended_because
 from triaxcald.recording.file import Head, RecordingFile
@@ -105,8 +106,7 @@ class SegmentedWriter(RecordingWriter):
         head = replace(self._head, metadata={**self._head.metadata, schema.SEGMENT_RECORD: told})
         segment = Segment(self._segments.file_name(number), number, first)
         path = self._segments.path_of(segment)
-        if os.path.lexists(path):
-            raise RecordingError(f"{path}: exists already; a recording is never overwritten")
+        require_new(path)
         # Before the file is: one that no manifest names would be in the way for ever.
         self._segments = self._segments.with_last(segment)
         self._segments.save()

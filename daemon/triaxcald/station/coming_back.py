@@ -159,8 +159,7 @@ class _Waiting:
         if await self.patience.rest(0.0, self.waited_s) is None:
             raise silent
         pause_s = self.pause_s
-        self.waited_s += pause_s
-        self.pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+        self._rested(pause_s)
         return pause_s
 
     async def _rest(self) -> bool:
@@ -168,9 +167,30 @@ class _Waiting:
         rested_s = await self.patience.rest(self.pause_s, self.waited_s)
         if rested_s is None:
             return False
+        self._rested(rested_s)
+        return True
+
+    def _rested(self, rested_s: float) -> None:
         self.waited_s += rested_s
         self.pause_s = min(2 * self.pause_s, LONGEST_PAUSE_S)
-        return True
+
+
+@dataclass
+class _Interruption:
+    """A gap that is not over. ``awaited`` is the source that is silent while
+    others bring their records, None where none does."""
+
+    gap: Gap
+    awaited: int | None = None
+
+    def ended(self, batch: RawBatch, good: NDArray[np.intp]) -> RawBatch | None:
+        """The batch with the gap before it, where one of its ``good`` records
+        ends the interruption."""
+        back = good if self.awaited is None else good[batch.source[good] == self.awaited]
+        if not len(back):
+            return None
+        lost = batch.gap.lost if batch.gap is not None else None
+        return batch.after(Gap(self.gap.from_ns, int(batch.time_ns[back[0]]), self.gap.cause, lost))
 
 
 async def until_open(
@@ -242,56 +262,65 @@ class Returning:
         clock = asyncio.get_running_loop()
         last_ns: int | None = None
         returned_ns = self._now_ns()
-        gap: Gap | None = None
-        awaited: int | None = None
+        interruption: _Interruption | None = None
         waiting = self._waiting()
         asked, until_s = list(names), math.inf
         with ExitStack() as at_rest:
             while True:
                 try:
-                    async with aclosing(cast(Any, self._device.stream(asked))) as stream:
+                    async with aclosing(self._of_some(asked, until_s)) as stream:
                         async for batch in stream:
                             good = _good(batch)
-                            back = good if awaited is None else good[batch.source[good] == awaited]
-                            if gap is not None and len(back):
-                                lost = batch.gap.lost if batch.gap is not None else None
-                                gap = Gap(gap.from_ns, int(batch.time_ns[back[0]]), gap.cause, lost)
-                                batch, gap, awaited = batch.after(gap), None, None
+                            ended = None if interruption is None else interruption.ended(batch, good)
+                            if ended is not None:
+                                batch, interruption = ended, None
                                 at_rest.close()
                                 self._tell(None)
                             for part in _parted(batch, good, last_ns, self._hole_s):
                                 yield part
                             if len(good):
                                 last_ns = int(batch.time_ns[good[-1]])
-                            if awaited is not None:
-                                self._complaint = None  # the cause is known better
-                            elif self._complaint is not None:
-                                raise self._complaint
-                            if clock.time() >= until_s:
-                                break
-                        else:
-                            return
+                            self._raise_complaint(interruption)
+                    if asked == list(names):
+                        return
                     asked, until_s = list(names), math.inf
                     continue
                 except LOST as e:
                     trouble: Exception = e
-                silent = trouble if isinstance(trouble, DeviceSilent) and trouble.stream in asked else None
-                awaited = awaited if silent is None else silent.source
-                asked = [name for name in asked if silent is not None and name != silent.stream]
-                if gap is None:
-                    gap = Gap(self._since_ns(trouble, last_ns), None, str(trouble))
+                if interruption is None:
+                    interruption = _Interruption(Gap(self._since_ns(trouble, last_ns), None, str(trouble)))
                     if self._complaint is None or self._now_ns() - returned_ns > AGAIN_S * 1e9:
                         waiting = self._waiting()
                     waiting.told = ""
                     at_rest.enter_context(self._patience.waiting())
                     waiting.say(trouble)
-                    yield RawBatch.of([]).after(gap)
-                if silent is not None and asked:
-                    until_s = clock.time() + await waiting.beside(silent)
-                    continue
+                    yield RawBatch.of([]).after(interruption.gap)
+                if isinstance(trouble, DeviceSilent) and trouble.stream in asked:
+                    interruption.awaited = trouble.source
+                    asked = [name for name in asked if name != trouble.stream]
+                    if asked:
+                        until_s = clock.time() + await waiting.beside(trouble)
+                        continue
                 asked, until_s = list(names), math.inf
                 await waiting.until(self._again, LOST, trouble)
                 self._complaint, returned_ns = None, self._now_ns()  # what was said meanwhile was of the one before
+
+    async def _of_some(self, names: Sequence[str], until_s: float) -> AsyncGenerator[RawBatch, None]:
+        """These streams of the device, until then by the loop's clock."""
+        clock = asyncio.get_running_loop()
+        async with aclosing(cast(Any, self._device.stream(names))) as stream:
+            async for batch in stream:
+                yield batch
+                if clock.time() >= until_s:
+                    return
+
+    def _raise_complaint(self, interruption: _Interruption | None) -> None:
+        """Of what was sent, unless the cause is known better: a stream that is
+        silent beside the others."""
+        if interruption is not None and interruption.awaited is not None:
+            self._complaint = None
+        elif self._complaint is not None:
+            raise self._complaint
 
     def _since_ns(self, trouble: Exception, last_ns: int | None) -> int:
         """Since when nothing has come, or nothing of the stream that is silent

@@ -25,6 +25,9 @@ _NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
 CELLS_MOST = 2**25
 """A number that never changes takes no room in a Parquet file, and 8 bytes
 here."""
+MOSTLY = 0.5
+"""A column of which at least this share of the cells are numbers is one of
+numbers, and a cell without one a fault; else it is one of texts."""
 DAY_NS = 86_400 * 10**9
 BYTES_MOST = 2**30
 """Of a Parquet file's values as they are stored, before compression; in memory

@@ -13,16 +13,13 @@ import numpy as np
 from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow
-from triaxcald.tables.arrow import Column
+from triaxcald.tables.arrow import MOSTLY, Column
 from triaxcald.tables.layout import Layout, decoded, is_sample, layout_of
 from triaxcald.tables.naming import Unclear
 from triaxcald.tables.own_text import FIELDS_MOST, REQUIRED, TIME_LIMIT_S, header_of, is_applied
 
 HEAD = 2**20
 """Characters in which the layout is looked for."""
-HALF = 0.5
-"""Of its cells a further column of our own layout has at least so many numbers:
-it is one of numbers that lacks some, which is a fault, else one of text."""
 _LEFT = r"^[ \t]*(?:(?:#|%|//)[^\n]*)?(?:\n|\Z)"
 _NO_NUMBERS = re.compile(r"[^\d.,eE+\-\s]|,[ \t\r]*(?:[,\n]|\Z)")
 """Of a text of our own layout, below its header."""
@@ -81,7 +78,7 @@ def holds_text(lines: bytes) -> bool:
         columns, _ = arrow.read_text(body, ",", ".", len(names))
     except (InputError, ValueError):
         return False  # it has a fault, which is told where all of it is read
-    least = 1.0 if is_applied(names) else HALF
+    least = 1.0 if is_applied(names) else MOSTLY
     return any(len(c.numbers) and c.share < least for c in columns[len(REQUIRED) :])
 
 

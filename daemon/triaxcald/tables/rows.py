@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.nearest import clipped
-from triaxcald.tables.arrow import Column
+from triaxcald.tables.arrow import MOSTLY, Column
 from triaxcald.tables.grid import Grid
 from triaxcald.tables.layout import NUMBER
 from triaxcald.tables.naming import OUTPUTS, Name, Unclear
@@ -20,8 +20,6 @@ ROWS_LOOKED_AT = 10_000
 """For the words in a column: those that come in turn come early."""
 SENSORS = frozenset(("sensor", "sensors", "type", "id", "device", "source", "node", "side", "imu", "name"))
 """Words by which a column of numbers names the sensor that a row is of."""
-MOST = 0.5
-"""More cells than this share are no number: a column of texts."""
 VALUES_MOST, IN_TURN = 50, 0.2
 """Sensors are few, and their rows come in turn; a label of what was done
 changes rarely."""
@@ -56,7 +54,7 @@ def require_one_sensor(grid: Grid, chosen: NDArray[np.bool_]) -> None:
     would be read as one that jumps. Raises Unclear."""
     for i, column in enumerate(grid.columns):
         by_number = bool(set(Name.of(grid.names[i]).words) & SENSORS) and grid.named
-        if column.strange[chosen].mean() > MOST and _of_quantities(column, by_number):
+        if column.strange[chosen].mean() > MOSTLY and _of_quantities(column, by_number):
             continue
         values = _in_turn(column, chosen, by_number)
         if values:
@@ -64,7 +62,7 @@ def require_one_sensor(grid: Grid, chosen: NDArray[np.bool_]) -> None:
                 f"rows of several sensors in turn ({grid.called(i)}: {clipped(', '.join(values))}); choose those of "
                 f"one: --where {Name.of(grid.names[i]).text}={values[0]}"
             )
-        if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > MOST:
+        if column.texts is None or column.moments_ns is not None or not column.strange[chosen].mean() > MOSTLY:
             continue
         texts = {column.text(int(row)) for row in np.flatnonzero(chosen)[:ROWS_LOOKED_AT]}
         if 1 < len(texts) <= 50 and sum(bool(_SENSORS.search(t)) for t in texts) > 1:
@@ -89,8 +87,8 @@ def _in_turn(column: Column, chosen: NDArray[np.bool_], by_number: bool) -> list
     """The few values that a column of texts, or of numbers that name something,
     has in turn from row to row."""
     rows = np.flatnonzero(chosen)[:ROWS_LOOKED_AT]
-    numbered = by_number and column.whole is not None and column.usable[rows].mean() > MOST
-    if column.moments_ns is not None or len(rows) < 4 or not (numbered or column.strange[rows].mean() > MOST):
+    numbered = by_number and column.whole is not None and column.usable[rows].mean() > MOSTLY
+    if column.moments_ns is not None or len(rows) < 4 or not (numbered or column.strange[rows].mean() > MOSTLY):
         return []
     names = column.whole if numbered else None
     held = [column.text(int(r)) if names is None else str(names[r]) for r in rows]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from triaxcal_drivers.nearest import clipped
 from triaxcald.errors import InputError
 from triaxcald.tables import arrow, clock
+from triaxcald.tables.arrow import MOSTLY
 from triaxcald.tables.channels import VALUE_LIMIT, channels_of
-from triaxcald.tables.grid import HALF, Grid, grid_of_own, grid_of_parquet, grid_of_text, holds_text
+from triaxcald.tables.grid import Grid, grid_of_own, grid_of_parquet, grid_of_text, holds_text
 from triaxcald.tables.naming import OUTPUTS, TIME, Name, Roles, Unclear, column_of, roles_of
 from triaxcald.tables.own_text import REQUIRED, CsvSamples, header_of, is_applied, is_own, samples_of_blocks
 from triaxcald.tables.rows import require_numbers, require_one_sensor, rows_in_time, rows_where, rows_with_numbers
@@ -110,7 +111,7 @@ def _used(reading: Reading, header: tuple[str, ...] | None, fields: int) -> Coll
 
 def _lacking(grid: Grid) -> Sequence[int]:
     """Further columns that lack some numbers, and have most of them."""
-    return [i for i, column in enumerate(grid.columns) if i >= len(REQUIRED) and HALF <= column.share < 1]
+    return [i for i, column in enumerate(grid.columns) if i >= len(REQUIRED) and MOSTLY <= column.share < 1]
 
 
 def _as_own(reading: Reading) -> Reading:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +12,7 @@ from triaxcal_drivers.load import LineLoad
 from triaxcal_drivers.modbus.decoder import ModbusDecoder
 from triaxcal_drivers.modbus.model import ModbusBus, ModbusProfile
 from triaxcal_drivers.modbus.protocol import SerialLine
+from triaxcal_drivers.nearest import nearest
 from triaxcal_drivers.profile import Bundle
 
 
@@ -45,9 +45,7 @@ class ModbusDriver:
     def decoder(self, bundle: Bundle, stream: str) -> Decoder:
         profile = _profile(bundle)
         if stream not in profile.streams:
-            close = difflib.get_close_matches(stream, profile.streams, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(profile.streams)}"
-            raise ProfileError(f"profile {profile.name}: no stream named '{stream}'; {hint}")
+            raise ProfileError(f"profile {profile.name}: no stream named '{stream}'{nearest(stream, profile.streams)}")
         return ModbusDecoder(profile, stream)
 
 
