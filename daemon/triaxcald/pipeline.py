@@ -17,7 +17,7 @@ from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
-from triaxcal_drivers.profile import READINGS, Bundle
+from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO, Bundle
 
 COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order", "receiver_overflows")
 
@@ -157,8 +157,29 @@ class Pipeline(DecodedStream):
             found["out_of_order_samples"] = f"{self.counts['out_of_order']}, left out"
         if self.counts["errors"]:
             found["bus_errors"] = f"{self.counts['errors']} records"
+        if absurd := self._implausible():
+            found["implausible_readings"] = absurd
         return together(
             found, self._seen(self.windows), self.bundle.profile.output.unit if self.stream == READINGS else "g"
+        )
+
+    def _implausible(self) -> str:
+        """Where still readings span more than gravity does, by the nominal
+        scale factors: of a wrong register, type or order of words; else
+        empty."""
+        nominal = self.bundle.profile.output.nominal_scale_factor
+        windows = self.windows
+        spans = [] if windows is None else self._still(windows)
+        if windows is None or not spans or nominal is None or self.stream != READINGS:
+            return ""
+        means = np.array([windows.mean[s.used].mean(axis=0) for s in spans])
+        half_g = np.ptp(means, axis=0) / 2 / np.abs(nominal)
+        if half_g.max() <= SCALE_FACTOR_RATIO:
+            return ""
+        axis = int(np.argmax(half_g))
+        return (
+            f"by output.nominal_scale_factor the poses span ±{half_g[axis]:.3g} g in {'xyz'[axis]}, and gravity has "
+            "±1 g; does the profile decode the readings as the unit sends them?"
         )
 
     def _seen(self, windows: Windows | None) -> list[Finding]:

@@ -24,6 +24,9 @@ AXES = ("x", "y", "z")
 READINGS, CORRECTED = "readings", "corrected"
 STREAMS_MOST, CHANNELS_MOST = 16, 256  # ours have two of six channels; a Modbus reply has room for 125
 STEPS_MOST = 100  # of a sequence; ours have at most three
+SCALE_FACTOR_RATIO = 4.0
+"""A scale factor this many times off its nominal value is no scale factor of
+the device: data sheets allow 0.1."""
 
 
 class Strict(BaseModel):

@@ -196,3 +196,13 @@ def test_samples_that_are_not_valid_are_left_out_and_said(records: list[tuple[in
     assert (pipeline.counts["samples"], pipeline.counts["invalid"], pipeline.counts["missing"]) == (1998, 3, 0)
     assert "invalid_samples: 3 that the unit says are not valid, left out" in pipeline.data_quality()
     assert "invalid" not in Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(records)]).counts
+
+
+def test_readings_of_many_g_by_the_nominal_scale_factor_are_said(records: list[tuple[int, int, int, bytes]]) -> None:
+    assert not any(
+        "implausible" in line for line in Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(records)]).data_quality()
+    )
+    small = BUNDLE.text.replace(b"nominal_scale_factor = [", b"nominal_scale_factor = [0.01, 0.01, 0.01] # [")
+    pipeline = Pipeline(parse_bundle(small, BUNDLE.files, where="test"), READINGS).feed_all([RawBatch.of(records)])
+    (line,) = [line for line in pipeline.data_quality() if line.startswith("implausible_readings: ")]
+    assert "by output.nominal_scale_factor the poses span ±2" in line

@@ -12,15 +12,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from triaxcal_drivers.errors import ProfileError, RegisterValueError
-from triaxcal_drivers.profile import Profile
+from triaxcal_drivers.profile import SCALE_FACTOR_RATIO, Profile
 from triaxcald.provision.image import CRC_ROLE, DATE_ROLE, REFERENCE_ROLE, RegisterImage, checksum_of
 from triaxcald.provision.snapshot import Snapshot
 
 Kind = Literal["not_a_number", "outside_limits", "implausible", "unstable", "checksum", "corrected_output"]
 
-SCALE_FACTOR_RATIO = 4.0
-"""A scale factor this many times off its nominal value is no scale factor of
-this device: data sheets allow 0.1."""
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "misalignment": (-0.5, 0.5),  # rad: half a right angle's worth; housings are square to a hundredth of that
     "bias": (-20.0, 20.0),  # g: the full scale of the triads in question
