@@ -350,11 +350,11 @@ class UnitRun(UnitSession):
         """Records nothing and writes nothing: only asks the device, in check
         poses, for its own corrected output."""
         async with self.place.opened() as device:
-            await self.identify(device)
+            there = self.returning(device, await self.identify(device), Patience(most_s=0.0))
             self.progress.stage(self.name, "check poses")
             check = Collection(VERIFICATION, self.place.bundle, self.place.address)
             wanted = self.station.file.plan.check_poses
-            await self._collect(device, None, check, CORRECTED, wanted)
+            await self._collect(there, None, check, CORRECTED, wanted)
             return corrected(check, self.station.file.reference)
 
     def _report(self, certified: Certified, pipeline: Pipeline, ending: Ending) -> str:

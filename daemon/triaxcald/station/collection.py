@@ -19,7 +19,7 @@ from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.coming_back import Returning, Streaming
+from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.raw_records import RawRecords
@@ -92,24 +92,20 @@ class Recorded(RawRecords):
 
     async def for_seconds(
         self,
-        device: Returning,
+        device: Streaming,
         writer: RecordingWriter,
         seconds: float | None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Records so many seconds of the readings' own time; for ever where
-        None. A device that sends, but no whole reading, is opened anew."""
+        None. A device that sends, but no whole reading, hears of it."""
         readings = self.streams[READINGS]
         watch = self._watch(READINGS, clock_s)
         async with aclosing(self.records(device, writer)) as records:
             async for batch in records:
                 if _interrupted(batch):
                     watch = self._watch(READINGS, clock_s)
-                try:
-                    watch.look()
-                except DeviceSilent as e:
-                    device.complain(e)
-                    watch = self._watch(READINGS, clock_s)
+                watch.look(device)
                 if seconds is not None and readings.seconds >= seconds:
                     return
 
@@ -139,7 +135,8 @@ class Collection(Recorded):
     ) -> None:
         """Records until ``stream`` shows ``wanted`` distinct poses, and of the
         readings the first of them once more, if the plan says so; ``tell`` is
-        told how it goes. ``apart_from`` as in `guide`.
+        told how it goes. ``apart_from`` as in `guide`. A device that sends, but
+        no whole sample of ``stream``, hears of it.
 
         Raises Refused when no new pose has come for the plan's patience, and
         what the device's stream raises. Where only the repeat does not come, it
@@ -156,7 +153,7 @@ class Collection(Recorded):
             async for batch in records:
                 if _interrupted(batch):
                     watch = self._watch(stream, clock_s)
-                watch.look()
+                watch.look(device)
                 now_s, host_s = pipeline.seconds, clock_s()
                 if now_s - looked_s < LOOK_SAMPLES_S or host_s < next_host_s:
                     continue
@@ -211,10 +208,14 @@ class _Watch:
         self._decoded, self._stream, self._timeout_s, self._clock_s = decoded, stream, timeout_s, clock_s
         self._samples, self._looks = -1, Looks(0.0, 0.0)
 
-    def look(self) -> None:
-        """Raises DeviceSilent."""
+    def look(self, device: Streaming) -> None:
+        """Complains to the device, and begins anew, where none came for too
+        long."""
         now_s, samples = self._clock_s(), self._decoded.counts["samples"]
         if samples != self._samples:
             self._samples, self._looks = samples, Looks(now_s, SILENCE_SHARE * self._timeout_s)
         elif self._looks.look(now_s) > self._timeout_s:
-            raise DeviceSilent(f"{self._stream}: the device sends, but no whole sample of it for {self._timeout_s:g} s")
+            self._samples, self._looks = -1, Looks(0.0, 0.0)
+            device.complain(
+                DeviceSilent(f"{self._stream}: the device sends, but no whole sample of it for {self._timeout_s:g} s")
+            )

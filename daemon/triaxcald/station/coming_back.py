@@ -48,6 +48,8 @@ class Streaming(Protocol):
 
     def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]: ...
 
+    def complain(self, trouble: Exception) -> None: ...
+
 
 class AtWork:
     """How many units of a station are at work; those that are lost are not."""

@@ -319,3 +319,17 @@ def test_a_folder_that_cannot_be_is_an_error_of_one_line(
     with workshop.serve(workshop.device()) as served:
         done = triaxcal("run", workshop.station({"bus": served.bus}, folder=folder))
     done.failed(2, f"{workshop.folder / folder}: no folder for recordings: ")
+
+
+@pytest.mark.slow
+def test_a_wrong_address_of_the_readings_is_named_though_another_stream_goes_on(
+    workshop: Any, triaxcal: Callable[..., Any]
+) -> None:
+    with workshop.serve(workshop.device(**QUICK)) as served:
+        profile = workshop.folder / workshop.impatient_profile()
+        profile.write_text(profile.read_text().replace("address = 0x0000", "address = 0x2000", 1))
+        done = triaxcal("run", workshop.station({"bus": served.bus, "profile": profile.name}, plan=PLAN))
+    done.failed(4, "stream readings has been silent for 0.5 s: exception 0x02 (illegal data address)")
+    causes = [detail["cause"] for kind, detail in _events(_only(workshop.folder, "*.mcap")) if kind == "interrupted"]
+    assert len(causes) == 1
+    assert "illegal data address" in causes[0]

@@ -275,9 +275,9 @@ def test_a_batch_without_a_sample_after_a_pause_of_ours_is_no_silence(held_up_s:
     """As of two streams polled in turn one comes first."""
     pipeline = SimpleNamespace(counts={"samples": 0})
     now_s = 0.0
-    watch = _Watch(cast(Any, pipeline), "stream readings", 4.0, lambda: now_s)
+    watch, device = _Watch(cast(Any, pipeline), "stream readings", 4.0, lambda: now_s), cast(Any, Bus(()))
     for _ in range(20):
-        watch.look()
+        watch.look(device)
         now_s += held_up_s
-        watch.look()
+        watch.look(device)
         pipeline.counts["samples"] += 1
