@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.pipeline import Pipeline, creeping, together
+from triaxcald.pipeline import DecodedStream, Pipeline, creeping, together
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents
 from triaxcald.recording.schema import RECOVERY_RECORD, Phase
@@ -217,6 +217,29 @@ def losses_of(recording: Contents) -> list[str]:
     missing = sum(int(count) for count in counts if count.isdecimal())
     if missing:
         found.append(f"missing_samples: {missing} records were lost when the recording was damaged")
+    return found
+
+
+def samples_of(recording: Contents, phases: Iterable[str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Of each phase, and each stream of the profile that came in it: how many
+    ``samples`` in how many ``seconds`` of their own time, and whatever else was
+    counted. Raises InputError, ProfileError, DriverMissing."""
+    bundle = bundle_of(recording)
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for phase in phases:
+        streams = {name: DecodedStream(bundle, name) for name in bundle.profile.streams}
+        for batch in recording.raw(phase):
+            for stream in streams.values():
+                stream.feed(batch)
+        found[phase] = {
+            name: {
+                "samples": stream.counts["samples"],
+                "seconds": round(stream.seconds, 9),
+                **{kind: n for kind, n in stream.counts.items() if n and kind != "samples"},
+            }
+            for name, stream in streams.items()
+            if any(stream.counts.values())
+        }
     return found
 
 

@@ -6,12 +6,15 @@ import argparse
 import dataclasses
 import io
 import sys
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
+from triaxcal_drivers.errors import DriverError
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
 from triaxcald.files import new_file
-from triaxcald.inputs import bundle_of
+from triaxcald.inputs import bundle_of, samples_of
 from triaxcald.pipeline import Pipeline
 from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
@@ -43,11 +46,24 @@ def audit_command(a: argparse.Namespace) -> int:
 
 def info_command(a: argparse.Namespace) -> int:
     document = describe(a.recording)
+    if "bus" not in document:  # beside the raw records of which they are made
+        items = list(document.items())
+        after = list(document).index("raw") + 1
+        document = dict([*items[:after], ("samples", _samples(a.recording, document["raw"])), *items[after:]])
     if a.json:
         emit(document)
     else:
         _show(document)
     return 0
+
+
+def _samples(path: Path, phases: Iterable[str]) -> dict[str, Any]:
+    """As `samples_of`; where the profile cannot be used, the ``fault``."""
+    try:
+        with open_recording(path, unfinished=True) as recording:
+            return samples_of(recording, phases)
+    except (InputError, DriverError) as e:
+        return {"fault": str(e)}
 
 
 def _show(value: Any, indent: str = "") -> None:

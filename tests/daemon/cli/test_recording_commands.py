@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from triaxcald.recording.raw_batch import decode_raw, encode_raw
+
 Run = Callable[..., Any]
 
 
@@ -58,6 +60,40 @@ def test_info_tells_what_is_in_a_recording(finished_run: Any, triaxcal: Run) -> 
         "registers-after.json", "verification.json", "report.html", "outcome.json",
     }  # fmt: skip
     assert "finished: True" in triaxcal("log", "info", finished_run.can).out
+    export = triaxcal("log", "export", finished_run.can)
+    assert info["samples"]["calibration"]["readings"]["samples"] == len(export.out.splitlines()) - 1
+    assert set(info["samples"]["verification"]) == {"readings", "corrected"}
+
+
+def test_info_counts_the_samples_that_the_counter_lacks(
+    finished_run: Any, rewrite: Callable[..., Path], triaxcal: Run
+) -> None:
+    """A batch of raw records is taken out: one sample at each end of it may have lost half of its frames."""
+    taken: list[int] = []
+
+    def without_the_tenth(topic: str, data: bytes) -> bytes:
+        if topic != "/raw":
+            return data
+        first, phase, batch = decode_raw(data)
+        taken.append(int(np.count_nonzero(batch.source == 0x185)))
+        return encode_raw(first, phase, batch.part(0, 0)) if len(taken) == 10 else data
+
+    path = rewrite(finished_run.can, message=without_the_tenth)
+    readings = triaxcal("log", "info", path, "--json").json["samples"]["calibration"]["readings"]
+    assert taken[9] > 2
+    assert abs(readings["missing"] + readings.get("incomplete", 0) - taken[9]) <= 1
+
+
+def test_info_of_a_recording_whose_profile_cannot_be_used_says_why(
+    finished_run: Any, rewrite: Callable[..., Path], triaxcal: Run
+) -> None:
+    path = rewrite(
+        finished_run.can,
+        attachment=lambda name, data: data.replace(b'"can"', b'"con"') if name == "profile.toml" else data,
+    )
+    done = triaxcal("log", "info", path, "--json")
+    assert done.code == 0
+    assert "no driver named 'con'; did you mean 'can'?" in done.json["samples"]["fault"]
 
 
 def test_export_is_csv_that_reads_back_as_the_same_numbers(finished_run: Any, triaxcal: Run) -> None:
