@@ -16,7 +16,7 @@ from triaxcal.poses.stream_covariates import InStream
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.profile import READINGS
 from triaxcald.inputs import CALIBRATION, bundle_of, require_same_outputs
-from triaxcald.pipeline import Pipeline
+from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.export import Rows
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.series import is_recording, open_recording
@@ -145,6 +145,6 @@ def _of_another_unit(calibration: Calibration, name: str, lengths: list[float]) 
 
 def _of_recording(path: Path, phase: Phase) -> Iterator[SampleBlock]:
     with open_recording(path) as recording:
-        pipeline = Pipeline(bundle_of(recording), READINGS)
+        stream = DecodedStream(bundle_of(recording), READINGS)
         for batch in recording.raw(phase):
-            yield pipeline.feed(batch)
+            yield stream.rising(batch)

@@ -155,7 +155,7 @@ def _measure_recording(
     bundle = bundle_of(recording)
     pipeline = Pipeline(bundle, stream, turn_s=turn_s)
     for batch in recording.raw(phase):
-        block = pipeline.feed(batch)
+        block = pipeline.rising(batch)
         if moments is not None:
             moments.feed(block.readings, block.channels.get(TEMPERATURE))
     pipeline.close()

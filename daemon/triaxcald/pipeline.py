@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,23 @@ from triaxcal.errors import InvalidData
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
 from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
+from triaxcal.poses.stillness.windows import READING_MOST
 from triaxcal_drivers.catalogue import driver_named
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
 from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO, Bundle
 
 COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order", "receiver_overflows")
+_PASSED_ON = ("missing", "duplicates", "incomplete", "errors")
+_SELDOM = ("invalid", "not_finite")
+"""Counted where there are any: older certificates have no such keys, and are
+compared byte for byte."""
+
+
+def only_finite(block: SampleBlock) -> SampleBlock:
+    """Without the samples that hold no reading: a float register, or a message,
+    may hold NaN or rubbish."""
+    finite = np.asarray((np.abs(block.readings) < READING_MOST).all(axis=1))
+    return block if finite.all() else replace(block.only(finite), not_finite=int((~finite).sum()))
 
 
 @dataclass
@@ -49,14 +61,25 @@ class DecodedStream:
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         """Takes raw records; gives the samples that they complete."""
+        return self._decoded(batch)[0]
+
+    def rising(self, batch: RawBatch) -> SampleBlock:
+        """The same without those that are out of order."""
+        block, fresh = self._decoded(batch)
+        return block if fresh.all() else block.only(fresh)
+
+    def _decoded(self, batch: RawBatch) -> tuple[SampleBlock, NDArray[np.bool_]]:
+        """The samples, and which of them go on in time."""
         if self._first_host_ns is None and len(batch):
             self._first_host_ns = int(batch.time_ns[0])
         self.counts["receiver_overflows"] += int(np.count_nonzero(batch.flags & RawFlag.LOST_BEFORE))
-        block = self._decoder.feed(batch)
-        for name in ("missing", "duplicates", "incomplete", "errors"):
+        block = only_finite(self._decoder.feed(batch))
+        for name in _PASSED_ON:
             self.counts[name] += getattr(block, name)
-        if block.invalid:  # older certificates have no such key, and are compared byte for byte
-            self.counts["invalid"] += block.invalid
+        for name in _SELDOM:
+            if count := getattr(block, name):
+                self.counts[name] += count
+        fresh = np.ones(len(block), dtype=bool)
         if len(block):
             if self._begin_ns is None:
                 self._begin_ns = int(block.time_ns[0])
@@ -66,7 +89,7 @@ class DecodedStream:
             self.counts["samples"] += int(fresh.sum())
             self._last_ns = max(int(block.time_ns.max()), self._last_ns or -(2**62))
             self._take(block, fresh)
-        return block
+        return block, fresh
 
     def _take(self, block: SampleBlock, fresh: NDArray[np.bool_]) -> None:
         """The block's samples, of which those that are ``fresh`` go on in
@@ -153,6 +176,8 @@ class Pipeline(DecodedStream):
             found["duplicate_samples"] = str(self.counts["duplicates"])
         if self.counts["invalid"]:
             found["invalid_samples"] = f"{self.counts['invalid']} that the unit says are not valid, left out"
+        if self.counts["not_finite"]:
+            found["not_finite_samples"] = f"{self.counts['not_finite']} whose outputs are no finite numbers, left out"
         if self.counts["out_of_order"]:
             found["out_of_order_samples"] = f"{self.counts['out_of_order']}, left out"
         if self.counts["errors"]:

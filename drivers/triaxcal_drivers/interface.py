@@ -148,7 +148,8 @@ class SampleBlock:
     auxiliary ones, each (n,). The counts are of this block: samples missing by
     the counter, repeated samples dropped, samples that could not be put
     together from their parts, records with an error flag, samples that the
-    device itself says are not valid, which are dropped.
+    device itself says are not valid, and those whose readings are no finite
+    numbers, both of which are dropped.
     """
 
     time_ns: NDArray[np.int64]
@@ -160,9 +161,21 @@ class SampleBlock:
     incomplete: int = 0
     errors: int = 0
     invalid: int = 0
+    not_finite: int = 0
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def only(self, rows: NDArray[np.bool_]) -> SampleBlock:
+        """Some of the samples; the counts stay."""
+        channels = {name: values[rows] for name, values in self.channels.items()}
+        return replace(
+            self,
+            time_ns=self.time_ns[rows],
+            counter=self.counter[rows],
+            readings=self.readings[rows],
+            channels=channels,
+        )
 
 
 class Decoder(Protocol):

@@ -11,10 +11,10 @@ import pytest
 from triaxcal.poses.pose import Pose
 from triaxcal.poses.quality import Finding, QualityDetector
 from triaxcal.poses.quality.finding import MissingSamples, StuckOutput
-from triaxcal_drivers.interface import RawBatch
+from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.loading import load_bundle, parse_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS
-from triaxcald.pipeline import Pipeline, together
+from triaxcald.pipeline import Pipeline, only_finite, together
 from triaxcald.recording.schema import cut
 from triaxcald.simulation.bench import DeviceFile, physics_of
 from triaxcald.simulation.can_unit import tpdos
@@ -206,3 +206,13 @@ def test_readings_of_many_g_by_the_nominal_scale_factor_are_said(records: list[t
     pipeline = Pipeline(parse_bundle(small, BUNDLE.files, where="test"), READINGS).feed_all([RawBatch.of(records)])
     (line,) = [line for line in pipeline.data_quality() if line.startswith("implausible_readings: ")]
     assert "by output.nominal_scale_factor the poses span ±2" in line
+
+
+def test_samples_without_a_number_are_left_out_and_said() -> None:
+    def block(values: list[float]) -> SampleBlock:
+        n = len(values)
+        return SampleBlock(np.arange(n), np.arange(n), np.column_stack([values, np.ones((n, 2))]), {"t": np.arange(n)})
+
+    kept = only_finite(block([1.0, np.nan, 2.0, np.inf, 1e200, 3.0]))
+    assert (kept.readings[:, 0].tolist(), kept.channels["t"].tolist(), kept.not_finite) == ([1, 2, 3], [0, 2, 5], 3)
+    assert only_finite(block([1.0])).not_finite == 0

@@ -36,7 +36,7 @@ def import_command(a: argparse.Namespace) -> int:
             from triaxcald.imports.of_mcap import import_mcap
 
             made = import_mcap(log, bundle, a.output)
-    for line in (text.left_out(made.document), *text.remarks(made.document)):
+    for line in (text.left_out(made.document), *text.remarks(made.document, made.seconds)):
         if line:
             say(line)
     if a.json:

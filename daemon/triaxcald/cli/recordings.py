@@ -14,8 +14,8 @@ from triaxcal_drivers.errors import DriverError
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
 from triaxcald.files import new_file
-from triaxcald.inputs import bundle_of, samples_of
-from triaxcald.pipeline import Pipeline
+from triaxcald.inputs import bundle_of, losses_of, samples_of
+from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
 from triaxcald.recording.recover import recover
@@ -91,8 +91,8 @@ def export_command(a: argparse.Namespace) -> int:
         bundle = bundle_of(recording)
         if a.stream not in bundle.profile.streams:
             raise InputError(f"--stream {a.stream}: the recording has {', '.join(bundle.profile.streams)}")
-        pipeline = Pipeline(bundle, a.stream)
-        blocks = (Rows.of(pipeline.feed(batch)) for batch in recording.raw(a.phase))
+        stream = DecodedStream(bundle, a.stream)
+        blocks = (Rows.of(stream.rising(batch)) for batch in recording.raw(a.phase))
         if a.output is None:
             rows = write_csv(sys.stdout, blocks)
         else:
@@ -101,6 +101,6 @@ def export_command(a: argparse.Namespace) -> int:
                     rows = write_csv(out, blocks)
             except OSError as e:
                 raise InputError(f"{a.output}: cannot be written: {e.strerror}") from e
-    lost = ", ".join(f"{n} {kind}" for kind, n in pipeline.counts.items() if n and kind != "samples")
-    say(f"{rows} samples; {lost or 'none lost'}")
+        lost = [f"{n} {kind}" for kind, n in stream.counts.items() if n and kind != "samples"] + losses_of(recording)
+    say(f"{rows} samples; {', '.join(lost) or 'none lost'}")
     return 0

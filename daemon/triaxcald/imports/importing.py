@@ -17,21 +17,23 @@ from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.certificate import software
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside, require_new
+from triaxcald.imports.times import Times
 from triaxcald.inputs import CALIBRATION, PROFILE, preview_channels
+from triaxcald.pipeline import only_finite
 from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic
 from triaxcald.recording.writer import RecordingWriter
 
 BATCH = 4096  # records; a quarter of an hour of a slow unit, 4 s of a fast one
 BATCH_BYTES = 2**20  # of their data; a chunk of a recording may have 16 MiB
 DRAINED_EACH = 32  # batches; the writer's queue has room for 256, and drops what comes beyond
-COUNTED = ("missing", "duplicates", "incomplete", "errors", "invalid")
+COUNTED = ("missing", "duplicates", "incomplete", "errors", "invalid", "not_finite")
 
 Record = tuple[int, int, int, bytes]
 """Time, source, flags and bytes of a raw record."""
 
 
-Describe = Callable[[dict[str, int]], dict[str, Any]]
-"""What the event has to say, of the counts of the readings' samples."""
+Describe = Callable[["Importing"], dict[str, Any]]
+"""What the event has to say, of what came of the readings."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +47,13 @@ class Imported:
 
 
 class Importing:
-    """One recording being made of a log's records."""
+    """One recording being made of a log's records. ``times`` are those of the
+    readings' samples, by their own stamps or counter."""
 
     def __init__(self, bundle: Bundle, writer: RecordingWriter) -> None:
         driver = driver_named(bundle.profile.driver)
         self.counts = dict.fromkeys(("samples", *COUNTED), 0)
-        self._first_ns = self._last_ns = 0
+        self.times = Times(1e9 / bundle.profile.sampling.rate_hz)
         self._writer = writer
         self._decoders: dict[str, Decoder] = {name: driver.decoder(bundle, name) for name in bundle.profile.streams}
         self._batches = 0
@@ -63,22 +66,16 @@ class Importing:
             self._writer.drain()
         self._writer.raw(CALIBRATION, batch)
         for name, decoder in self._decoders.items():
-            block = decoder.feed(batch)
+            block = only_finite(decoder.feed(batch))
             if topic := _topic(name):
                 self._writer.preview(topic, block)
             if name != READINGS:
                 continue
             for what in COUNTED:
                 self.counts[what] += getattr(block, what)
-            if len(block):
-                if not self.counts["samples"]:
-                    self._first_ns = int(block.time_ns[0])
-                self._last_ns = int(block.time_ns[-1])
-                self.counts["samples"] += len(block)
-
-    @property
-    def seconds(self) -> float:
-        return (self._last_ns - self._first_ns) / 1e9
+            self.counts["samples"] += len(block)
+            for time_ns in block.time_ns.tolist():
+                self.times.note(time_ns)
 
 
 def _topic(stream: str) -> PreviewTopic | None:
@@ -102,10 +99,9 @@ def write_recording(
     """Makes the recording ``out`` of all the records; its `imported` event, and
     the seconds that the samples cover.
 
-    ``describe`` is called once all have been taken, with the counts of the
-    readings' samples: it gives what the event has to say besides, or raises
-    InputError where the log is not one unit's. Nothing is left then. Raises
-    InputError, RecordingError, LogError.
+    ``describe`` is called once all have been taken: it gives what the event has
+    to say besides, or raises InputError where the log is not one unit's.
+    Nothing is left then. Raises InputError, RecordingError, LogError.
     """
     require_new(out)
     try:
@@ -130,6 +126,7 @@ def _write(
         preview_channels=preview_channels(bundle.profile),
         preview_unit=bundle.profile.output.unit,
         clock_ns=clock,
+        provisional=True,
     ) as writer:
         writer.path = out  # what messages name
         writer.attach(PROFILE, "application/toml", bundle.text)
@@ -143,12 +140,12 @@ def _write(
             clock.now_ns = max(clock.now_ns, batch[-1][0])
         detail = {
             **file_told(source),
-            **describe(importing.counts),
+            **describe(importing),
             "samples": importing.counts,
             "imported": datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="seconds"),
         }
         writer.event(IMPORTED, detail)
-    return detail, importing.seconds
+    return detail, importing.times.seconds
 
 
 def in_batches(records: Iterable[Record]) -> Iterator[list[Record]]:

@@ -9,11 +9,11 @@ from typing import Any, cast
 from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.model import CanProfile
 from triaxcal_drivers.interface import RawFlag
-from triaxcal_drivers.logs.frames import Account, LoggedFrame, Remark
+from triaxcal_drivers.logs.frames import EXTENDED, Account, LoggedFrame, Remark
 from triaxcal_drivers.logs.kinds import Kind, Log
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import InputError
-from triaxcald.imports.importing import Imported, Record, write_recording
+from triaxcald.imports.importing import Imported, Importing, Record, write_recording
 from triaxcald.imports.selection import Selection
 from triaxcald.imports.times import LONGEST_NS, Ticks, Times
 
@@ -29,8 +29,8 @@ def import_can(log: Log, bundle: Bundle, out: Path, *, node: int | None, channel
     period_ns = 1e9 / profile.sampling.rate_hz
     work = _Work(Selection(layouts, node, channel), Account(), Times(period_ns), Ticks(period_ns))
 
-    def describe(counts: dict[str, int]) -> dict[str, Any]:
-        return work.described(log, counts)
+    def describe(importing: Importing) -> dict[str, Any]:
+        return work.described(log, importing)
 
     detail, seconds = write_recording(out, bundle, work.records(log), Path(log.name), describe)
     return Imported(out, detail, seconds)
@@ -44,10 +44,12 @@ class _Work:
 
     def __init__(self, selection: Selection, account: Account, times: Times, ticks: Ticks) -> None:
         self._selection, self._account, self._times, self._ticks = selection, account, times, ticks
+        self._latest_ns: dict[tuple[int, int], int] = {}  # by identifier
 
     def records(self, log: Log) -> Iterator[Record]:
         """A loss before a frame that is not taken was before the next that is:
-        it may have been of the unit's."""
+        it may have been of the unit's. A pause of an identifier is such a loss,
+        as its counter may have wrapped meanwhile."""
         lost: set[str] = set()  # channels
         for frame in log.frames(self._account):
             if frame.flags & _LOST_BEFORE:
@@ -59,25 +61,29 @@ class _Work:
                 self._account.note(f"frame {self._selection.frames}", f"a time of {time_ns} ns")
                 continue
             self._times.note(time_ns)
-            flags = frame.flags | _LOST_BEFORE if frame.channel in lost else frame.flags
+            key = frame.source, frame.flags & EXTENDED
+            paused = self._times.is_pause(time_ns - self._latest_ns.get(key, time_ns))
+            self._latest_ns[key] = time_ns
+            flags = frame.flags | _LOST_BEFORE if paused or frame.channel in lost else frame.flags
             lost.discard(frame.channel)
             yield time_ns, frame.source, flags, frame.data
 
     def _time_ns(self, frame: LoggedFrame) -> int:
         if Remark.NO_TIMES in self._account.remarks:  # where a few lines lack theirs, the others' are of no use either
-            return self._ticks.of((frame.source, frame.flags))
+            return self._ticks.of((frame.source, frame.flags & EXTENDED), self._selection.is_reading(frame))
         return -1 if frame.time_ns is None else frame.time_ns
 
-    def described(self, log: Log, counts: dict[str, int]) -> dict[str, Any]:
+    def described(self, log: Log, importing: Importing) -> dict[str, Any]:
         """Raises InputError."""
-        chosen, account = self._selection, self._account
+        chosen, account, counts = self._selection, self._account, importing.counts
         try:
             chosen.settle(log.name)
             if not counts["samples"]:
                 why = ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "no sample is whole"
                 raise InputError(f"{log.name}: no sample in its {chosen.taken} frames of the profile: {why}")
         except InputError as e:
-            raise InputError(f"{e}; damaged: {account.damage}" if account.damaged else str(e)) from e
+            others = "".join(f"; {count} of kind '{kind}'" for kind, count in account.others.items())
+            raise InputError(f"{e}{others}" + (f"; damaged: {account.damage}" if account.damaged else "")) from e
         assert isinstance(log.kind, Kind)
         return {
             "kind": log.kind.name,
@@ -92,5 +98,6 @@ class _Work:
             "damaged": account.damaged,
             "damage": account.damage,
             "remarks": sorted(account.remarks),
-            "times": self._times.document(),
+            "seconds_by_log": self._times.seconds,
+            "times": self._times.document() | {"equal": importing.times.equal},
         }

@@ -17,7 +17,7 @@ from triaxcal_drivers.mcap.schema import MessageSchema
 from triaxcal_drivers.nearest import clipped, nearest
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import InputError
-from triaxcald.imports.importing import Imported, Record, write_recording
+from triaxcald.imports.importing import Imported, Importing, Record, write_recording
 from triaxcald.imports.times import LONGEST_NS, Times
 
 MESSAGE_MOST = 65535  # bytes of a raw record
@@ -34,8 +34,8 @@ def import_mcap(log: Log, bundle: Bundle, out: Path) -> Imported:
     work = _Work(profile, log)
     still = any(schema.stamp_stands_still for schema in schemas.values())
 
-    def describe(counts: dict[str, int]) -> dict[str, Any]:
-        return work.described(counts, still)
+    def describe(importing: Importing) -> dict[str, Any]:
+        return work.described(importing, still)
 
     detail, seconds = write_recording(out, whole, work.records(), Path(log.name), describe)
     return Imported(out, detail, seconds)
@@ -92,7 +92,7 @@ def _stands_still(profile: McapProfile, name: str, schema: MessageSchema, head: 
     for data in head:
         try:
             stamps.add(read(data)[1])
-        except ValueError:
+        except (ValueError, OverflowError):
             continue
         if len(stamps) > 1:
             return False
@@ -130,8 +130,9 @@ class _Work:
                 self._times.note(message.log_time_ns)
                 yield message.log_time_ns, self._numbers[topic], 0, message.data
 
-    def described(self, counts: dict[str, int], still: bool) -> dict[str, Any]:
+    def described(self, importing: Importing, still: bool) -> dict[str, Any]:
         """Raises InputError."""
+        counts = importing.counts
         if not counts["samples"]:
             raise InputError(
                 f"{self._log.name}: no sample in its {self._taken} messages of the profile: {counts['errors']} are not"
@@ -150,5 +151,6 @@ class _Work:
             "damaged": self._account.damaged,
             "damage": self._account.damage,
             "remarks": ["stamp_stands_still"] if still else [],
-            "times": self._times.document(),
+            "seconds_by_log": self._times.seconds,
+            "times": importing.times.document(),
         }

@@ -12,6 +12,7 @@ from triaxcal_drivers.can.layout import NODES, Layout, Message
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.frames import LoggedFrame
 from triaxcal_drivers.nearest import clipped
+from triaxcal_drivers.profile import READINGS
 from triaxcald.errors import InputError
 
 _EXTENDED, _ERROR = int(RawFlag.EXTENDED_ID), int(RawFlag.ERROR)
@@ -50,7 +51,10 @@ class Selection:
         for layout in self.layouts.values():
             for message in layout.messages:
                 self._nodes |= _identifiers(message)
+        self._readings = {key for m in self.layouts[READINGS].messages for key in _identifiers(m)}
         self._seen: Counter[tuple[Key, str]] = Counter()
+        self._strangers: Counter[int] = Counter()  # frames of other nodes than the one asked for
+        self._of_unit: set[str] = set()  # channels
 
     def takes(self, frame: LoggedFrame) -> bool:
         self.frames += 1
@@ -60,6 +64,9 @@ class Selection:
             self.elsewhere += 1
             return False
         if frame.flags & _ERROR:
+            if frame.channel not in self._of_unit:  # nobody knows yet whose bus that is
+                self.elsewhere += 1
+                return False
             self.error_frames += 1
             return True
         key = frame.source, frame.flags & _EXTENDED
@@ -68,19 +75,27 @@ class Selection:
             return False
         node = self._nodes[key]
         if self.node is not None and node is not None and node != self.node:
-            self._seen[key, frame.channel] += 1
+            self._strangers[node] += 1
             self.elsewhere += 1
             return False
         self._seen[key, frame.channel] += 1
+        self._of_unit.add(frame.channel)
         self.taken += 1
         return True
+
+    def is_reading(self, frame: LoggedFrame) -> bool:
+        """Whether it is one of the messages that make a sample of the
+        readings."""
+        return not frame.flags & _ERROR and (frame.source, frame.flags & _EXTENDED) in self._readings
 
     def settle(self, name: str) -> None:
         """The node and the channels that the frames came by, once all have been
         seen. Raises InputError where that is not one unit's, or none."""
         if self.channel is not None and self.channel not in self.channels:
             raise InputError(f"--channel {self.channel}: {name} has {_listed(self.channels)}")
-        nodes: Counter[int] = Counter()
+        if self.node is not None and not any(node is not None for node in self._nodes.values()):
+            raise InputError(f"--node {self.node}: the identifiers of the profile are the same for all nodes")
+        nodes = Counter(self._strangers)
         for (key, _), count in self._seen.items():
             if (node := self._nodes[key]) is not None:
                 nodes[node] += count
@@ -92,11 +107,12 @@ class Selection:
             self.node = next(iter(nodes))
         self._require_one_channel(name)
         if not self.taken:
-            there = (
-                _identifiers_shown(key for key, _ in self.others.most_common(SHOWN) if key != _FURTHER) or "no frame"
-            )
+            known = _identifiers_shown(key for key, _ in self.others.most_common(SHOWN) if key != _FURTHER)
+            elsewhere = f"{self.elsewhere} frames of other channels or nodes, or in error" if self.elsewhere else ""
+            there = " and ".join(filter(None, (known, elsewhere))) or "no frame"
             wanted = ", ".join(self._wanted()[:SHOWN])
-            raise InputError(f"{name}: none of the profile's identifiers ({wanted}) is in it; there is {there}")
+            where = "in it" if self.channel is None else f"on its channel {self.channel}"
+            raise InputError(f"{name}: none of the profile's identifiers ({wanted}) is {where}; there is {there}")
 
     def _require_one_channel(self, name: str) -> None:
         places: dict[Key, Counter[str]] = {}

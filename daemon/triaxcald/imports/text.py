@@ -12,7 +12,11 @@ _REMARKS = {
     "times_added_up": "each time in the log is since the line before: they are added up",
     "stamp_stands_still": "the messages' own time stamp stands still: times are those at which they were logged",
 }
+_RATE_OFF = 1.1
+"""Samples by the counter last so many times as long as the log, or so many times
+less: oscillators are off by a hundredth at most."""
 _COUNTS = {
+    "not_finite": "whose outputs are no finite numbers",
     "invalid": "that the unit says are not valid",
     "missing": "missing by the counter",
     "duplicates": "repeated",
@@ -39,8 +43,20 @@ def left_out(detail: Mapping[str, Any]) -> str:
     return f"left out: {', '.join(parts)}" if parts else ""
 
 
-def remarks(detail: Mapping[str, Any]) -> list[str]:
-    """What a reader of the recording ought to know, a line each."""
+def _off(detail: Mapping[str, Any], seconds: float) -> str:
+    """Where the samples' own time is not the log's; empty where it is."""
+    by_log = detail["seconds_by_log"]
+    if not by_log or "no_times" in detail["remarks"] or by_log / _RATE_OFF < seconds < by_log * _RATE_OFF:
+        return ""
+    return (
+        f"the samples last {seconds:.2f} s by their own time, which is their counter at the profile's"
+        f" sampling.rate_hz, or their stamps, and {by_log:.2f} s by the log's times"
+    )
+
+
+def remarks(detail: Mapping[str, Any], seconds: float) -> list[str]:
+    """What a reader of the recording ought to know, a line each; ``seconds``
+    are those that the samples cover."""
     lines = [_REMARKS[name] for name in detail["remarks"]]
     times = detail["times"]
     if times["back"]:
@@ -48,6 +64,13 @@ def remarks(detail: Mapping[str, Any]) -> list[str]:
             f"{times['back']} times are before those of records that came earlier, by up to"
             f" {times['furthest_back_s']:.6g} s; they are kept"
         )
+    if times["equal"]:
+        lines.append(
+            f"{times['equal']} samples have the time of the one before; the commands that read the recording leave"
+            " them out"
+        )
+    if off := _off(detail, seconds):
+        lines.append(off)
     if times["pauses"]:
         lines.append(f"{times['pauses']} pauses, the longest of {times['longest_pause_s']:.6g} s")
     if detail["damaged"]:

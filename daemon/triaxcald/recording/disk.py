@@ -42,13 +42,17 @@ def not_created(path: Path, e: OSError) -> RecordingError:
     return kind(f"{path}: cannot be created: {e.strerror}")
 
 
-def not_written(path: Path, e: OSError, sound_ns: int) -> DiskError:
-    """``sound_ns`` is the host's time up to which everything is in the file."""
-    return DiskError(f"{path}: writing failed: {e.strerror or e}; sound up to {_utc(sound_ns)}")
+def not_written(path: Path, e: OSError, sound_ns: int | None) -> DiskError:
+    """``sound_ns`` is the host's time up to which everything is in the file;
+    None where the file is removed."""
+    left = "nothing of it is left" if sound_ns is None else f"sound up to {_utc(sound_ns)}"
+    return DiskError(f"{path}: writing failed: {e.strerror or e}; {left}")
 
 
-def ended_early(path: Path, free: int, sound_ns: int) -> DiskError:
+def ended_early(path: Path, free: int, sound_ns: int | None) -> DiskError:
     """The file was ended while there was room for its end."""
+    if sound_ns is None:
+        return DiskError(f"{path}: cannot be written: {free} bytes are free on the disk; nothing of it is left")
     return DiskError(f"{path}: ended, as {free} bytes are free on the disk; whole up to {_utc(sound_ns)}")
 
 

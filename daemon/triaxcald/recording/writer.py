@@ -38,7 +38,8 @@ class RecordingWriter:
     full is dropped, counted in `losses` and noted in the file, unless the
     caller ``waits`` for room. Registers, events and attachments are few and
     never dropped. ``ends_with`` is the format of the document that `seal` will
-    be given.
+    be given. A ``provisional`` file is removed by the caller where it does not
+    come to its end, so that nothing is said of how far it is sound.
 
     Where the disk has hardly room left, the file is ended while there is room
     for its end.
@@ -60,8 +61,10 @@ class RecordingWriter:
         ends_with: str = "",
         sync_s: float = SYNC_S,
         waits: bool = False,
+        provisional: bool = False,
     ) -> None:
         self.path = path
+        self._provisional = provisional
         self.losses: dict[str, int] = {}
         self.ends_with = ends_with
         self._clock_ns, self._sync_s, self._waits = clock_ns, sync_s, waits
@@ -188,10 +191,12 @@ class RecordingWriter:
         if self._failure is not None:
             raise self._failure
 
-    def _finish_at_abort(self, until_s: float) -> Left:
+    def _finish_at_abort(self, until_s: float) -> Left | None:
         self._closed = True
         self._jobs.put(None)
         self._thread.join(max(0.0, until_s - time.monotonic()))
+        if self._provisional:
+            return None
         if self._thread.is_alive():
             return Left(f"{self._told} is not finished; triaxcal log recover mends it")
         return Left(str(self._failure) if self._failure else f"{self._told} is finished")
@@ -252,13 +257,17 @@ class RecordingWriter:
             self._report_losses()
             self._finish()
         except OSError as e:
-            self._failure = disk.not_written(self._told, e, self._file.sound_ns)
+            self._failure = disk.not_written(self._told, e, self._sound_ns)
         except RecordingError as e:
             self._failure = e
         finally:
             if self._failure is None and not self._finished:
                 self._failure = RecordingError(f"{self.path}: the writer stopped on a fault of its own")
             self._file.abandon()
+
+    @property
+    def _sound_ns(self) -> int | None:
+        return None if self._provisional else self._file.sound_ns
 
     def _finish(self) -> None:
         self._file.finish()
@@ -294,7 +303,7 @@ class RecordingWriter:
         detail = json.dumps({"reason": "disk", "free_bytes": free}, sort_keys=True)
         self._file.write(schema.EVENTS, schema.Event(self._clock_ns(), ENDED, detail))
         self._finish()
-        raise disk.ended_early(self._told, free, self._file.sound_ns)
+        raise disk.ended_early(self._told, free, self._sound_ns)
 
     def _make_room(self, job: Callable[[], None]) -> None:
         job()

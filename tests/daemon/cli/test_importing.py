@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
+import os
 import re
 import struct
 import subprocess
@@ -17,10 +19,12 @@ import pytest
 from numpy.typing import NDArray
 
 from triaxcal_drivers.interface import RawFlag
+from triaxcald.recording.file import RecordingFile
 from triaxcald.recording.reader import Recording
 
 Run = Callable[..., Any]
 NODE = 5
+T0_NS = 1_700_000_000_000_000_000
 
 
 @pytest.fixture(scope="module")
@@ -219,6 +223,42 @@ def test_what_is_there_is_not_overwritten_and_other_drivers_are_refused(
     before = (tmp_path / "rec.mcap").read_bytes()
     imported(path, code=2).failed(2, "rec.mcap: exists already; a recording is never overwritten")
     assert (tmp_path / "rec.mcap").read_bytes() == before
+
+
+def test_a_pause_in_which_the_counter_wrapped_is_as_long_as_the_log_says(tmp_path: Path, imported: Run) -> None:
+    """700 s at 100 samples/s: more than the 655 that the counter of 16 bits can tell."""
+    frames = []
+    for number in (*range(200), *range(70_200, 70_400)):
+        for identifier, data in ((0x185, bytes(6)), (0x285, bytes(5))):
+            data += struct.pack("<H", number & 0xFFFF) + bytes(identifier == 0x285)
+            frames.append(_message(T0_NS + number * 10_000_000, identifier, data))
+    done = imported(written(tmp_path / "a.log", frames))
+    assert "1 pauses, the longest of 700.01 s" in done.err
+    assert "400 samples in 703.99 s" in done.out
+    assert "70000 missing by the counter" in done.out
+
+
+def test_a_rate_that_the_log_contradicts_is_said(tmp_path: Path, imported: Run) -> None:
+    frames = [
+        _message(T0_NS + number * 20_000_000, identifier, head + struct.pack("<H", number) + tail)
+        for number in range(500)
+        for identifier, head, tail in ((0x185, bytes(6), b""), (0x285, bytes(5), bytes(1)))
+    ]
+    done = imported(written(tmp_path / "a.log", frames))
+    assert "the samples last 4.99 s by their own time" in done.err
+    assert "9.98 s by the log's times" in done.err
+
+
+def test_an_import_that_the_disk_ends_leaves_nothing_and_says_so(
+    messages: list[can.Message], tmp_path: Path, imported: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: RecordingFile, *_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(RecordingFile, "raw", full)
+    done = imported(written(tmp_path / "a.blf", messages), code=5)
+    done.failed(5, f"{tmp_path / 'rec.mcap'}: writing failed: No space left on device; nothing of it is left")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.blf"]
 
 
 def test_error_frames_of_the_bus_come_along(messages: list[can.Message], tmp_path: Path, imported: Run) -> None:

@@ -57,8 +57,32 @@ def test_messages_may_come_by_a_bus_each_but_none_by_two() -> None:
     chosen.settle("log")
 
 
-def test_error_frames_come_along_but_are_none_of_the_units() -> None:
+def test_error_frames_come_along_where_they_are_of_the_units_bus() -> None:
+    chosen, broken = Selection({"readings": layout()}), int(RawFlag.ERROR)
+    taken = [chosen.takes(f) for f in (frame(0x180, "a"), frame(4, "b", broken), frame(4, "a", broken))]
+    assert taken == [True, False, True]
+    assert (chosen.taken, chosen.error_frames, chosen.elsewhere) == (1, 1, 1)
+
+
+def test_what_is_there_instead_of_the_unit_is_said() -> None:
     chosen = Selection({"readings": layout()})
-    assert chosen.takes(frame(4, flags=int(RawFlag.ERROR)))
     with pytest.raises(InputError, match=r"none of the profile's identifiers \(0x180\) is in it; there is no frame"):
+        chosen.settle("log")
+    chosen.takes(frame(4, flags=int(RawFlag.ERROR)))
+    with pytest.raises(InputError, match="there is 1 frames of other channels or nodes, or in error"):
+        chosen.settle("log")
+
+
+def test_frames_of_strangers_on_several_buses_are_none_of_the_units() -> None:
+    chosen = Selection({"readings": layout(per_node=True)}, node=5)
+    for source, channel in ((0x185, "a"), (0x186, "a"), (0x186, "b")):
+        chosen.takes(frame(source, channel))
+    chosen.settle("log")
+    assert (chosen.from_channels, chosen.elsewhere) == (["a"], 2)
+
+
+def test_a_node_is_refused_where_the_identifiers_know_none() -> None:
+    chosen = Selection({"readings": layout()}, node=5)
+    chosen.takes(frame(0x180))
+    with pytest.raises(InputError, match=r"^--node 5: the identifiers of the profile are the same for all nodes"):
         chosen.settle("log")

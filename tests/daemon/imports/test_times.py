@@ -9,7 +9,17 @@ def test_steps_back_and_pauses_are_counted_and_the_largest_kept() -> None:
     times = Times(period_ns=10 * MS)
     for time_ms in (1000, 1010, 1005, 1020, 900, 1030, 3000, 3010, 10_000):
         times.note(time_ms * MS)
-    assert times.document() == {"back": 2, "furthest_back_s": 0.12, "pauses": 2, "longest_pause_s": 6.99}
+    assert times.document() == {
+        "back": 2, "furthest_back_s": 0.12, "equal": 0, "pauses": 2, "longest_pause_s": 6.99
+    }  # fmt: skip
+    assert times.seconds == 9.0
+
+
+def test_equal_times_are_counted() -> None:
+    times = Times(period_ns=10 * MS)
+    for time_ms in (0, 10, 10, 10, 20, 20):
+        times.note(time_ms * MS)
+    assert times.document()["equal"] == 3
 
 
 def test_a_slow_stream_pauses_after_ten_periods() -> None:
@@ -19,6 +29,6 @@ def test_a_slow_stream_pauses_after_ten_periods() -> None:
     assert times.document()["pauses"] == 1
 
 
-def test_ticks_go_on_with_the_message_that_came_first() -> None:
+def test_ticks_go_on_with_the_first_message_that_may_lead() -> None:
     ticks = Ticks(period_ns=10 * MS)
-    assert [ticks.of(key) for key in "abaabb"] == [0, 0, 10 * MS, 20 * MS, 20 * MS, 20 * MS]
+    assert [ticks.of(key, key in "ab") for key in "cabcaacb"] == [n * MS for n in (0, 0, 0, 0, 10, 20, 20, 20)]
