@@ -90,6 +90,8 @@ class Habits:
     """So long after a restart it answers nothing."""
     reset_reply: bool = True
     """The reset command is acknowledged before the device restarts."""
+    reset_ignored: bool = False
+    """It is acknowledged, and nothing is done."""
 
     def __post_init__(self) -> None:
         if not self.checksum and (self.checksum_checked or self.stored_checksum_wrong):

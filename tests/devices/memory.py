@@ -275,6 +275,8 @@ class Electronics:
     def _reset(self, raw: bytes, now: float) -> None:
         if int.from_bytes(raw, "big") != RESET_COMMAND:
             raise Refused("value")
+        if self.habits.reset_ignored:
+            return
         self.restart(now)
         if not self.habits.reset_reply:
             raise Silent

@@ -60,6 +60,27 @@ class Traffic:
                 part = {}
         return found
 
+    @cached_property
+    def marks(self) -> set[int]:
+        """Writes by which a restart was to show: one bit off what the register
+        was read as, and never stored."""
+        found, read, pending = set[int](), dict[str, bytes](), dict[str, int]()
+        stores = {i for i, _ in self.steps("store")}
+        for i, a in enumerate(self.accesses):
+            if i in stores:
+                found -= set(pending.values())
+            if a.register not in self.names:
+                continue
+            if a.operation == "read":
+                if not a.error:
+                    read[a.register] = a.raw
+                continue
+            pending.pop(a.register, None)
+            if _bits_apart(a.raw, read.get(a.register, b"")) == 1:
+                found.add(i)
+                pending[a.register] = i
+        return found if self.sequence("reset") else set()
+
     @property
     def last_write(self) -> int:
         return self.writes[-1][0] if self.writes else -1
@@ -67,12 +88,16 @@ class Traffic:
     @cached_property
     def known(self) -> Raw:
         """What was read last of each calibration register, without those that
-        were written since."""
+        were written since. What shows a restart is stored nowhere, and counts
+        for nothing."""
         found: dict[str, bytes] = {}
-        for a in self.accesses:
-            if a.operation == "write":
+        marked: dict[str, bytes] = {}
+        for i, a in enumerate(self.accesses):
+            if i in self.marks:
+                marked[a.register] = a.raw
+            elif a.operation == "write":
                 found.pop(a.register, None)
-            elif a.register in self.names and not a.error:
+            elif a.register in self.names and not a.error and a.raw != marked.get(a.register):
                 found[a.register] = a.raw
         return found
 
@@ -100,6 +125,13 @@ class Traffic:
                 missed = missed + 1 if a.unanswered else 0
                 longest = max(longest, missed)
         return longest >= MISSED
+
+
+def _bits_apart(one: bytes, other: bytes) -> int:
+    """-1 where they differ in length."""
+    if len(one) != len(other):
+        return -1
+    return (int.from_bytes(one, "big") ^ int.from_bytes(other, "big")).bit_count()
 
 
 @dataclass(frozen=True)
@@ -162,10 +194,11 @@ def _identity(traffic: Traffic, serial: str | None) -> list[Difference]:
 
 def _asked_for(traffic: Traffic, said: Said) -> list[Difference]:
     """Every write is of the certificate's image, of what the device held
-    before, or of a sequence of the profile."""
+    before, or of a sequence of the profile, or is to show a restart."""
     steps = {step for label in ("unlock", "store", "lock", "reset") for step in traffic.sequence(label)}
     asked = {(name, raw) for some in (said.new, said.before, said.earlier) for name, raw in (some or {}).items()}
-    written = dict.fromkeys((a.register, a.raw) for a in traffic.accesses if a.operation == "write")
+    writes = [(i, a) for i, a in enumerate(traffic.accesses) if a.operation == "write"]
+    written = dict.fromkeys((a.register, a.raw) for i, a in writes if i not in traffic.marks)
     return [
         Difference(REGISTERS, Kind.NOT_ASKED_FOR, name, raw.hex())
         for name, raw in written
@@ -297,15 +330,16 @@ _GOES_WITH: dict[DeviceState, tuple[Evidence, ...]] = {
 
 def _restarted(traffic: Traffic, said: Said) -> bool:
     """A restart after the last write, then all registers read. One that nobody
-    acknowledged counts where an old value was put into a register in use before
-    it, and did not come back."""
+    acknowledged counts where another value was put into a register in use
+    before it, and did not come back."""
     lasting = said.held is not None and said.held.state is DeviceState.OLD
     if not traffic.profile.sequences.reset:  # it may have lost its supply, and started from what is stored
         return lasting
     if not traffic.sequence("reset"):  # by no register, so that no traffic could show it
         return True
     image, old = said.new, said.before or {}
-    tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
+    tried = traffic.last_write in traffic.marks
+    tried |= any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
     if _acknowledged(traffic):
         return True

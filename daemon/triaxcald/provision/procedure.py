@@ -18,7 +18,7 @@ from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.provision.image import RegisterImage, calibration_registers
 from triaxcald.provision.journal import Entry, Journal, Step
 from triaxcald.provision.plausible import Doubt, doubts, unstable
-from triaxcald.provision.proof import show_restart
+from triaxcald.provision.proof import proven_restart
 from triaxcald.provision.restore import restore
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
@@ -155,11 +155,11 @@ class Provisioning:
                 await self._write()
                 await self._store()
                 await self._prove()
-            elif self._restarted:
+            elif self._restarted and not self._journal_lies:
                 self.held.now(DeviceState.NEW_VERIFIED, Evidence.RESTART)
             else:
                 self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
-                await self._prove_by_power_cycle()
+                await self._prove()
         except (DriverError, StationError) as e:
             await to_its_end(self._give_up())
             if not self.written and isinstance(e, ProvisionError):
@@ -295,24 +295,18 @@ class Provisioning:
             await self._decide(Evidence.POWER_CYCLE)
 
     async def _prove_by_restart(self) -> None:
+        self.steps.append("reset")
         try:
-            acknowledged = await self._sequence("reset")
+            shown = await proven_restart(self.link, self.bundle, self.image.raw, self.before.raw, self.found.raw)
         except RegisterRefused:
             if self.power_cycle is None:
                 raise
             return
+        except ProvisionError:
+            self._decided = False  # a value that nobody wants is in use
+            raise
         self.steps.append("identity after the reset")
-        await self._decide(Evidence.RESTART if acknowledged else Evidence.READ_BACK)
-        if not acknowledged and self.stores and self.held.state is not DeviceState.OLD:
-            self.steps.append("showing the restart")
-            was = self.held.state, self.held.evidence
-            self._decided = False  # for as long as an old value is in one of the registers
-            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
-            shown = await show_restart(self.link, self.bundle, self.image.raw, self.found.raw, self.differing)
-            self._decided = True
-            self.held.now(*was)
-            if shown:
-                await self._decide(Evidence.RESTART)
+        await self._decide(Evidence.RESTART if shown else Evidence.READ_BACK)
 
     async def _decide(self, evidence: Evidence) -> None:
         """What the device holds, by reading it. Raises ProvisionError where
@@ -367,7 +361,7 @@ class Provisioning:
         """What an undoing that failed has left. Raises DriverError,
         StationError."""
         await self._require_same_unit()
-        restarted = self.resets and await run_sequence(self.link, self.bundle, "reset")
+        restarted = self.resets and await proven_restart(self.link, self.bundle, self.before.raw, self.image.raw)
         held = self.after = await self._look()
         state = self._state_of(held)
         if not restarted and state is DeviceState.OLD and lasting:

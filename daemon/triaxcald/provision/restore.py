@@ -10,6 +10,7 @@ from triaxcal_drivers.profile import Bundle, PollStep, WaitStep
 from triaxcald.errors import ProvisionError, StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import WrongUnit, check_identity
+from triaxcald.provision.proof import proven_restart
 from triaxcald.provision.sequence import lock_quietly, reconnect, run_sequence, run_steps
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.provision.state import Evidence
@@ -30,7 +31,7 @@ async def restore(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, *, sto
         await _contact(link, bundle, snapshot)
         if stored:
             await let_a_store_end(link, bundle)
-        restarted = await _restart(link, bundle)
+        restarted = await _restart(link, bundle, snapshot)
         if await differing(link, bundle, snapshot):
             restarted = await _write_back(link, bundle, snapshot, stored)
     except DriverError as e:
@@ -65,13 +66,13 @@ async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> No
         await check_identity(link, bundle, snapshot.serial)
 
 
-async def _restart(link: RegisterLink, bundle: Bundle) -> bool:
+async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> bool:
     """Whether the device is known to have restarted."""
     if not bundle.profile.sequences.reset:
         return False
     await lock_quietly(link, bundle)
     try:
-        return await run_sequence(link, bundle, "reset")
+        return await proven_restart(link, bundle, snapshot.raw)
     except RegisterRefused:
         return False  # writing back may still do
 
@@ -93,7 +94,7 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, st
             await lock_quietly(link, bundle)
     if not stored:
         return False
-    restarted = bool(bundle.profile.sequences.reset) and await run_sequence(link, bundle, "reset")
+    restarted = bool(bundle.profile.sequences.reset) and await proven_restart(link, bundle, snapshot.raw)
     await _require_equal(link, bundle, snapshot)
     if not acknowledged and not restarted:
         raise ProvisionError("the store of the old calibration went unanswered, and no read decides what it did")

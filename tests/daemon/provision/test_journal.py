@@ -71,7 +71,8 @@ async def test_it_is_there_before_the_first_register_is_written(tmp_path: Path) 
 
     host.unit.write = looked_at  # type: ignore[method-assign]
     assert await host.provision()
-    writes = {register: entries for register, entries in kept if register in host.old}
+    stored = [register for register, _ in kept].index("store")  # after it a value shows the restart
+    writes = {register: entries for register, entries in kept[:stored] if register in host.old}
     assert set(writes) == {name for name, raw in host.old.items() if host.new[name] != raw}
     assert all(entry.before == host.old and entry.step == "writing" for (entry,) in writes.values())
     assert all({**host.old, **entry.wanted} == host.new for (entry,) in writes.values())

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from tests.devices.bench import Bench
+from tests.devices.habits import Habits
 from tests.devices.rows import ROWS, Row
 from triaxcald.cli import provisioning
 
@@ -47,3 +49,15 @@ def test_the_page_about_them_shows_these_rows() -> None:
         "|---|---|---|---|---|",
         *(f"| {row.does} | {row.holds} | `{row.state}` | {row.exit_code} | {row.says} |" for row in ROWS),
     ]
+
+
+@pytest.mark.slow
+def test_a_second_provisioning_proves_no_more_of_a_device_that_ignores_its_restart(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=Habits(reset_ignored=True, forget_store=True)) as bench:
+        again = partial(triaxcal, "provision", "--resume", bench.station, "--json")
+        for provision in (partial(bench.provision, "--json"), again):
+            done = provision()
+            assert done.code == 0, done.err
+            assert done.json["outcome"]["device_state"] == "new_unverified"
+        bench.power_cycle()
+        assert bench.holds_old()

@@ -136,6 +136,8 @@ async def test_a_unit_that_takes_the_place_of_another_at_any_request_is_not_give
         assert len(lost) <= (0 if habits.store_command else 1), request
         if other.written:
             assert not ended_well, request
-            assert state in ("unknown", "untouched"), request
+            # The other's register in use may be off by a bit until it restarts.
+            assert state in ("unknown", "untouched", "new_unverified"), request
+            assert state != "new_unverified" or host.starts_with() == "new", request
         if state in ("old", "untouched"):
             assert host.starts_with() == "old", request

@@ -120,7 +120,7 @@ async def test_what_a_unit_holds_that_dies_while_storing_is_unknown(make_bench) 
     bench.assert_stored(bench.old)
 
 
-async def test_an_old_value_that_was_put_in_to_show_a_restart_does_not_stay(bench) -> None:
+async def test_a_value_that_was_put_in_to_show_a_restart_does_not_stay(bench) -> None:
     """No reset is heard, and the register takes the new value again only at the second attempt."""
     puts: list[str] = []
 
@@ -132,11 +132,11 @@ async def test_an_old_value_that_was_put_in_to_show_a_restart_does_not_stay(benc
             raise DeviceSilent("no reply")
         if request == ("write", "scale_factor_x"):
             puts.append(request[1])
-            if len(puts) == 3:  # the new value, the old one for the proof, the new one again
+            if len(puts) == 3:  # the new value, another for the proof, the new one again
                 raise RegisterRefused("locked", register=request[1], code=1)
 
     bench.device.trouble = deaf_to_resets
-    assert await fail(bench) == "showing the restart: register scale_factor_x does not take the new value again"
+    assert await fail(bench) == "reset: register scale_factor_x does not take its value again"
     assert bench.held.state in (OLD, UNKNOWN)
     bench.assert_holds(bench.old)
 
