@@ -8,7 +8,8 @@ for the first sample, and to bridge a restart.
 
 A restart is seen where the time stamp goes back or contradicts the counter;
 without a time stamp, where the counter is near zero again after failed
-requests. A gap that the host knows of, in which it lost the device, is treated
+requests, or has gone on much further than the host's time allows
+(`FASTEST`). A gap that the host knows of, in which it lost the device, is treated
 alike. The first sample after it follows the last one before by the time
 between their arrivals, at least one period. The counter goes on by one: what
 was lost is not known.
@@ -25,6 +26,9 @@ from numpy.typing import NDArray
 Int64 = NDArray[np.int64]
 NEAR_START_S = 10.0
 """A device that restarted is heard again within this time of its own."""
+FASTEST = 100.0
+"""No device, not even a simulated one, is faster than its rate by so much: a
+counter that says so, and by more than `NEAR_START_S`, has started anew."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +92,8 @@ class Timeline:
         n = len(a.arrival_ns)
         if n == 0:
             return Placed(np.zeros(0, dtype=bool), np.zeros(0, np.int64), np.zeros(0, np.int64), 0)
-        steps, ticks, restart = self._steps(a)
         elapsed_ns = np.diff(a.arrival_ns, prepend=self._last[2] if self._last else a.arrival_ns[0])
+        steps, ticks, restart = self._steps(a, elapsed_ns)
         restart = restart | a.after_gap
         if self._last is None:
             restart[0] = True
@@ -109,7 +113,7 @@ class Timeline:
         )
         return Placed(new, counter[new], time_ns[new], missing)
 
-    def _steps(self, a: Arrivals) -> tuple[Int64, Int64, NDArray[np.bool_]]:
+    def _steps(self, a: Arrivals, elapsed_ns: Int64) -> tuple[Int64, Int64, NDArray[np.bool_]]:
         """Of each sample to the one before: samples, ticks of the time stamp,
         and whether it restarted."""
         n = len(a.arrival_ns)
@@ -129,7 +133,9 @@ class Timeline:
         if a.stamp is None:
             near_steps = min(round(near / self._clock.period_ns), modulus // 8)
             restart = a.broken & (a.counter < near_steps) & (steps >= near_steps)
-            return np.where(steps >= modulus - self._clock.repeat_window, steps - modulus, steps), no_ticks, restart
+            steps = np.where(steps >= modulus - self._clock.repeat_window, steps - modulus, steps)
+            restart |= steps * self._clock.period_ns > FASTEST * np.maximum(elapsed_ns, 0) + near
+            return steps, no_ticks, restart
         ticks = _signed_steps(a.stamp, last_stamp, self._clock.stamp_bits or 64)
         by_stamp = ticks * (self._clock.tick_ns / self._clock.period_ns)
         steps = steps + (np.rint((by_stamp - steps) / modulus) * modulus).astype(np.int64)

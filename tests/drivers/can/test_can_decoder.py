@@ -230,6 +230,17 @@ def test_messages_of_one_sample_stay_together_though_a_gap_was_noticed_between_t
     assert decoded["counter"] == list(range(20))
 
 
+def test_a_counter_that_outruns_the_hosts_time_a_hundredfold_has_started_anew(
+    decoder: CanDecoder, decode_all: DecodeAll
+) -> None:
+    """As where another node sends the same identifiers."""
+    counts = [100, 101, 20_000, 20_001, 20_002]
+    records = [r for k, count in enumerate(counts) for r in (xy(count, k * PERIOD), z(count, k * PERIOD))]
+    decoded = decode_all(decoder, records)
+    assert [(t - T0) // PERIOD for t in decoded["time_ns"]] == [0, 1, 2, 3, 4]
+    assert decoded["missing"] == 0
+
+
 def test_time_never_goes_back_when_a_restart_takes_no_host_time(decoder: CanDecoder, decode_all: DecodeAll) -> None:
     records = [r for k in (40000, 40001, 0, 1, 2) for r in (xy(k), z(k))]  # all at the same host time
     decoded = decode_all(decoder, records)

@@ -159,7 +159,8 @@ def test_a_failed_request_counts_for_the_sample_after_it_and_no_later_one(bundle
     no_stamp = ('time_stamp = { word = 1, type = "uint32", unit_s = 1e-6 }', "")
     decode = decoder(bundle, "full", no_stamp)
     decode.feed(full((RawFlag.ERROR, b""), (0, window(40_000))))
-    assert decode.feed(full((0, window(3)))).missing == 65_536 + 3 - 40_000 - 1
+    later_ns = (65_536 + 3 - 40_000) * 10_000_000
+    assert decode.feed(RawBatch.of([(later_ns, FULL_SOURCE, 0, window(3))])).missing == 65_536 + 3 - 40_000 - 1
     decode.feed(full((0, window(40_000))))
     decode.feed(full((RawFlag.ERROR, b"")))
     assert decode.feed(full((0, window(3)))).missing == 0

@@ -123,9 +123,24 @@ def test_without_a_time_stamp_a_counter_near_zero_after_a_failed_request_is_a_re
     assert placed.missing == 0
 
 
-def test_without_a_failed_request_it_is_a_gap():
-    placed = Timeline(COUNTED).place(arrivals(counter=[40_000, 40_001, 3]))
-    assert placed.missing == 65536 + 3 - 40_001 - 1
+def test_without_a_failed_request_it_is_a_gap_where_there_was_time_for_it():
+    at_ns = [0, PERIOD_NS, (65_536 + 3 - 40_000) * PERIOD_NS]
+    placed = Timeline(COUNTED).place(arrivals(counter=[40_000, 40_001, 3], arrival_ns=at_ns))
+    assert placed.missing == 65_536 + 3 - 40_001 - 1
+
+
+@pytest.mark.parametrize("before", [300, 30_000, 60_000])
+def test_a_counter_that_outruns_the_hosts_time_a_hundredfold_has_started_anew(before):
+    """The unit restarted between two replies: no request failed."""
+    at_ns = [0, PERIOD_NS, 30 * PERIOD_NS, 31 * PERIOD_NS]
+    placed = Timeline(COUNTED).place(arrivals(counter=[before, before + 1, 0, 1], arrival_ns=at_ns))
+    assert ((placed.time_ns - placed.time_ns[0]) // PERIOD_NS).tolist() == [0, 1, 30, 31]
+    assert placed.counter.tolist() == [before, before + 1, before + 2, before + 3]
+
+
+def test_a_simulated_device_may_be_sixty_times_as_fast():
+    placed = Timeline(COUNTED).place(arrivals(counter=[300, 301, 6_301], arrival_ns=[0, PERIOD_NS, 101 * PERIOD_NS]))
+    assert placed.missing == 5_999
 
 
 def test_a_counter_that_turns_during_a_failed_request_is_no_restart():
