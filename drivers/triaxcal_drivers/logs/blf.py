@@ -7,7 +7,6 @@ times to a quarter of a microsecond.
 
 from __future__ import annotations
 
-import calendar
 import struct
 import zlib
 from collections.abc import Iterator
@@ -28,6 +27,7 @@ from triaxcal_drivers.logs.frames import (
     LoggedFrame,
     Remark,
 )
+from triaxcal_drivers.logs.times import utc_ns
 
 MAGIC = b"LOGG"
 OBJECT_MOST = 16 * 2**20
@@ -88,10 +88,9 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
 
 def _start_ns(system_time: list[int], account: Account) -> int:
     year, month, _, day, hour, minute, second, ms = system_time
-    if not 1970 <= year <= 2200 or not 1 <= month <= 12 or not 1 <= day <= 31:
-        account.remarks.add(Remark.NO_DATE)
-        return 0
-    return (calendar.timegm((year, month, day, hour, minute, second)) * 1000 + ms) * 1_000_000
+    time_ns = utc_ns(year, month, day, hour, minute, second)
+    account.remarks.add(Remark.NO_DATE if time_ns is None else Remark.DATE_WITHOUT_ZONE)
+    return 0 if time_ns is None else time_ns + ms * 1_000_000
 
 
 def _unpacked(body: bytes, where: str, account: Account) -> bytes:

@@ -18,6 +18,7 @@ from triaxcal_drivers.errors import LogError
 from triaxcal_drivers.files import open_file
 from triaxcal_drivers.logs import asc, blf, candump, mf4, pcap, trc
 from triaxcal_drivers.logs.frames import Account, LoggedFrame
+from triaxcal_drivers.logs.lines import BYTE_ORDER_MARK
 
 HEAD = 8192  # bytes by which the kind is told
 GZIP = b"\x1f\x8b"
@@ -63,7 +64,7 @@ def kind_of(head: bytes) -> Kind | str | None:
 
 
 def _of_text(head: bytes) -> Kind | None:
-    lines = [line.strip() for line in head.split(b"\n")[:LINES_LOOKED_AT] if line.strip()]
+    lines = [line.strip() for line in head.removeprefix(BYTE_ORDER_MARK).split(b"\n")[:LINES_LOOKED_AT] if line.strip()]
     if len(head) == HEAD and len(lines) > 1:
         lines = lines[:-1]  # cut off
     if any(trc.HEAD.match(line) for line in lines):

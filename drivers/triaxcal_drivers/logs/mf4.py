@@ -34,7 +34,9 @@ from triaxcal_drivers.logs.frames import (
     SWITCHED,
     Account,
     LoggedFrame,
+    Remark,
 )
+from triaxcal_drivers.logs.times import LONGEST_NS
 
 MAGICS = (b"MDF     ", b"UnFinMF ")
 RECORDS_AT_ONCE = 8192
@@ -51,6 +53,7 @@ _CHAINED = frozenset((b"##DG", b"##CG", b"##CN", b"##DL", b"##FH", b"##CH", b"##
 """Blocks whose first link leads to the next of a chain; that of a channel also
 has its parts in the second."""
 _VARIABLE_LENGTH = 1  # flag of a group
+_LOCAL_TIME = 1  # flag of the time in the header: of no known zone
 
 
 def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
@@ -67,6 +70,8 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
         stack.callback(mdf.close)
         try:
             start_ns = int(mdf.header.abs_time)
+            if mdf.header.time_flags & _LOCAL_TIME:
+                account.remarks.add(Remark.DATE_WITHOUT_ZONE)
             yield from _in_order([_Group(mdf, number, start_ns, name) for number, name in _bus_groups(mdf, account)])
         except LogError:
             raise
@@ -135,7 +140,7 @@ class _Group:
                 self._name, group=self._number, record_offset=first, record_count=RECORDS_AT_ONCE, raw=False
             )
             seconds = np.asarray(signal.timestamps, dtype=np.float64)
-            yield self._frames(self._start_ns + np.rint(seconds * 1e9).astype(np.int64), signal.samples)
+            yield self._frames(_times_ns(self._start_ns, seconds), signal.samples)
 
     def _frames(self, time_ns: NDArray[np.int64], samples: Any) -> list[LoggedFrame]:
         column = _Columns(samples, self._name)
@@ -153,6 +158,12 @@ class _Group:
         channels = column.channels(self._channel)
         rows = zip(time_ns.tolist(), (source & EXTENDED_MOST).tolist(), flags.tolist(), data, channels, strict=True)
         return [LoggedFrame(*row) for row in rows]
+
+
+def _times_ns(start_ns: int, seconds: NDArray[np.float64]) -> NDArray[np.int64]:
+    """-1, which is no time, for what is no number or beyond all measure."""
+    told = np.abs(seconds) < LONGEST_NS / 1e9
+    return np.where(told, start_ns + np.rint(np.where(told, seconds, 0) * 1e9).astype(np.int64), -1)
 
 
 class _Columns:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from typing import BinaryIO
 
 from triaxcal_drivers.logs.frames import (
@@ -27,10 +27,13 @@ from triaxcal_drivers.logs.frames import (
     LoggedFrame,
     Remark,
 )
-from triaxcal_drivers.logs.lines import numbered
+from triaxcal_drivers.logs.lines import numbered, whole
+from triaxcal_drivers.logs.times import LONGEST_NS
 
 LINE = re.compile(rb"\s*\d+\)?\s+\d+(?:\.\d+)?\s+\S+\s+\S+")
 HEAD = re.compile(rb";(?:\$FILEVERSION\s*=|\$STARTTIME\s*=|#{40})")
+_MILLISECONDS = re.compile(r"(\d{1,15})(?:\.(\d{1,6})\d*)?$", re.A)  # behind the point, down to nanoseconds
+_DAYS = re.compile(r"\d{1,6}(?:\.\d*)?$", re.A)
 _DAY_ZERO = 25569  # days from TRC's, 1899-12-30, to the epoch
 _DAY_NS = 86_400_000_000_000
 _COLUMNS: Mapping[str, str] = {
@@ -66,7 +69,7 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
         else:
             try:
                 frame = _frame(line.decode("ascii"), columns, start_ns or 0, account)
-            except (ValueError, KeyError, IndexError, InvalidOperation):
+            except (ValueError, KeyError, IndexError):
                 account.note(f"line {number}", f"expected a message of the columns {','.join(columns)}")
                 continue
             if frame is not None:
@@ -75,15 +78,22 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
 
 
 def _start_ns(text: str) -> int | None:
-    try:
-        days = Decimal(text.strip())
-    except InvalidOperation:
+    if not _DAYS.match(text.strip()):
         return None
-    return int((days - _DAY_ZERO) * _DAY_NS) if _DAY_ZERO <= days < 150_000 else None
+    time_ns = int((Decimal(text.strip()) - _DAY_ZERO) * _DAY_NS)
+    return time_ns if 0 <= time_ns < LONGEST_NS else None
+
+
+def _offset_ns(text: str) -> int:
+    """Raises ValueError."""
+    m = _MILLISECONDS.match(text)
+    if m is None:
+        raise ValueError("no time in milliseconds")
+    return int(m[1] + (m[2] or "").ljust(6, "0"))
 
 
 def _frame(line: str, columns: str, start_ns: int, account: Account) -> LoggedFrame | None:
-    """Raises ValueError, KeyError, IndexError, InvalidOperation."""
+    """Raises ValueError, KeyError, IndexError."""
     words = line.split(None, len(columns) - 1)
     at = dict(zip(columns, words, strict=False))
     kind, direction = at.get("T", "DT"), at.get("d", "Rx")
@@ -91,17 +101,19 @@ def _frame(line: str, columns: str, start_ns: int, account: Account) -> LoggedFr
         account.other(kind[:8] if kind != "DT" else "status")
         return None
     flags = _TYPES[kind] | (SENT if direction == "Tx" else 0)
-    time_ns = start_ns + int(Decimal(at["O"]) * 1_000_000)
+    time_ns = start_ns + _offset_ns(at["O"])
     channel = at.get("B", "1")
     if flags & ERROR:
         return LoggedFrame(time_ns, 0, ERROR, b"", channel)
-    source = int(at["I"], 16)
+    source = whole(at["I"], 16)
     flags |= EXTENDED if len(at["I"]) > 4 else 0
-    length = FD_LENGTHS[int(at["L"])] if "L" in at else int(at["l"])
+    if source > (EXTENDED_MOST if flags & EXTENDED else STANDARD_MOST):
+        raise ValueError(line)
+    length = FD_LENGTHS[whole(at["L"])] if "L" in at else whole(at["l"])
     data = at.get("D", "")
     if flags & (REMOTE | FD) == REMOTE or data.startswith("RTR"):
         return LoggedFrame(time_ns, source, flags | REMOTE, bytes(min(length, CLASSIC_MOST)), channel)
     octets = bytes.fromhex("".join(data.split()[:length]))
-    if len(octets) != length or length > FD_MOST or source > (EXTENDED_MOST if flags & EXTENDED else STANDARD_MOST):
+    if len(octets) != length or length > FD_MOST:
         raise ValueError(line)
     return LoggedFrame(time_ns, source, flags, octets, channel)

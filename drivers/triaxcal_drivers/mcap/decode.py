@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from triaxcal_drivers.interface import RawBatch, RawFlag, SampleBlock
+from triaxcal_drivers.logs.times import LONGEST_NS
 from triaxcal_drivers.mcap.fields import Read
 from triaxcal_drivers.mcap.model import READING_CHANNELS, MessageStream
 
@@ -45,19 +46,23 @@ class MessageDecoder:
             elif source == self._source:
                 try:
                     found, stamp_ns = self._read(data)
-                except (ValueError, OverflowError):
+                    times.append(self._time_ns(time_ns, stamp_ns))
+                except ValueError:
                     errors += 1
                     continue
-                times.append(self._time_ns(time_ns, stamp_ns))
                 rows.append(found)
         return self._block(times, rows, errors)
 
     def _time_ns(self, logged_ns: int, stamp_ns: int | None) -> int:
+        """Raises ValueError where the stamps are too far apart."""
         if stamp_ns is None:
             return logged_ns
         if self._origin_ns is None:
             self._origin_ns = logged_ns - stamp_ns
-        return self._origin_ns + stamp_ns
+        time_ns = self._origin_ns + stamp_ns
+        if not -LONGEST_NS < time_ns < LONGEST_NS:
+            raise ValueError("a time beyond all measure")
+        return time_ns
 
     def _block(self, times: list[int], rows: list[list[float]], errors: int) -> SampleBlock:
         values = np.array(rows, dtype=np.float64).reshape(len(rows), len(self._names)) * self._scale + self._offset

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.logs.times import LONGEST_NS
 from triaxcal_drivers.mcap.cdr import CdrReader, members
 from triaxcal_drivers.mcap.definitions import message_types
 from triaxcal_drivers.mcap.schema import DEFINITION_MOST, MessageSchema
 
 SECONDS = ("sec", "secs", "seconds")
 NANOSECONDS = ("nanosec", "nsec", "nsecs", "nanos", "nanoseconds")
-LONGEST_NS = 2**62
 
 Read = Callable[[bytes], tuple[list[float], int | None]]
 """The numbers asked for, and the time stamp in nanoseconds. Raises
@@ -56,14 +55,15 @@ def _cdr(schema: MessageSchema, paths: list[list[str]], stamp: list[str] | None,
 def _stamp_ns(seconds: float, nanoseconds: float | None = None) -> int:
     """Of a stamp's two parts; of one number where that is all: a float is
     seconds, a whole number nanoseconds. Raises ValueError."""
-    if nanoseconds is not None:
-        time_ns = int(seconds) * 1_000_000_000 + int(nanoseconds)
-    elif isinstance(seconds, float):
-        if not math.isfinite(seconds):
-            raise ValueError("a time that is no number")
-        time_ns = round(seconds * 1e9)
-    else:
-        time_ns = seconds
+    try:
+        if nanoseconds is not None:
+            time_ns = int(seconds) * 1_000_000_000 + int(nanoseconds)
+        elif isinstance(seconds, float):
+            time_ns = round(seconds * 1e9)
+        else:
+            time_ns = seconds
+    except OverflowError as e:
+        raise ValueError("a time that is infinite") from e
     if not -LONGEST_NS < time_ns < LONGEST_NS:
         raise ValueError("a time beyond all measure")
     return time_ns
@@ -105,6 +105,10 @@ def _numbers(message: Any, paths: list[list[str]], stamp: list[str] | None) -> t
     found = [_at(message, path) for path in paths]
     if not all(isinstance(value, int | float) for value in found):
         raise ValueError("no number")
+    try:
+        found = [float(value) for value in found]
+    except OverflowError as e:
+        raise ValueError("a number beyond all measure") from e
     if stamp is None:
         return found, None
     told = _at(message, stamp)

@@ -78,8 +78,14 @@ def test_errors_and_other_objects(read: Read) -> None:
     assert account.others == {"BLF object 65": 1}
 
 
-def test_without_a_date_it_is_said(read: Read) -> None:
-    (frame,), account = read(frames, head((0,) * 8) + container(thing(1, CLASSIC)))
+def test_a_date_tells_no_zone(read: Read) -> None:
+    _, account = read(frames, head() + container(thing(1, CLASSIC)))
+    assert account.remarks == {Remark.DATE_WITHOUT_ZONE}
+
+
+@pytest.mark.parametrize("start", [(0,) * 8, (2017, 2, 4, 31, 12, 0, 0, 0), (2017, 9, 6, 30, 65535, 0, 0, 0)])
+def test_without_a_date_it_is_said(read: Read, start: tuple[int, ...]) -> None:
+    (frame,), account = read(frames, head(start) + container(thing(1, CLASSIC)))
     assert frame.time_ns == 7
     assert account.remarks == {Remark.NO_DATE}
 

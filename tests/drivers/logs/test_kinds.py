@@ -29,6 +29,7 @@ from triaxcal_drivers.logs.kinds import NAMES, Kind, kind_of, opened
         (b"     1)     1841 0001 8 00 00 00 00 00 00 00 00\n", "TRC"),
         (b"(1436509052.249713) vcan0 044#2A366C2B\n", "candump"),
         (b"\n  vcan0  044   [4]  2A 36 6C 2B\n", "candump"),
+        (b"\xef\xbb\xbf(1436509052.249713) vcan0 044#2A366C2B\n", "candump"),
         (b"t_s,ux,uy,uz\n0,1,2,3\n", None),
         (b"", None),
         (b"\x7fELF\x02\x01\x01", None),

@@ -13,7 +13,7 @@ import can
 import pytest
 
 from triaxcal_drivers.errors import LogError
-from triaxcal_drivers.logs.frames import LoggedFrame
+from triaxcal_drivers.logs.frames import LoggedFrame, Remark
 from triaxcal_drivers.logs.mf4 import frames, look_through
 
 Read = Callable[..., tuple[list[LoggedFrame], Any]]
@@ -63,6 +63,16 @@ def written(messages: list[can.Message], tmp_path_factory: pytest.TempPathFactor
         for message in messages[:100]:
             log.on_message_received(message)
     return path.read_bytes()
+
+
+@pytest.mark.parametrize(("flags", "remarks"), [(0, set()), (1, {Remark.DATE_WITHOUT_ZONE}), (2, set())])
+def test_local_time_tells_no_zone(read: Read, written: bytes, flags: int, remarks: set[Remark]) -> None:
+    header = 64
+    links = struct.unpack_from("<Q", written, header + 16)[0]
+    at = header + 24 + 8 * links + 12  # behind the time and the two offsets from UTC
+    found, account = read(frames, written[:at] + bytes([flags]) + written[at + 1 :])
+    assert len(found) == 100
+    assert account.remarks == remarks
 
 
 def test_a_file_cut_short_is_refused(read: Read, written: bytes) -> None:

@@ -80,12 +80,15 @@ def test_mf4_is_read_through_asammdf(messages: list[can.Message], tmp_path: Path
 
 
 def test_times_since_the_epoch_come_through(messages: list[can.Message], tmp_path: Path) -> None:
-    for suffix, writer in ((".blf", can.BLFWriter), (".log", can.CanutilsLogWriter)):
+    for suffix, writer, remarks in (
+        (".blf", can.BLFWriter, {Remark.DATE_WITHOUT_ZONE}),
+        (".log", can.CanutilsLogWriter, set()),
+    ):
         path = tmp_path / f"log{suffix}"
         written(writer)(path, messages[:10])
         _, frames, account = from_file(path)
         assert frames[0].time_ns == pytest.approx(messages[0].timestamp * 1e9, abs=1000)
-        assert account.remarks == set()
+        assert account.remarks == remarks
 
 
 @pytest.mark.parametrize(("suffix", "writer"), [(".blf", can.BLFWriter), (".log", can.CanutilsLogWriter)])
