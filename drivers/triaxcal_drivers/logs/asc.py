@@ -27,7 +27,7 @@ from triaxcal_drivers.logs.frames import (
     LoggedFrame,
     Remark,
 )
-from triaxcal_drivers.logs.lines import date_ns, nanoseconds, numbered
+from triaxcal_drivers.logs.lines import date_ns, nanoseconds, numbered, whole
 
 HEAD = re.compile(rb"(?:date\s+\w+\s+\w+|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version\s+\d)", re.I)
 _DATE = re.compile(rb"(?:date|begin\s+triggerblock)\s+(.*)", re.I)
@@ -59,18 +59,30 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
         frame = reader.event(event, f"line {number}")
         if frame is not None:
             yield frame
-    if not reader.dated:
+    if Remark.DATE_WITHOUT_ZONE not in account.remarks:
         account.remarks.add(Remark.NO_DATE)
 
 
 @dataclass
 class _Reader:
+    """**Time.** Absolute times are since the start, relative ones since the
+    event before. The start is the last date before the first event: that of
+    the head, or the trigger block's.
+
+    The date of a later block says when that block begins. The block's times
+    may count from there (a measurement that was started again), or go on from
+    before (one that was not): its first event tells, which lies near the date
+    and does not go back. Going back counts twice: dates are often in whole
+    seconds, and are local time.
+    """
+
     account: Account
     base: int = 16
     relative: bool = False
-    dated: bool = False
+    begun: bool = False  # with the first event
     start_ns: int = 0
     now_ns: int = 0
+    date_ns: int | None = None  # that no event has followed yet
 
     def head(self, line: bytes) -> bool:
         """Whether the line is one that may stand where no event does."""
@@ -82,30 +94,45 @@ class _Reader:
         elif date := _DATE.match(line):
             found = date_ns(date[1].decode("cp1252", "replace"))
             if found is not None:
-                self.start_ns, self.dated = found, True
+                self.date_ns = found
                 self.account.remarks.add(Remark.DATE_WITHOUT_ZONE)
         return _PASSED_OVER.match(line) is not None
 
     def event(self, event: re.Match[bytes], where: str) -> LoggedFrame | None:
-        time_ns = nanoseconds(event[1], event[2])
-        self.now_ns = self.now_ns + time_ns if self.relative else time_ns
+        self._advance(nanoseconds(event[1], event[2]))
         what = event[3]
         if fd := _FD.match(what):
             return self._fd(fd, where)
         if classic := _CLASSIC.match(what):
             return self._classic(classic, where)
         if error := _ERROR.match(what):
-            return LoggedFrame(self.start_ns + self.now_ns, 0, ERROR, b"", error[1].decode())
+            return LoggedFrame(self.now_ns, 0, ERROR, b"", error[1].decode())
         if _ALMOST.match(what):
             self.account.note(where, "a frame that cannot be read")
         elif what != b"Start of measurement":
             self.account.other("event")
         return None
 
+    def _advance(self, told_ns: int) -> None:
+        """To the next event."""
+        now_ns = (self.now_ns if self.relative else self.start_ns) + told_ns
+        date_ns, self.date_ns = self.date_ns, None
+        if date_ns is not None:
+            anew_ns = date_ns + told_ns
+            if not self.begun or self._strange(anew_ns, date_ns) < self._strange(now_ns, date_ns):
+                self.start_ns, now_ns = date_ns, anew_ns
+        self.begun, self.now_ns = True, now_ns
+
+    def _strange(self, time_ns: int, date_ns: int) -> int:
+        return abs(time_ns - date_ns) + 2 * max(0, self.now_ns - time_ns)
+
     def _classic(self, m: re.Match[bytes], where: str) -> LoggedFrame | None:
         channel, name, direction, kind, dlc, rest = m.groups()
         if dlc is None and kind.lower() != b"r":
             self.account.note(where, "a frame without its length")
+            return None
+        if dlc is not None and self.base == 10 and not dlc.isdigit():
+            self.account.note(where, f"a length of '{dlc.decode()}', expected a decimal one")
             return None
         length = FD_LENGTHS[min(int(dlc or b"0", self.base), 15)]
         found = self._identifier(name, rest or b"")
@@ -138,7 +165,7 @@ class _Reader:
         if data is None or source > (EXTENDED_MOST if flags & EXTENDED else STANDARD_MOST):
             self.account.note(where, "a frame that cannot be read")
             return None
-        return LoggedFrame(self.start_ns + self.now_ns, source, flags, data, channel.decode())
+        return LoggedFrame(self.now_ns, source, flags, data, channel.decode())
 
     def _identifier(self, name: bytes, rest: bytes) -> tuple[int, int] | None:
         """Identifier and flag of a name: digits, or a symbolic one with
@@ -154,6 +181,8 @@ class _Reader:
     def _octets(self, text: bytes, count: int) -> bytes | None:
         words = text.split(None, count)[:count]
         try:
+            if count:
+                whole(b"".join(words), self.base)  # digits alone, as each word has to be
             return bytes(int(word, self.base) for word in words) if len(words) == count else None
         except ValueError:
             return None

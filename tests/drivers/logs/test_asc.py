@@ -59,6 +59,44 @@ def test_relative_times_are_added_up_over_all_events(read: Read) -> None:
     assert account.others == {"event": 1}
 
 
+BLOCK_2 = "End TriggerBlock\nBegin Triggerblock Sat Sep 30 10:06:18.191 pm 2017\n"  # 5 s later
+
+
+@pytest.mark.parametrize(
+    ("kind", "first", "second", "seconds"),
+    [
+        ("absolute", "4.990 5.000", "5.010 5.020", [4.99, 5.0, 5.01, 5.02]),  # one measurement
+        ("absolute", "4.990 5.005", "5.001 5.010", [4.99, 5.005, 5.001, 5.01]),  # the same, out of step
+        ("absolute", "4.980 4.990", "0.000 0.010", [4.98, 4.99, 5.0, 5.01]),  # one that was started again
+        ("absolute", "0.980 0.990", "0.000 0.010", [0.98, 0.99, 5.0, 5.01]),  # and that after a pause
+        ("absolute", "0.980 0.990", "5.001 5.010", [0.98, 0.99, 5.001, 5.01]),
+        ("relative", "4.995 0.005", "0.005 0.010", [4.995, 5.0, 5.005, 5.015]),
+        ("relative", "4.995 0.010", "0.000 0.010", [4.995, 5.005, 5.005, 5.015]),  # of a date a little early
+        ("relative", "0.980 0.010", "0.000 0.010", [0.98, 0.99, 5.0, 5.01]),  # since the block's start
+        ("relative", "0.980 0.010", "4.010 0.010", [0.98, 0.99, 5.0, 5.01]),  # since the event before
+    ],
+)
+def test_a_later_block_goes_on_or_starts_again_as_its_date_says(
+    read: Read, kind: str, first: str, second: str, seconds: list[float]
+) -> None:
+    block_1, block_2 = ("".join(f"  {t} 1  12D  Rx d 0\n" for t in times.split()) for times in (first, second))
+    found, account = read(frames, (HEAD.replace("absolute", kind) + block_1 + BLOCK_2 + block_2).encode())
+    assert [(f.time_ns or 0) - START_NS for f in found] == [round(s * 1000) * 1_000_000 for s in seconds]
+    assert account.damaged == 0
+
+
+def test_the_first_block_counts_from_its_own_date(read: Read) -> None:
+    lines = BLOCK_2 + "  5.000 1  12D  Rx d 0\n"
+    (frame,), _ = read(frames, (HEAD + lines).encode())
+    assert frame.time_ns == START_NS + 10_000_000_000
+
+
+def test_clocks_that_are_set_back_between_blocks_take_no_time_back(read: Read) -> None:
+    lines = "  5.000 1  12D  Rx d 0\n" + BLOCK_2.replace("10:06:18", "09:06:18") + "  5.010 1  12D  Rx d 0\n"
+    found, _ = read(frames, (HEAD + lines).encode())
+    assert [(f.time_ns or 0) - START_NS for f in found] == [5_000_000_000, 5_010_000_000]
+
+
 def test_without_a_date_times_count_from_zero(read: Read) -> None:
     (frame,), account = read(frames, b"base hex  timestamps absolute\n  1.000000 1  12D  Rx d 1 ff\n")
     assert frame.time_ns == 1_000_000_000
