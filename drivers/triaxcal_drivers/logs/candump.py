@@ -6,10 +6,9 @@ python-can reads the log alone, and ends with the first damaged line.
 
 from __future__ import annotations
 
-import calendar
 import re
 from collections.abc import Iterator
-from itertools import chain, islice, pairwise
+from itertools import chain, islice
 from typing import BinaryIO
 
 from triaxcal_drivers.logs.frames import (
@@ -27,6 +26,7 @@ from triaxcal_drivers.logs.frames import (
     Remark,
 )
 from triaxcal_drivers.logs.lines import nanoseconds, numbered
+from triaxcal_drivers.logs.times import Placed, timed, utc_ns
 
 LOG = re.compile(
     rb"\((\d{1,12})\.(\d{1,9})\)\s+(\S{1,64})\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
@@ -43,22 +43,39 @@ _ERROR_BIT = 0x20000000
 _BRS, _ESI = 1, 2  # bits of the digit behind ##
 EPOCH_FROM_NS = 10**17  # a time since the epoch is later, in 1973, and one since the start is earlier
 LOOKED_AT = 1000  # lines by which times since the start are told from times since the line before
+NEAR, NEAR_LEAST = 8, 16
+"""Lines are compared with those that lie nearer than an eighth of those looked
+at: so few of the pairs have a new start between them, where several logs were
+joined. Of a short log all are compared."""
+RISING = 0.75  # of the pairs: midway between those of times since the line before, and of times since the start
 
 
 def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
-    found = _frames(stream, account)
+    """**Time.** Since the epoch, since the start (``-t z``) or since the line
+    before (``-t d``). What is since the start rises from nearly every line to
+    the next ones, however much a few go back; what is since the line before
+    has no trend: of two lines either is as often the larger, or they are
+    equal."""
+    found = timed(_frames(stream, account), account)
     head = list(islice(found, LOOKED_AT))
     times = [f.time_ns for f in head if f.time_ns is not None]
-    if len(times) < len(head):
-        account.remarks.add(Remark.NO_TIMES)
-    elif times and times[0] < EPOCH_FROM_NS:
+    if times and sorted(times)[len(times) // 2] < EPOCH_FROM_NS:
         account.remarks.add(Remark.NO_DATE)
-        if any(b < a for a, b in pairwise(times)):
+        if not _rise(times[1:]):  # the first is zero in either
             account.remarks.add(Remark.TIMES_ADDED_UP)
             yield from _added_up(chain(head, found))
             return
     yield from head
     yield from found
+
+
+def _rise(times: list[int]) -> bool:
+    """True of fewer than two."""
+    score = pairs = 0  # a pair that rises counts two, one of equals one
+    for apart in range(1, max(len(times) // NEAR, NEAR_LEAST)):
+        score += sum((b > a) + (b >= a) for a, b in zip(times, times[apart:], strict=False))
+        pairs += max(0, len(times) - apart)
+    return score >= 2 * RISING * pairs
 
 
 def _added_up(found: Iterator[LoggedFrame]) -> Iterator[LoggedFrame]:
@@ -68,13 +85,10 @@ def _added_up(found: Iterator[LoggedFrame]) -> Iterator[LoggedFrame]:
         yield frame._replace(time_ns=time_ns)
 
 
-def _frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
+def _frames(stream: BinaryIO, account: Account) -> Iterator[Placed]:
     for number, line in numbered(stream, account):
         frame = _logged(LOG.match(line)) or _shown(SHOWN.match(line), account)
-        if frame is not None:
-            yield frame
-        else:
-            account.note(f"line {number}", "expected a frame as candump writes it")
+        yield f"line {number}", frame or "expected a frame as candump writes it"
 
 
 _Match = re.Match[bytes] | None
@@ -110,16 +124,23 @@ def _shown(m: _Match, account: Account) -> LoggedFrame | None:
         flags |= REMOTE
         octets = bytes(int(length))
     time_ns = _time_ns(day, seconds, fraction, account) if seconds else None
-    return _frame(time_ns, identifier, flags, octets, channel)
+    return None if seconds and time_ns is None else _frame(time_ns, identifier, flags, octets, channel)
 
 
-def _time_ns(day: bytes, seconds: bytes, fraction: bytes, account: Account) -> int:
+def _time_ns(day: bytes, seconds: bytes, fraction: bytes, account: Account) -> int | None:
+    """None where the date is none."""
     time_ns = nanoseconds(seconds, fraction)
-    if found := _DAY.match(day):
-        account.remarks.add(Remark.DATE_WITHOUT_ZONE)
-        year, month, date, hour, minute = map(int, found.groups())
-        time_ns += calendar.timegm((year, max(1, min(month, 12)), date, hour, minute, 0)) * 1_000_000_000
-    return time_ns
+    if not day.strip():
+        return time_ns
+    found = _DAY.match(day)
+    if found is None or int(seconds) > 60:  # a leap second is one
+        return None
+    year, month, date, hour, minute = map(int, found.groups())
+    day_ns = utc_ns(year, month, date, hour, minute, 0)
+    if day_ns is None:
+        return None
+    account.remarks.add(Remark.DATE_WITHOUT_ZONE)
+    return day_ns + time_ns
 
 
 def _fd_flags(bits: int) -> int:

@@ -26,8 +26,8 @@ from triaxcal_drivers.logs.frames import (
     SWITCHED,
     Account,
     LoggedFrame,
-    Remark,
 )
+from triaxcal_drivers.logs.times import Placed, timed
 
 PACKET_MOST = 2**20  # bytes of a packet or a block; tcpdump keeps 256 KiB of one
 INTERFACES_MOST = 1000
@@ -68,6 +68,10 @@ class _Inner(NamedTuple):
 
 
 def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
+    yield from timed(_frames(stream, account), account)
+
+
+def _frames(stream: BinaryIO, account: Account) -> Iterator[Placed]:
     magic = stream.read(4)
     packets = _pcapng(stream, account) if magic == _SECTION else _pcap(stream, magic, account)
     found = ((packet, inner) for packet in packets if (inner := _inner(packet, account)))
@@ -75,10 +79,7 @@ def frames(stream: BinaryIO, account: Account) -> Iterator[LoggedFrame]:
     swapped = _swapped([inner for _, inner in head])
     for packet, inner in chain(head, found):
         frame = _frame(packet, inner, swapped)
-        if frame is None:
-            account.note(packet.where, "a packet that is no CAN frame")
-        else:
-            yield frame
+        yield packet.where, frame or "a packet that is no CAN frame"
 
 
 def _pcap(stream: BinaryIO, magic: bytes, account: Account) -> Iterator[_Packet]:
@@ -162,7 +163,6 @@ def _block(kind: bytes, body: bytes, section: _Section, where: str, account: Acc
             interface, _, high, low, kept, _ = struct.unpack_from(section.order + "HHIIII", body)
             return _packet(section, interface, high << 32 | low, body[20 : 20 + kept], where)
         elif number == 3:
-            account.remarks.add(Remark.NO_TIMES)
             return _packet(section, 0, None, body[4:], where)
     except (struct.error, IndexError):
         account.note(where, f"a block of type {number} that cannot be read")

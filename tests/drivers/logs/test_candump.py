@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import random
+from collections.abc import Callable, Iterable
+from itertools import accumulate
 from typing import Any
 
 import pytest
 
 from triaxcal_drivers.interface import RawFlag
+from triaxcal_drivers.logs import times
 from triaxcal_drivers.logs.candump import frames
 from triaxcal_drivers.logs.frames import LoggedFrame, Remark
 
@@ -82,6 +85,78 @@ def test_times_from_zero_and_times_between_lines_are_told_apart(read: Read) -> N
     found, account = read(frames, lines("000.000000", "000.010000", "000.009000"))
     assert [f.time_ns for f in found] == [0, 10_000_000, 19_000_000]
     assert account.remarks == {Remark.NO_DATE, Remark.TIMES_ADDED_UP}
+
+
+def shown(times_ns: Iterable[int]) -> bytes:
+    return "".join(f" ({t // 10**9:03d}.{t // 1000 % 10**6:06d})  can0  123   [2]  11 22\n" for t in times_ns).encode()
+
+
+def test_a_line_that_goes_back_makes_no_log_of_differences(read: Read) -> None:
+    given = [i * 5_000_000 for i in range(400)]
+    given[200] -= 6_000_000
+    found, account = read(frames, shown(given))
+    assert [f.time_ns for f in found] == given
+    assert account.remarks == {Remark.NO_DATE}
+
+
+def test_channels_out_of_step_and_logs_joined_are_no_differences(read: Read) -> None:
+    dice = random.Random(3)
+    for given in (
+        [i * 1_000_000 + dice.randrange(3) * 1_000_000 for i in range(1200)],
+        [i % 300 * 5_000_000 for i in range(900)],
+        [i // 10 * 10_000_000 for i in range(1200)],
+    ):
+        found, account = read(frames, shown(given))
+        assert [f.time_ns for f in found] == given
+        assert account.remarks == {Remark.NO_DATE}
+
+
+def test_differences_are_told_by_their_having_no_trend(read: Read) -> None:
+    dice = random.Random(4)
+    for steps in (
+        [5_000_000] * 400,
+        [5_000_000] * 500 + [6_000_000] * 500,
+        [round(dice.gauss(5_000, 300)) * 1000 for _ in range(1200)],
+        [round(dice.expovariate(0.0002)) * 1000 for _ in range(1200)],
+        [100_000 * (1 + i % 10) for i in range(1200)],
+        [5_000_000] * 300 + [3_000_000_000] + [5_000_000] * 10,
+    ):
+        found, account = read(frames, shown([0, *steps]))
+        assert [f.time_ns for f in found] == list(accumulate([0, *steps]))
+        assert account.remarks == {Remark.NO_DATE, Remark.TIMES_ADDED_UP}
+
+
+@pytest.mark.parametrize("place", [0, 1, 1500, 2999])
+def test_a_line_without_a_time_is_damage_wherever_it_stands(read: Read, place: int) -> None:
+    lines = [f" (1790000000.{i:06d})  can0  101   [1]  74\n" for i in range(2999)]
+    lines.insert(place, "  can0  101   [1]  75\n")
+    found, account = read(frames, "".join(lines).encode())
+    assert [f.time_ns for f in found] == [1_790_000_000_000_000_000 + i * 1000 for i in range(2999)]
+    assert (account.damaged, account.damage) == (
+        1,
+        f"line {place + 1}: a frame without a time, in a log that has times",
+    )
+    assert account.remarks == set()
+
+
+def test_lines_without_times_before_the_first_that_has_one_are_damage_in_order(read: Read) -> None:
+    untimed, timed = "  can0  101   [1]  75\n", " (1790000000.000001)  can0  101   [1]  74\n"
+    found, account = read(frames, (untimed * 1500 + "garbage\n" + timed * 2).encode())
+    assert (len(found), account.damaged, account.damage[:7]) == (2, 1501, "line 1:")
+    assert account.remarks == set()
+
+
+def test_a_log_of_more_lines_without_times_than_are_held_has_none(read: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(times, "UNTIMED_MOST", 10)
+    untimed, timed = "  can0  101   [1]  75\n", " (1790000000.000001)  can0  101   [1]  74\n"
+    found, account = read(frames, (untimed * 12 + timed).encode())
+    assert [f.time_ns for f in found] == [None] * 13
+    assert account.remarks == {Remark.NO_TIMES}
+
+
+def test_a_byte_order_mark_costs_no_line(read: Read) -> None:
+    found, account = read(frames, b"\xef\xbb\xbf(1436509052.249713) vcan0 044#2A\n")
+    assert ([f.time_ns for f in found], account.damaged) == ([T], 0)
 
 
 def test_a_line_without_an_end_takes_no_memory(read: Read) -> None:

@@ -127,6 +127,17 @@ def test_simple_packets_tell_no_times(read: Read) -> None:
     assert account.remarks == {Remark.NO_TIMES}
 
 
+@pytest.mark.parametrize("place", [0, 1, 3])
+def test_a_packet_without_a_time_among_others_is_damage(read: Read, place: int) -> None:
+    start, whole = len(pcapng([])), pcapng([CLASSIC] * 3)
+    at = start + place * (len(whole) - start) // 3
+    simple = block(3, struct.pack("<I", len(CLASSIC)) + CLASSIC, "<")
+    found, account = read(frames, whole[:at] + simple + whole[at:])
+    assert [f.time_ns for f in found] == [T_NS] * 3
+    assert (account.damaged, account.damage) == (1, f"byte {at}: a frame without a time, in a log that has times")
+    assert account.remarks == set()
+
+
 def test_packets_that_are_no_can_are_counted(read: Read) -> None:
     ipv4 = bytes.fromhex("0000 0001 0006") + bytes(8) + b"\x08\x00" + bytes(40)
     found, account = read(frames, pcap([cooked(CLASSIC, "<"), ipv4], "<", SLL))
