@@ -7,7 +7,7 @@ import asyncio
 import math
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import AsyncExitStack, ExitStack, aclosing, asynccontextmanager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Protocol, cast
 
@@ -25,6 +25,10 @@ from triaxcald.station.lock import locked
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 """Between attempts, doubled each time: a unit that restarts is there again in a
 second or two, and an operator who plugs one in waits no longer than this."""
+
+TICK_S = 0.001
+"""With less left there is nothing to wait for: clocks and sums of pauses are
+off by less."""
 
 HOLE_S = 10.0
 """Nothing for so long is a gap, though nobody was told of a loss: a laptop
@@ -89,26 +93,25 @@ class Patience:
     others: AtWork | None = None
     in_use: bool = False
 
-    async def rest(self, pause_s: float, waited_s: float) -> float | None:
-        """Waits ``pause_s``, or less; so long did it, or None where the unit is
-        given up after ``waited_s``."""
+    async def rest(self, pause_s: float, waited_s: float) -> bool:
+        """Waits ``pause_s``, or less. False where the unit is given up after
+        ``waited_s``."""
         if self.most_s is not None:
-            if waited_s >= self.most_s:
-                return None
+            if waited_s > self.most_s - TICK_S:
+                return False
             pause_s = min(pause_s, self.most_s - waited_s)
         if self.others is None:
             await asyncio.sleep(pause_s)
-            return pause_s
+            return True
         if waited_s < self.least_s:
-            pause_s = min(pause_s, self.least_s - waited_s)
-            await asyncio.sleep(pause_s)
-            return pause_s
+            await asyncio.sleep(min(pause_s, self.least_s - waited_s))
+            return True
         try:
             async with asyncio.timeout(pause_s):
                 await self.others.nobody.wait()
         except TimeoutError:
-            return pause_s
-        return None
+            return True
+        return False
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -128,8 +131,14 @@ class _Waiting:
     tell: Callable[[Exception], None]
     attempted: bool = False
     pause_s: float = FIRST_PAUSE_S
-    waited_s: float = 0.0
+    begun_s: float = field(default_factory=lambda: asyncio.get_running_loop().time())
     told: str = ""
+
+    @property
+    def waited_s(self) -> float:
+        """Attempts take time too, and so does a unit that opens and sends
+        nothing of use."""
+        return asyncio.get_running_loop().time() - self.begun_s
 
     def say(self, trouble: Exception) -> None:
         if str(trouble) != self.told:
@@ -157,24 +166,18 @@ class _Waiting:
         """So long the other streams go on without the ``silent`` one before
         that is asked again. Raises it once patience ends."""
         self.say(silent)
-        self.waited_s += silent.silent_s
-        if await self.patience.rest(0.0, self.waited_s) is None:
+        if not await self.patience.rest(0.0, self.waited_s):
             raise silent
-        pause_s = self.pause_s
-        self._rested(pause_s)
-        return pause_s
+        return self._next_pause_s()
 
     async def _rest(self) -> bool:
         """Until the next attempt; whether there is to be one."""
-        rested_s = await self.patience.rest(self.pause_s, self.waited_s)
-        if rested_s is None:
-            return False
-        self._rested(rested_s)
-        return True
+        return await self.patience.rest(self._next_pause_s(), self.waited_s)
 
-    def _rested(self, rested_s: float) -> None:
-        self.waited_s += rested_s
-        self.pause_s = min(2 * self.pause_s, LONGEST_PAUSE_S)
+    def _next_pause_s(self) -> float:
+        pause_s = self.pause_s
+        self.pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+        return pause_s
 
 
 @dataclass
