@@ -62,6 +62,7 @@ def _document(o: Outcome) -> dict[str, Any]:
         "exit_code": o.exit_code,
         "error": o.error,
         "wanted_poses": list(o.wanted),
+        "data_quality": list(o.data_quality),
         "serial": o.certified.document["unit"]["serial"] if o.certified else None,
         "recording": str(o.recording) if o.recording else None,
         "certificate": str(o.certificate) if o.certificate else None,
@@ -82,6 +83,8 @@ def _document(o: Outcome) -> dict[str, Any]:
 
 def say_error(o: Outcome) -> None:
     if o.error:
+        for line in o.data_quality:
+            say(f"warning: unit {o.unit}: {line}")
         say(f"triaxcal: {o.error}" + (f"; add the poses {', '.join(o.wanted)}" if o.wanted else ""))
 
 

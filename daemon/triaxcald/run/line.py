@@ -21,7 +21,7 @@ from triaxcald.abort import Left, at_abort
 from triaxcald.certificate import Certified, certify, software
 from triaxcald.documents import to_text
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.exit_codes import DISK
+from triaxcald.exit_codes import DISK, REFUSED
 from triaxcald.files import write_text
 from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.outcome import (
@@ -65,7 +65,8 @@ class Outcome:
     ``document`` is the `triaxcal.outcome/1`. ``device_state`` says in words
     what the device holds, None where nothing was to be written; ``settling``
     the command that clears it up, None where nothing is left to be cleared up.
-    ``lost`` counts records that did not get to the disk.
+    ``lost`` counts records that did not get to the disk. ``data_quality`` is
+    what may be why the readings were refused.
     """
 
     unit: str
@@ -84,6 +85,7 @@ class Outcome:
     error: str | None = None
     wanted: tuple[str, ...] = ()
     lost: int = 0
+    data_quality: tuple[str, ...] = ()
 
 
 class UnitRun(UnitSession):
@@ -108,6 +110,7 @@ class UnitRun(UnitSession):
         self._recording: Path | None = None
         self._papers: dict[str, str] = {}
         self._paths: dict[str, Path] = {}
+        self._tumble: Collection | None = None
         self._certified: Certified | None = None
         self._write_back: WriteBack | None = None
         self._document: Document | None = None
@@ -255,6 +258,9 @@ class UnitRun(UnitSession):
             error=error,
             wanted=ending.wanted,
             lost=self._lost,
+            data_quality=tuple(self._tumble.pipelines[READINGS].data_quality())
+            if self._tumble and ending.exit_code == REFUSED
+            else (),
         )
 
     def _require_readable_journal(self, identity: IdentityRead) -> None:
@@ -268,6 +274,7 @@ class UnitRun(UnitSession):
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan
         tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
+        self._tumble = tumble
         returning = self.returning(device, identity, Patience(plan.comes_back_s, others=self.others))
         await self._collect(returning, writer, tumble, READINGS, plan.poses)
         self.progress.stage(self.name, "fitting")

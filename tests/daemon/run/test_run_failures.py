@@ -333,3 +333,19 @@ def test_a_wrong_address_of_the_readings_is_named_though_another_stream_goes_on(
     causes = [detail["cause"] for kind, detail in _events(_only(workshop.folder, "*.mcap")) if kind == "interrupted"]
     assert len(causes) == 1
     assert "illegal data address" in causes[0]
+
+
+@pytest.mark.slow
+def test_what_spoils_the_readings_is_said_where_no_new_pose_comes(workshop: Any, triaxcal: Callable[..., Any]) -> None:
+    """One axis is dead, so that turns about it look like one pose."""
+    with workshop.serve(workshop.device(**QUICK)) as served:
+        profile = workshop.folder / workshop.impatient_profile()
+        y = 'uy = { word = 5, type = "int32", scale = 1.1920928955078125e-6'
+        profile.write_text(
+            profile.read_text().replace(y, 'uy = { word = 5, type = "int32", offset = 1.0, scale = 1e-30')
+        )
+        station = workshop.station({"bus": served.bus, "profile": profile.name}, plan={**PLAN, "patience_s": 20.0})
+        done = triaxcal("run", station, "--json")
+    assert done.code == 3, done.err
+    assert "warning: unit unit0: stuck_output: y never changes" in done.err
+    assert done.json["units"][0]["data_quality"][0].startswith("stuck_output: y never changes")
