@@ -17,9 +17,17 @@ from triaxcald.abort import at_abort
 from triaxcald.errors import InputError, RecordingError
 
 
+def require_recording(path: Path) -> None:
+    """For the name of a recording that is to be made. Raises RecordingError
+    where anything is there, if only a link to nothing, or where no command
+    would read it by that name."""
+    require_new(path)
+    if path.suffix != ".mcap":
+        raise RecordingError(f"{path}: the name of a recording ends in .mcap")
+
+
 def require_new(path: Path) -> None:
-    """For a recording. Raises RecordingError where anything is there, if only a
-    link to nothing."""
+    """Raises RecordingError where anything is there."""
     if os.path.lexists(path):
         raise exists_already(path)
 
@@ -44,7 +52,7 @@ def write_bytes(path: Path, data: bytes) -> Path:
     """
     require_writable(path)
     try:
-        if _is_stream(path):
+        if is_stream(path):
             path.write_bytes(data)
         else:
             replace_bytes(path, data)
@@ -98,11 +106,11 @@ def synchronise(folder: Path) -> None:
 def require_writable(path: Path) -> None:
     """Raises InputError where ``path`` is a symbolic link to a file, or to
     nothing."""
-    if path.is_symlink() and not _is_stream(path):
+    if path.is_symlink() and not is_stream(path):
         raise InputError(f"{path}: cannot be written: a symbolic link, expected a file of its own")
 
 
-def _is_stream(path: Path) -> bool:
+def is_stream(path: Path) -> bool:
     """Whether it is a pipe or a character device, wherever links lead, or one
     of the system's own names for whatever a descriptor stands for (/dev/stdout,
     /dev/fd/3)."""

@@ -20,7 +20,7 @@ from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import INTERRUPTED, severest
-from triaxcald.files import require_new, unused
+from triaxcald.files import require_recording, unused
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
 from triaxcald.station.buses import BusPlace
@@ -56,7 +56,7 @@ def record_command(a: argparse.Namespace) -> int:
     a.folder = a.output.is_dir()
     if not a.folder:
         writable(a.output)
-        require_new(a.output)  # before any device is asked
+        require_recording(a.output)  # before any device is asked
     chosen, hangup = _load(a), asyncio.Event()
     with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
         # A single file is one recording, which cannot begin anew.

@@ -7,13 +7,14 @@ import dataclasses
 import io
 import sys
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from triaxcal_drivers.errors import DriverError
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
-from triaxcald.files import new_file
+from triaxcald.files import is_stream, new_file
 from triaxcald.inputs import bundle_of, losses_of, samples_of
 from triaxcald.pipeline import DecodedStream
 from triaxcald.recording.export import Rows, write_csv
@@ -86,6 +87,12 @@ def recover_command(a: argparse.Namespace) -> int:
     return 0
 
 
+def _opened(path: Path) -> AbstractContextManager[BinaryIO]:
+    """A file that was not there, or a pipe or device as it is. Raises
+    OSError."""
+    return open(path, "wb") if is_stream(path) else new_file(path)
+
+
 def export_command(a: argparse.Namespace) -> int:
     with open_recording(a.recording) as recording:
         bundle = bundle_of(recording)
@@ -97,7 +104,7 @@ def export_command(a: argparse.Namespace) -> int:
             rows = write_csv(sys.stdout, blocks)
         else:
             try:
-                with new_file(a.output) as file, io.TextIOWrapper(file, "utf-8") as out:
+                with _opened(a.output) as file, io.TextIOWrapper(file, "utf-8") as out:
                     rows = write_csv(out, blocks)
             except OSError as e:
                 raise InputError(f"{a.output}: cannot be written: {e.strerror}") from e

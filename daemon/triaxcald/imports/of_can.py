@@ -11,11 +11,12 @@ from triaxcal_drivers.can.model import CanProfile
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.frames import EXTENDED, Account, LoggedFrame, Remark
 from triaxcal_drivers.logs.kinds import Kind, Log
+from triaxcal_drivers.logs.times import LONGEST_NS
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import InputError
 from triaxcald.imports.importing import Imported, Importing, Record, write_recording
 from triaxcald.imports.selection import Selection
-from triaxcald.imports.times import LONGEST_NS, Ticks, Times
+from triaxcald.imports.times import Ticks, Times
 
 
 def import_can(log: Log, bundle: Bundle, out: Path, *, node: int | None, channel: str | None) -> Imported:
@@ -69,7 +70,7 @@ class _Work:
             yield time_ns, frame.source, flags, frame.data
 
     def _time_ns(self, frame: LoggedFrame) -> int:
-        if Remark.NO_TIMES in self._account.remarks:  # where a few lines lack theirs, the others' are of no use either
+        if Remark.NO_TIMES in self._account.remarks:
             return self._ticks.of((frame.source, frame.flags & EXTENDED), self._selection.is_reading(frame))
         return -1 if frame.time_ns is None else frame.time_ns
 

@@ -10,6 +10,7 @@ from typing import Any, cast
 from triaxcal_drivers.errors import LogError
 from triaxcal_drivers.logs.frames import Account
 from triaxcal_drivers.logs.kinds import MCAP_KIND, Log
+from triaxcal_drivers.logs.times import LONGEST_NS
 from triaxcal_drivers.mcap.container import Channel, LoggedMessage, McapFile
 from triaxcal_drivers.mcap.driver import stream_reader
 from triaxcal_drivers.mcap.model import McapProfile, schema_file
@@ -18,7 +19,7 @@ from triaxcal_drivers.nearest import clipped, nearest
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import InputError
 from triaxcald.imports.importing import Imported, Importing, Record, write_recording
-from triaxcald.imports.times import LONGEST_NS, Times
+from triaxcald.imports.times import Times
 
 MESSAGE_MOST = 65535  # bytes of a raw record
 STAMPS_LOOKED_AT = 10_000  # messages by whose stamps it is told whether they move

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import io
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -21,15 +23,23 @@ _PROFILE = slice(len(MCAP) + 13, len(MCAP) + 13 + len(PROFILE))
 
 
 def is_own(path: Path) -> bool:
-    """Whether it is a recording of ours, or the manifest of one in segments."""
+    """Whether it is a recording of ours, or the manifest of one in segments.
+    Raises InputError where such a one is packed."""
     if is_manifest(path):
         return True
     try:
         with open_file(path) as file:
             head = file.read(_PROFILE.stop)
-    except OSError:
+            packed = head.startswith(b"\x1f\x8b")
+            if packed:
+                file.seek(0)
+                head = gzip.GzipFile(fileobj=file).read(_PROFILE.stop)
+    except (OSError, EOFError, zlib.error):
         return False
-    return head.startswith(MCAP) and head[_PROFILE] == PROFILE.encode()
+    own = head.startswith(MCAP) and head[_PROFILE] == PROFILE.encode()
+    if own and packed:
+        raise InputError(f"{path}: a recording of triaxcal, packed with gzip; unpack it first")
+    return own
 
 
 def own_log(path: Path) -> Log:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-LONGEST_NS = 2**62  # a hundred and forty-six years since the epoch; later ones are damage
 PAUSE_S = 1.0
 PERIODS = 10
 """A pause is longer than this many periods, and than `PAUSE_S`."""

@@ -317,3 +317,13 @@ def test_the_logs_of_two_vehicles_give_their_known_figures(
     assert found[:, 1:4].mean(axis=0) == pytest.approx(mean, abs=0.001)
     assert np.linalg.norm(found[:, 1:4], axis=1).mean() == pytest.approx(magnitude, abs=0.001)
     triaxcal("fit", tmp_path / "rec.mcap", "--reference", "9.81").failed(3, "refused")
+
+
+def test_a_recording_is_named_so_that_it_can_be_read(
+    messages: list[can.Message], tmp_path: Path, triaxcal: Run
+) -> None:
+    path = written(tmp_path / "a.blf", messages[:100])
+    out = tmp_path / "rec.txt"
+    done = triaxcal("log", "import", path, "--profile", "triax-ref-can", "-o", out)
+    done.failed(2, f"{out}: the name of a recording ends in .mcap")
+    assert not out.exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -124,3 +125,10 @@ def test_a_bus_recording_is_mended_like_any_other(bus_recording: Path, tmp_path:
     with Recording.open(tmp_path / "mended.mcap") as recording:
         assert recording.metadata["bus"]["interface"] == "socketcan"
         assert recording.phases() == ["bus/chassis", "bus/1"]
+
+
+def test_one_that_is_packed_is_to_be_unpacked_for_an_import(bus_recording: Path, triaxcal: Callable[..., Any]) -> None:
+    packed = bus_recording.with_suffix(".mcap.gz")
+    packed.write_bytes(gzip.compress(bus_recording.read_bytes()))
+    done = triaxcal("log", "import", packed, "--profile", "triax-ref-can", "-o", bus_recording.with_name("unit.mcap"))
+    done.failed(2, f"{packed}: a recording of triaxcal, packed with gzip; unpack it first")
