@@ -18,16 +18,15 @@ from triaxcald.errors import InputError, RecordingError
 
 
 def require_recording(path: Path) -> None:
-    """For the name of a recording that is to be made. Raises RecordingError
-    where anything is there, if only a link to nothing, or where no command
-    would read it by that name."""
-    require_new(path)
+    """Raises RecordingError where no command would read a recording of that
+    name."""
     if path.suffix != ".mcap":
-        raise RecordingError(f"{path}: the name of a recording ends in .mcap")
+        raise RecordingError(f"{path}: the name of a recording ends in .mcap, and there is no such folder")
 
 
 def require_new(path: Path) -> None:
-    """Raises RecordingError where anything is there."""
+    """For a recording. Raises RecordingError where anything is there, if only a
+    link to nothing."""
     if os.path.lexists(path):
         raise exists_already(path)
 

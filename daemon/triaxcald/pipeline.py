@@ -48,11 +48,18 @@ class DecodedStream:
         self._last_ns: int | None = None
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
+        self._last_host_ns = 0
 
     @property
     def first_host_ns(self) -> int | None:
         """Host time of the first raw record."""
         return self._first_host_ns
+
+    @property
+    def host_seconds(self) -> float:
+        """From the first raw record to the latest that completed a sample, by
+        the host's clock."""
+        return 0.0 if self._begin_ns is None else max(0.0, (self._last_host_ns - (self._first_host_ns or 0)) * 1e-9)
 
     @property
     def seconds(self) -> float:
@@ -83,6 +90,7 @@ class DecodedStream:
         if len(block):
             if self._begin_ns is None:
                 self._begin_ns = int(block.time_ns[0])
+            self._last_host_ns = int(batch.time_ns[-1])
             latest = np.maximum.accumulate(np.r_[self._last_ns or -(2**62), block.time_ns[:-1]])
             fresh = block.time_ns > latest
             self.counts["out_of_order"] += int((~fresh).sum())

@@ -73,6 +73,15 @@ def one_of_several(units: Sequence[str], buses: Sequence[str], output: Path) -> 
     )
 
 
+def own_seconds(own: float, by_host: float | None) -> str:
+    """How long samples span by the unit's counter or stamps, and by the host's
+    clock where that is another time by a tenth: its rate is not the profile's,
+    or it is simulated faster."""
+    if by_host is None or by_host < 1.0 or by_host / 1.1 < own < by_host * 1.1:
+        return f"{own:.1f} s"
+    return f"{own:.1f} s of the unit's own time ({by_host:.1f} s by the host's clock)"
+
+
 def bus_recorded(name: str, counts: Mapping[str, int], seconds: float) -> str:
     """What the recording of a bus has come to; ``counts`` as
     `triaxcald.station.listening.Listened` has them."""

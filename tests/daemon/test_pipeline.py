@@ -14,7 +14,8 @@ from triaxcal.poses.quality.finding import MissingSamples, StuckOutput
 from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.loading import load_bundle, parse_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS
-from triaxcald.pipeline import Pipeline, only_finite, together
+from triaxcald import text
+from triaxcald.pipeline import DecodedStream, Pipeline, only_finite, together
 from triaxcald.recording.schema import cut
 from triaxcald.simulation.bench import DeviceFile, physics_of
 from triaxcald.simulation.can_unit import tpdos
@@ -216,3 +217,15 @@ def test_samples_without_a_number_are_left_out_and_said() -> None:
     kept = only_finite(block([1.0, np.nan, 2.0, np.inf, 1e200, 3.0]))
     assert (kept.readings[:, 0].tolist(), kept.channels["t"].tolist(), kept.not_finite) == ([1, 2, 3], [0, 2, 5], 3)
     assert only_finite(block([1.0])).not_finite == 0
+
+
+def test_the_hosts_time_is_kept_beside_the_units(records: list[tuple[int, int, int, bytes]]) -> None:
+    """As of a unit that is a quarter slower than its profile says."""
+    slow = [(T0_NS + round((t - T0_NS) * 1.25), *rest) for t, *rest in records]
+    stream = DecodedStream(BUNDLE, READINGS)
+    stream.feed(RawBatch.of(slow))
+    assert stream.seconds == pytest.approx(20.0, abs=0.05)
+    assert stream.host_seconds == pytest.approx(25.0, abs=0.05)
+    said = text.own_seconds(stream.seconds, stream.host_seconds)
+    assert said == "20.0 s of the unit's own time (25.0 s by the host's clock)"
+    assert text.own_seconds(20.0, 21.0) == "20.0 s"

@@ -10,13 +10,14 @@ from triaxcal_drivers.logs.kinds import Kind, opened
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
-from triaxcald.files import require_recording
+from triaxcald.files import require_new, require_recording
 from triaxcald.imports import text
 from triaxcald.imports.of_recording import is_own, own_log
 
 
 def import_command(a: argparse.Namespace) -> int:
     writable(a.output)
+    require_new(a.output)
     require_recording(a.output)
     bundle = load_bundle(a.profile)
     driver = bundle.profile.driver

@@ -20,7 +20,7 @@ from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import INTERRUPTED, severest
-from triaxcald.files import require_recording, unused
+from triaxcald.files import require_new, require_recording, unused
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
 from triaxcald.station.buses import BusPlace
@@ -56,8 +56,10 @@ def record_command(a: argparse.Namespace) -> int:
     a.folder = a.output.is_dir()
     if not a.folder:
         writable(a.output)
-        require_recording(a.output)  # before any device is asked
+        require_new(a.output)  # before any device is asked
     chosen, hangup = _load(a), asyncio.Event()
+    if not a.folder:
+        require_recording(a.output)
     with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
         # A single file is one recording, which cannot begin anew.
         kept = run_interruptible(_record(a, chosen, progress, hangup), hangup.set if a.folder else None)
@@ -257,7 +259,9 @@ def _summary(kept: Kept) -> str:
     if kept.kind == "bus":
         parts = [text.bus_recorded(kept.unit, kept.counts, kept.seconds), str(kept.path)]
     else:
-        parts = [f"{kept.path}: {kept.counts['samples']} samples in {kept.seconds:.1f} s"]
+        parts = [
+            f"{kept.path}: {kept.counts['samples']} samples in {text.own_seconds(kept.seconds, kept.host_seconds)}"
+        ]
         of_samples = ("samples", "receiver_overflows")
         parts += [f"{n} {kind}" for kind, n in kept.counts.items() if n and kind not in of_samples]
     if kept.gaps:

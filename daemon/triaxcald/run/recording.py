@@ -28,10 +28,11 @@ from triaxcald.station.raw_records import RawRecords
 @dataclass(frozen=True)
 class Kept:
     """What the recording of a unit, or of a bus, has come to. ``counts`` are of
-    the unit's readings, which span ``seconds``, or of the bus's frames; in
-    ``gaps`` gaps it was lost for ``gaps_s``, and ``lost`` raw records did not
-    get to the disk. ``error`` is one line where it failed, and ``trace`` says where
-    in this program, where the fault is its own."""
+    the unit's readings, which span ``seconds`` of the unit's own time and
+    ``host_seconds`` of the host's, or of the bus's frames; in ``gaps`` gaps it
+    was lost for ``gaps_s``, and ``lost`` raw records did not get to the disk.
+    ``error`` is one line where it failed, and ``trace`` says where in this
+    program, where the fault is its own."""
 
     unit: str
     path: Path | None
@@ -44,6 +45,7 @@ class Kept:
     error: str | None = None
     kind: Kind = "unit"
     trace: str | None = None
+    host_seconds: float | None = None
 
 
 class State(Enum):
@@ -118,6 +120,11 @@ class AtRecording(ABC):
         """As of `Kept`."""
 
     @property
+    def _host_seconds(self) -> float | None:
+        """As of `Kept`."""
+        return None
+
+    @property
     def _latest(self) -> dict[str, float]:
         return {}
 
@@ -130,7 +137,7 @@ class AtRecording(ABC):
         records = self._records
         return Kept(
             self.name, self._path, self._counts, self._seconds, records.gaps, records.gaps_s, self._lost,
-            kind=self.kind,
+            kind=self.kind, host_seconds=self._host_seconds,
         )  # fmt: skip
 
     def leave(self) -> None:

@@ -54,6 +54,10 @@ class UnitRecording(AtRecording):
         return self._recorded.streams[READINGS].seconds
 
     @property
+    def _host_seconds(self) -> float | None:
+        return self._recorded.streams[READINGS].host_seconds
+
+    @property
     def _latest(self) -> dict[str, float]:
         return dict(self._recorded.latest)
 
