@@ -149,7 +149,8 @@ class SampleBlock:
     the counter, repeated samples dropped, samples that could not be put
     together from their parts, records with an error flag, samples that the
     device itself says are not valid, and those whose readings are no finite
-    numbers, both of which are dropped.
+    numbers, both of which are dropped; restarts of the device that its counter
+    or stamps show, and nothing else had told.
     """
 
     time_ns: NDArray[np.int64]
@@ -162,6 +163,7 @@ class SampleBlock:
     errors: int = 0
     invalid: int = 0
     not_finite: int = 0
+    restarts: int = 0
 
     def __len__(self) -> int:
         return len(self.time_ns)

@@ -13,7 +13,7 @@ from triaxcal.arrays import Floats
 from triaxcal.errors import Refused
 from triaxcal.model.directions import directions
 from triaxcal_drivers.attention import Looks
-from triaxcal_drivers.errors import DeviceSilent
+from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.pipeline import DecodedStream, Pipeline
@@ -78,6 +78,8 @@ class Recorded(RawRecords):
             async for batch in written:
                 for name, decoded in self.streams.items():
                     block = decoded.feed(batch)
+                    if block.restarts:  # what it was told when it was opened is gone, and it may be another unit
+                        device.complain(DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
                     if len(block) and name == READINGS:
                         self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
                     if writer is not None and len(block):

@@ -108,6 +108,7 @@ class CanDecoder:
         self._origin_ns = self._origin = 0  # time and unwrapped counter of the first record
         self._last_ns = self._last_raw = self._last = 0  # of the record before
         self._top = 0  # highest unwrapped counter so far
+        self._restarts = 0  # that the latest records show
         self._settled = 0  # every sample below is delivered or given up
         empty = np.zeros(0, dtype=np.int64)
         self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
@@ -234,6 +235,7 @@ class CanDecoder:
         restarted |= step > FASTEST * np.maximum(pause, 0) + NEAR_S * 1e9 / self._period_ns
         for i in np.flatnonzero(parts.after_gap):
             step[i], restarted[i] = self._across(int(parts.counter[i] - before[i]), pause[i])
+        self._restarts = int(np.count_nonzero(restarted & ~parts.after_gap))
         step[restarted] = np.maximum(1, np.rint(pause[restarted]))
         unwrapped = self._last + np.cumsum(step)
         self._last_ns, self._last_raw = int(parts.time_ns[-1]), int(parts.counter[-1])
@@ -260,7 +262,8 @@ class CanDecoder:
             fresh = fresh[np.unique(key[fresh], return_index=True)[1]]
             duplicates, parts = len(parts) - len(fresh), parts[fresh]
         self._top = int(highest[-1])
-        return replace(self._settle(self._held.followed_by(parts)), duplicates=duplicates)
+        block = self._settle(self._held.followed_by(parts))
+        return replace(block, duplicates=duplicates, restarts=self._restarts)
 
     def _key(self, parts: _Parts) -> Ints:
         return parts.counter * len(self._layout.messages) + parts.message

@@ -144,6 +144,7 @@ class ModbusDecoder:
             # record comes out of a FIFO once.
             duplicates=len(records) - len(kept) if isinstance(stream, FifoStream) else 0,
             errors=errors,
+            restarts=placed.restarts,
         )
 
     @staticmethod

@@ -73,6 +73,8 @@ class Placed:
     counter: Int64
     time_ns: Int64
     missing: int
+    restarts: int = 0
+    """Those that were no known gaps."""
 
 
 class Timeline:
@@ -94,6 +96,8 @@ class Timeline:
             return Placed(np.zeros(0, dtype=bool), np.zeros(0, np.int64), np.zeros(0, np.int64), 0)
         elapsed_ns = np.diff(a.arrival_ns, prepend=self._last[2] if self._last else a.arrival_ns[0])
         steps, ticks, restart = self._steps(a, elapsed_ns)
+        first = int(self._last is None)
+        restarts = int(np.count_nonzero((restart & ~a.after_gap)[first:]))
         restart = restart | a.after_gap
         if self._last is None:
             restart[0] = True
@@ -111,7 +115,7 @@ class Timeline:
             int(a.stamp[-1]) if a.stamp is not None else 0,
             int(a.arrival_ns[-1]),
         )
-        return Placed(new, counter[new], time_ns[new], missing)
+        return Placed(new, counter[new], time_ns[new], missing, restarts)
 
     def _steps(self, a: Arrivals, elapsed_ns: Int64) -> tuple[Int64, Int64, NDArray[np.bool_]]:
         """Of each sample to the one before: samples, ticks of the time stamp,

@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from triaxcal_drivers.catalogue import driver_named
-from triaxcal_drivers.errors import DeviceSilent
+from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.host_clock import SteadyClock
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcal_drivers.loading import load_bundle
@@ -39,7 +39,8 @@ class Bus:
     """A Device that sends a still unit's frames as fast as they are taken; from 5 s on not those of ``stopped``.
 
     They come back at ``again_s``. Its own time is the host's. Before the first
-    batch ``discarding_s`` go by. At ``interrupted_s`` an interruption begins.
+    batch ``discarding_s`` go by. At ``interrupted_s`` an interruption begins. At
+    ``restarts_s`` the unit begins anew, without a word.
     """
 
     stopped: Sequence[int]
@@ -47,6 +48,7 @@ class Bus:
     now_s: float = 0.0
     discarding_s: float = 0.0
     interrupted_s: float = float("inf")
+    restarts_s: float = float("inf")
 
     def clock_s(self) -> float:
         return self.now_s
@@ -56,16 +58,22 @@ class Bus:
 
     async def stream(self, names: Sequence[str]) -> AsyncIterator[RawBatch]:
         assert list(names) == [READINGS, CORRECTED]
-        unit = ReferenceUnit(ConstantPhysics(), serial_number=1)
+        unit, begun_s = ReferenceUnit(ConstantPhysics(), serial_number=1), 0.0
         self.now_s += self.discarding_s
         while self.now_s < END_S:
             self.now_s += BATCH_S
             if self.now_s >= self.interrupted_s:
                 self.interrupted_s = float("inf")
                 yield RawBatch.of([]).after(Gap(round(self.now_s * 1e9), None, "the link is down"))
+            if self.now_s >= self.restarts_s + BATCH_S:
+                unit, begun_s, self.restarts_s = (
+                    ReferenceUnit(ConstantPhysics(), serial_number=1),
+                    self.restarts_s,
+                    float("inf"),
+                )
             silent = self.stopped if STOP_S <= self.now_s < self.again_s else ()
             records = []
-            for frames in zip(*tpdos(unit.advance(self.now_s)), strict=True):
+            for frames in zip(*tpdos(unit.advance(self.now_s - begun_s)), strict=True):
                 for identifier, data in zip((*OF_READINGS, *OF_CORRECTED), frames, strict=True):
                     if identifier not in silent:
                         records.append((round(self.now_s * 1e9), identifier, 0, data))
@@ -110,6 +118,17 @@ async def test_a_stream_that_stops_while_another_goes_on_is_silence(
     with pytest.raises(DeviceSilent, match=f"^node 5: stream {stream}: the device sends, but no whole sample of it"):
         await _until_posed(bundle, bus, stream)
     assert timeout_s <= bus.now_s - STOP_S < timeout_s + 3 * BATCH_S
+
+
+async def test_a_unit_that_restarts_in_between_is_opened_again(bundle: Bundle, tmp_path: Path) -> None:
+    """Its start sequence is gone, and it may be another unit."""
+    device: Any = Bus((), restarts_s=STOP_S)
+    with (
+        RecordingWriter(tmp_path / "rec.mcap", metadata={}, preview_channels=["temp_c", "status"]) as writer,
+        pytest.raises(DeviceRestarted, match=r"^node 5: stream readings: it has started anew$"),
+    ):
+        await Collection(CALIBRATION, bundle, "node 5").for_seconds(device, writer, 50.0, device.clock_s)
+    assert device.now_s == pytest.approx(STOP_S + BATCH_S, abs=BATCH_S)
 
 
 @pytest.mark.parametrize("seconds", [None, 50.0])

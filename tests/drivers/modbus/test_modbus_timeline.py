@@ -136,6 +136,9 @@ def test_a_counter_that_outruns_the_hosts_time_a_hundredfold_has_started_anew(be
     placed = Timeline(COUNTED).place(arrivals(counter=[before, before + 1, 0, 1], arrival_ns=at_ns))
     assert ((placed.time_ns - placed.time_ns[0]) // PERIOD_NS).tolist() == [0, 1, 30, 31]
     assert placed.counter.tolist() == [before, before + 1, before + 2, before + 3]
+    assert placed.restarts == 1
+    told = arrivals(counter=[before, before + 1, 0, 1], arrival_ns=at_ns, after_gap=[2])
+    assert Timeline(COUNTED).place(told).restarts == 0
 
 
 def test_a_simulated_device_may_be_sixty_times_as_fast():
