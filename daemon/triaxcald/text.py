@@ -73,6 +73,23 @@ def one_of_several(units: Sequence[str], buses: Sequence[str], output: Path) -> 
     )
 
 
+_NOT_A_SAMPLE = {
+    "errors": "replies or frames in error",
+    "incomplete": "that lack a message or part",
+    "duplicates": "that repeat an earlier one",
+    "invalid": "that the unit says are not valid",
+    "not_finite": "whose outputs are no finite numbers",
+}
+
+
+def no_sample(seconds: float, counts: Mapping[str, int]) -> str:
+    """Of a stream of which records come, and no sample; ``counts`` is what was
+    made of them meanwhile."""
+    said = [f"{counts[name]} {what}" for name, what in _NOT_A_SAMPLE.items() if counts.get(name)]
+    came = f": {', '.join(said)}" if said else ": its counter stands still, or a message of it never comes"
+    return f"the device sends, but no whole sample of it for {seconds:g} s{came}"
+
+
 def own_seconds(own: float, by_host: float | None) -> str:
     """How long samples span by the unit's counter or stamps, and by the host's
     clock where that is another time by a tenth: its rate is not the profile's,

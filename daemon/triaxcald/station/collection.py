@@ -4,6 +4,7 @@ until there are poses enough."""
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcald import text
 from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
@@ -209,6 +211,7 @@ class _Watch:
     def __init__(self, decoded: DecodedStream, stream: str, timeout_s: float, clock_s: Callable[[], float]) -> None:
         self._decoded, self._stream, self._timeout_s, self._clock_s = decoded, stream, timeout_s, clock_s
         self._samples, self._looks = -1, Looks(0.0, 0.0)
+        self._before: Counter[str] = Counter()
 
     def look(self, device: Streaming) -> None:
         """Complains to the device, and begins anew, where none came for too
@@ -216,8 +219,8 @@ class _Watch:
         now_s, samples = self._clock_s(), self._decoded.counts["samples"]
         if samples != self._samples:
             self._samples, self._looks = samples, Looks(now_s, SILENCE_SHARE * self._timeout_s)
+            self._before = Counter(self._decoded.counts)
         elif self._looks.look(now_s) > self._timeout_s:
             self._samples, self._looks = -1, Looks(0.0, 0.0)
-            device.complain(
-                DeviceSilent(f"{self._stream}: the device sends, but no whole sample of it for {self._timeout_s:g} s")
-            )
+            what = text.no_sample(self._timeout_s, self._decoded.counts - self._before)
+            device.complain(DeviceSilent(f"{self._stream}: {what}"))
