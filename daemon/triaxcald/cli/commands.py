@@ -32,7 +32,7 @@ class _Version(argparse.Action):
 def say_version() -> None:
     from importlib.metadata import version  # a third of the time that this takes
 
-    print(f"triaxcal {version('triaxcal')}")
+    print(f"triaxcal {version('triaxcal')}", flush=True)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -50,6 +50,10 @@ def main(arguments: Sequence[str]) -> int:
         chosen = parsed(top, arguments)
     except SystemExit as e:
         return int(e.code or 0)
+    except OSError as e:  # what was asked for is the version, and standard output does not take it
+        from triaxcald.cli.running import not_written
+
+        return not_written(e, 0)
     from triaxcald.cli.running import run  # what an error may be of, and what shows it
 
     return run(lambda: keep_apart(chosen), _working(chosen))

@@ -6,8 +6,8 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -29,6 +29,27 @@ if TYPE_CHECKING:  # every command says something, few show poses
 def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
     """One JSON document on standard output, nothing else."""
     sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+class Unshown(Exception):
+    """Standard output does not take what came of work that has ended. ``code``
+    is the work's own exit code, ``told`` what came of it in one line."""
+
+    def __init__(self, error: OSError, code: int, told: str) -> None:
+        super().__init__(told)
+        self.error, self.code, self.told = error, code, told
+
+
+@contextmanager
+def showing(code: int, told: str) -> Iterator[None]:
+    """For what is shown of work that has changed a device: its exit code and
+    what came of it are said, whatever becomes of standard output. Raises
+    Unshown."""
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError as e:
+        raise Unshown(e, code, told) from e
 
 
 def say(text: str) -> None:

@@ -8,7 +8,6 @@ import shutil
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal.text.advice import of_creep
 from triaxcal_drivers.extras import absent
 from triaxcald import text
-from triaxcald.cli.console import Bars, emit, micro, say, table
+from triaxcald.cli.console import Bars, emit, micro, say, showing, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
 from triaxcald.errors import InputError
@@ -41,7 +40,7 @@ def run_command(a: argparse.Namespace) -> int:
 
     with Bars() as bars:
         outcomes = run_interruptible(run_station(station, bars, force=a.force, ended=say_error))
-    with suppress(OSError):  # where nobody reads standard output, the exit code is the outcomes' all the same
+    with showing(worst(outcomes), _told(outcomes)):
         if a.json:
             emit({"format": "triaxcal.run/1", "units": [_document(o) for o in outcomes]})
         else:
@@ -49,6 +48,12 @@ def run_command(a: argparse.Namespace) -> int:
                 if o.error is None:
                     show_outcome(o)
     return worst(outcomes)
+
+
+def _told(outcomes: Sequence[Outcome]) -> str:
+    """What came of the units of which no error was said."""
+    each = [(o, [f"{o.document['verdict']}: {o.document['reason']}", o.settling]) for o in outcomes if o.error is None]
+    return "; ".join(f"unit {o.unit}: {'; '.join(filter(None, told))}" for o, told in each)
 
 
 def worst(outcomes: Sequence[Outcome]) -> int:
@@ -154,16 +159,18 @@ def demo_command(a: argparse.Namespace) -> int:
 
     with Bars() as bars:
         units = run_interruptible(run_demo(a.out, a.seed, bars))
-    if a.json:
-        emit({"format": "triaxcal.demo/1", "units": [_demo_document(u) for u in units]})
-    else:
-        for u in units:
-            if u.outcome.error is None:
-                _show_demo(u)
-        _show_next(a.out, units)
     for u in units:
         say_error(u.outcome)
-    return worst([u.outcome for u in units]) or (0 if all(u.found and u.kept for u in units) else 1)
+    code = worst([u.outcome for u in units]) or (0 if all(u.found and u.kept for u in units) else 1)
+    with showing(code, ""):  # its devices are gone with it
+        if a.json:
+            emit({"format": "triaxcal.demo/1", "units": [_demo_document(u) for u in units]})
+        else:
+            for u in units:
+                if u.outcome.error is None:
+                    _show_demo(u)
+            _show_next(a.out, units)
+    return code
 
 
 def _demo_document(u: DemoUnit) -> dict[str, Any]:

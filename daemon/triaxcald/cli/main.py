@@ -19,6 +19,7 @@ LAST_THREADS_S = 1.0
 
 def entry() -> NoReturn:
     """Console script. Says what is not installed in one line."""
+    _open_what_is_closed()
     heed_stop_signals()
     _keep_from_python_can()
     try:
@@ -30,6 +31,20 @@ def entry() -> NoReturn:
         code = 2
     _leave_nothing_unsaid()
     _end(code)
+
+
+def _open_what_is_closed() -> None:
+    """A standard stream that the caller has closed (``>&-``) is /dev/null.
+
+    Python has None in its place, and the next file to be opened, a recording or
+    a port, would get its number: what others write there would go into it.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest that is free: ``number``
+            os.set_inheritable(descriptor, True)
+            stream = open(descriptor, "w" if number else "r", encoding="utf-8", closefd=False)  # noqa: SIM115
+            setattr(sys, name, stream)
 
 
 def _keep_from_python_can() -> None:

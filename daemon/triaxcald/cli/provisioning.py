@@ -19,7 +19,7 @@ from triaxcal_drivers.profile import Profile
 from triaxcald import text
 from triaxcald.certificate import held_by_device, image_of, why_not_written
 from triaxcald.choices import is_passing
-from triaxcald.cli.console import emit, say, table
+from triaxcald.cli.console import emit, say, showing, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.errors import InputError
 from triaxcald.inputs import read_document
@@ -40,13 +40,23 @@ def provision_command(a: argparse.Namespace) -> int:
     ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
     run = ProvisionRun(station, place, image, serial, dry_run=a.dry_run, force=a.force, ask=ask)
     done = run_interruptible(run.run())
-    if a.json:
-        emit(_document(done, place, dry_run=a.dry_run))
-    elif done.error is None:
-        _show(done, place, station.path)
     if done.error is not None:
         say(f"triaxcal: {done.error}")
+    with showing(done.exit_code, _told(done, station.path)):
+        if a.json:
+            emit(_document(done, place, dry_run=a.dry_run))
+        elif done.error is None:
+            _show(done, place, station.path)
     return done.exit_code
+
+
+def _told(done: Provisioned, station: Path) -> str:
+    """What came of it, and what would settle it; nothing where the error said
+    so."""
+    p = done.provisioning
+    if p is None or done.error is not None:
+        return ""
+    return "; ".join(filter(None, [done.document["reason"], text.settling(p, station)]))
 
 
 def _ask(what: str) -> None:
@@ -189,24 +199,24 @@ def restore_command(a: argparse.Namespace) -> int:
     run = RestoreRun(station, place, ask=ask, snapshot=snapshot)
     done = run_interruptible(run.run())
     p = done.provisioning
-    if a.json:
-        emit(
-            {
-                "format": "triaxcal.restoration/1",
-                "unit": place.unit.name,
-                "serial": p.identity.serial if p else None,
-                "device_state": done.document["device_state"],
-                "evidence": done.document["evidence"],
-                "registers": {name: raw.hex() for name, raw in snapshot.raw.items()},
-                "error": done.error,
-                "outcome": done.document,
-                "outcome_file": str(done.path) if done.path else None,
-            }
-        )
-    elif p is not None and done.error is None:
-        told = [text.put_back(p), text.settling(p, station.path)]
-        print(f"unit {place.unit.name}, serial {p.identity.serial}: {'; '.join(filter(None, told))}")
-        print(f"outcome {done.path}")
     if done.error is not None:
         say(f"triaxcal: {done.error}")
+    with showing(done.exit_code, _told(done, station.path)):
+        if a.json:
+            emit(
+                {
+                    "format": "triaxcal.restoration/1",
+                    "unit": place.unit.name,
+                    "serial": p.identity.serial if p else None,
+                    "device_state": done.document["device_state"],
+                    "evidence": done.document["evidence"],
+                    "registers": {name: raw.hex() for name, raw in snapshot.raw.items()},
+                    "error": done.error,
+                    "outcome": done.document,
+                    "outcome_file": str(done.path) if done.path else None,
+                }
+            )
+        elif p is not None and done.error is None:
+            print(f"unit {place.unit.name}, serial {p.identity.serial}: {_told(done, station.path)}")
+            print(f"outcome {done.path}")
     return done.exit_code

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from triaxcal.errors import Refused, TriaxcalError
 from triaxcal_drivers.errors import DriverError, RegisterValueError
 from triaxcal_drivers.extras import lacking
-from triaxcald.cli.console import say
+from triaxcald.cli.console import Unshown, say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import DaemonError
-from triaxcald.exit_codes import BAD_INPUT, DONE, INTERRUPTED, REFUSED, exit_code_of
+from triaxcald.exit_codes import BAD_INPUT, DISK, DONE, INTERRUPTED, REFUSED, exit_code_of, severest
 
 
 def run(check: Callable[[], None], work: Callable[[], int]) -> int:
@@ -43,14 +43,20 @@ def run(check: Callable[[], None], work: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         say("triaxcal: interrupted")
         return INTERRUPTED
-    except BrokenPipeError:
-        # Whoever read our output has gone; nothing more can be said there.
-        _drop_output()
-        return code
+    except Unshown as e:
+        return not_written(e.error, e.code, e.told)
     except OSError as e:
-        _drop_output()
-        say(f"triaxcal: {e.filename or 'standard output'}: {e.strerror}")
-        return max(code, BAD_INPUT)
+        return not_written(e, code)
+
+
+def not_written(e: OSError, code: int, told: str = "") -> int:
+    """The exit code where standard output, or a file, does not take what came
+    of work that itself ends with ``code``; ``told`` is what came of it."""
+    _drop_output()
+    if isinstance(e, BrokenPipeError):  # whoever read our output has gone; nothing more can be said there
+        return code
+    say(f"triaxcal: {e.filename or 'standard output'}: {e.strerror}{f'; {told}' if told else ''}")
+    return max(code, BAD_INPUT) if e.filename else severest((code, DISK))
 
 
 def _drop_output() -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +16,6 @@ from triaxcal.model.directions import directions
 from triaxcald.recording.frames import MAGIC
 
 Run = Callable[..., Any]
-PROGRAM = Path(sys.executable).with_name("triaxcal")
 HEADER = "t_s,ux,uy,uz\n"
 ROWS = "".join(f"{i / 100},1,2,3\n" for i in range(100))
 
@@ -284,24 +281,6 @@ def test_help_is_no_error(triaxcal: Run) -> None:
     for command in ("demo", "run", "sim", "record", "poses", "fit", "diagnose", "verify", "plan", "provision",
                     "registers", "audit", "log", "devices"):  # fmt: skip
         assert f"\n    {command}" in done.out
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arguments", [["plan"], ["plan", "--json"]])
-def test_a_standard_output_that_takes_no_more_is_an_error_of_one_line(arguments: list[str]) -> None:
-    with open("/dev/full", "w") as full:
-        done = subprocess.run([PROGRAM, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
-    assert (done.returncode, done.stderr) == (2, "triaxcal: standard output: No space left on device\n")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arguments", [["plan"], ["plan", "--json"]])
-def test_a_reader_that_has_gone_is_no_error(arguments: list[str]) -> None:
-    reading, writing = os.pipe()
-    os.close(reading)
-    done = subprocess.run([PROGRAM, *arguments], stdout=writing, stderr=subprocess.PIPE, text=True, timeout=60)
-    os.close(writing)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize(
