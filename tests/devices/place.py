@@ -39,6 +39,8 @@ class Trouble:
     """From the first request on, everything is answered as busy for so long."""
     busy_code: int | None = None
     """None: Modbus exception 6, SDO abort 0x08000022. Modbus also has 5, and gateways 0x0A and 0x0B."""
+    gateway: int | None = None
+    """What the unit leaves unanswered, a gateway before it answers by this exception, at once."""
     brown_out: When = 0.0
     """The unit loses its power for a moment before it hears the request: RAM gone, locked."""
     drop: When = 0.0
@@ -119,7 +121,9 @@ class Place:
         try:
             data, after_s = self._answered(now, busy, carry_out, refuse)
         except Silent:
-            return Exchange(drop=drop)
+            if t.gateway is None or drop:
+                return Exchange(drop=drop)
+            data, after_s = refuse(Refused("busy", t.gateway)), 0.0
         if drop or unheard:
             return Exchange(drop=drop)
         reply = Reply(data, after_s + late * t.late_s, kind if garbled else None)

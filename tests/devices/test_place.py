@@ -103,6 +103,13 @@ def test_another_unit_takes_the_place_with_a_memory_of_its_own() -> None:
     assert (len(first.log), len(other.log)) == (1, 2)
 
 
+def test_a_gateway_answers_for_a_unit_that_does_not() -> None:
+    place = make(Trouble(gateway=0x0B))
+    assert ask(place).replies[0].data == SERIAL
+    place.unit.power_off(0.0)
+    assert [r.data for r in ask(place).replies] == [b"refused"]
+
+
 def test_a_unit_that_is_dark_is_not_even_busy() -> None:
     place = make(Trouble(busy=1.0))
     place.unit.power_off(0.0)

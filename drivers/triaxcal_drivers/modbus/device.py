@@ -21,6 +21,7 @@ from triaxcal_drivers.interface import RawBatch, RawFlag
 from triaxcal_drivers.modbus.client import ModbusClient
 from triaxcal_drivers.modbus.model import FifoStream, ModbusBus, ModbusProfile, ModbusRegister, PollStream, words_of
 from triaxcal_drivers.modbus.protocol import (
+    GATEWAY_CODES,
     READ_HOLDING,
     READ_INPUT,
     MalformedReply,
@@ -99,19 +100,29 @@ class ModbusDevice:
             await client.close()
 
     async def _probe(self, client: ModbusClient) -> None:
-        """Any answer shows that the unit is there, an exception too. Takes no
-        samples from it."""
+        """Any answer of the unit shows that it is there, an exception too.
+        Takes no samples from it."""
         function, address, count = self._probe_request()
         for last in (False, True):
             try:
                 await client.read(function, address, count)
-            except (ModbusRefusal, MalformedReply):
+            except MalformedReply:
                 return
-            except DeviceSilent as e:
+            except (ModbusRefusal, DeviceSilent) as e:
+                cause = _cause(e) if isinstance(e, DeviceSilent) else self._no_contact(e)
+                if cause is None:
+                    return
                 if last:
-                    raise DeviceAbsent(f"nothing answers at {client.where}: {_cause(e)}") from e
+                    raise DeviceAbsent(f"nothing answers at {client.where}: {cause}") from e
             else:
                 return
+
+    def _no_contact(self, e: ModbusRefusal) -> str | None:
+        """What a gateway says of a unit that it has not reached; None where the
+        exception is the unit's own."""
+        if e.code not in GATEWAY_CODES or e.code in self._profile.busy_codes:
+            return None
+        return f"no contact: {e}"
 
     def _probe_request(self) -> tuple[int, int, int]:
         names = [self._profile.identity.serial_register, *self._profile.identity.expect]
@@ -229,7 +240,9 @@ class ModbusDevice:
         try:
             data = await self._connected().read(p.stream.function, p.stream.address, p.stream.words)
         except ModbusRefusal as e:
-            p.trouble = str(e)
+            no_contact = self._no_contact(e)
+            p.trouble = no_contact or str(e)
+            p.unanswered = unanswered + 1 if no_contact else 0
             return RawFlag.ERROR, bytes([e.code])
         except MalformedReply as e:
             p.trouble = "malformed replies"
@@ -257,7 +270,7 @@ class ModbusDevice:
         try:
             raw = await self._connected().read(_function(entry), entry.address, words_of(entry.type))
         except ModbusRefusal as e:
-            raise self._refused(register, "read", e.code, str(e)) from e
+            raise self._refused(register, "read", e) from e
         except MalformedReply as e:
             raise BusError(f"register {register}: {e}") from e
         return self._ordered(entry, raw)
@@ -275,14 +288,16 @@ class ModbusDevice:
         try:
             await self._connected().write(entry.address, self._ordered(entry, raw), single=single, timeout_s=timeout_s)
         except ModbusRefusal as e:
-            raise self._refused(register, "written", e.code, str(e)) from e
+            raise self._refused(register, "written", e) from e
         except MalformedReply as e:
             raise BusError(f"register {register}: {e}") from e
 
-    def _refused(self, register: str, done: str, code: int, reason: str) -> RegisterRefused:
+    def _refused(self, register: str, done: str, e: ModbusRefusal) -> RegisterRefused | DeviceSilent:
         where = f"{self._connected().where}: register {register} (0x{self._register(register).address:04X})"
-        kind = DeviceBusy if code in self._profile.busy_codes else RegisterRefused
-        return kind(f"{where} cannot be {done}: {reason}", register=register, code=code)
+        if no_contact := self._no_contact(e):
+            return DeviceSilent(f"{where} cannot be {done}: {no_contact}")
+        kind = DeviceBusy if e.code in self._profile.busy_codes else RegisterRefused
+        return kind(f"{where} cannot be {done}: {e}", register=register, code=e.code)
 
     def _register(self, name: str) -> ModbusRegister:
         if name not in self._profile.registers:

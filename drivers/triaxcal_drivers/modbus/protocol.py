@@ -21,8 +21,11 @@ _REASONS = {
     6: "device busy",
     8: "memory parity error",
     10: "gateway path unavailable",
-    11: "gateway target does not respond",
+    11: "gateway target device failed to respond",
 }
+GATEWAY_CODES = frozenset({0x0A, 0x0B})
+"""By which a gateway says that it has not reached the unit, or had no answer
+from it: the unit may have done what was asked, and has refused nothing."""
 
 
 class ModbusRefusal(DriverError):

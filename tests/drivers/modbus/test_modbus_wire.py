@@ -14,6 +14,7 @@ import pytest
 from triaxcal_drivers.errors import (
     BusError,
     DeviceAbsent,
+    DeviceBusy,
     DeviceSilent,
     ProfileError,
     RegisterRefused,
@@ -137,6 +138,36 @@ async def test_a_refused_register_names_itself_and_the_code(bundle, tcp_device):
         await device.close()
 
 
+async def test_a_gateway_that_has_not_reached_the_device_is_no_refusal(bundle, tcp_device):
+    exchanges = [
+        PROBE,
+        ("0002 0000 0006 11 03 0001 0002", "0002 0000 0003 11 83 0B"),
+        ("0003 0000 0009 11 10 0001 0001 02 0003", "0003 0000 0003 11 90 0A"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(), heard)
+        said = r"register pair \(0x0001\) cannot be read: no contact: exception 0x0B \(gateway target device failed to"
+        with pytest.raises(DeviceSilent, match=said):
+            await device.read("pair")
+        said = r"register setting \(0x0001\) cannot be written: no contact: exception 0x0A \(gateway path unavailable"
+        with pytest.raises(DeviceSilent, match=said):
+            await device.write("setting", b"\x00\x03")
+        await device.close()
+
+
+async def test_a_gateways_code_is_the_devices_own_where_the_profile_says_so(bundle, tcp_device):
+    busy = ('name = "by-hand"', 'name = "by-hand"\nbusy_codes = [11]')
+    exchanges = [
+        (PROBE[0], "0001 0000 0003 11 84 0B"),
+        ("0002 0000 0006 11 03 0001 0002", "0002 0000 0003 11 83 0B"),
+    ]
+    async with tcp_device(*exchanges) as heard:
+        device = await opened(bundle(busy), heard)
+        with pytest.raises(DeviceBusy, match=r"cannot be read: exception 0x0B"):
+            await device.read("pair")
+        await device.close()
+
+
 async def test_a_register_of_the_wrong_length_is_not_sent(bundle, tcp_device):
     async with tcp_device(PROBE) as heard:
         device = await opened(bundle(), heard)
@@ -245,11 +276,12 @@ async def test_failed_requests_are_records_with_flags(bundle, tcp_device):
         (f"0004 {ask}", None),  # nothing
         (f"0005 {ask}", "0005 0000 0009 11 04 06 0001 0002 0003"),  # another function
         (f"0006 {ask}", "0006 0000 0007 11 03 06 0001 0002"),  # fewer words than it says
-        (f"0007 {ask}", "0007 0000 0009 11 03 06 0001 0002 0003"),
+        (f"0007 {ask}", "0007 0000 0003 11 83 0B"),  # a gateway that has not reached it
+        (f"0008 {ask}", "0008 0000 0009 11 03 06 0001 0002 0003"),
     ]
     async with tcp_device(*exchanges) as heard:
         device = await opened(bundle(hasty=True), heard)
-        batches = await first_batches(device, "readings", 6)
+        batches = await first_batches(device, "readings", 7)
         await device.close()
     assert [int(b.flags[0]) for b in batches] == [
         RawFlag.ERROR,
@@ -257,6 +289,7 @@ async def test_failed_requests_are_records_with_flags(bundle, tcp_device):
         RawFlag.ERROR,
         RawFlag.INVALID,
         RawFlag.INVALID,
+        RawFlag.ERROR,
         0,
     ]
     assert [b.payload.hex() for b in batches] == [
@@ -265,6 +298,7 @@ async def test_failed_requests_are_records_with_flags(bundle, tcp_device):
         "",
         "0406000100020003",
         "030600010002",
+        "0b",
         "000100020003",
     ]
     assert {int(b.source[0]) for b in batches} == {0x0003_006B}
@@ -372,12 +406,13 @@ async def test_a_device_that_gives_nothing_to_discard_is_silent(bundle, tcp_devi
         await device.close()
 
 
-async def test_a_stream_that_fails_for_long_is_silent_and_says_why(bundle, tcp_device):
-    refusals = [(f"{i:04X} 0000 0006 11 03 006B 0003", f"{i:04X} 0000 0003 11 83 04") for i in range(2, 2000)]
+@pytest.mark.parametrize(("code", "why"), [("04", "exception 0x04"), ("0B", "no contact: exception 0x0B")])
+async def test_a_stream_that_fails_for_long_is_silent_and_says_why(bundle, tcp_device, code, why):
+    refusals = [(f"{i:04X} 0000 0006 11 03 006B 0003", f"{i:04X} 0000 0003 11 83 {code}") for i in range(2, 2000)]
     async with tcp_device(PROBE, *refusals) as heard:
         device = await opened(bundle(hasty=True), heard)
         batches = []
-        with pytest.raises(DeviceSilent, match=r"stream readings has been silent .*exception 0x04") as silent:
+        with pytest.raises(DeviceSilent, match=rf"stream readings has been silent .* s: {why}") as silent:
             await collect(device, "readings", batches)
         assert silent.value.stream is None, "there is no other that goes on"
         assert sum(map(len, batches)) == len(heard) - 1
@@ -441,6 +476,17 @@ async def test_a_device_that_never_answers_is_absent(bundle, tcp_device):
         with pytest.raises(DeviceAbsent, match=r"^nothing answers at .* unit 17: no reply in 0\.2 s$"):
             await opened(bundle(hasty=True), heard)
     assert len(heard) == 2
+
+
+async def test_a_device_that_its_gateway_does_not_reach_is_absent(bundle, tcp_device):
+    again = "0002" + PROBE[0][4:]
+    async with tcp_device((PROBE[0], "0001 0000 0003 11 84 0B"), (again, "0002 0000 0003 11 84 0B")) as heard:
+        with pytest.raises(DeviceAbsent, match=r"^nothing answers at .* unit 17: no contact: exception 0x0B \(gateway"):
+            await opened(bundle(), heard)
+    assert len(heard) == 2
+    async with tcp_device((PROBE[0], "0001 0000 0003 11 84 0A"), (again, "0002" + PROBE[1][4:])) as heard:
+        device = await opened(bundle(), heard)
+        await device.close()
 
 
 async def test_an_exception_shows_that_the_device_is_there(bundle, tcp_device):
