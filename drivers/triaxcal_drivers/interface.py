@@ -37,6 +37,13 @@ EXTENDED_KEY = 1 << 32
 """Added to an extended identifier: a standard one may have the same number."""
 
 
+BUSY_S = 6.0
+"""So long a busy device is waited for: longer than any EEPROM takes, and short
+enough that a provisioning and its undoing, with a reconnection each, end within
+30 s."""
+BUSY_PAUSE_S = 0.02
+
+
 @dataclass(frozen=True)
 class Gap:
     """Records that were sent, or would have been, and are not in a stream.

@@ -166,6 +166,8 @@ ROWS = (
     row("is busy for every fifth request", "new", "new_verified", 0, RESTARTED, trouble=Trouble(busy=0.2, seed=14),
         wording=NO_OUTPUT),
     row("is busy for the first two seconds", "new", "new_verified", 0, RESTARTED, trouble=Trouble(busy_for_s=2.0)),
+    row("is busy for the first two seconds (CANopen)", "new", "new_verified", 0, RESTARTED, transport="canopen",
+        trouble=Trouble(busy_for_s=2.0)),
     row("is not reached by its gateway now and then", "new", "new_verified", 0, RESTARTED, wording=NO_OUTPUT,
         trouble=Trouble(busy=0.1, busy_code=0x0B, seed=15)),
     row("stores, and its gateway says that it did not answer", "new", "new_verified", 0, RESTARTED, timing=QUICK,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError
-from triaxcal_drivers.interface import Device, RawBatch
+from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Device, RawBatch
 from triaxcal_drivers.profile import Profile, WriteStep
 from triaxcald.errors import DaemonError
 from triaxcald.provision.pace import REAL_PACE, Pace
@@ -19,11 +19,6 @@ Kind = Literal["read", "write"]
 
 RETRIES = 2
 """A lost request in a hundred then fails one request in a million."""
-BUSY_S = 6.0
-"""So long a busy device is waited for: longer than any EEPROM takes, and short
-enough that a provisioning and its undoing, with a reconnection each, end within
-30 s."""
-BUSY_PAUSE_S = 0.02
 NO_CONTACT = (BusError, DeviceAbsent, DeviceSilent)
 """Nothing came back; unlike a refusal, that says nothing about what the device
 did."""

@@ -30,7 +30,7 @@ from triaxcal_drivers.errors import (
     ProfileError,
     RegisterRefused,
 )
-from triaxcal_drivers.interface import RawBatch, RawFlag
+from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, RawBatch, RawFlag
 from triaxcal_drivers.nearest import nearest
 
 T = TypeVar("T")
@@ -197,9 +197,11 @@ class CanDevice:
         asked = [*identity.expect, *([identity.serial_register] if identity.serial_register else [])]
         for name in asked or list(self._profile.registers)[:1]:
             try:
-                raw = await self.read(name)
+                raw = await self._read_when_ready(name)
             except DeviceSilent as e:
                 raise DeviceAbsent(f"nothing answers at {self._settings}") from e
+            except DeviceBusy as e:
+                raise DeviceAbsent(f"{self._settings} does not say for {BUSY_S:g} s what it is: {e}") from e
             except RegisterRefused as e:
                 raise DeviceAbsent(f"{self._settings} is not a {identity.product}: {e}") from e
             expected = identity.expect.get(name)
@@ -208,6 +210,19 @@ class CanDevice:
                     f"{self._settings} is not a {identity.product}: {name} is "
                     f"0x{int.from_bytes(raw, 'little'):X}, expected 0x{expected:X}"
                 )
+
+    async def _read_when_ready(self, register: str) -> bytes:
+        """As `read`; a node that refuses for now, as one does that starts or
+        stores, is asked again. Raises DeviceBusy after `BUSY_S`."""
+        now_s = self._connected().line.attention.now_s
+        until_s = now_s() + BUSY_S
+        while True:
+            try:
+                return await self.read(register)
+            except DeviceBusy:
+                if now_s() >= until_s:
+                    raise
+            await asyncio.sleep(BUSY_PAUSE_S)
 
     async def stream(self, names: Sequence[str]) -> AsyncGenerator[RawBatch, None]:
         """Frames of the named streams and error frames, until the iterator is

@@ -92,6 +92,21 @@ async def test_a_node_without_the_identity_object_is_not_the_device(closed: CanD
         await asyncio.gather(closed.open(), peer.converse([(START, None), refused]))
 
 
+NOT_YET = VENDOR[0], (0x585, "80 18 10 01 22 00 00 08")
+
+
+async def test_a_node_that_does_not_say_yet_what_it_is_is_asked_again(closed: CanDevice, peer: Peer) -> None:
+    await asyncio.gather(closed.open(), peer.converse([OPENING[0], NOT_YET, NOT_YET, *OPENING[1:]]))
+
+
+async def test_a_node_that_never_says_what_it_is_is_not_called_another(
+    closed: CanDevice, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("triaxcal_drivers.can.device.BUSY_S", 0.0)
+    with pytest.raises(DeviceAbsent, match=r"^node 5 on .* does not say for 0 s what it is: .*0x08000022"):
+        await asyncio.gather(closed.open(), peer.converse([OPENING[0], NOT_YET]))
+
+
 @pytest.mark.parametrize(
     ("register", "request_", "answer", "raw"),
     [
