@@ -3,8 +3,8 @@ device is waited for, all is recorded."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
@@ -62,11 +62,17 @@ class RegisterLink:
         self._record = record or (lambda access: None)
         self._once = {step.write for step in steps if isinstance(step, WriteStep)}
         self._tired: set[Kind] = set()
+        self._not_opened: str | None = None
         self.touched: set[str] = set()
         """Registers that somebody has tried to write."""
 
     async def open(self) -> None:
-        await self._device.open()
+        try:
+            await self._device.open()
+        except NO_CONTACT as e:
+            self._not_opened = str(e)
+            raise
+        self._not_opened = None
 
     async def close(self) -> None:
         await self._device.close()
@@ -105,8 +111,8 @@ class RegisterLink:
     async def renew(self) -> None:
         """A new connection, where one is to be had."""
         with suppress(*NO_CONTACT):
-            await self._device.close()
-            await self._device.open()
+            await self.close()
+            await self.open()
 
     async def _patiently(self, kind: Kind, request: Callable[[], Awaitable[T]]) -> T:
         left, busy_since_s = RETRIES, None
@@ -133,20 +139,28 @@ class RegisterLink:
                 await self.renew()
 
     async def _read(self, register: str) -> bytes:
-        try:
+        with self._failure_told("read", register, b""):
             raw = await self._device.read(register)
-        except DriverError as e:
-            self._record(RegisterAccess("read", register, b"", str(e), isinstance(e, NO_CONTACT)))
-            raise
         self._record(RegisterAccess("read", register, raw))
         return raw
 
     async def _write(self, register: str, raw: bytes, timeout_s: float | None) -> None:
         self.touched.add(register)
         given = {} if timeout_s is None else {"timeout_s": timeout_s}  # a driver may know nothing of it
-        try:
+        with self._failure_told("write", register, raw):
             await self._device.write(register, raw, **given)
-        except DriverError as e:
-            self._record(RegisterAccess("write", register, raw, str(e), isinstance(e, NO_CONTACT)))
-            raise
         self._record(RegisterAccess("write", register, raw))
+
+    @contextmanager
+    def _failure_told(self, kind: Kind, register: str, raw: bytes) -> Iterator[None]:
+        """A device that could not be opened again says of a request only that
+        it is not open: what kept it from that is told instead."""
+        try:
+            yield
+        except DriverError as e:
+            no_contact = isinstance(e, NO_CONTACT)
+            why = str(e) if self._not_opened is None or not no_contact else self._not_opened
+            self._record(RegisterAccess(kind, register, raw, why, no_contact))
+            if why == str(e):
+                raise
+            raise BusError(why) from e
