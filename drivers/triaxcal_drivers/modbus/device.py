@@ -25,6 +25,7 @@ from triaxcal_drivers.modbus.protocol import (
     READ_HOLDING,
     READ_INPUT,
     MalformedReply,
+    Misanswered,
     ModbusRefusal,
 )
 from triaxcal_drivers.register_types import TYPES
@@ -112,6 +113,8 @@ class ModbusDevice:
                 cause = _cause(e) if isinstance(e, DeviceSilent) else self._no_contact(e)
                 if cause is None:
                     return
+                if last and isinstance(e, Misanswered):
+                    raise DeviceAbsent(str(e)) from e
                 if last:
                     raise DeviceAbsent(f"nothing answers at {client.where}: {cause}") from e
             else:
@@ -247,8 +250,9 @@ class ModbusDevice:
         except MalformedReply as e:
             p.trouble = "malformed replies"
             return RawFlag.INVALID, e.pdu
-        except DeviceSilent:
-            p.trouble, p.unanswered = "no reply", unanswered + 1
+        except DeviceSilent as e:
+            p.trouble = _cause(e) if isinstance(e, Misanswered) else "no reply"
+            p.unanswered = unanswered + 1
             return RawFlag.ERROR, b""
         return RawFlag(0), data
 

@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.claim import canonical_host, canonical_port
 from triaxcal_drivers.errors import BusError, DeviceSilent
-from triaxcal_drivers.modbus.protocol import SerialLine, TcpAddress
+from triaxcal_drivers.modbus.protocol import Misanswered, SerialLine, TcpAddress
 from triaxcal_drivers.modbus.stack import Link, connect_serial, connect_tcp, reason_of
 
 _LOOK_S = 0.01
@@ -42,6 +42,8 @@ class Line:
         self._transaction = 0
         self._asked = 0
         self._expected: asyncio.Future[bytes] | None = None
+        self._other: str | None = None
+        """A reply that came while another was expected, in words."""
 
     async def open(self, timeout_s: float) -> None:
         """Nothing where it is open and answers; a TCP connection that went mute
@@ -111,7 +113,7 @@ class Line:
             if self._link.transport is None:
                 raise BusError(f"{self.name} unit {unit}: the connection was lost")
             expected = self._expected = asyncio.get_running_loop().create_future()
-            self._asked = unit
+            self._asked, self._other = unit, None
             if not self._frame_gap_s:
                 self._transaction = self._transaction % 0xFFFF + 1
             until_s = self.attention.now_s() + patience_s
@@ -121,7 +123,10 @@ class Line:
                     reply: bytes = await expected
             except TimeoutError as e:
                 self._mute = not self._frame_gap_s  # by TCP: until another frame comes
-                raise DeviceSilent(f"{self.name} unit {unit}: no reply in {patience_s:g} s") from e
+                silent = f"{self.name} unit {unit}: no reply in {patience_s:g} s"
+                if came := self._other or self._link.came():
+                    raise Misanswered(f"{silent}; {came}") from e
+                raise DeviceSilent(silent) from e
             finally:
                 self._expected = None
                 if not expected.done() or expected.cancelled():
@@ -156,9 +161,11 @@ class Line:
             return
         self._mute = False
         if transaction != self._transaction:
+            self._other = f"a reply came as transaction {transaction}, expected {self._transaction}"
             return
         if self._expected is None or unit != self._asked:
             self._late_until_s.pop(unit, None)  # the late reply has come
+            self._other = f"a reply came as unit {unit}"
         elif not self._expected.done():
             self._expected.set_result(pdu)
 

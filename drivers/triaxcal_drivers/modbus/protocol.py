@@ -7,7 +7,7 @@ import struct
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from triaxcal_drivers.errors import DriverError
+from triaxcal_drivers.errors import DeviceSilent, DriverError
 
 READ_HOLDING, READ_INPUT, WRITE_SINGLE, WRITE_MULTIPLE = 3, 4, 6, 16
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
@@ -43,6 +43,10 @@ class MalformedReply(DriverError):
     def __init__(self, message: str, pdu: bytes) -> None:
         super().__init__(message)
         self.pdu = pdu
+
+
+class Misanswered(DeviceSilent):
+    """Something came while a reply was waited for, and it was not the reply."""
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,7 @@ class Link(asyncio.Protocol):
         self.lost: Callable[[], None] = lambda: None
         self._received = received
         self._buffer = b""
+        self._sent, self._head, self._came = b"", b"", 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
@@ -66,6 +67,8 @@ class Link(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         self.last_byte_s = asyncio.get_running_loop().time()
+        self._head += data[: len(self._sent) - len(self._head)]
+        self._came += len(data)
         self._buffer += data
         while self._buffer:
             try:
@@ -88,7 +91,17 @@ class Link(asyncio.Protocol):
 
     def send(self, unit: int, transaction: int, pdu: bytes) -> None:
         if self.transport is not None:
-            self.transport.write(self.framer.encode(pdu, unit, transaction))
+            self._sent, self._head, self._came = self.framer.encode(pdu, unit, transaction), b"", 0
+            self.transport.write(self._sent)
+
+    def came(self) -> str | None:
+        """What bytes have come since the last request, in words; None where
+        none have."""
+        if not self._came:
+            return None
+        if self._head == self._sent:
+            return "what is sent comes back: the adapter echoes"
+        return f"{self._came} bytes came, and no whole reply"
 
     def close(self) -> None:
         if self.transport is not None:

@@ -478,6 +478,39 @@ async def test_a_device_that_never_answers_is_absent(bundle, tcp_device):
     assert len(heard) == 2
 
 
+@pytest.mark.parametrize(
+    ("reply", "words"),
+    [
+        ("{n} 0000 0005 FF 04 02 000A", "a reply came as unit 255"),
+        ("0000 0000 0005 11 04 02 000A", "a reply came as transaction 0, expected 2"),
+        ("{n} 0000 0005 11 04 02", "9 bytes came, and no whole reply"),
+        ("0000 0001 0000 05", "7 bytes came, and no whole reply"),  # of another protocol
+    ],
+)
+async def test_what_came_in_place_of_a_reply_is_said(bundle, tcp_device, reply, words):
+    exchanges = [(n + PROBE[0][4:], reply.format(n=n)) for n in ("0001", "0002")]
+    async with tcp_device(*exchanges) as heard:
+        with pytest.raises(DeviceAbsent, match=rf"^127\.0\.0\.1:\d+ unit 17: no reply in 0\.2 s; {words}$"):
+            await opened(bundle(hasty=True), heard)
+    assert len(heard) == 2
+
+
+async def test_an_adapter_that_echoes_is_called_one(bundle, serial_device):
+    echo = RTU_PROBE[0], RTU_PROBE[0] + RTU_PROBE[1]
+    async with serial_device(echo, echo) as heard:
+        with pytest.raises(DeviceAbsent, match=r"unit 17: no reply in 0\.2 s; what is sent comes back: the adapter"):
+            await opened(bundle(hasty=True), heard)
+
+
+async def test_a_stream_says_what_comes_in_place_of_its_replies(bundle, tcp_device):
+    asked = [(f"{i:04X} 0000 0006 11 03 006B 0003", f"{i:04X} 0000 0003 12 83 04") for i in range(2, 2000)]
+    async with tcp_device(PROBE, *asked) as heard:
+        device = await opened(bundle(hasty=True), heard)
+        with pytest.raises(DeviceSilent, match=r"silent for .* s: no reply in 0\.2 s; a reply came as unit 18$"):
+            await collect(device, "readings", [])
+        await device.close()
+
+
 async def test_a_device_that_its_gateway_does_not_reach_is_absent(bundle, tcp_device):
     again = "0002" + PROBE[0][4:]
     async with tcp_device((PROBE[0], "0001 0000 0003 11 84 0B"), (again, "0002 0000 0003 11 84 0B")) as heard:
