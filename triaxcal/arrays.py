@@ -21,3 +21,15 @@ def rms(values: Floats) -> float:
 def evenly_spread(values: Numbers, most: int) -> Numbers:
     """All values, or ``most`` of them, the first and the last among these."""
     return values if len(values) <= most else values[np.linspace(0, len(values) - 1, most).astype(np.int64)]
+
+
+def joined(parts: list[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """The arrays of all parts, place by place one after the other. ``parts`` is
+    emptied, and what is joined is given up at once: a long stream's summaries
+    are never there twice."""
+    columns = [list(column) for column in zip(*parts, strict=True)]
+    parts.clear()
+    found = []
+    while columns:
+        found.append(np.concatenate(columns.pop(0)))
+    return tuple(found)

@@ -20,6 +20,12 @@ from triaxcal.poses.stillness.detector import Span
 from triaxcal.poses.stillness.quantization import left_in_means, resolution
 from triaxcal.poses.stillness.windows import Windows
 
+LONGEST = 2**17
+"""Windows of a pose whose noise is taken window by window; of a longer one,
+three and a half hours, several are averaged, since the arrays of a day would
+take half a gigabyte."""
+SHORTEST = 64
+"""So many windows, or averages of some, even the shortest pose keeps."""
 SHAKEN, QUIET = 2.0, 0.1
 """Poses are shaken in which the outputs scatter with so many times the variance
 of the quietest tenth of them."""
@@ -42,8 +48,9 @@ class MeanNoise:
 
 def noise_of_means(w: Windows, spans: Sequence[Span], mean: Floats) -> MeanNoise:
     """Of the still spans, whose means (k,3) are known."""
-    tracks = [_track(w, s) for s in spans]
-    recording = float(w.end_ns[spans[-1].last] - w.start_ns[spans[0].first]) / w.period_ns
+    at_once = _averaged_at_once([len(s.used) for s in spans])
+    tracks = [_track(w, s, at_once) for s in spans]
+    recording = float(w.end_ns[spans[-1].last] - w.start_ns[spans[0].first]) / w.period_ns / at_once
     noise = pose_noise(tracks, recording)
     creeping = np.asarray(noise.creeping.any(axis=1))
     length = np.array([t.place[-1] - t.place[0] for t in tracks])[:, None]
@@ -67,12 +74,27 @@ def noise_of_means(w: Windows, spans: Sequence[Span], mean: Floats) -> MeanNoise
     return MeanNoise(covariance, creep, slope, slope_error, dof, shared_dof, levels)
 
 
-def _track(w: Windows, s: Span) -> Track:
+def _averaged_at_once(lengths: Sequence[int]) -> int:
+    """How many windows are averaged. The variance of a mean is the sum of the
+    autocovariances, which averages of neighbours keep; what lies above their
+    frequency averages out of the mean itself."""
+    at_once = 1
+    while max(lengths) > LONGEST * at_once and min(lengths) >= 2 * SHORTEST * at_once:
+        at_once *= 2
+    return at_once
+
+
+def _track(w: Windows, s: Span, at_once: int) -> Track:
     """Places by time, so that a silence inside a pose counts as the windows
     that it lacks."""
     place = np.round((w.start_ns[s.used] - w.start_ns[s.first]) / w.period_ns).astype(np.int64)
     place = np.maximum.accumulate(place - np.arange(len(place))) + np.arange(len(place))
-    return Track(place, w.mean[s.used] - w.mean[s.used].mean(axis=0))
+    deviation = w.mean[s.used] - w.mean[s.used].mean(axis=0)
+    if at_once == 1:
+        return Track(place, deviation)
+    first = np.flatnonzero(np.diff(place // at_once, prepend=-1))
+    count = np.diff(first, append=len(place))[:, None]
+    return Track(place[first] // at_once, np.add.reduceat(deviation, first, axis=0) / count)
 
 
 def _correlation(w: Windows, s: Span) -> Floats:

@@ -4,10 +4,12 @@ step of the output."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.arrays import Bools, Floats, Ints, joined
 
 LATTICE = 20.5
 """Differences up to so many steps tell whether there are steps at all."""
@@ -50,8 +52,8 @@ class Cells:
     end_ns: Ints
     high: Floats
     low: Floats
-    at_high: Ints
-    at_low: Ints
+    at_high: NDArray[np.integer[Any]]
+    at_low: NDArray[np.integer[Any]]
 
     def __len__(self) -> int:
         return len(self.start_ns)
@@ -62,15 +64,16 @@ class CellKeeper:
     """Fed whole cells, in order."""
 
     size: int
-    _done: list[tuple[Ints, Ints, Floats, Floats, Ints, Ints]] = field(default_factory=list)
+    _done: list[tuple[Any, ...]] = field(default_factory=list)  # as Cells has them, behind its size
 
     def feed(self, time_ns: Ints, u: Floats) -> None:
         """``u`` (3,n), n a multiple of ``size``."""
         blocks = u.reshape(3, -1, self.size)
         times = time_ns.reshape(-1, self.size)
         high, low = blocks.max(axis=2), blocks.min(axis=2)
-        at_high = np.count_nonzero(blocks == high[:, :, None], axis=2).astype(np.int32)
-        at_low = np.count_nonzero(blocks == low[:, :, None], axis=2).astype(np.int32)
+        small = np.min_scalar_type(self.size)  # there is one for each tenth of a second, however long
+        at_high = np.count_nonzero(blocks == high[:, :, None], axis=2).astype(small)
+        at_low = np.count_nonzero(blocks == low[:, :, None], axis=2).astype(small)
         self._done.append((times[:, 0].copy(), times[:, -1].copy(), high.T, low.T, at_high.T, at_low.T))
 
     def cells(self) -> Cells:
@@ -79,7 +82,7 @@ class CellKeeper:
             empty = np.zeros((0, 3))
             return Cells(self.size, none, none, empty, empty, empty.astype(np.int64), empty.astype(np.int64))
         if len(self._done) > 1:
-            self._done = [tuple(np.concatenate([d[i] for d in self._done]) for i in range(6))]  # type: ignore[list-item]
+            self._done = [joined(self._done)]
         return Cells(self.size, *self._done[0])
 
 

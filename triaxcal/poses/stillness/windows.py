@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from triaxcal.arrays import Bools, Floats, Ints
+from triaxcal.arrays import Bools, Floats, Ints, joined
 from triaxcal.errors import InvalidData
 
 WINDOW_S = 0.1
@@ -86,9 +87,9 @@ class WindowCutter:
     _held: int = 0
     _size: int = 0
     _period_ns: float = 0.0
-    _done: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats, dict[str, Floats], Bools]] = field(
-        default_factory=list
-    )
+    _names: tuple[str, ...] = ()
+    _done: list[tuple[Any, ...]] = field(default_factory=list)
+    """As `Windows` has them, the channels last."""
     _last_ns: int | None = None
     _broken: bool = False
 
@@ -156,12 +157,13 @@ class WindowCutter:
         variance = (rest * rest).sum(axis=2) / (self._size - 1)
         cross = (rest * rest[:, [1, 2, 0]]).sum(axis=2) / (self._size - 1)
         times = time_ns.reshape(count, self._size)
-        joined = np.ones(count, dtype=bool)
-        joined[0] = not self._broken and bool(self._done)
+        in_one_piece = np.ones(count, dtype=bool)
+        in_one_piece[0] = not self._broken and bool(self._done)
         self._broken = False
-        means = {n: v.reshape(count, self._size).mean(axis=1) for n, v in channels.items()}
+        self._names = tuple(channels)
+        means = [v.reshape(count, self._size).mean(axis=1) for v in channels.values()]
         self._done.append(
-            (times[:, 0].copy(), times[:, -1].copy(), mean, variance, cross, _hop(columns), means, joined)
+            (times[:, 0].copy(), times[:, -1].copy(), mean, variance, cross, _hop(columns), in_one_piece, *means)
         )
 
     def windows(self) -> Windows:
@@ -169,16 +171,10 @@ class WindowCutter:
         if not self._done:
             raise InvalidData(f"too few samples for one window (at least {RATE_SAMPLES})")
         if len(self._done) > 1:
-            names = self._done[0][6]
-            self._done = [
-                (
-                    *(np.concatenate([d[i] for d in self._done]) for i in range(6)),
-                    {n: np.concatenate([d[6][n] for d in self._done]) for n in names},
-                    np.concatenate([d[7] for d in self._done]),
-                )  # type: ignore[list-item]
-            ]
-        start, end, mean, variance, cross, hop, channels, joined = self._done[0]
-        return Windows(self._size, start, end, mean, variance, cross, hop, channels, joined)
+            self._done = [joined(self._done)]
+        start, end, mean, variance, cross, hop, in_one_piece, *channels = self._done[0]
+        named = dict(zip(self._names, channels, strict=True))
+        return Windows(self._size, start, end, mean, variance, cross, hop, named, in_one_piece)
 
 
 def _hop(columns: Floats) -> Floats:
