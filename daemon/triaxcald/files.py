@@ -21,7 +21,7 @@ def require_recording(path: Path) -> None:
     """Raises RecordingError where no command would read a recording of that
     name."""
     if path.suffix != ".mcap":
-        raise RecordingError(f"{path}: the name of a recording ends in .mcap, and there is no such folder")
+        raise RecordingError(f"{path}: the name of a recording ends in .mcap")
 
 
 def require_new(path: Path) -> None:

@@ -48,7 +48,7 @@ class DecodedStream:
         self._last_ns: int | None = None
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
-        self._last_host_ns = 0
+        self._host_span_ns: tuple[int, int] | None = None
 
     @property
     def first_host_ns(self) -> int | None:
@@ -57,9 +57,10 @@ class DecodedStream:
 
     @property
     def host_seconds(self) -> float:
-        """From the first raw record to the latest that completed a sample, by
-        the host's clock."""
-        return 0.0 if self._begin_ns is None else max(0.0, (self._last_host_ns - (self._first_host_ns or 0)) * 1e-9)
+        """From the first batch of raw records that completed a sample to the
+        latest, by the host's clock."""
+        first_ns, last_ns = self._host_span_ns or (0, 0)
+        return max(0.0, (last_ns - first_ns) * 1e-9)
 
     @property
     def seconds(self) -> float:
@@ -90,7 +91,8 @@ class DecodedStream:
         if len(block):
             if self._begin_ns is None:
                 self._begin_ns = int(block.time_ns[0])
-            self._last_host_ns = int(batch.time_ns[-1])
+            first_ns = self._host_span_ns[0] if self._host_span_ns else int(batch.time_ns[0])
+            self._host_span_ns = first_ns, int(batch.time_ns[-1])
             latest = np.maximum.accumulate(np.r_[self._last_ns or -(2**62), block.time_ns[:-1]])
             fresh = block.time_ns > latest
             self.counts["out_of_order"] += int((~fresh).sum())

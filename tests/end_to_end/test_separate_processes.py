@@ -15,7 +15,8 @@ from triaxcald.inputs import measure
 from triaxcald.simulation.memory import Stored, factory_calibration
 
 UNIT = {
-    "unit", "exit_code", "error", "wanted_poses", "serial", "recording", "certificate", "report", "before", "after",
+    "unit", "exit_code", "error", "wanted_poses", "data_quality", "serial", "recording", "certificate", "report",
+    "before", "after",
     "findings", "candidates", "choices", "registers_written", "verification", "device_state", "records_lost",
     "outcome", "outcome_file",
 }  # fmt: skip

@@ -3,7 +3,7 @@ says was there, and is there now."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -33,11 +33,18 @@ class Snapshot:
 
 class Traffic:
     """Register accesses in their order, read as what the line did. ``profile``
-    says which registers are which."""
+    says which registers are which; ``asked`` are the values that are to be in
+    them, or were."""
 
-    def __init__(self, accesses: Iterable[RegisterAccess], profile: Profile) -> None:
+    def __init__(
+        self,
+        accesses: Iterable[RegisterAccess],
+        profile: Profile,
+        asked: Collection[tuple[str, bytes]] = (),
+    ) -> None:
         self.accesses = list(accesses)
         self.profile = profile
+        self.asked = frozenset(asked)
         self.names = calibration_registers(profile)
 
     @cached_property
@@ -60,26 +67,59 @@ class Traffic:
                 part = {}
         return found
 
+    @property
+    def marks(self) -> dict[int, bool]:
+        """Writes by which a restart was to show, and whether it did: of a value
+        that nobody ``asked`` for, one bit off what the register was read as,
+        and never stored."""
+        return self._proofs[0]
+
+    @property
+    def for_a_proof(self) -> set[int]:
+        """These writes, and those that put back what was there before."""
+        return {*self._proofs[0], *self._proofs[1]}
+
     @cached_property
-    def marks(self) -> set[int]:
-        """Writes by which a restart was to show: one bit off what the register
-        was read as, and never stored."""
-        found, read, pending = set[int](), dict[str, bytes](), dict[str, int]()
-        stores = {i for i, _ in self.steps("store")}
+    def _proofs(self) -> tuple[dict[int, bool], set[int]]:
+        own_store, reset = self._own_store(), self.sequence("reset")
+        found: dict[int, bool] = {}
+        read: dict[str, bytes] = {}
+        in_use: dict[str, int] = {}  # by register, as far as is known
+        back, held = set[int](), dict[int, bytes]()
+        restarted = False
         for i, a in enumerate(self.accesses):
-            if i in stores:
-                found -= set(pending.values())
-            if a.register not in self.names:
-                continue
+            step = (a.register, a.raw)
             if a.operation == "read":
-                if not a.error:
+                if not a.error and a.register in self.names:
                     read[a.register] = a.raw
-                continue
-            pending.pop(a.register, None)
-            if _bits_apart(a.raw, read.get(a.register, b"")) == 1:
-                found.add(i)
-                pending[a.register] = i
-        return found if self.sequence("reset") else set()
+                    if restarted and (at := in_use.get(a.register)) is not None:
+                        found[at] = found[at] or a.raw != self.accesses[at].raw
+            elif a.register in self.names:
+                before = in_use.pop(a.register, None)
+                if before is not None and a.raw == held[before]:
+                    back.add(i)
+                if own_store and reset and step not in self.asked and self._is_beside(a, read, found):
+                    in_use[a.register], found[i], restarted = i, False, False
+                    held[i] = read.get(a.register, b"") if before is None else held[before]
+            elif step in own_store:
+                for at in in_use.values():
+                    del found[at]
+                in_use.clear()
+            elif step in reset:
+                restarted = True
+        return found, back
+
+    def _is_beside(self, a: RegisterAccess, read: Mapping[str, bytes], marks: Collection[int]) -> bool:
+        """Whether it writes a value one bit off the one that was read, or once
+        more one that did."""
+        again = any((a.register, a.raw) == (self.accesses[i].register, self.accesses[i].raw) for i in marks)
+        return again or _bits_apart(a.raw, read.get(a.register, b"")) == 1
+
+    def _own_store(self) -> set[tuple[str, bytes]]:
+        """The writes of a store that are in no other sequence, a key for
+        example; all of them where there are none."""
+        store = self.sequence("store")
+        return store - {step for other in ("unlock", "lock", "reset") for step in self.sequence(other)} or store
 
     @property
     def last_write(self) -> int:
@@ -88,16 +128,20 @@ class Traffic:
     @cached_property
     def known(self) -> Raw:
         """What was read last of each calibration register, without those that
-        were written since. What shows a restart is stored nowhere, and counts
-        for nothing."""
+        were written since. What shows a restart is stored nowhere: until that
+        the register's stored value is the one from before."""
         found: dict[str, bytes] = {}
         marked: dict[str, bytes] = {}
+        reset, restarted = self.sequence("reset"), False
         for i, a in enumerate(self.accesses):
             if i in self.marks:
-                marked[a.register] = a.raw
+                marked, restarted = {a.register: a.raw}, False
             elif a.operation == "write":
+                restarted |= (a.register, a.raw) in reset
+                if a.register in self.names:
+                    marked.pop(a.register, None)
                 found.pop(a.register, None)
-            elif a.register in self.names and not a.error and a.raw != marked.get(a.register):
+            elif a.register in self.names and not a.error and (restarted or a.raw != marked.get(a.register)):
                 found[a.register] = a.raw
         return found
 
@@ -164,6 +208,7 @@ class Said:
 
 
 def check(traffic: Traffic, said: Said, serial: str | None) -> list[Difference]:
+    traffic = Traffic(traffic.accesses, traffic.profile, _asked(said))
     return [
         *([] if said.aborted else _identity(traffic, serial)),  # another unit may be why it was aborted
         *_asked_for(traffic, said),
@@ -196,14 +241,18 @@ def _asked_for(traffic: Traffic, said: Said) -> list[Difference]:
     """Every write is of the certificate's image, of what the device held
     before, or of a sequence of the profile, or is to show a restart."""
     steps = {step for label in ("unlock", "store", "lock", "reset") for step in traffic.sequence(label)}
-    asked = {(name, raw) for some in (said.new, said.before, said.earlier) for name, raw in (some or {}).items()}
     writes = [(i, a) for i, a in enumerate(traffic.accesses) if a.operation == "write"]
     written = dict.fromkeys((a.register, a.raw) for i, a in writes if i not in traffic.marks)
     return [
         Difference(REGISTERS, Kind.NOT_ASKED_FOR, name, raw.hex())
         for name, raw in written
-        if (name, raw) not in asked and (name, raw) not in steps
+        if (name, raw) not in traffic.asked and (name, raw) not in steps
     ]
+
+
+def _asked(said: Said) -> set[tuple[str, bytes]]:
+    """Each register with the values that it is to hold, or held."""
+    return {(name, raw) for some in (said.new, said.before, said.earlier) for name, raw in (some or {}).items()}
 
 
 def _before(traffic: Traffic, said: Said) -> list[Difference]:
@@ -309,7 +358,7 @@ def _mixed(traffic: Traffic, said: Said) -> bool:
 
 _Shows = Callable[[Traffic, Said], bool]
 _SHOWN: dict[DeviceState, _Shows] = {
-    DeviceState.UNTOUCHED: lambda traffic, _: not traffic.writes,
+    DeviceState.UNTOUCHED: lambda traffic, _: not {i for i, _ in traffic.writes} - traffic.for_a_proof,
     DeviceState.OLD: _old,
     DeviceState.NEW_VERIFIED: _new,
     DeviceState.NEW_UNVERIFIED: _new,
@@ -338,8 +387,9 @@ def _restarted(traffic: Traffic, said: Said) -> bool:
     if not traffic.sequence("reset"):  # by no register, so that no traffic could show it
         return True
     image, old = said.new, said.before or {}
-    tried = traffic.last_write in traffic.marks
-    tried |= any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
+    if traffic.last_write in traffic.marks:
+        return traffic.marks[traffic.last_write]
+    tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
     if _acknowledged(traffic):
         return True

@@ -59,6 +59,8 @@ def record_command(a: argparse.Namespace) -> int:
         require_new(a.output)  # before any device is asked
     chosen, hangup = _load(a), asyncio.Event()
     if not a.folder:
+        if not a.output.suffix:
+            raise InputError(f"{a.output}: there is no such folder, and the name of a recording ends in .mcap")
         require_recording(a.output)
     with Bars() if a.log_format == "text" else nullcontext(JsonLines()) as progress:
         # A single file is one recording, which cannot begin anew.

@@ -108,6 +108,8 @@ def export_command(a: argparse.Namespace) -> int:
                     rows = write_csv(out, blocks)
             except OSError as e:
                 raise InputError(f"{a.output}: cannot be written: {e.strerror}") from e
-        lost = [f"{n} {kind}" for kind, n in stream.counts.items() if n and kind != "samples"] + losses_of(recording)
+        names = {kind: kind for kind in stream.counts} | {"receiver_overflows": "interruptions"}
+        lost = [f"{n} {names[kind]}" for kind, n in stream.counts.items() if n and kind != "samples"]
+        lost += losses_of(recording)
     say(f"{rows} samples; {', '.join(lost) or 'none lost'}")
     return 0

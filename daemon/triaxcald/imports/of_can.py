@@ -45,12 +45,14 @@ class _Work:
 
     def __init__(self, selection: Selection, account: Account, times: Times, ticks: Ticks) -> None:
         self._selection, self._account, self._times, self._ticks = selection, account, times, ticks
+        self._readings = Times(times.period_ns)
         self._latest_ns: dict[tuple[int, int], int] = {}  # by identifier
+        self._marked_ns = -1  # where a pause was marked last
 
     def records(self, log: Log) -> Iterator[Record]:
         """A loss before a frame that is not taken was before the next that is:
-        it may have been of the unit's. A pause of an identifier is such a loss,
-        as its counter may have wrapped meanwhile."""
+        it may have been of the unit's. A pause is such a loss, as counters may
+        have wrapped meanwhile."""
         lost: set[str] = set()  # channels
         for frame in log.frames(self._account):
             if frame.flags & _LOST_BEFORE:
@@ -62,12 +64,24 @@ class _Work:
                 self._account.note(f"frame {self._selection.frames}", f"a time of {time_ns} ns")
                 continue
             self._times.note(time_ns)
-            key = frame.source, frame.flags & EXTENDED
-            paused = self._times.is_pause(time_ns - self._latest_ns.get(key, time_ns))
-            self._latest_ns[key] = time_ns
+            paused = self._paused(frame, time_ns)
             flags = frame.flags | _LOST_BEFORE if paused or frame.channel in lost else frame.flags
             lost.discard(frame.channel)
             yield time_ns, frame.source, flags, frame.data
+
+    def _paused(self, frame: LoggedFrame, time_ns: int) -> bool:
+        """Whether this is the first frame of a stream with a counter after a
+        pause of that."""
+        if self._selection.is_reading(frame):
+            self._readings.note(time_ns)
+        if not self._selection.is_counted(frame):
+            return False
+        key = frame.source, frame.flags & EXTENDED
+        before_ns, self._latest_ns[key] = self._latest_ns.get(key, time_ns), time_ns
+        if not self._times.is_pause(time_ns - before_ns) or self._marked_ns > before_ns:
+            return False
+        self._marked_ns = time_ns
+        return True
 
     def _time_ns(self, frame: LoggedFrame) -> int:
         if Remark.NO_TIMES in self._account.remarks:
@@ -99,6 +113,6 @@ class _Work:
             "damaged": account.damaged,
             "damage": account.damage,
             "remarks": sorted(account.remarks),
-            "seconds_by_log": self._times.seconds,
+            "seconds_by_log": self._readings.seconds,
             "times": self._times.document() | {"equal": importing.times.equal},
         }

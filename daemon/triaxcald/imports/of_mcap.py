@@ -16,7 +16,7 @@ from triaxcal_drivers.mcap.driver import stream_reader
 from triaxcal_drivers.mcap.model import McapProfile, schema_file
 from triaxcal_drivers.mcap.schema import MessageSchema
 from triaxcal_drivers.nearest import clipped, nearest
-from triaxcal_drivers.profile import Bundle
+from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
 from triaxcald.imports.importing import Imported, Importing, Record, write_recording
 from triaxcald.imports.times import Times
@@ -108,6 +108,7 @@ class _Work:
         self._account = Account()
         self._times = Times(1e9 / profile.sampling.rate_hz)
         self._numbers = {stream.topic: i for i, stream in enumerate(profile.streams.values())}
+        self._readings = list(profile.streams).index(READINGS)
         self._schemas: dict[str, Any] = {}
         self._messages = self._taken = self._others = 0
 
@@ -128,7 +129,8 @@ class _Work:
                 self._account.note(where, f"a time of {message.log_time_ns} ns")
             else:
                 self._taken += 1
-                self._times.note(message.log_time_ns)
+                if self._numbers[topic] == self._readings:
+                    self._times.note(message.log_time_ns)
                 yield message.log_time_ns, self._numbers[topic], 0, message.data
 
     def described(self, importing: Importing, still: bool) -> dict[str, Any]:

@@ -52,6 +52,8 @@ class Selection:
             for message in layout.messages:
                 self._nodes |= _identifiers(message)
         self._readings = {key for m in self.layouts[READINGS].messages for key in _identifiers(m)}
+        counted = (m for layout in self.layouts.values() if layout.counters for m in layout.messages)
+        self._counted = {key for m in counted for key in _identifiers(m)}
         self._seen: Counter[tuple[Key, str]] = Counter()
         self._strangers: Counter[int] = Counter()  # frames of other nodes than the one asked for
         self._of_unit: set[str] = set()  # channels
@@ -88,6 +90,10 @@ class Selection:
         readings."""
         return not frame.flags & _ERROR and (frame.source, frame.flags & _EXTENDED) in self._readings
 
+    def is_counted(self, frame: LoggedFrame) -> bool:
+        """Whether it is a message of a stream with a counter."""
+        return not frame.flags & _ERROR and (frame.source, frame.flags & _EXTENDED) in self._counted
+
     def settle(self, name: str) -> None:
         """The node and the channels that the frames came by, once all have been
         seen. Raises InputError where that is not one unit's, or none."""
@@ -108,11 +114,11 @@ class Selection:
         self._require_one_channel(name)
         if not self.taken:
             known = _identifiers_shown(key for key, _ in self.others.most_common(SHOWN) if key != _FURTHER)
-            elsewhere = f"{self.elsewhere} frames of other channels or nodes, or in error" if self.elsewhere else ""
-            there = " and ".join(filter(None, (known, elsewhere))) or "no frame"
+            elsewhere = f"frames of other channels or nodes, or in error ({self.elsewhere})" if self.elsewhere else ""
+            there = ", ".join(filter(None, (known, elsewhere))) or "no frame"
             wanted = ", ".join(self._wanted()[:SHOWN])
             where = "in it" if self.channel is None else f"on its channel {self.channel}"
-            raise InputError(f"{name}: none of the profile's identifiers ({wanted}) is {where}; there is {there}")
+            raise InputError(f"{name}: none of the profile's identifiers ({wanted}) is {where}; found: {there}")
 
     def _require_one_channel(self, name: str) -> None:
         places: dict[Key, Counter[str]] = {}

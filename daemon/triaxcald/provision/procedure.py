@@ -4,7 +4,7 @@ old one, and says with which."""
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -105,11 +105,12 @@ class Provisioning:
         return self.journal.path if self._journal_lies and not self.settled else None
 
     async def examine(self, *, restart: bool = True) -> None:
-        """Who is there, and what it holds. Nothing is written.
+        """Who is there, and what it holds. Nothing is written, but what shows
+        the restart of a device that has a journal.
 
         A device that holds the image already, or that has a journal, is
         restarted, where ``restart`` allows: what is in use may not be what is
-        stored. Raises WrongUnit, InputError (the journal), DriverError,
+        stored. Raises ProvisionError, WrongUnit, InputError (the journal), DriverError,
         SequenceStalled.
         """
         await self.identify()
@@ -122,7 +123,11 @@ class Provisioning:
             self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         self.found = await self._read("reading the old calibration")
         if restart and self.resets and (entry is not None or not self.found.differing(self.image.raw)):
-            self._restarted = await self._sequence("reset")
+            if entry is None:  # what nothing is to be written to is not written for a proof
+                self._restarted = await self._sequence("reset")
+            else:
+                self.steps.append("reset")
+                self._restarted = await self._restart(entry.before, entry.wanted)
             self.found = await self._read("reading the stored calibration")
         self.before = self.after = self.found
         self.differing = self.found.differing(self.image.raw)
@@ -297,7 +302,7 @@ class Provisioning:
     async def _prove_by_restart(self) -> None:
         self.steps.append("reset")
         try:
-            shown = await proven_restart(self.link, self.bundle, self.image.raw, self.before.raw, self.found.raw)
+            shown = await self._restart(self.image.raw, self.before.raw, self.found.raw)
         except RegisterRefused:
             if self.power_cycle is None:
                 raise
@@ -361,7 +366,7 @@ class Provisioning:
         """What an undoing that failed has left. Raises DriverError,
         StationError."""
         await self._require_same_unit()
-        restarted = self.resets and await proven_restart(self.link, self.bundle, self.before.raw, self.image.raw)
+        restarted = self.resets and await self._restart(self.before.raw, self.image.raw)
         held = self.after = await self._look()
         state = self._state_of(held)
         if not restarted and state is DeviceState.OLD and lasting:
@@ -381,6 +386,9 @@ class Provisioning:
     async def _sequence(self, label: Label) -> bool:
         self.steps.append(label)
         return await run_sequence(self.link, self.bundle, label)
+
+    async def _restart(self, *known: Mapping[str, bytes]) -> bool:
+        return await proven_restart(self.link, self.bundle, self.identity.serial, *known)
 
     async def _read(self, step: str) -> Snapshot:
         self.steps.append(step)

@@ -72,7 +72,7 @@ async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> bo
         return False
     await lock_quietly(link, bundle)
     try:
-        return await proven_restart(link, bundle, snapshot.raw)
+        return await proven_restart(link, bundle, snapshot.serial, snapshot.raw)
     except RegisterRefused:
         return False  # writing back may still do
 
@@ -94,7 +94,9 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, st
             await lock_quietly(link, bundle)
     if not stored:
         return False
-    restarted = bool(bundle.profile.sequences.reset) and await proven_restart(link, bundle, snapshot.raw)
+    restarted = bool(bundle.profile.sequences.reset) and await proven_restart(
+        link, bundle, snapshot.serial, snapshot.raw
+    )
     await _require_equal(link, bundle, snapshot)
     if not acknowledged and not restarted:
         raise ProvisionError("the store of the old calibration went unanswered, and no read decides what it did")

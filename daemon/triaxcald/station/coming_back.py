@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal_drivers.claim import Claim
-from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, RegisterRefused
+from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceRestarted, DeviceSilent, RegisterRefused
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Device, Gap, RawBatch, RawFlag
 from triaxcald.errors import DeviceInUseElsewhere
@@ -294,7 +294,8 @@ class Returning:
                     trouble: Exception = e
                 if interruption is None:
                     interruption = _Interruption(Gap(self._since_ns(trouble, last_ns), None, str(trouble)))
-                    if self._complaint is None or self._now_ns() - returned_ns > AGAIN_S * 1e9:
+                    anew = self._complaint is None or isinstance(trouble, DeviceRestarted)
+                    if anew or self._now_ns() - returned_ns > AGAIN_S * 1e9:
                         waiting = self._waiting()
                     waiting.told = ""
                     at_rest.enter_context(self._patience.waiting())
@@ -321,8 +322,9 @@ class Returning:
 
     def _raise_complaint(self, interruption: _Interruption | None) -> None:
         """Of what was sent, unless the cause is known better: a stream that is
-        silent beside the others."""
-        if interruption is not None and interruption.awaited is not None:
+        silent beside the others. A restart is more than that."""
+        known = interruption is not None and interruption.awaited is not None
+        if known and not isinstance(self._complaint, DeviceRestarted):
             self._complaint = None
         elif self._complaint is not None:
             raise self._complaint

@@ -39,8 +39,8 @@ def timed(found: Iterator[Placed], account: Account) -> Iterator[LoggedFrame]:
         first.append(placed)
         if _has_time(placed) or len(first) == UNTIMED_MOST:
             break
-    without = not any(map(_has_time, first[-1:]))
-    if without and any(isinstance(frame, LoggedFrame) for _, frame in first):
+    without = any(isinstance(frame, LoggedFrame) for _, frame in first) and not any(map(_has_time, first[-1:]))
+    if without:
         account.remarks.add(Remark.NO_TIMES)
     for where, frame in chain(first, found):
         if isinstance(frame, str):

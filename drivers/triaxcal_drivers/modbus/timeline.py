@@ -27,8 +27,8 @@ Int64 = NDArray[np.int64]
 NEAR_START_S = 10.0
 """A device that restarted is heard again within this time of its own."""
 FASTEST = 100.0
-"""No device, not even a simulated one, is faster than its rate by so much: a
-counter that says so, and by more than `NEAR_START_S`, has started anew."""
+"""A counter that went on so many times as fast as the rate, and by more than
+`NEAR_START_S`, has started anew. Simulated devices run at up to sixty times."""
 
 
 @dataclass(frozen=True)

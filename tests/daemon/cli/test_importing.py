@@ -169,7 +169,7 @@ def test_nodes_are_told_apart_or_asked_about(
 def test_a_log_without_the_units_frames_says_what_is_there(tmp_path: Path, imported: Run) -> None:
     path = written(tmp_path / "a.blf", [_message(10**18, 0x700, b"\1"), _message(10**18, 0x7FE, b"\1")])
     imported(path, code=2).failed(
-        2, "(0x180 + node, 0x280 + node, 0x380 + node, 0x480 + node) is in it; there is 0x700, 0x7FE"
+        2, "(0x180 + node, 0x280 + node, 0x380 + node, 0x480 + node) is in it; found: 0x700, 0x7FE"
     )
     path = written(tmp_path / "b.blf", [_message(10**18, 0x185, bytes(8))])
     imported(path, code=2).failed(2, "no sample in its 1 frames of the profile")

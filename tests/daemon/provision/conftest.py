@@ -1,7 +1,7 @@
 """A bench: a reference unit behind an in-memory Device, whose every operation can go wrong."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ import pytest
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, Register
+from triaxcald.audit.differences import Difference
 from triaxcald.audit.traffic import Said, Traffic, check
 from triaxcald.outcome import registers_told
 from triaxcald.provision.access import RegisterAccess, RegisterLink
@@ -236,7 +237,10 @@ class Bench:
         return p
 
     def assert_traffic_shows(self, p: Provisioning, records: list[RegisterAccess], *, aborted: bool) -> None:
-        """What the device is said to hold, by the rules of an audit."""
+        assert self.differences(p, records, aborted=aborted) == []
+
+    def differences(self, p: Provisioning, records: Sequence[RegisterAccess], *, aborted: bool) -> list[Difference]:
+        """Of what the device is said to hold, by the rules of an audit."""
         accesses = [schema.RegisterAccess(0, a.register, a.kind, a.raw, a.error or "", a.unanswered) for a in records]
         traffic = Traffic(accesses, self.profile)
         said = Said(
@@ -250,7 +254,7 @@ class Bench:
             aborted=aborted,
             provisioned=None if aborted else list(p.written),
         )
-        assert check(traffic, said, f"{self.serial_number:04d}") == []
+        return check(traffic, said, f"{self.serial_number:04d}")
 
     @property
     def held(self) -> Held:

@@ -199,6 +199,38 @@ def test_a_device_whose_records_are_not_those_wanted_is_opened_anew_ever_more_ra
     ]
 
 
+def test_a_unit_that_restarts_again_and_again_is_opened_at_once_each_time_and_never_given_up() -> None:
+    """It delivers in between; patience is for a unit that does not."""
+    device = Played([[records(10 * i), 41.0, records(10 * i + 1)] for i in range(6)])
+
+    async def restarting() -> None:
+        patience = Patience(most_s=30.0)
+        returning = Returning(cast(Any, device), device.identify, patience, device.told.append, lambda: BEGUN_NS)
+        async with aclosing(returning.stream(["readings"])) as stream:
+            async for batch in stream:
+                if len(batch) and int(batch.time_ns[0]) % 10 == 1 and device.streams:
+                    returning.complain(DeviceRestarted("it has started anew"))
+
+    run(restarting())
+    assert device.opened_s == pytest.approx([41.0 * (i + 1) for i in range(5)])
+
+
+def test_a_restart_is_heeded_though_one_stream_is_awaited() -> None:
+    silent = DeviceSilent("readings: nothing", stream="readings", source=7, silent_s=2.0)
+    device = Played([[silent], [of_source(8, 1), of_source(8, 2), of_source(8, 3)], [of_source(7, 9)]])
+
+    async def restarting() -> None:
+        returning = Returning(cast(Any, device), device.identify, Patience(), device.told.append, lambda: BEGUN_NS)
+        async with aclosing(returning.stream(["readings", "corrected"])) as stream:
+            async for batch in stream:
+                if len(batch) and int(batch.time_ns[0]) == BEGUN_NS + 2:
+                    returning.complain(DeviceRestarted("it has started anew"))
+
+    run(restarting())
+    assert len(device.opened_s) == 1
+    assert device.asked == [["readings", "corrected"], ["corrected"], ["readings", "corrected"]]
+
+
 @pytest.mark.parametrize(("most_s", "attempts"), [(0.0, 1), (0.4, 2), (0.5, 2), (10.0, 6)])
 def test_who_gives_up_says_the_last_trouble(most_s: float, attempts: int) -> None:
     device = Played([[records(1), DeviceSilent("gone")]], [BusError(f"attempt {i}") for i in range(20)])

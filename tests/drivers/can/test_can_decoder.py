@@ -230,15 +230,18 @@ def test_messages_of_one_sample_stay_together_though_a_gap_was_noticed_between_t
     assert decoded["counter"] == list(range(20))
 
 
-def test_a_counter_that_outruns_the_hosts_time_a_hundredfold_has_started_anew(
-    decoder: CanDecoder, decode_all: DecodeAll
-) -> None:
-    """As where another node sends the same identifiers."""
-    counts = [100, 101, 20_000, 20_001, 20_002]
-    records = [r for k, count in enumerate(counts) for r in (xy(count, k * PERIOD), z(count, k * PERIOD))]
-    decoded = decode_all(decoder, records)
-    assert [(t - T0) // PERIOD for t in decoded["time_ns"]] == [0, 1, 2, 3, 4]
-    assert decoded["missing"] == 0
+@pytest.mark.parametrize(("lost", "restarts"), [(150, 0), (3, 0), (-150, 1)])
+def test_a_burst_of_lost_messages_is_no_restart_of_a_counter_of_few_bits(lost: int, restarts: int) -> None:
+    """150 lost of a counter of 8 bits look as if it had gone back by 106; the host's time tells."""
+    signals = {n: Signal(n, 8 * i, 8) for i, n in enumerate(("ux", "uy", "uz"))}
+    count = Signal("n", 24, 8)
+    layout = Layout((Message("M", 0x100, signals),), {n: (0, s) for n, s in signals.items()}, (count,))
+    decoder = CanDecoder(layout, rate_hz=100.0)
+    begun, again = range(60), range(60 + lost, 80 + lost) if lost > 0 else range(20)
+    pause = max(lost, 0)
+    frames = [(T0 + i * PERIOD, 0x100, 0, bytes([1, 2, 3, n % 256])) for i, n in enumerate(begun)]
+    frames += [(T0 + (60 + pause + i) * PERIOD, 0x100, 0, bytes([1, 2, 3, n % 256])) for i, n in enumerate(again)]
+    assert decoder.feed(RawBatch.of(frames)).restarts == restarts
 
 
 def test_time_never_goes_back_when_a_restart_takes_no_host_time(decoder: CanDecoder, decode_all: DecodeAll) -> None:
