@@ -9,12 +9,15 @@ from functools import cached_property
 
 from triaxcal_drivers.profile import Profile, WriteStep
 from triaxcald.audit.differences import Difference, Kind
+from triaxcald.audit.marks import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import snapshot
 from triaxcald.provision.identity import raw_number
 from triaxcald.provision.image import RegisterImage, calibration_registers
 from triaxcald.provision.plausible import doubts
 from triaxcald.provision.power import MISSED
+from triaxcald.provision.proof import may_mark, own_steps
+from triaxcald.provision.sequence import Label
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.schema import REGISTERS, RegisterAccess
 from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE
@@ -37,20 +40,28 @@ class Traffic:
     them, or were."""
 
     def __init__(
-        self,
-        accesses: Iterable[RegisterAccess],
-        profile: Profile,
-        asked: Collection[tuple[str, bytes]] = (),
+        self, accesses: Iterable[RegisterAccess], profile: Profile, asked: Collection[tuple[str, bytes]] = ()
     ) -> None:
         self.accesses = list(accesses)
         self.profile = profile
-        self.asked = frozenset(asked)
         self.names = calibration_registers(profile)
+        self.asked = frozenset(asked)
+
+    @cached_property
+    def marks(self) -> Marks:
+        """What was written only to show a restart."""
+        return marks_in(self.accesses, self.profile, self.asked)
 
     @cached_property
     def writes(self) -> list[tuple[int, RegisterAccess]]:
-        """Of calibration registers, those that failed too."""
-        return [(i, a) for i, a in enumerate(self.accesses) if a.operation == "write" and a.register in self.names]
+        """Of calibration registers, those that failed too; without what was
+        written only to show a restart."""
+        held = enumerate(self.accesses)
+        return [
+            (i, a)
+            for i, a in held
+            if a.operation == "write" and a.register in self.names and i not in self.marks.writes
+        ]
 
     @cached_property
     def snapshots(self) -> list[Snapshot]:
@@ -68,80 +79,21 @@ class Traffic:
         return found
 
     @property
-    def marks(self) -> dict[int, bool]:
-        """Writes by which a restart was to show, and whether it did: of a value
-        that nobody ``asked`` for, one bit off what the register was read as,
-        and never stored."""
-        return self._proofs[0]
-
-    @property
-    def for_a_proof(self) -> set[int]:
-        """These writes, and those that put back what was there before."""
-        return {*self._proofs[0], *self._proofs[1]}
-
-    @cached_property
-    def _proofs(self) -> tuple[dict[int, bool], set[int]]:
-        own_store, reset = self._own_store(), self.sequence("reset")
-        found: dict[int, bool] = {}
-        read: dict[str, bytes] = {}
-        in_use: dict[str, int] = {}  # by register, as far as is known
-        back, held = set[int](), dict[int, bytes]()
-        restarted = False
-        for i, a in enumerate(self.accesses):
-            step = (a.register, a.raw)
-            if a.operation == "read":
-                if not a.error and a.register in self.names:
-                    read[a.register] = a.raw
-                    if restarted and (at := in_use.get(a.register)) is not None:
-                        found[at] = found[at] or a.raw != self.accesses[at].raw
-            elif a.register in self.names:
-                before = in_use.pop(a.register, None)
-                if before is not None and a.raw == held[before]:
-                    back.add(i)
-                if own_store and reset and step not in self.asked and self._is_beside(a, read, found):
-                    in_use[a.register], found[i], restarted = i, False, False
-                    held[i] = read.get(a.register, b"") if before is None else held[before]
-            elif step in own_store:
-                for at in in_use.values():
-                    del found[at]
-                in_use.clear()
-            elif step in reset:
-                restarted = True
-        return found, back
-
-    def _is_beside(self, a: RegisterAccess, read: Mapping[str, bytes], marks: Collection[int]) -> bool:
-        """Whether it writes a value one bit off the one that was read, or once
-        more one that did."""
-        again = any((a.register, a.raw) == (self.accesses[i].register, self.accesses[i].raw) for i in marks)
-        return again or _bits_apart(a.raw, read.get(a.register, b"")) == 1
-
-    def _own_store(self) -> set[tuple[str, bytes]]:
-        """The writes of a store that are in no other sequence, a key for
-        example; all of them where there are none."""
-        store = self.sequence("store")
-        return store - {step for other in ("unlock", "lock", "reset") for step in self.sequence(other)} or store
-
-    @property
     def last_write(self) -> int:
         return self.writes[-1][0] if self.writes else -1
 
     @cached_property
     def known(self) -> Raw:
         """What was read last of each calibration register, without those that
-        were written since. What shows a restart is stored nowhere: until that
-        the register's stored value is the one from before."""
+        were written since. What was in use only to show a restart was stored
+        nowhere."""
         found: dict[str, bytes] = {}
-        marked: dict[str, bytes] = {}
-        reset, restarted = self.sequence("reset"), False
         for i, a in enumerate(self.accesses):
-            if i in self.marks:
-                marked, restarted = {a.register: a.raw}, False
-            elif a.operation == "write":
-                restarted |= (a.register, a.raw) in reset
-                if a.register in self.names:
-                    marked.pop(a.register, None)
+            if i in self.marks.writes or i in self.marks.reads:
+                continue
+            if a.operation == "write":
                 found.pop(a.register, None)
-            elif a.register in self.names and not a.error and (restarted or a.raw != marked.get(a.register)):
+            elif a.register in self.names and not a.error:
                 found[a.register] = a.raw
         return found
 
@@ -150,6 +102,12 @@ class Traffic:
         wanted = self.sequence(label)
         held = enumerate(self.accesses)
         return [(i, a) for i, a in held if a.operation == "write" and (a.register, a.raw) in wanted]
+
+    def own(self, label: Label) -> list[int]:
+        """Where a sequence was asked for, by writes that are of no other."""
+        wanted = own_steps(self.profile, label)
+        held = enumerate(self.accesses)
+        return [i for i, a in held if a.operation == "write" and (a.register, a.raw) in wanted]
 
     def sequence(self, label: str) -> set[tuple[str, bytes]]:
         steps = getattr(self.profile.sequences, label)
@@ -169,13 +127,6 @@ class Traffic:
                 missed = missed + 1 if a.unanswered else 0
                 longest = max(longest, missed)
         return longest >= MISSED
-
-
-def _bits_apart(one: bytes, other: bytes) -> int:
-    """-1 where they differ in length."""
-    if len(one) != len(other):
-        return -1
-    return (int.from_bytes(one, "big") ^ int.from_bytes(other, "big")).bit_count()
 
 
 @dataclass(frozen=True)
@@ -208,7 +159,8 @@ class Said:
 
 
 def check(traffic: Traffic, said: Said, serial: str | None) -> list[Difference]:
-    traffic = Traffic(traffic.accesses, traffic.profile, _asked(said))
+    asked = {(name, raw) for some in (said.new, said.before, said.earlier) for name, raw in (some or {}).items()}
+    traffic = Traffic(traffic.accesses, traffic.profile, asked)
     return [
         *([] if said.aborted else _identity(traffic, serial)),  # another unit may be why it was aborted
         *_asked_for(traffic, said),
@@ -242,17 +194,12 @@ def _asked_for(traffic: Traffic, said: Said) -> list[Difference]:
     before, or of a sequence of the profile, or is to show a restart."""
     steps = {step for label in ("unlock", "store", "lock", "reset") for step in traffic.sequence(label)}
     writes = [(i, a) for i, a in enumerate(traffic.accesses) if a.operation == "write"]
-    written = dict.fromkeys((a.register, a.raw) for i, a in writes if i not in traffic.marks)
+    written = dict.fromkeys((a.register, a.raw) for i, a in writes if i not in traffic.marks.writes)
     return [
         Difference(REGISTERS, Kind.NOT_ASKED_FOR, name, raw.hex())
         for name, raw in written
         if (name, raw) not in traffic.asked and (name, raw) not in steps
     ]
-
-
-def _asked(said: Said) -> set[tuple[str, bytes]]:
-    """Each register with the values that it is to hold, or held."""
-    return {(name, raw) for some in (said.new, said.before, said.earlier) for name, raw in (some or {}).items()}
 
 
 def _before(traffic: Traffic, said: Said) -> list[Difference]:
@@ -324,7 +271,7 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
             expect("written", list(written), differing)
             expect("undoing_failed", said.told.get("undoing_failed"), None)
         stores = bool(traffic.sequence("store"))
-        if said.told.get("stored") and stores and not traffic.steps("store"):
+        if said.told.get("stored") and stores and not traffic.own("store"):
             found.append(Difference(ATTACHMENT, Kind.NOT_SHOWN, "registers.stored", said.told.get("stored")))
     return found
 
@@ -358,7 +305,9 @@ def _mixed(traffic: Traffic, said: Said) -> bool:
 
 _Shows = Callable[[Traffic, Said], bool]
 _SHOWN: dict[DeviceState, _Shows] = {
-    DeviceState.UNTOUCHED: lambda traffic, _: not {i for i, _ in traffic.writes} - traffic.for_a_proof,
+    DeviceState.UNTOUCHED: lambda traffic, _: (
+        not traffic.writes and all(m.over or m.refused for m in traffic.marks.marks)
+    ),
     DeviceState.OLD: _old,
     DeviceState.NEW_VERIFIED: _new,
     DeviceState.NEW_UNVERIFIED: _new,
@@ -378,19 +327,19 @@ _GOES_WITH: dict[DeviceState, tuple[Evidence, ...]] = {
 
 
 def _restarted(traffic: Traffic, said: Said) -> bool:
-    """A restart after the last write, then all registers read. One that nobody
-    acknowledged counts where another value was put into a register in use
-    before it, and did not come back."""
+    """A restart after the last write, then all registers read. Where another
+    value was put into a register in use before it, that value has to be gone;
+    one that nobody acknowledged counts likewise."""
     lasting = said.held is not None and said.held.state is DeviceState.OLD
     if not traffic.profile.sequences.reset:  # it may have lost its supply, and started from what is stored
         return lasting
     if not traffic.sequence("reset"):  # by no register, so that no traffic could show it
         return True
-    image, old = said.new, said.before or {}
-    if traffic.last_write in traffic.marks:
-        return traffic.marks[traffic.last_write]
-    tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
+    if _offered(traffic):
+        return _shown(traffic)
+    image, old = said.new, said.before or {}
+    tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     if _acknowledged(traffic):
         return True
     return (tried or lasting) and any(traffic.last_write < i < last for i, _ in traffic.steps("reset"))
@@ -401,14 +350,29 @@ def _power_cycled(traffic: Traffic, said: Said) -> bool:
 
 
 def _not_restarted(traffic: Traffic, said: Said) -> bool:
-    """Nothing was read after a restart that was acknowledged: else it would
-    have proven the registers."""
-    return said.held is None or said.held.state is not DeviceState.NEW_UNVERIFIED or not _acknowledged(traffic)
+    """Nothing was read after a restart that showed, or that was acknowledged
+    where none can show: else it would have proven the registers."""
+    if said.held is None or said.held.state is not DeviceState.NEW_UNVERIFIED:
+        return True
+    return not (_shown(traffic) if may_mark(traffic.profile) else _acknowledged(traffic))
+
+
+def _offered(traffic: Traffic) -> list[Mark]:
+    """What was to show a restart since the last write, and was not refused."""
+    return [m for m in traffic.marks.marks if m.at[0] > traffic.last_write and not m.refused]
+
+
+def _shown(traffic: Traffic) -> bool:
+    """Whether one of them was gone before all registers were read, and none is
+    left in use."""
+    last = traffic.snapshots[-1].at if traffic.snapshots else -1
+    gone = [m.gone_at for m in _offered(traffic) if m.shows and m.gone_at is not None]
+    return any(at < last for at in gone) and all(m.over for m in _offered(traffic))
 
 
 def _acknowledged(traffic: Traffic) -> bool:
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
-    return any(not a.error for i, a in traffic.steps("reset") if traffic.last_write < i < last)
+    return any(not traffic.accesses[i].error for i in traffic.own("reset") if traffic.last_write < i < last)
 
 
 def _counted(traffic: Traffic, said: Said) -> bool:
@@ -416,7 +380,7 @@ def _counted(traffic: Traffic, said: Said) -> bool:
 
 
 _PROVEN: dict[Evidence, _Shows] = {
-    Evidence.NOTHING_STORED: lambda traffic, _: not traffic.steps("store"),
+    Evidence.NOTHING_STORED: lambda traffic, _: not traffic.own("store"),
     Evidence.READ_BACK: _not_restarted,
     Evidence.RESTART: _restarted,
     Evidence.POWER_CYCLE: _power_cycled,

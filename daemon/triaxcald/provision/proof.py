@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 
-from triaxcal_drivers.errors import RegisterRefused
+from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, WriteStep
 from triaxcald.errors import ProvisionError, StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import WrongUnit, check_identity
-from triaxcald.provision.sequence import lock_quietly, reconnect, run_sequence
+from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 
 ATTEMPTS = 2
 """The request of a restart is lost at times, and is not repeated by itself."""
+TRIED = 3
+"""Values that a device is offered; one may lie beyond limits that its profile
+does not tell."""
 
 
 @dataclass(frozen=True)
 class _Mark:
     """A register that ``held`` a value and is to hold another one, ``put``.
-    ``taken``: whether it does; None where nobody answered."""
+    ``taken``: whether it is known to."""
 
     name: str
     held: bytes
     put: bytes
-    taken: bool | None
+    taken: bool
 
 
 async def proven_restart(link: RegisterLink, bundle: Bundle, serial: str | None, *known: Mapping[str, bytes]) -> bool:
@@ -35,85 +40,134 @@ async def proven_restart(link: RegisterLink, bundle: Bundle, serial: str | None,
     be ignored by a device that is locked, or be carried out later. So before it
     a register in use is given a value that is stored nowhere, off by one bit
     from the one that it holds: only a restart takes it away. The value is put
-    back where the restart did not.
+    back where the restart did not, or failed.
 
     ``known`` are the values by register of which one is stored. Where writes
-    last without a store, or the device refuses the value, its acknowledgement
-    has to do; where nobody answers to the value, nothing is shown. Raises
-    ProvisionError where the register does not take its value again; WrongUnit;
-    RegisterRefused, other DriverError, SequenceStalled of the restart.
+    last without a store, or the device refuses such values, its acknowledgement
+    has to do; where the value is not known to be in use, nothing is shown.
+    Raises ProvisionError where the register does not take its value again;
+    WrongUnit; RegisterRefused, other DriverError, SequenceStalled of the
+    restart.
     """
+    touched = set(link.touched)
     mark = await _marked(link, bundle, serial, known)
     if mark is None:
         return await run_sequence(link, bundle, "reset")
-    for _ in range(ATTEMPTS):
+    try:
+        gone = await _taken_away(link, bundle, mark)
+    except BaseException as e:
         try:
-            acknowledged = await run_sequence(link, bundle, "reset")
-        except RegisterRefused:
-            if mark.taken is not False:
-                await _put_back(link, bundle, serial, mark)
-            raise
-        if mark.taken is False:
-            return acknowledged
+            await _put_back(link, bundle, serial, mark)
+        except (DriverError, StationError):
+            if isinstance(e, RegisterRefused):  # it answers, and keeps a value that nobody wants
+                raise
+        raise
+    if not gone:
+        await _put_back(link, bundle, serial, mark)
+    link.touched &= touched | (link.touched - {mark.name})
+    return gone and mark.taken
+
+
+async def _taken_away(link: RegisterLink, bundle: Bundle, mark: _Mark) -> bool:
+    for _ in range(ATTEMPTS):
+        await run_sequence(link, bundle, "reset")
         if await _read_again(link, bundle.profile, mark.name) != mark.put:
-            return bool(mark.taken)
-    await _put_back(link, bundle, serial, mark)
+            return True
     return False
 
 
 async def _marked(
     link: RegisterLink, bundle: Bundle, serial: str | None, known: Collection[Mapping[str, bytes]]
 ) -> _Mark | None:
-    """None where no register may have another value."""
-    profile = bundle.profile
-    if not profile.sequences.store or not any(isinstance(step, WriteStep) for step in profile.sequences.reset):
+    """None where no register may have another value, or the device refuses
+    each."""
+    if not may_mark(bundle.profile):
         return None
-    checksum = profile.crc.register_name if profile.crc else None
-    names = dict.fromkeys(name for registers in known for name in registers if name != checksum)
-    # Better one that was written anyhow.
-    for name in sorted(names, key=lambda name: len({registers.get(name) for registers in known}) == 1):
+    for name in islice(_names(bundle.profile, known), TRIED):
         held = await link.read(name)
-        for put in _beside(profile, name, held):
-            if put not in [registers.get(name) for registers in known]:
+        wanted = [put for put in beside(bundle.profile, name, held) if put not in [r.get(name) for r in known]]
+        for put in wanted[:1]:
+            with suppress(RegisterRefused):
                 return _Mark(name, held, put, await _put(link, bundle, serial, name, put))
     return None
 
 
-def _beside(profile: Profile, name: str, raw: bytes) -> list[bytes]:
+def _names(profile: Profile, known: Collection[Mapping[str, bytes]]) -> Iterator[str]:
+    """Better one that was written anyhow, and never the checksum."""
+    checksum = profile.crc.register_name if profile.crc else None
+    names = dict.fromkeys(name for registers in known for name in registers if name != checksum)
+    yield from sorted(names, key=lambda name: len({registers.get(name) for registers in known}) == 1)
+
+
+def may_mark(profile: Profile) -> bool:
+    """Whether a value may be written that is not to stay: nothing lasts without
+    the store, and no other sequence stores."""
+    elsewhere = _steps(profile, "lock") | _steps(profile, "reset")
+    store = _steps(profile, "store") - _steps(profile, "unlock")
+    return bool(store) and not store & elsewhere
+
+
+def own_steps(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
+    """The writes of a sequence that are in no other one, as a key is; all of
+    them where there are none."""
+    others: tuple[Label, ...] = ("unlock", "store", "lock", "reset")
+    mine = _steps(profile, label)
+    return mine - {step for other in others if other != label for step in _steps(profile, other)} or mine
+
+
+def _steps(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
+    steps = getattr(profile.sequences, label)
+    return {(s.write, profile.encode(s.write, s.value)) for s in steps if isinstance(s, WriteStep)}
+
+
+def beside(profile: Profile, name: str, raw: bytes) -> list[bytes]:
     """Values within the register's limits that differ from ``raw`` by one bit,
-    the nearest first: that of the last byte, or of the first where the least
+    the nearest first: of the last byte, or of the first where the least
     significant one comes first."""
     register, value = profile.registers[name], profile.decode(name, raw)
     low = -math.inf if register.minimum is None else register.minimum
     high = math.inf if register.maximum is None else register.maximum
     near = [bytes([*raw[:-1], raw[-1] ^ bit]) for bit in (1, 2)] + [bytes([raw[0] ^ bit, *raw[1:]]) for bit in (1, 2)]
-    allowed = [other for other in near if low <= profile.decode(name, other) <= high]
-    found = {abs(profile.decode(name, other) - value): other for other in allowed}
-    return [found[off] for off in sorted(off for off in found if off > 0)]
+    off = [(abs(profile.decode(name, other) - value), other) for other in near]
+    allowed = sorted((far, other) for far, other in off if far > 0 and low <= profile.decode(name, other) <= high)
+    return [other for _, other in allowed[:2]]
 
 
-async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str, raw: bytes) -> bool | None:
-    """Whether the device took it; None where nobody answered. Raises
-    WrongUnit."""
+async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str, raw: bytes) -> bool:
+    """Whether the register is known to hold the value now. Raises WrongUnit,
+    with nothing written; RegisterRefused of the write."""
     try:
+        await check_identity(link, bundle, serial)
         await run_sequence(link, bundle, "unlock")
         await check_identity(link, bundle, serial)  # right before the one write that could reach another unit
-        await link.write(name, raw)
-        taken: bool | None = await link.read(name) == raw
     except WrongUnit:
         raise
-    except NO_CONTACT:
+    except (*NO_CONTACT, RegisterRefused, StationError):
         link.refresh()
-        taken = None
-    except (RegisterRefused, StationError):
+        return False
+    try:
+        await link.write(name, raw)
+        taken = await _is(link, name, raw)
+    except NO_CONTACT:
         taken = False
-    await lock_quietly(link, bundle)
+    finally:
+        link.refresh()
+        await lock_quietly(link, bundle)
     return taken
 
 
+async def _is(link: RegisterLink, name: str, raw: bytes) -> bool:
+    try:
+        return await link.read(name) == raw
+    except (*NO_CONTACT, RegisterRefused):
+        return False
+
+
 async def _put_back(link: RegisterLink, bundle: Bundle, serial: str | None, mark: _Mark) -> None:
-    if not await _put(link, bundle, serial, mark.name, mark.held):
-        raise ProvisionError(f"register {mark.name} does not take its value again")
+    with suppress(RegisterRefused):
+        if await _put(link, bundle, serial, mark.name, mark.held):
+            return
+    raise ProvisionError(f"register {mark.name} does not take its value again")
 
 
 async def _read_again(link: RegisterLink, profile: Profile, name: str) -> bytes:

@@ -73,7 +73,9 @@ async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> bo
     await lock_quietly(link, bundle)
     try:
         return await proven_restart(link, bundle, snapshot.serial, snapshot.raw)
-    except RegisterRefused:
+    except WrongUnit:
+        raise
+    except (RegisterRefused, ProvisionError):
         return False  # writing back may still do
 
 

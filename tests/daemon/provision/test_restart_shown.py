@@ -12,9 +12,12 @@ from triaxcald.audit.traffic import Traffic
 from triaxcald.provision.access import RegisterAccess
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.image import build_image
-from triaxcald.provision.proof import proven_restart
+from triaxcald.provision.procedure import Provisioning
+from triaxcald.provision.proof import may_mark, proven_restart
+from triaxcald.provision.sequence import SequenceStalled
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording import schema
+from triaxcald.simulation.unit import Faults
 
 
 def marked(bench) -> tuple[int, RegisterAccess]:
@@ -76,15 +79,17 @@ def test_a_key_that_store_and_restart_share_is_no_store(bench) -> None:
     def step(register: str, value: int) -> schema.RegisterAccess:
         return access("write", register, profile.encode(register, value))
 
-    raw, beside = b"\x3f\x80\x00\x00", b"\x3f\x80\x00\x01"
+    raw, beside = b"\x3c\x00\x00\x00", b"\x3c\x00\x00\x01"
     traffic = Traffic(
         [
             access("read", "bias_x", raw), step("unlock_key", 0x5A17), access("write", "bias_x", beside),
             step("unlock_key", 0x5A17), step("reset", 2), access("read", "bias_x", raw),
         ],
         profile,
+        [("bias_x", raw)],
     )  # fmt: skip
-    assert traffic.marks == {2: True}
+    (mark,) = traffic.marks.marks
+    assert (mark.at, mark.over, mark.gone_at) == ([2], True, 5)
 
 
 @pytest.mark.parametrize("struck", ["unlock_key", "scale_factor_x"])
@@ -105,3 +110,67 @@ async def test_a_proof_is_given_to_no_other_unit(bench) -> None:
     with pytest.raises(WrongUnit):
         await proven_restart(bench.link, bench.bundle, "0008", bench.image.raw)
     assert bench.device.written == []
+
+
+async def test_an_undoing_after_a_proof_passes_an_audit(bench) -> None:
+    """The register that shows the restart is the same in old and new, and the store of the undoing follows."""
+    changed = {**bench.old_coefficients, "bias.x": 0.125}
+    bench.image = build_image(bench.profile, changed, date_days=bench.old_date_days)
+    report = await bench.provision()
+    await report.undo()
+    assert report.held.state is DeviceState.OLD
+    assert bench.differences(report, bench.records, aborted=True) == []
+    bench.assert_holds(bench.old)
+
+
+async def test_a_proof_before_the_first_reading_passes_an_audit(bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process was killed between write and store; the restart that the journal asks for has to show."""
+
+    class Killed(BaseException): ...
+
+    async def nothing(self: Provisioning) -> None: ...
+
+    def kill(operation: int, done: bool) -> None:
+        if bench.device.log[-1] == ("write", "store") and not done:
+            raise Killed
+
+    bench.device.trouble = kill
+    with monkeypatch.context() as gone:
+        gone.setattr(Provisioning, "_give_up", nothing)
+        gone.setattr(Provisioning, "finish", lambda self: None)
+        gone.setattr(type(bench), "assert_traffic_shows", lambda *_, **__: None)
+        with pytest.raises(Killed):
+            await bench.provision()
+    bench.device.trouble = lambda operation, done: None
+    bench.link = bench.connected()
+    report = await bench.provision()
+    assert report.held.state is DeviceState.NEW_VERIFIED
+    bench.assert_holds(bench.new)
+
+
+async def test_a_value_does_not_stay_in_use_where_the_restart_stalls(bench) -> None:
+    def ignored(operation: int, done: bool) -> None:
+        if bench.device.log[-1] == ("write", "reset") and not done:
+            raise SequenceStalled("it is not back")
+
+    bench.device.trouble = ignored
+    with pytest.raises(SequenceStalled):
+        await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw)
+    bench.assert_holds(bench.old)
+
+
+async def test_a_value_that_is_acknowledged_and_not_kept_shows_nothing(make_bench) -> None:
+    """As of a device that is locked, and ignores writes and restarts in silence."""
+    bench = make_bench(faults=Faults(corrupt_write={"scale_factor_x": 0x01}))
+    assert await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw) is False
+    assert ("write", "reset") in bench.device.log
+
+
+def test_nothing_is_marked_where_another_sequence_stores(bench) -> None:
+    assert may_mark(bench.profile)
+    store = {"write": "store", "value": 0x65766173}
+    for other in ("lock", "reset"):
+        sequences = bench.profile.sequences.model_dump()
+        sequences[other] = (store, *sequences[other])
+        update = {"sequences": type(bench.profile.sequences).model_validate(sequences)}
+        assert not may_mark(bench.profile.model_copy(update=update))
