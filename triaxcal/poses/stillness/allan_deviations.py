@@ -90,7 +90,6 @@ def contrasts(
     their average exceeds that of the former (k,3).
     """
     n = len(values)
-    sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - values[0], axis=0)])
     if at is None:
         broken = np.ones(n + 1, dtype=bool)
         broken[1:n] = ~(still[:-1] & still[1:] & joined[1:])
@@ -100,7 +99,12 @@ def contrasts(
         # window must be still itself.
         at = i[breaks[i + after - 1] == breaks[i - before]]
         at = at[still[at - before]] if len(at) else at
-    here = (sums[at] - sums[at - before]) / max(before, 1)
-    there = (sums[at + after] - sums[at]) / max(after, 1)
+    at = np.asarray(at, dtype=np.int64)
     offset = values[0] * ((after > 0) - int(before > 0))
-    return np.asarray(at, dtype=np.int64), there - here + offset
+    out = np.empty((len(at), values.shape[1]))
+    for axis in range(values.shape[1]):  # one by one: a recording may last for days
+        sums = np.concatenate([[0.0], np.cumsum(values[:, axis] - values[0, axis])])
+        here = (sums[at] - sums[at - before]) / max(before, 1)
+        there = (sums[at + after] - sums[at]) / max(after, 1)
+        out[:, axis] = there - here + offset[axis]
+    return at, out
