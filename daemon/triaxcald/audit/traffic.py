@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from triaxcal_drivers.profile import Profile, WriteStep
+from triaxcal_drivers.profile import Profile
 from triaxcald.audit.differences import Difference, Kind
 from triaxcald.audit.marks import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
@@ -16,7 +16,7 @@ from triaxcald.provision.identity import raw_number
 from triaxcald.provision.image import RegisterImage, calibration_registers
 from triaxcald.provision.plausible import doubts
 from triaxcald.provision.power import MISSED
-from triaxcald.provision.proof import may_mark, own_steps
+from triaxcald.provision.proof import SEQUENCES, may_mark, own_steps, writes_of
 from triaxcald.provision.sequence import Label
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.schema import REGISTERS, RegisterAccess
@@ -97,21 +97,17 @@ class Traffic:
                 found[a.register] = a.raw
         return found
 
-    def steps(self, label: str) -> list[tuple[int, RegisterAccess]]:
-        """Writes of a sequence of the profile."""
-        wanted = self.sequence(label)
-        held = enumerate(self.accesses)
-        return [(i, a) for i, a in held if a.operation == "write" and (a.register, a.raw) in wanted]
+    def steps(self, label: Label) -> list[int]:
+        """Where a sequence of the profile was at work: its writes."""
+        return self._at(writes_of(self.profile, label))
 
     def own(self, label: Label) -> list[int]:
         """Where a sequence was asked for, by writes that are of no other."""
-        wanted = own_steps(self.profile, label)
-        held = enumerate(self.accesses)
-        return [i for i, a in held if a.operation == "write" and (a.register, a.raw) in wanted]
+        return self._at(own_steps(self.profile, label))
 
-    def sequence(self, label: str) -> set[tuple[str, bytes]]:
-        steps = getattr(self.profile.sequences, label)
-        return {(s.write, self.profile.encode(s.write, s.value)) for s in steps if isinstance(s, WriteStep)}
+    def _at(self, writes: set[tuple[str, bytes]]) -> list[int]:
+        held = enumerate(self.accesses)
+        return [i for i, a in held if a.operation == "write" and (a.register, a.raw) in writes]
 
     def counts(self) -> list[bytes]:
         """What the device's counter of stores was read as."""
@@ -192,7 +188,7 @@ def _identity(traffic: Traffic, serial: str | None) -> list[Difference]:
 def _asked_for(traffic: Traffic, said: Said) -> list[Difference]:
     """Every write is of the certificate's image, of what the device held
     before, or of a sequence of the profile, or is to show a restart."""
-    steps = {step for label in ("unlock", "store", "lock", "reset") for step in traffic.sequence(label)}
+    steps = {step for label in SEQUENCES for step in writes_of(traffic.profile, label)}
     writes = [(i, a) for i, a in enumerate(traffic.accesses) if a.operation == "write"]
     written = dict.fromkeys((a.register, a.raw) for i, a in writes if i not in traffic.marks.writes)
     return [
@@ -270,7 +266,7 @@ def _told(traffic: Traffic, said: Said) -> list[Difference]:
         if not said.aborted:
             expect("written", list(written), differing)
             expect("undoing_failed", said.told.get("undoing_failed"), None)
-        stores = bool(traffic.sequence("store"))
+        stores = bool(writes_of(traffic.profile, "store"))
         if said.told.get("stored") and stores and not traffic.own("store"):
             found.append(Difference(ATTACHMENT, Kind.NOT_SHOWN, "registers.stored", said.told.get("stored")))
     return found
@@ -333,7 +329,7 @@ def _restarted(traffic: Traffic, said: Said) -> bool:
     lasting = said.held is not None and said.held.state is DeviceState.OLD
     if not traffic.profile.sequences.reset:  # it may have lost its supply, and started from what is stored
         return lasting
-    if not traffic.sequence("reset"):  # by no register, so that no traffic could show it
+    if not writes_of(traffic.profile, "reset"):  # by no register, so that no traffic could show it
         return True
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
     if _offered(traffic):
@@ -342,7 +338,7 @@ def _restarted(traffic: Traffic, said: Said) -> bool:
     tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     if _acknowledged(traffic):
         return True
-    return (tried or lasting) and any(traffic.last_write < i < last for i, _ in traffic.steps("reset"))
+    return (tried or lasting) and any(traffic.last_write < i < last for i in traffic.steps("reset"))
 
 
 def _power_cycled(traffic: Traffic, said: Said) -> bool:

@@ -43,7 +43,7 @@ def _open_what_is_closed() -> None:
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest that is free: ``number``
             os.set_inheritable(descriptor, True)
-            stream = open(descriptor, "w" if number else "r", encoding="utf-8", closefd=False)  # noqa: SIM115
+            stream = open(descriptor, "w" if number else "r", encoding="utf-8", closefd=False)  # noqa: SIM115 - for good
             setattr(sys, name, stream)
 
 

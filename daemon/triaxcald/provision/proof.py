@@ -17,6 +17,7 @@ from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_seq
 
 ATTEMPTS = 2
 """The request of a restart is lost at times, and is not repeated by itself."""
+SEQUENCES: tuple[Label, ...] = ("unlock", "store", "lock", "reset")
 TRIED = 3
 """Values that a device is offered; one may lie beyond limits that its profile
 does not tell."""
@@ -64,7 +65,8 @@ async def proven_restart(link: RegisterLink, bundle: Bundle, serial: str | None,
         raise
     if not gone:
         await _put_back(link, bundle, serial, mark)
-    link.touched &= touched | (link.touched - {mark.name})
+    if mark.name not in touched:  # it holds what it would without the proof
+        link.touched.discard(mark.name)
     return gone and mark.taken
 
 
@@ -85,8 +87,9 @@ async def _marked(
         return None
     for name in islice(_names(bundle.profile, known), TRIED):
         held = await link.read(name)
-        wanted = [put for put in beside(bundle.profile, name, held) if put not in [r.get(name) for r in known]]
-        for put in wanted[:1]:
+        taken = [registers.get(name) for registers in known]
+        put = next((other for other in beside(bundle.profile, name, held) if other not in taken), None)
+        if put is not None:
             with suppress(RegisterRefused):
                 return _Mark(name, held, put, await _put(link, bundle, serial, name, put))
     return None
@@ -102,20 +105,20 @@ def _names(profile: Profile, known: Collection[Mapping[str, bytes]]) -> Iterator
 def may_mark(profile: Profile) -> bool:
     """Whether a value may be written that is not to stay: nothing lasts without
     the store, and no other sequence stores."""
-    elsewhere = _steps(profile, "lock") | _steps(profile, "reset")
-    store = _steps(profile, "store") - _steps(profile, "unlock")
+    elsewhere = writes_of(profile, "lock") | writes_of(profile, "reset")
+    store = writes_of(profile, "store") - writes_of(profile, "unlock")
     return bool(store) and not store & elsewhere
 
 
 def own_steps(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
     """The writes of a sequence that are in no other one, as a key is; all of
     them where there are none."""
-    others: tuple[Label, ...] = ("unlock", "store", "lock", "reset")
-    mine = _steps(profile, label)
-    return mine - {step for other in others if other != label for step in _steps(profile, other)} or mine
+    mine = writes_of(profile, label)
+    return mine - {step for other in SEQUENCES if other != label for step in writes_of(profile, other)} or mine
 
 
-def _steps(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
+def writes_of(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
+    """Of a sequence, as registers and values."""
     steps = getattr(profile.sequences, label)
     return {(s.write, profile.encode(s.write, s.value)) for s in steps if isinstance(s, WriteStep)}
 
