@@ -155,6 +155,16 @@ def provisioned(p: Provisioning) -> str:
     return f"{len(p.written)} registers {stored}; {held(p.held)}"
 
 
+def rehearsed(p: Provisioning) -> str:
+    """The same where only a dry run was asked for."""
+    if p.restart_owed:
+        return (
+            f"dry run: nothing was written; {len(p.differing)} registers in use differ from the calibration; "
+            "the device would be restarted first, and the registers that differ then would be written"
+        )
+    return f"dry run: {len(p.differing)} registers would be written, nothing was"
+
+
 def put_back(p: Provisioning) -> str:
     """The same of an old calibration."""
     done = f"{len(p.written)} registers written back" if p.written else "nothing had to be written"

@@ -46,7 +46,7 @@ def provision_command(a: argparse.Namespace) -> int:
         if a.json:
             emit(_document(done, place, dry_run=a.dry_run))
         elif done.error is None:
-            _show(done, place, station.path)
+            _show(done, place, station.path, dry_run=a.dry_run)
     return done.exit_code
 
 
@@ -95,14 +95,14 @@ def _words(p: Provisioning) -> list[dict[str, Any]]:
     ]
 
 
-def _show(done: Provisioned, place: Place, station: Path) -> None:
+def _show(done: Provisioned, place: Place, station: Path, *, dry_run: bool) -> None:
     p = done.provisioning
     assert p is not None
-    table(
-        f"unit {place.unit.name}, serial {p.identity.serial}",
-        ["register", "before", "wanted", "after", "value"],
-        [[w["register"], w["before"], w["wanted"], w["after"], w["value"]] for w in _words(p)],
-    )
+    columns = ["register", "before", "wanted", "after", "value"]
+    if dry_run:
+        columns.remove("after")
+    rows = [[word[column] for column in columns] for word in _words(p)]
+    table(f"unit {place.unit.name}, serial {p.identity.serial}", columns, rows)
     for doubt in p.doubts:
         say(f"warning: {text.doubt(doubt)}")
     print(done.document["reason"])

@@ -62,6 +62,9 @@ class Provisioning:
     carried: bool = False
     """Whether an earlier provisioning was cut short."""
     undoing_failed: str | None = None
+    restart_owed: bool = False
+    """Whether what was read may be what is in use alone, which a restart would
+    have shown."""
     _store_owed: bool = False
     """What is in use is the image, and the provisioning that was cut short may
     not have stored it."""
@@ -122,13 +125,15 @@ class Provisioning:
             self._journal_lies = True
             self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         self.found = await self._read("reading the old calibration")
-        if restart and self.resets and (entry is not None or not self.found.differing(self.image.raw)):
+        self.restart_owed = self.resets and (entry is not None or not self.found.differing(self.image.raw))
+        if restart and self.restart_owed:
             if entry is None:  # what nothing is to be written to is not written for a proof
                 self._restarted = await self._sequence("reset")
             else:
                 self.steps.append("reset")
                 self._restarted = await self._restart(entry.before, entry.wanted)
             self.found = await self._read("reading the stored calibration")
+            self.restart_owed = False
         self.before = self.after = self.found
         self.differing = self.found.differing(self.image.raw)
         if entry is not None and was_cut_short(entry, self.bundle.profile, self.found, self.image, self._restarted):

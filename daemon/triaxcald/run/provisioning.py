@@ -169,7 +169,7 @@ class ProvisionRun:
     def _done(self) -> str:
         assert self.provisioning is not None
         if self.dry_run:
-            return f"dry run: {len(self.provisioning.differing)} registers would be written, nothing was"
+            return text.rehearsed(self.provisioning)
         return text.provisioned(self.provisioning)
 
     def _document(self, ending: Ending) -> Document:

@@ -76,6 +76,19 @@ def test_the_outcome_of_a_resumed_provisioning_replaces_that_of_the_one_cut_shor
 
 
 @pytest.mark.slow
+def test_a_dry_run_after_a_cut_says_that_a_restart_decides_what_would_be_written(tmp_path: Path, triaxcal) -> None:
+    with Bench(tmp_path, triaxcal, habits=Habits(), wanted=OLD) as bench:
+        told = bench.provision("--dry-run").out
+        assert "nothing was written; 0 registers in use differ from the calibration; the device would be " in told
+        assert bench.unit.written == []
+    with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
+        journal = cut_short(bench)
+        told = bench.provision("--dry-run").out
+        assert "registers in use differ from the calibration; the device would be restarted first" in told
+        assert f"restore {journal}" in told
+
+
+@pytest.mark.slow
 def test_a_restore_that_no_restart_proves_is_proven_by_the_supply(
     tmp_path: Path, triaxcal, monkeypatch: pytest.MonkeyPatch
 ) -> None:

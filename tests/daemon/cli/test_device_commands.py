@@ -76,6 +76,8 @@ def test_a_dry_run_shows_what_would_be_written_and_writes_nothing(workshop: Any,
     assert (words["bias_x"]["before"], words["bias_x"]["wanted"]) == ("00000000", "3ba3d70a")
     assert words["bias_x"]["after"] == "00000000"
     assert f"dry run: {len(done.json['differing'])} registers would be written, nothing was" in shown.out
+    assert "wanted" in shown.out
+    assert "after" not in shown.out
 
 
 @pytest.mark.slow
