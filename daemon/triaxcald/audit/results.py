@@ -74,7 +74,7 @@ class Again:
 
 def digests(recording: Recording) -> Digests:
     found = Digests(*(RawDigest(recording.ends_with) for _ in range(3)))
-    for phase, batch in recording.raw_batches():
+    for phase, batch in recording.joined_batches():
         found.whole.update(phase, batch)
         if phase in (CALIBRATION, VERIFICATION):
             (found.calibration if phase == CALIBRATION else found.verification).update(phase, batch)
@@ -93,7 +93,7 @@ def compute(recording: Recording, raw: Digests) -> Again:
     tumble, check = ({s: Pipeline(bundle, s) for s in streams} for _ in range(2))
     previews = Previews(bundle.profile)
     phases: dict[str, dict[str, Pipeline]] = {CALIBRATION: tumble, VERIFICATION: check}
-    for phase, batch in recording.raw_batches():
+    for phase, batch in recording.joined_batches():
         for stream, pipeline in phases.get(phase, {}).items():
             previews.feed(stream, pipeline.feed(batch))
     certified, why_not = None, ""

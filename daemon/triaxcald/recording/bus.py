@@ -93,7 +93,7 @@ def describe_bus(recording: Contents) -> dict[str, Any]:
     channels; ``gaps`` of a channel are the places where its receiver lost
     some. Raises RecordingError."""
     channels: dict[str, _Channel] = {}
-    for phase, batch in recording.raw_batches():
+    for phase, batch in recording.joined_batches():
         if phase.startswith(BUS_PHASE) and len(batch):
             channels.setdefault(phase.removeprefix(BUS_PHASE), _Channel()).feed(batch)
     return {

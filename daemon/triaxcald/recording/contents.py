@@ -40,8 +40,9 @@ class Contents(ABC):
     attachments: Mapping[str, bytes]
 
     @abstractmethod
-    def messages(self) -> Iterator[TopicMessage]:
-        """Every message with its topic, undecoded, in the order of the file."""
+    def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
+        """Every message with its topic, undecoded, in the order of the file;
+        those of one ``topic`` where it is given."""
 
     @abstractmethod
     def close(self) -> None: ...
@@ -56,34 +57,49 @@ class Contents(ABC):
 
     def phases(self) -> list[str]:
         """In the order in which they began."""
-        return list(dict.fromkeys(phase for phase, _ in self.raw_batches()))
+        return list(dict.fromkeys(phase for phase, _ in self.joined_batches()))
 
     def raw(self, phase: str) -> Iterator[RawBatch]:
         """The phase's raw records in the order in which they came, some
         `JOINED` at a time: a live bus hands out few."""
-        name, waiting, records, size = phase.encode(), list[tuple[int, Fields]](), 0, 0
+        return (batch for _, batch in self._raw(phase.encode()))
+
+    def joined_batches(self) -> Iterator[tuple[str, RawBatch]]:
+        """All raw records with their phase, likewise."""
+        return self._raw()
+
+    def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
+        """The same in the batches in which they were recorded, of which the
+        phases take turns."""
+        return ((phase, batch) for _, phase, batch in self._decoded(schema.RAW, decode_raw))
+
+    def _raw(self, phase: bytes | None = None) -> Iterator[tuple[str, RawBatch]]:
+        waiting, records, size = list[tuple[int, Fields]](), 0, 0
         for message, fields in self._read(schema.RAW, fields_of):
-            if fields.phase == name:
-                waiting.append((message.log_time, fields))
-                records, size = records + len(fields.flags), size + len(message.data)
-                if records >= JOINED or size >= JOINED_BYTES:
-                    yield self._joined(waiting)
-                    waiting, records, size = [], 0, 0
+            if phase is not None and fields.phase != phase:
+                continue
+            if waiting and fields.phase != waiting[0][1].phase:
+                yield self._joined(waiting)
+                waiting, records, size = [], 0, 0
+            waiting.append((message.log_time, fields))
+            records, size = records + len(fields.flags), size + len(message.data)
+            if records >= JOINED or size >= JOINED_BYTES:
+                yield self._joined(waiting)
+                waiting, records, size = [], 0, 0
         if waiting:
             yield self._joined(waiting)
 
-    def _joined(self, waiting: Sequence[tuple[int, Fields]]) -> RawBatch:
-        """Raises RecordingError, which names the message at fault."""
+    def _joined(self, waiting: Sequence[tuple[int, Fields]]) -> tuple[str, RawBatch]:
+        """Of messages of one phase. Raises RecordingError, which names the
+        message at fault."""
+        time_ns, first = waiting[0]
+        phase = self._decode(schema.RAW, time_ns, first.phase.decode)
         try:
-            return batch_of([fields for _, fields in waiting])
+            return phase, batch_of([fields for _, fields in waiting])
         except ValueError:
             for time_ns, fields in waiting:
                 self._decode(schema.RAW, time_ns, partial(batch_of, [fields]))
             raise
-
-    def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
-        """All raw records with their phase."""
-        return ((phase, batch) for _, phase, batch in self._decoded(schema.RAW, decode_raw))
 
     @property
     def ends_with(self) -> str:
@@ -95,7 +111,7 @@ class Contents(ABC):
         """Of all raw records; the metadata record ``raw`` says what it was when
         they were written."""
         digest = schema.RawDigest(self.ends_with)
-        for phase, batch in self.raw_batches():
+        for phase, batch in self.joined_batches():
             digest.update(phase, batch)
         return digest
 
@@ -112,9 +128,8 @@ class Contents(ABC):
         return (value for _, value in self._read(topic, decode))
 
     def _read(self, topic: str, decode: Callable[[bytes], T]) -> Iterator[tuple[Message, T]]:
-        for found, message in self.messages():
-            if found == topic:
-                yield message, self._decode(topic, message.log_time, partial(decode, message.data))
+        for _, message in self.messages(topic):
+            yield message, self._decode(topic, message.log_time, partial(decode, message.data))
 
     def _decode(self, topic: str, time_ns: int, decode: Callable[[], T]) -> T:
         """Raises RecordingError."""

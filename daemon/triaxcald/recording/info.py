@@ -94,7 +94,7 @@ def _phases(recording: Contents) -> dict[str, dict[str, Any]]:
     """Of each phase: records, their bytes, and the time from the first to the
     last."""
     phases: dict[str, dict[str, Any]] = {}
-    for phase, batch in recording.raw_batches():
+    for phase, batch in recording.joined_batches():
         if not len(batch):
             continue
         first_ns, last_ns = int(batch.time_ns.min()), int(batch.time_ns.max())

@@ -80,6 +80,8 @@ class Recording(Contents):
         self.attachments: Attachments = Attachments(self)
         self._stream = stream
         self._chunks: list[int] = []
+        self._topics_in: dict[int, frozenset[str]] = {}
+        """Of the messages of a chunk, once all of them have been read."""
         self._topics: dict[int, str] = {}
         self._said = 0  # bytes of metadata
         self.size = size_of(stream)
@@ -116,18 +118,24 @@ class Recording(Contents):
     def chunks(self) -> int:
         return len(self._chunks)
 
-    def messages(self) -> Iterator[TopicMessage]:
-        topics = dict(self._topics)
+    def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
         unpacked = Unpacked(self.name, self.size)
         for offset in self._chunks:
+            if topic is not None and topic not in self._topics_in.get(offset, {topic}):
+                continue
+            seen: set[str] = set()
             for record in self._records(offset):
                 unpacked.record()
                 if isinstance(record, Channel):
-                    topics[record.id] = record.topic
+                    self._topics[record.id] = record.topic
                 elif isinstance(record, Message):
-                    if record.channel_id not in topics:
+                    if record.channel_id not in self._topics:
                         raise Damage(self.name, offset, f"message on unknown channel {record.channel_id}")
-                    yield TopicMessage(topics[record.channel_id], record)
+                    found = self._topics[record.channel_id]
+                    seen.add(found)
+                    if topic is None or found == topic:
+                        yield TopicMessage(found, record)
+            self._topics_in[offset] = frozenset(seen)
 
     def frames(self) -> Iterator[Frame]:
         """Every record of the file in its order, as bytes."""

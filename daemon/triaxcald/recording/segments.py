@@ -238,7 +238,7 @@ def _as_it_lies(path: Path, segment: Segment) -> Segment:
     """What is in it, of one that was not closed. Raises RecordingError."""
     with Recording.open(path, unfinished=True) as recording:
         digest, span = schema.RawDigest(), list[int]()
-        for phase, batch in recording.raw_batches():
+        for phase, batch in recording.joined_batches():
             digest.update(phase, batch)
             if len(batch):
                 span = [min([*span, int(batch.time_ns.min())]), max([*span, int(batch.time_ns.max())])]

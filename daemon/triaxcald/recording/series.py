@@ -43,11 +43,11 @@ class Series(Contents):
     def size(self) -> int:
         return sum(segment.bytes for segment in self.manifest.segments)
 
-    def messages(self) -> Iterator[TopicMessage]:
-        yield from self._first.messages()
+    def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
+        yield from self._first.messages(topic)
         for segment in self.manifest.segments[1:]:
             with self._opened(segment) as recording:
-                yield from recording.messages()
+                yield from recording.messages(topic)
 
     def _require_there(self, segment: Segment) -> None:
         path = self.manifest.path_of(segment)

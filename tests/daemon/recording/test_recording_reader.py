@@ -10,8 +10,8 @@ from mcap.writer import Writer as McapWriter
 
 from triaxcal_drivers.interface import RawBatch
 from triaxcald.errors import RecordingError
-from triaxcald.recording import contents, schema
-from triaxcald.recording.frames import MAGIC
+from triaxcald.recording import contents, reader, schema
+from triaxcald.recording.frames import MAGIC, Frame
 from triaxcald.recording.raw_batch import Fields
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
@@ -47,15 +47,40 @@ def test_iterators_do_not_disturb_each_other(recording: Path) -> None:
             np.testing.assert_array_equal(a.time_ns, b.time_ns)
 
 
+def test_messages_of_one_topic_are_those_among_all_and_chunks_known_to_have_none_are_not_unpacked_again(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unpacked: list[int] = []
+    unpack = reader.chunk_data
+
+    def counted(frame: Frame, name: str) -> bytes:
+        unpacked.append(frame.offset)
+        return unpack(frame, name)
+
+    monkeypatch.setattr(reader, "chunk_data", counted)
+    with Recording.open(recording) as rec:
+        before = list(rec.messages(schema.EVENTS))
+        every = list(rec.messages())
+        assert unpacked == 2 * unpacked[: len(unpacked) // 2]
+        unpacked.clear()
+        assert list(rec.losses()) == []
+        assert unpacked == []
+        assert list(rec.messages(schema.EVENTS)) == before == [m for m in every if m.topic == schema.EVENTS]
+        assert 0 < len(unpacked) <= rec.chunks
+
+
 def test_records_of_a_phase_come_many_at_a_time_however_few_a_message_has(
     recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Recording.open(recording) as rec:
         single = [batch for phase, batch in rec.raw_batches() if phase == "calibration"]
+        together = dict(rec.joined_batches())
         (joined,) = rec.raw("calibration")
         monkeypatch.setattr("triaxcald.recording.contents.JOINED", len(single[0]) + 1)
         parts = list(rec.raw("calibration"))
     assert len(single) == 4
+    assert list(together) == ["calibration", "verification"]
+    assert together["calibration"].payload == joined.payload
     assert [len(p) for p in parts] == [len(single[0]) + len(single[1]), len(single[2]) + len(single[3])]
     for column in ("time_ns", "source", "flags", "length"):
         whole = np.concatenate([getattr(b, column) for b in single])
