@@ -85,6 +85,7 @@ def habits_of(draw: random.Random) -> Habits:
         power_back_s=draw.choice([0.2, 2.0]),
         restart_s=draw.choice([0.0, 0.05, 0.3]),
         reset_reply=draw.random() < 0.7,
+        reset_ignored=bool(rarely(stores, False)),  # without a store no value can show it (decision 0056)
     )  # fmt: skip
 
 
