@@ -82,24 +82,29 @@ def _scale(differences: Floats, quantile: float, least: Floats, white: Floats, h
     return np.asarray(np.where(sigma > 0, sigma, np.sqrt(white)))
 
 
-def contrasts(
-    values: Floats, still: Bools, joined: Bools, before: int, after: int, at: Ints | None = None
-) -> tuple[Ints, Floats]:
-    """Where ``before`` windows and the ``after`` windows behind them are
-    unbroken and still: the index of the first of the latter (k,), and how much
-    their average exceeds that of the former (k,3).
-    """
-    n = len(values)
-    if at is None:
-        broken = np.ones(n + 1, dtype=bool)
-        broken[1:n] = ~(still[:-1] & still[1:] & joined[1:])
-        breaks = np.cumsum(broken)
-        i = np.arange(before, n - after + 1)
-        # Between the first and the last of them no boundary is broken; a single
-        # window must be still itself.
-        at = i[breaks[i + after - 1] == breaks[i - before]]
-        at = at[still[at - before]] if len(at) else at
-    at = np.asarray(at, dtype=np.int64)
+def contrasts(values: Floats, still: Bools, joined: Bools, before: int, after: int) -> tuple[Ints, Floats]:
+    """`unbroken` and the `contrast` there."""
+    at = unbroken(still, joined, before, after)
+    return at, contrast(values, at, before, after)
+
+
+def unbroken(still: Bools, joined: Bools, before: int, after: int) -> Ints:
+    """(k,) where ``before`` windows and the ``after`` windows behind them are
+    unbroken and still: the index of the first of the latter."""
+    n = len(still)
+    broken = np.ones(n + 1, dtype=bool)
+    broken[1:n] = ~(still[:-1] & still[1:] & joined[1:])
+    breaks = np.cumsum(broken)
+    i = np.arange(before, n - after + 1)
+    # Between the first and the last of them no boundary is broken; a single
+    # window must be still itself.
+    at = i[breaks[i + after - 1] == breaks[i - before]]
+    return np.asarray(at[still[at - before]] if len(at) else at, dtype=np.int64)
+
+
+def contrast(values: Floats, at: Ints, before: int, after: int) -> Floats:
+    """(k,c) how much the average of ``values`` (n,c) over ``after`` windows
+    from ``at`` (k,) on exceeds that of the ``before`` windows before it."""
     offset = values[0] * ((after > 0) - int(before > 0))
     out = np.empty((len(at), values.shape[1]))
     for axis in range(values.shape[1]):  # one by one: a recording may last for days
@@ -107,4 +112,4 @@ def contrasts(
         here = (sums[at] - sums[at - before]) / max(before, 1)
         there = (sums[at + after] - sums[at]) / max(after, 1)
         out[:, axis] = there - here + offset[axis]
-    return at, out
+    return out

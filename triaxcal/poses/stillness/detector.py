@@ -20,7 +20,7 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
-from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrasts
+from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrast, contrasts, unbroken
 from triaxcal.poses.stillness.quantization import Rounding, resolution
 from triaxcal.poses.stillness.shaken import ALONE_S, MOVE_SIGMA, runs, shaken_noise, shaken_runs
 from triaxcal.poses.stillness.trimming import SPAN_LEAST_WINDOWS, trimmed
@@ -274,20 +274,25 @@ def _steady(w: Windows, calm: Bools, noise: NoiseScales) -> Bools:
     or long, is more than noise."""
     steady = calm.copy()
     for scale in SCALES:
-        at, difference = contrasts(w.mean, steady, w.joined, scale, scale)
-        if not len(at):
-            break
-        sigma = noise.step[scale]
-        if scale == 1:
-            moved = at[(np.abs(difference) > STEP_SIGMA * sigma).any(axis=1)]
-        else:
-            difference = difference - _common_climb(at, difference / sigma) * sigma
-            moved = at[(np.abs(difference) > MOVE_SIGMA * sigma).any(axis=1)]
+        moved = _moved(w, steady, noise, scale)
         half = max(scale // 2, 1)
         for shift in range(-half, half):
             steady[moved + shift] = False
         steady[_bumped(w, steady, noise, scale)] = False
     return steady
+
+
+def _moved(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
+    """Windows before which and from which on averages over ``scale`` windows
+    differ by more than noise."""
+    at, difference = contrasts(w.mean, steady, w.joined, scale, scale)
+    if not len(at):
+        return at
+    sigma = noise.step[scale]
+    if scale == 1:
+        return np.asarray(at[(np.abs(difference) > STEP_SIGMA * sigma).any(axis=1)])
+    difference -= _common_climb(at, difference / sigma) * sigma
+    return np.asarray(at[(np.abs(difference) > MOVE_SIGMA * sigma).any(axis=1)])
 
 
 def _common_climb(at: Ints, z: Floats) -> Floats:
@@ -312,12 +317,14 @@ def _bumped(w: Windows, steady: Bools, noise: NoiseScales, scale: int) -> Ints:
     if scale not in noise.edge:
         return np.zeros(0, dtype=np.int64)
     limit = MOVE_SIGMA * noise.edge[scale]
-    at, before = contrasts(w.mean, steady, w.joined, 4 * scale, scale)
-    to, after = contrasts(w.mean, steady, w.joined, scale, 4 * scale)
-    _, i, j = np.intersect1d(at, to - scale, return_indices=True)
-    out = ((np.abs(before[i]) > limit) & (np.abs(after[j]) > limit) & (before[i] * after[j] < 0)).any(axis=1)
-    hit = at[i[out]]
-    return np.asarray(np.unique(hit[:, None] + np.arange(scale)), dtype=np.int64)
+    behind, ahead = unbroken(steady, w.joined, 4 * scale, scale), unbroken(steady, w.joined, scale, 4 * scale)
+    at = np.intersect1d(behind, ahead - scale, assume_unique=True)
+    out = np.zeros(len(at), dtype=bool)
+    for axis in range(3):  # one by one: a recording may last for days
+        mean = w.mean[:, axis : axis + 1]
+        before, after = contrast(mean, at, 4 * scale, scale), contrast(mean, at + scale, scale, 4 * scale)
+        out |= ((np.abs(before) > limit[axis]) & (np.abs(after) > limit[axis]) & (before * after < 0))[:, 0]
+    return np.asarray(np.unique(at[out][:, None] + np.arange(scale)), dtype=np.int64)
 
 
 def _rejoin(w: Windows, pieces: list[Ints], noise: NoiseScales, disturbed: Bools, longest_s: float) -> list[Span]:

@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 
 from triaxcal.arrays import Bools, Floats, Ints
-from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrasts
+from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrast, contrasts
 from triaxcal.poses.stillness.trimming import trimmed
 from triaxcal.poses.stillness.windows import Windows
 
@@ -109,8 +109,8 @@ def _staying(w: Windows, rest: Bools, alike: Bools, level: Floats, noise: NoiseS
     excess = np.maximum(level - noise.scatter**2, 0.0)
     for scale in (*SCALES, LONGEST):
         at, difference = contrasts(w.mean, staying, alike, scale, scale)
-        _, after = contrasts(excess, staying, alike, 0, scale, at)
-        _, before = contrasts(excess, staying, alike, scale, 0, at)
+        after = contrast(excess, at, 0, scale)
+        before = contrast(excess, at, scale, 0)
         quiet = noise.step[min(scale, SCALES[-1])]
         sigma = quiet**2 + (after - before) / 2 * _share(scale, w.size)
         moved = at[(difference**2 > MOVE_SIGMA**2 * sigma).any(axis=1)]
