@@ -31,7 +31,7 @@ from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import DecodedStream, Pipeline, creeping, together
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents
-from triaxcald.recording.schema import RECOVERY_RECORD, Phase
+from triaxcald.recording.schema import RECOVERY_RECORD, STATION_FILE, Phase
 from triaxcald.recording.series import is_recording, open_recording
 from triaxcald.station.config import parse_station
 from triaxcald.tables.naming import ERRORS
@@ -41,7 +41,6 @@ DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses h
 PROFILE = "profile.toml"
 """Name under which a recording carries the profile; the files it names stand
 beside it under ``profile/``."""
-STATION_FILE = "station.toml"
 UNKNOWN_NOISE = "unknown_noise"
 CALIBRATION: Phase = "calibration"
 VERIFICATION: Phase = "verification"

@@ -36,6 +36,8 @@ _HELD: dict[tuple[DeviceState, Evidence | None], str] = {
 IS_BACK = "the unit is back"
 BUS_IS_BACK = "the bus is back"
 NOTHING_YET = "nothing has come yet"
+DISK_IS_BEHIND = "records are lost: the disk does not keep up"
+DISK_KEEPS_UP = "the disk keeps up again"
 
 
 def waits(trouble: str) -> str:
@@ -47,11 +49,12 @@ def metrics_at(port: int) -> str:
     return f"http://127.0.0.1:{port}/metrics has the numbers, http://127.0.0.1:{port}/health says how it stands"
 
 
-def recorded(units: int, buses: int, lost: Sequence[str], records: int) -> str:
+def recorded(units: int, buses: int, lost: Sequence[str], ended: Sequence[str], records: int) -> str:
     """How recordings stand, in a line."""
     missing = f", waiting for {', '.join(lost)}" if lost else ""
+    missing += f", ended: {', '.join(ended)}" if ended else ""
     kinds = " and ".join(kind for kind, count in (("units", units), ("buses", buses)) if count)
-    return f"{units + buses - len(lost)} of {units + buses} {kinds} recorded, {records} records{missing}"
+    return f"{units + buses - len(lost) - len(ended)} of {units + buses} {kinds} recorded, {records} records{missing}"
 
 
 def reloaded(changed: Sequence[str]) -> str:

@@ -14,12 +14,12 @@ from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify
 from triaxcald.errors import DaemonError, RecordingError
-from triaxcald.inputs import CALIBRATION, STATION_FILE, VERIFICATION, bundle_of, signs_of
+from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
 from triaxcald.outcome import Ending, Papers, Verdict, measured_in, outcome_document
 from triaxcald.pipeline import Pipeline
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.schema import RawDigest
+from triaxcald.recording.schema import STATION_FILE, RawDigest
 from triaxcald.report.unit import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.write_back import VERIFICATION_FILE

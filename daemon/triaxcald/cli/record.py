@@ -6,7 +6,7 @@ import argparse
 import asyncio
 import time
 from collections.abc import Callable, Collection, Sequence
-from contextlib import AsyncExitStack, nullcontext
+from contextlib import AsyncExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
 from triaxcald.errors import InputError
-from triaxcald.exit_codes import INTERRUPTED, severest
+from triaxcald.exit_codes import DISK, INTERRUPTED, severest
 from triaxcald.files import require_new, require_recording, unused
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
@@ -33,6 +33,11 @@ if TYPE_CHECKING:  # matplotlib and all come once the file is known to be good
     from triaxcald.run.roster import Roster
     from triaxcald.run.session import Segments, UnitSession
     from triaxcald.station.serials import SerialsSeen
+
+
+AGAIN_S = 60.0
+"""What a full disk ended begins again so often while others go on: it may have
+been cleared meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +96,9 @@ async def _record(
 
     def in_a_line() -> str:
         there = roster.statuses()
-        lost = [one.unit for one in there if one.state is State.WAITING]
+        lost, ended = ([one.unit for one in there if one.state is state] for state in (State.WAITING, State.ENDED))
         buses = sum(one.kind == "bus" for one in there)
-        return text.recorded(len(there) - buses, buses, lost, sum(one.records for one in there))
+        return text.recorded(len(there) - buses, buses, lost, ended, sum(one.records for one in there))
 
     async with AsyncExitStack() as stack:
         if a.metrics is not None:
@@ -118,11 +123,15 @@ async def _reload(
     hangup: asyncio.Event,
 ) -> None:
     """The station file, each time that it is asked for. What is as it was goes
-    on; what ended, for whatever reason, begins again."""
+    on; what ended, for whatever reason, begins again. What the disk ended does
+    so now and then by itself."""
     from triaxcald.run.endings import reason_of, trace_of
 
     while True:
-        await hangup.wait()
+        if not await _is_set(hangup, AGAIN_S):
+            if a.folder and (names := roster.ended_with(DISK)):
+                roster.begin(_recordings(a, chosen, progress, serials, chosen.names - names))
+            continue
         hangup.clear()
         try:
             new = await asyncio.to_thread(_load, a)
@@ -134,6 +143,13 @@ async def _reload(
         _tell(progress, "info", text.reloaded(sorted(leaving)))
         chosen = new
         await roster.change(leaving, beginning)
+
+
+async def _is_set(event: asyncio.Event, within_s: float) -> bool:
+    with suppress(TimeoutError):
+        async with asyncio.timeout(within_s):
+            await event.wait()
+    return event.is_set()
 
 
 def _tell(progress: Bars | JsonLines, level: str, message: str, trace: str | None = None) -> None:
@@ -246,7 +262,7 @@ def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
         counts = {name: n for name, n in kept.counts.items() if n}
         path = str(kept.path) if kept.path else None
         asked_to = kept.error is None or kept.exit_code == INTERRUPTED
-        level = "info" if asked_to else "error"
+        level = "error" if not asked_to else "warning" if kept.lost else "info"
         told = {"message": kept.error, **_traced(kept.trace), **counts, "lost": kept.lost}
         progress.say(level, "ended", unit=kept.unit, kind=kept.kind, recording=path, **told)
         return

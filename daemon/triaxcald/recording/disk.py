@@ -42,6 +42,11 @@ def not_created(path: Path, e: OSError) -> RecordingError:
     return kind(f"{path}: cannot be created: {e.strerror}")
 
 
+def no_room(path: Path, free: int) -> DiskError:
+    """For a file and its end."""
+    return DiskError(f"{path}: cannot be created: {free} bytes are free on the disk")
+
+
 def not_written(path: Path, e: OSError, sound_ns: int | None) -> DiskError:
     """``sound_ns`` is the host's time up to which everything is in the file;
     None where the file is removed."""

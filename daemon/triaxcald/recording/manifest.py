@@ -4,7 +4,10 @@ it consists of, in order."""
 from __future__ import annotations
 
 import json
+import os
+import re
 from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -58,6 +61,16 @@ class Manifest:
     @property
     def next_number(self) -> int:
         return max([sum(self.deleted.values()), *(s.number for s in self.segments)]) + 1
+
+    @property
+    def taken(self) -> int:
+        """The highest number that the name of a file beside it has: an earlier
+        manifest may have been lost."""
+        name = re.compile(re.escape(self.path.name.removesuffix(SUFFIX)) + r"-(\d{6,18})\.mcap")
+        with suppress(OSError):  # a folder that one may write to, and not read
+            found = map(name.fullmatch, os.listdir(self.path.parent))
+            return max((int(match[1]) for match in found if match), default=0)
+        return 0
 
     def path_of(self, segment: Segment) -> Path:
         return self.path.with_name(segment.file)

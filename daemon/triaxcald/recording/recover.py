@@ -32,6 +32,7 @@ from triaxcald.recording.frames import (
     unpack,
     unpack_part,
 )
+from triaxcald.recording.manifest import is_manifest
 from triaxcald.recording.raw_batch import decode_raw
 
 
@@ -78,6 +79,8 @@ def recover(path: Path, out: Path) -> Recovery:
     ``out`` exists or cannot be written; Refused: ``path`` holds neither a whole
     message nor an attachment. Nothing of ``out`` is left behind.
     """
+    if is_manifest(path):
+        raise RecordingError(f"{path}: is a manifest; mend each segment that it says is cut short or damaged")
     try:
         with open_file(path) as source:
             damaged = DamagedFile(source, str(path))

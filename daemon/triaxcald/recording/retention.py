@@ -62,17 +62,28 @@ def _too_old(age_ns: int | None, keep_s: float) -> bool:
     return age_ns is None or age_ns > keep_s * 1e9
 
 
-def evidence(manifest: Manifest) -> frozenset[str]:
+class Evidence(NamedTuple):
+    """``kept`` are files that stay; ``unread`` is the document that may name any
+    of them."""
+
+    kept: frozenset[str]
+    unread: str | None = None
+
+
+def evidence(manifest: Manifest) -> Evidence:
     """The files that an outcome or a certificate beside the manifest names, by
-    name or by digest; all, where such a document cannot be read."""
+    name or by digest; all, where such a document cannot be read, and which that
+    is."""
     texts = []
     for pattern in EVIDENCE:
         for path in manifest.path.parent.glob(pattern):
             try:
                 texts.append((path.name, read_whole(path, EVIDENCE_MOST).decode("utf-8", "replace")))
+            except FileNotFoundError:  # a link to nowhere, or it has just gone
+                continue
             except OSError:
-                return frozenset(s.file for s in manifest.segments)
-    return frozenset(s.file for s in manifest.segments if _is_named(s, texts))
+                return Evidence(frozenset(s.file for s in manifest.segments), path.name)
+    return Evidence(frozenset(s.file for s in manifest.segments if _is_named(s, texts)))
 
 
 def _is_named(segment: Segment, texts: Iterable[tuple[str, str]]) -> bool:

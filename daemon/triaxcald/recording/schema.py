@@ -32,6 +32,7 @@ IMPORTED = "imported"  # the kind of the event that says of which log a recordin
 RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
 BUS_RECORD = "bus"  # the metadata record that takes the place of `unit` where all frames of a bus were recorded
 SEGMENT_RECORD = "segment"  # the metadata record that says which part of a longer recording this is
+STATION_FILE = "station.toml"  # the attachment with the station file
 PROFILE = "triaxcal"  # in the header of the MCAP file
 
 Phase = Literal["calibration", "verification"]

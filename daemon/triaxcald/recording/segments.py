@@ -13,8 +13,7 @@ from typing import Any
 from triaxcal_drivers.files import open_file
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Gap, RawBatch
-from triaxcald.errors import RecordingError
-from triaxcald.files import require_new
+from triaxcald.errors import DiskError, RecordingError
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ended_because
 from triaxcald.recording.file import Head, RecordingFile
@@ -66,6 +65,8 @@ class SegmentedWriter(RecordingWriter):
         self._closed_ns: dict[int, int] = {}  # by number, on the steady line
         self._kept: list[tuple[int, str, str, bytes]] = []
         self._recorded = self._told_low = False
+        self._unread: str | None = None
+        """A document that cannot be read, and may name any segment."""
         super().__init__(self.manifest, metadata=metadata, **options)
 
     def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
@@ -90,15 +91,33 @@ class SegmentedWriter(RecordingWriter):
             ends = [s.end_ns for s in self._segments.segments if s.end_ns is not None]
             damaged = bool(self._segments.segments) and self._segments.segments[-1].state == "damaged"
             self._resumes = Gap(ends[-1], None, DAMAGED if damaged else AWAY) if ends else None
-            return self._next()
+            gone = self._room_made()
+            file = self._next()
+            if gone:
+                file.write(schema.EVENTS, self._deleted(gone))
+            return file
         except OSError as e:
             raise disk.not_created(self.manifest, e) from e
+
+    def _room_made(self) -> list[Surplus]:
+        """What had to go so that there is room for a file and its end: a
+        service that is started again and again would fill the disk to its last
+        byte. Raises DiskError."""
+        gone: list[Surplus] = []
+        for last in (False, True):
+            free = disk.free_bytes(self.manifest.parent)
+            if free is None or free >= disk.END_BYTES:
+                break
+            if last:
+                raise disk.no_room(self.manifest, free)
+            gone = self._take_away()
+        return gone
 
     # What follows runs on the writer's thread, but for the first segment.
 
     def _next(self) -> RecordingFile:
         """Raises OSError, RecordingError."""
-        known, number = self._segments.segments, self._segments.next_number
+        known, number = self._segments.segments, max(self._segments.next_number, self._segments.taken + 1)
         first = known[-1].end if known else 0
         told = {"number": str(number), "first": str(first), "of": self.manifest.name}
         if known:
@@ -106,7 +125,6 @@ class SegmentedWriter(RecordingWriter):
         head = replace(self._head, metadata={**self._head.metadata, schema.SEGMENT_RECORD: told})
         segment = Segment(self._segments.file_name(number), number, first)
         path = self._segments.path_of(segment)
-        require_new(path)
         # Before the file is: one that no manifest names would be in the way for ever.
         self._segments = self._segments.with_last(segment)
         self._segments.save()
@@ -135,15 +153,21 @@ class SegmentedWriter(RecordingWriter):
         super()._flushed()
         if not self._told_low and self._lacks() and not self._retain():
             self._told_low = True
-            self._say("disk_low", {"wanted_bytes": self._retention.free_bytes if self._retention else 0})
+            wanted = self._retention.free_bytes if self._retention else 0
+            unread = {} if self._unread is None else {"unread": self._unread}
+            self._file.write(schema.EVENTS, self._event("disk_low", {"wanted_bytes": wanted, **unread}))
 
     def _finish(self) -> None:
         super()._finish()
         file, last = self._file, self._segments.segments[-1]
         start_ns, end_ns = file.span_ns or (None, None)
+        try:
+            sha256 = digest_of(file.path)
+        except RecordingError as e:  # moved away, or the disk was taken from under it
+            raise DiskError(str(e)) from e
         closed = replace(
             last, state="closed", end=file.raw_end, records=file.digest.records, start_ns=start_ns, end_ns=end_ns,
-            closed_ns=self._clock_ns(), bytes=file.size, sha256=digest_of(file.path),
+            closed_ns=self._clock_ns(), bytes=file.size, sha256=sha256,
             raw_sha256=file.digest.hexdigest(),
         )  # fmt: skip
         self._closed_ns[last.number] = self._steady_ns()
@@ -152,8 +176,14 @@ class SegmentedWriter(RecordingWriter):
 
     def _end_for_lack_of_room(self, free: int) -> None:
         """Unless older segments make room. Raises DiskError."""
-        if not self._retain():
+        if self._retain():
+            return
+        try:
             super()._end_for_lack_of_room(free)
+        except DiskError as e:
+            if self._unread is None:
+                raise
+            raise DiskError(f"{e}; nothing was deleted, as {self._unread} cannot be read") from e
 
     def _lacks(self) -> bool:
         """Whether less of the disk is free than is to be."""
@@ -171,23 +201,32 @@ class SegmentedWriter(RecordingWriter):
 
     def _retain(self) -> list[Surplus]:
         """What it has taken away, also said in the file."""
+        gone = self._take_away()
+        if gone:
+            self._file.write(schema.EVENTS, self._deleted(gone))
+        return gone
+
+    def _take_away(self) -> list[Surplus]:
         self._retained_ns = self._steady_ns()
         if self._retention is None:
             return []
+        kept, self._unread = evidence(self._segments)
         chosen = surplus(
             self._segments.segments, self._retention, age_ns=self._age_ns,
-            free_bytes=disk.free_bytes(self.manifest.parent), kept=evidence(self._segments),
+            free_bytes=disk.free_bytes(self.manifest.parent), kept=kept,
         )  # fmt: skip
         gone = delete(self._segments, chosen)
         if gone:
             self._segments = self._segments.without([(one.segment, one.reason) for one in gone])
             self._segments.save()
             self.deleted += gone
-            self._say("deleted", {"segments": [_told(one) for one in gone]})
         return gone
 
-    def _say(self, kind: str, detail: Mapping[str, Any]) -> None:
-        self._write(schema.EVENTS, schema.Event(self._clock_ns(), kind, json.dumps(detail, sort_keys=True)))
+    def _deleted(self, gone: list[Surplus]) -> schema.Event:
+        return self._event("deleted", {"segments": [_told(one) for one in gone]})
+
+    def _event(self, kind: str, detail: Mapping[str, Any]) -> schema.Event:
+        return schema.Event(self._clock_ns(), kind, json.dumps(detail, sort_keys=True))
 
     def _write_attachment(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
         if not self._recorded:

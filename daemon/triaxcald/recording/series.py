@@ -47,6 +47,7 @@ class Series(Contents):
         yield from self._first.messages(topic)
         for segment in self.manifest.segments[1:]:
             with self._opened(segment) as recording:
+                self._require_alike(recording, segment)
                 yield from recording.messages(topic)
 
     def _require_there(self, segment: Segment) -> None:
@@ -58,6 +59,20 @@ class Series(Contents):
         if segment.state != "open" and size != segment.bytes:
             raise RecordingError(
                 f"{self.name}: segment {segment.file}: {size} bytes, expected {segment.bytes}; it was changed since"
+            )
+
+    def _require_alike(self, recording: Recording, segment: Segment) -> None:
+        """What is in a segment means what it does in the first: the station
+        file may have changed in between, and with it profile, signs or bus. One
+        that ended before its first record may lack attachments."""
+        first, ours, theirs = self.manifest.segments[0].file, self.metadata, recording.metadata
+        named = [name for name in ("unit", schema.BUS_RECORD) if theirs.get(name) != ours.get(name)]
+        there = set(self.attachments) & set(recording.attachments) - {schema.STATION_FILE}
+        named += [name for name in sorted(there) if recording.attachments[name] != self.attachments[name]]
+        if named:
+            raise RecordingError(
+                f"{self.name}: segment {segment.file}: {', '.join(named)}: not as in {first}; "
+                "read the segments before and after such a change one by one"
             )
 
     def _opened(self, segment: Segment) -> Recording:

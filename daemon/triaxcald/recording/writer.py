@@ -98,6 +98,11 @@ class RecordingWriter:
         return self._jobs.qsize()
 
     @property
+    def is_behind(self) -> bool:
+        """Whether records are being lost since the disk does not keep up."""
+        return bool(self._unreported)
+
+    @property
     def resumes(self) -> Gap | None:
         """What was not recorded before this writer began, where it goes on
         behind earlier records; not over yet."""

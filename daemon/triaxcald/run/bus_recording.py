@@ -10,9 +10,8 @@ from typing import Any
 
 from triaxcald import text
 from triaxcald.certificate import software
-from triaxcald.inputs import STATION_FILE
 from triaxcald.recording.bus import bus_record, phase_of
-from triaxcald.recording.schema import BUS_RECORD
+from triaxcald.recording.schema import BUS_RECORD, STATION_FILE
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.run.recording import AtRecording, State
 from triaxcald.run.session import Segments, new_writer, stamp
@@ -41,8 +40,8 @@ class BusRecording(AtRecording):
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         listened = Listened(phase_of(place.settings.channel))
-        super().__init__(place.name, listened)
-        self._station, self._place, self._progress = station, place, progress
+        super().__init__(place.name, listened, progress)
+        self._station, self._place = station, place
         self._path_of, self._segments, self._clock_ns = path_of, segments, clock_ns
         self._listened = listened
 

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from triaxcal_drivers.claim import Claim
+from triaxcald import text
 from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import DEVICE, DONE, exit_code_of
 from triaxcald.recording.ending import Kind, ended_because
@@ -20,6 +21,7 @@ from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import LOOK_S, RecordingWriter
 from triaxcald.run.endings import reason_of, trace_of
 from triaxcald.run.together import while_sound, whole_on_a_thread
+from triaxcald.station.collection import Progress
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.lock import locked
 from triaxcald.station.raw_records import RawRecords
@@ -76,28 +78,35 @@ class UnitStatus:
 
 class AtRecording(ABC):
     """One of the recordings that a process makes side by side, of a unit or a
-    bus of that ``name``, whose records go through ``records``."""
+    bus of that ``name``, whose records go through ``records``. ``progress``
+    shows the operator how it goes."""
 
     kind: Kind
 
-    def __init__(self, name: str, records: RawRecords) -> None:
-        self.name, self._records = name, records
+    def __init__(self, name: str, records: RawRecords, progress: Progress) -> None:
+        self.name, self._records, self._progress = name, records, progress
         self._path: Path | None = None
+        self._written: Path | None = None
+        """The last file of it."""
         self._writer: RecordingWriter | None = None
         self._lost = 0
         self._state = State.WAITING
         self._trouble: str | None = None
-        self._leaves = False
+        self._leaves = self._was_behind = False
 
     @property
     def status(self) -> UnitStatus:
-        """From any thread."""
+        """From any thread. One that loses what comes, as the disk does not keep
+        up, is waited for."""
         records, writer = self._records, self._writer
+        state, trouble = self._state, self._trouble
+        if state is State.RECORDING and writer is not None and writer.is_behind:
+            state, trouble = State.WAITING, text.DISK_IS_BEHIND
         return UnitStatus(
             self.name,
-            self._state,
-            self._trouble,
-            self._path if writer is None else writer.current,
+            state,
+            trouble,
+            self._written if writer is None else writer.current,
             records.digest.records,
             self._counts,
             records.gaps,
@@ -153,7 +162,8 @@ class AtRecording(ABC):
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a recording
             if self._asked(e):
                 return self._result()
-            error = f"{self.kind} {self.name}: {reason_of(e)}"
+            self._trouble = reason_of(e)
+            error = f"{self.kind} {self.name}: {self._trouble}"
             return replace(self._result(), exit_code=exit_code_of(e), error=error, trace=trace_of(e))
         else:
             if self._trouble is None:
@@ -186,14 +196,24 @@ class AtRecording(ABC):
             self._writer, self._state, self._trouble = writer, State.RECORDING, None
             try:
                 # A disk fails while a unit is lost, and nothing comes, too.
-                await while_sound(record(writer), writer.check, LOOK_S)
+                await while_sound(record(writer), partial(self._look_after, writer), LOOK_S)
             except (Exception, asyncio.CancelledError) as e:
                 await self._end(writer, e)
                 raise
             else:
                 await whole_on_a_thread(partial(writer.close, ended_because(None, self.kind)))
             finally:
-                self._lost, self._writer = writer.losses.get(RAW, 0), None
+                self._lost, self._written, self._writer = writer.losses.get(RAW, 0), writer.current, None
+
+    def _look_after(self, writer: RecordingWriter) -> None:
+        """Raises RecordingError."""
+        writer.check()
+        if writer.is_behind is not self._was_behind:
+            self._was_behind = writer.is_behind
+            if self._was_behind:
+                self._progress.lost(self.name, text.DISK_IS_BEHIND)
+            else:
+                self._progress.stage(self.name, text.DISK_KEEPS_UP)
 
     async def _end(self, writer: RecordingWriter, e: BaseException) -> None:
         """Where the disk has failed, that is on its way already."""

@@ -30,6 +30,10 @@ class Roster:
     def at_work(self) -> set[str]:
         return {name for name, (_, task) in self._work.items() if not task.done()}
 
+    def ended_with(self, code: int) -> set[str]:
+        """Those whose last recording ended with that exit code."""
+        return {name for name, (_, task) in self._work.items() if task.done() and task.result().exit_code == code}
+
     def begin(self, recordings: Iterable[AtRecording]) -> None:
         """None of a name that is at work."""
         for one in recordings:

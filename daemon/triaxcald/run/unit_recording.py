@@ -33,7 +33,7 @@ class UnitRecording(AtRecording):
         segments: Segments | None = None,
     ) -> None:
         self._recorded = Recorded(CALIBRATION, session.place.bundle, session.place.address)
-        super().__init__(session.name, self._recorded)
+        super().__init__(session.name, self._recorded, session.progress)
         self._session, self._path_of, self._identified, self._segments = session, path_of, identified, segments
 
     @property

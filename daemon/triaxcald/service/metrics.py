@@ -7,6 +7,7 @@ import errno
 import html
 import json
 import shutil
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -23,6 +24,9 @@ from triaxcal_drivers.host_clock import HOST
 from triaxcald.errors import InputError, StationError
 from triaxcald.run.recording import State, UnitStatus
 
+IDLE_S = 10.0
+"""A client that says nothing for so long is let go: each holds a descriptor,
+which the recording may need."""
 Statuses = Callable[[], Sequence[UnitStatus]]
 
 _COUNTED = {
@@ -47,7 +51,7 @@ class UnitMetrics(Collector):
         recording = GaugeMetricFamily(
             "triaxcal_unit_recording", "1 while samples come, or the bus is there", labels=["unit"]
         )
-        records = CounterMetricFamily("triaxcal_records", "Raw records taken from the bus", labels=["unit"])
+        records = CounterMetricFamily("triaxcal_records", "Raw records that were recorded", labels=["unit"])
         lost = CounterMetricFamily("triaxcal_lost_records", "Records lost between bus and disk", labels=["unit"])
         gaps = CounterMetricFamily("triaxcal_gaps", "Interruptions and losses on the bus", labels=["unit"])
         gaps_s = CounterMetricFamily("triaxcal_gap_seconds", "Time in which the unit was lost", labels=["unit"])
@@ -92,10 +96,11 @@ class UnitMetrics(Collector):
 
 
 def health(units: Sequence[UnitStatus]) -> dict[str, Any]:
-    """``healthy`` where every unit and bus is there and is recorded."""
+    """``healthy`` where every unit and bus is there and is recorded; not before
+    there is any."""
     return {
         "format": "triaxcal.health/1",
-        "healthy": all(u.state is State.RECORDING for u in units),
+        "healthy": bool(units) and all(u.state is State.RECORDING for u in units),
         "units": [
             {
                 "unit": u.unit,
@@ -112,6 +117,16 @@ def health(units: Sequence[UnitStatus]) -> dict[str, Any]:
     }
 
 
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Of a client that has gone meanwhile nothing is said: standard error is
+        the recording's."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
+
 @contextmanager
 def served(port: int, statuses: Statuses, folder: Path) -> Iterator[int]:
     """``/metrics``, ``/health`` (503 where a unit is lost) and ``/`` on the
@@ -122,6 +137,11 @@ def served(port: int, statuses: Statuses, folder: Path) -> Iterator[int]:
     registry.register(UnitMetrics(statuses, folder))
 
     class Page(BaseHTTPRequestHandler):
+        timeout = IDLE_S
+
+        def do_HEAD(self) -> None:
+            self.do_GET()
+
         def do_GET(self) -> None:
             path = self.path.partition("?")[0]
             if path == "/metrics":
@@ -140,17 +160,17 @@ def served(port: int, statuses: Statuses, folder: Path) -> Iterator[int]:
             self.send_header("Content-Type", kind)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
-            self.wfile.write(body)
+            if self.command != "HEAD":
+                self.wfile.write(body)
 
         def log_message(self, format: str, *args: object) -> None:
             """Nothing: standard error is the recording's."""
 
     try:
-        server = ThreadingHTTPServer(("127.0.0.1", port), Page)
+        server = _Server(("127.0.0.1", port), Page)
     except OSError as e:
         kind = StationError if e.errno == errno.EADDRINUSE else InputError
         raise kind(f"--metrics {port}: cannot listen on 127.0.0.1: {e.strerror}") from e
-    server.daemon_threads = True
     threading.Thread(target=server.serve_forever, name="metrics", daemon=True).start()
     try:
         yield server.server_address[1]

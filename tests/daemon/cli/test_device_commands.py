@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from triaxcald.recording import disk
 from triaxcald.recording.reader import Recording
 from triaxcald.simulation.memory import CALIBRATION, TABLE, Stored, factory_calibration
 from triaxcald.simulation.unit import Faults
@@ -21,6 +22,7 @@ from triaxcald.station.collection import Recorded
 
 Run = Callable[..., Any]
 OLD = Stored(factory_calibration())
+NOBODY = {"host": "127.0.0.1", "port": 1}
 CAL = {
     "format": "triaxcal.calibration/1",
     "scale_factor": [-2.41, -2.405, -2.37],
@@ -292,6 +294,31 @@ def test_a_recording_in_segments_goes_on_with_the_next_start_and_is_read_by_its_
     assert len(poses) >= 6
     for segment in info["segments"]:
         assert triaxcal("log", "info", folder / segment["file"], "--json").json["finished"] is True
+
+
+@pytest.mark.slow
+def test_what_a_full_disk_ended_begins_again_while_another_unit_is_waited_for(
+    workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = iter([0, 0])
+    monkeypatch.setattr(disk, "free_bytes", lambda _: next(free, 2**40))
+    monkeypatch.setattr("triaxcald.cli.record.AGAIN_S", 0.05)
+    folder = workshop.folder / "recordings"
+    folder.mkdir()
+    with workshop.serve(workshop.device()) as served:
+        station = workshop.station({"bus": served.bus}, {"bus": NOBODY})
+        done = triaxcal(
+            "record", station, "-o", folder, "--seconds", "3", "--give-up-after", "2", "--segment-time", "1h",
+            "--log-format", "json",
+        )  # fmt: skip
+    assert done.code == 4, "of the unit that is not there"
+    ends = [
+        line for line in map(json.loads, done.err.splitlines()) if line["event"] == "ended" and line["unit"] == "unit0"
+    ]
+    assert [end["level"] for end in ends] == ["error", "info"]
+    assert "cannot be created: 0 bytes are free on the disk" in ends[0]["message"]
+    assert ends[1]["samples"] >= 300
+    assert triaxcal("log", "info", folder / "unit0-4711.segments.json", "--json").json["finished"] is True
 
 
 def test_progress_may_be_json_and_the_numbers_are_served(workshop: Any, triaxcal: Run) -> None:

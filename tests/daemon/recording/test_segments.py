@@ -13,7 +13,7 @@ import pytest
 from triaxcal_drivers.errors import DeviceSilent
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.audit import audit_each
-from triaxcald.errors import RecordingError
+from triaxcald.errors import DiskError, RecordingError
 from triaxcald.recording import disk, schema
 from triaxcald.recording import writer as writer_module
 from triaxcald.recording.manifest import load_manifest
@@ -321,6 +321,44 @@ def test_segments_older_than_they_are_kept_go_and_that_is_said(tmp_path: Path, n
     assert told == gone
 
 
+def test_a_link_to_nowhere_keeps_no_segment_and_a_document_that_cannot_be_read_keeps_all(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "old.outcome.json").symlink_to("nowhere")
+    with new(retention=Retention(keep_s=30.0)) as writer:
+        minutes(writer, 2)
+        assert len(writer.deleted) == 1
+    (tmp_path / "other.outcome.json").mkdir()
+    writer = new(retention=Retention(free_bytes=2**62))
+    minutes(writer, 2, first=20)
+    monkeypatch.setattr(disk, "free_bytes", lambda _: 1000)
+    with pytest.raises(DiskError, match=r"; nothing was deleted, as other\.outcome\.json cannot be read$"):
+        minutes(writer, 1, first=40)
+    with pytest.raises(DiskError):
+        writer.close()
+    last = tmp_path / files(tmp_path)[-1]
+    with Recording.open(last) as recording:
+        assert [e.detail["unread"] for e in recording.events() if e.kind == "disk_low"] == ["other.outcome.json"]
+
+
+def test_no_segment_begins_where_there_is_no_room_for_its_end(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with new() as writer:
+        minutes(writer, 3)
+    before = files(tmp_path)
+    free = disk.END_BYTES - 1
+    monkeypatch.setattr(disk, "free_bytes", lambda _: free)
+    with pytest.raises(DiskError, match=rf"rec\.segments\.json: cannot be created: {free} bytes are free on the disk$"):
+        new()
+    assert files(tmp_path) == before
+    monkeypatch.setattr(disk, "free_bytes", lambda _: 2**30 if len(files(tmp_path)) < 4 else free)
+    with new(retention=Retention(free_bytes=2**23)) as writer:
+        minutes(writer, 1, first=30)
+    assert files(tmp_path)[0] == "rec-000005.mcap", "those before have made room"
+    assert kinds(tmp_path / "rec-000005.mcap").count("deleted") == 1
+
+
 @pytest.mark.parametrize("step_s", [-3600, 3600])
 def test_a_clock_that_is_set_takes_no_fresh_segment_away(
     tmp_path: Path, new: NewWriter, minutes: Callable[..., None], clock: Any, step_s: int
@@ -400,6 +438,32 @@ def test_where_nothing_can_go_the_lack_of_room_is_said_once(
 # Its end
 
 
+def test_a_segment_that_was_taken_away_meanwhile_is_a_fault_of_the_disk(
+    tmp_path: Path, new: NewWriter, batch_of: BatchOf
+) -> None:
+    writer = new()
+    writer.raw("calibration", batch_of(0, 10))
+    writer.drain()
+    (tmp_path / "archive").mkdir()
+    (tmp_path / "rec-000001.mcap").rename(tmp_path / "archive" / "rec-000001.mcap")
+    with pytest.raises(DiskError, match=r"rec-000001\.mcap: cannot be read: No such file") as e:
+        writer.close()
+    assert e.value.exit_code == 5
+
+
+def test_files_of_a_manifest_that_was_lost_are_not_in_the_way(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None]
+) -> None:
+    with new() as writer:
+        minutes(writer, 2)
+    (tmp_path / "rec.segments.json").unlink()
+    (tmp_path / "rec-0000xy.mcap").touch()
+    (tmp_path / "other-000099.mcap").touch()
+    with new() as writer:
+        minutes(writer, 2)
+    assert [s.number for s in load_manifest(tmp_path / "rec.segments.json").segments] == [4, 5, 6]
+
+
 @pytest.mark.parametrize(
     ("error", "said"), [(None, "asked"), (KeyboardInterrupt(), "signal"), (DeviceSilent("a"), "unit gave up")]
 )
@@ -428,6 +492,39 @@ def test_a_recording_in_segments_ends_with_no_document(new: NewWriter) -> None:
 
 
 # Read by commands
+
+
+@pytest.mark.parametrize(
+    ("changed", "profile", "named"),
+    [
+        ({"unit": {"serial": "42", "signs": "1,1,1"}}, b"scale = 1", "unit"),
+        ({"bus": {"channel": "can1"}}, b"scale = 1", "bus"),
+        ({}, b"scale = 2", "profile.toml"),
+        ({"station": {"name": "another"}}, b"scale = 1", None),
+    ],
+)
+def test_segments_that_mean_another_thing_are_not_read_as_one(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], changed: dict[str, Any], profile: bytes,
+    named: str | None,
+) -> None:  # fmt: skip
+    for metadata, text in ((METADATA, b"scale = 1"), (METADATA | changed, profile)):
+        with new(metadata=metadata) as writer:
+            writer.attach("profile.toml", "application/toml", text)
+            writer.attach("station.toml", "application/toml", repr(metadata).encode())
+            minutes(writer, 1)
+    with Series(tmp_path / "rec.segments.json") as series:
+        if named is None:
+            assert sum(len(batch) for batch in series.raw("calibration")) == 20
+            return
+        with pytest.raises(RecordingError, match=rf"segment rec-000003\.mcap: {named}: not as in rec-000001\.mcap; "):
+            list(series.raw("calibration"))
+
+
+def test_a_manifest_is_not_mended(tmp_path: Path, new: NewWriter, minutes: Callable[..., None]) -> None:
+    with new() as writer:
+        minutes(writer, 1)
+    with pytest.raises(RecordingError, match=r"rec\.segments\.json: is a manifest; mend each segment "):
+        recover(tmp_path / "rec.segments.json", tmp_path / "out.mcap")
 
 
 def test_info_tells_the_segments_and_what_is_in_them(

@@ -3,15 +3,36 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from triaxcald.errors import RecordingError
-from triaxcald.exit_codes import INTERRUPTED
+from triaxcald.errors import DiskError, RecordingError
+from triaxcald.exit_codes import DISK, INTERRUPTED
+from triaxcald.recording.schema import Phase
 from triaxcald.run.recording import AtRecording, Kept, State
 from triaxcald.run.roster import Roster
 from triaxcald.station.coming_back import Patience
+from triaxcald.station.guidance import Guide
 from triaxcald.station.raw_records import RawRecords
+from triaxcald.text import DISK_IS_BEHIND, DISK_KEEPS_UP
+
+
+class Shown:
+    """What the operator is shown."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def stage(self, unit: str, text: str) -> None:
+        self.lines.append(text)
+
+    def lost(self, unit: str, trouble: str) -> None:
+        self.lines.append(f"lost: {trouble}")
+
+    def poses(self, unit: str, phase: Phase, guide: Guide) -> None: ...
 
 
 class Played(AtRecording):
@@ -20,7 +41,8 @@ class Played(AtRecording):
     kind = "unit"
 
     def __init__(self, name: str) -> None:
-        super().__init__(name, RawRecords("calibration"))
+        self.shown = Shown()
+        super().__init__(name, RawRecords("calibration"), self.shown)
         self.ends = asyncio.Event()
         self.fault: Exception | None = None
 
@@ -37,6 +59,41 @@ class Played(AtRecording):
         await self.ends.wait()
         if self.fault is not None:
             raise self.fault
+
+
+class Writer:
+    """As much of one as a recording looks at."""
+
+    def __init__(self, path: Path) -> None:
+        self.current, self.is_behind, self.queued = path, False, 0
+        self.losses: dict[str, int] = {}
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def check(self) -> None: ...
+
+    def close(self, because: str | None = None) -> None: ...
+
+
+class Written(Played):
+    """Through a writer."""
+
+    writer: Any
+
+    async def _work(self, seconds: float | None, patience: Patience) -> None:
+        async def record(_: object) -> None:
+            await self.ends.wait()
+
+        await self._recorded_by(lambda: self.writer, record, None)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():
+            await asyncio.sleep(0.001)
 
 
 @pytest.fixture
@@ -69,6 +126,38 @@ async def test_who_leaves_ends_as_asked_and_is_on_the_roster_no_more(roster: Ros
     assert states(roster) == {"b": State.RECORDING, "c": State.RECORDING}
     finished.cancel()
     assert [(kept.unit, kept.exit_code) for kept in await finished] == [("b", INTERRUPTED), ("c", INTERRUPTED)]
+
+
+async def test_what_the_disk_ended_is_told_apart_and_says_why(roster: Roster) -> None:
+    full, other, whole = Played("a"), Played("b"), Played("c")
+    full.fault, other.fault = DiskError("x.mcap: ended, as 7 bytes are free"), RecordingError("no such file")
+    roster.begin([full, other, whole])
+    for one in (full, other):
+        one.ends.set()
+    await turned()
+    assert roster.ended_with(DISK) == {"a"}
+    assert [one.trouble for one in roster.statuses()] == ["x.mcap: ended, as 7 bytes are free", "no such file", None]
+    whole.ends.set()
+    await roster.finish()
+
+
+async def test_one_that_loses_what_comes_is_not_said_to_be_recorded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("triaxcald.run.recording.LOOK_S", 0.001)
+    one = Written("a")
+    one.writer = Writer(tmp_path / "a-000002.mcap")
+    work = asyncio.ensure_future(one.run(None, Patience()))
+    await until(lambda: one.status.state is State.RECORDING)
+    one.writer.is_behind = True
+    assert (one.status.state, one.status.trouble) == (State.WAITING, DISK_IS_BEHIND)
+    await until(lambda: one.shown.lines == [f"lost: {DISK_IS_BEHIND}"])
+    one.writer.is_behind = False
+    await until(lambda: one.shown.lines[1:] == [DISK_KEEPS_UP])
+    assert one.status.state is State.RECORDING
+    one.ends.set()
+    await work
+    assert (one.status.state, one.status.path) == (State.ENDED, tmp_path / "a-000002.mcap")
 
 
 async def test_a_name_that_failed_may_begin_again_and_its_last_recording_counts(roster: Roster) -> None:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import errno
+import http.client
 import json
+import socket
+import struct
+import threading
 import urllib.error
 import urllib.request
 from dataclasses import replace
@@ -99,6 +103,7 @@ def test_a_bus_has_its_numbers_and_none_of_a_unit_s(tmp_path: Path) -> None:
         ([status("a")], 200),
         ([status("a"), status("b", State.WAITING, "nothing answers at node 5")], 503),
         ([status("a", State.ENDED)], 503),
+        ([], 503),
     ],
 )
 def test_health_is_that_of_the_worst_unit(tmp_path: Path, units: list[UnitStatus], code: int) -> None:
@@ -122,6 +127,40 @@ def test_the_page_shows_what_is_the_matter_and_runs_no_script_of_it(tmp_path: Pa
     assert "<script>" not in text
 
 
+def test_who_asks_for_the_head_alone_gets_no_body(tmp_path: Path) -> None:
+    with served(0, lambda: [status("a")], tmp_path) as port:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection.request("HEAD", "/health")
+        answer = connection.getresponse()
+        assert (answer.status, answer.read()) == (200, b"")
+        assert int(answer.headers["Content-Length"]) > 0
+
+
+def test_a_client_that_says_nothing_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("triaxcald.service.metrics.IDLE_S", 0.05)
+    with served(0, list, tmp_path) as port, socket.create_connection(("127.0.0.1", port), timeout=10) as idle:
+        assert idle.recv(1) == b""
+
+
+def test_of_a_client_that_has_gone_nothing_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    asked, gone = threading.Event(), threading.Event()
+
+    def late() -> list[UnitStatus]:
+        asked.set()
+        assert gone.wait(10)
+        return [status("a")]
+
+    with served(0, late, tmp_path) as port:
+        client = socket.create_connection(("127.0.0.1", port), timeout=10)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closed by a reset
+        client.sendall(b"GET /health HTTP/1.0\r\n\r\n")
+        assert asked.wait(10)
+        client.close()
+        gone.set()
+        fetched(port, "/health")
+    assert capfd.readouterr().err == ""
+
+
 def test_a_port_that_is_taken_is_said_in_a_line_and_tried_again_by_a_service(tmp_path: Path) -> None:
     with (
         served(0, list, tmp_path) as port,
@@ -136,6 +175,6 @@ def test_a_port_that_this_user_may_not_have_is_bad_input(tmp_path: Path, monkeyp
     def refused(*_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("triaxcald.service.metrics.ThreadingHTTPServer", refused)
+    monkeypatch.setattr("triaxcald.service.metrics._Server", refused)
     with pytest.raises(InputError, match=r"^--metrics 80: "), served(80, list, tmp_path):
         pass
