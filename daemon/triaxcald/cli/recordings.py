@@ -6,8 +6,9 @@ import argparse
 import dataclasses
 import io
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,6 +18,7 @@ from triaxcald.errors import InputError
 from triaxcald.files import is_stream, new_file
 from triaxcald.inputs import bundle_of, losses_of, samples_of
 from triaxcald.pipeline import DecodedStream
+from triaxcald.recording.contents import Contents
 from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
 from triaxcald.recording.recover import recover
@@ -93,13 +95,43 @@ def _opened(path: Path) -> AbstractContextManager[BinaryIO]:
     return open(path, "wb") if is_stream(path) else new_file(path)
 
 
+def _rows(recording: Contents, stream: DecodedStream, phase: str) -> Iterator[Rows]:
+    """The stream's samples in the phase. Raises InputError, before anything is
+    written, where there are none."""
+    blocks = (Rows.of(stream.rising(batch)) for batch in recording.raw(phase))
+    first = next((block for block in blocks if len(block)), None)
+    if first is not None:
+        return chain([first], blocks)
+    phases = recording.phases()
+    if phase not in phases:
+        raise InputError(f"--phase {phase}: {recording.name} has {', '.join(phases) or 'no raw records of any phase'}")
+    counted = _counted(stream)
+    why = f" ({', '.join(counted)})" if counted else ""
+    raise InputError(
+        f"--stream {stream.stream}: {recording.name} has no sample of it in its phase {phase}{why}; samples:"
+        f" {_there(samples_of(recording, phases))}"
+    )
+
+
+def _there(samples: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    """Which streams have samples in which phases, of what `samples_of` gives."""
+    shown = [f"{phase} {name}" for phase, of in samples.items() for name, found in of.items() if found["samples"]]
+    return ", ".join(shown) or "none of any stream"
+
+
+def _counted(stream: DecodedStream) -> list[str]:
+    """Whatever was no sample, by kind."""
+    names = {kind: kind for kind in stream.counts} | {"receiver_overflows": "interruptions"}
+    return [f"{n} {names[kind]}" for kind, n in stream.counts.items() if n and kind != "samples"]
+
+
 def export_command(a: argparse.Namespace) -> int:
     with open_recording(a.recording) as recording:
         bundle = bundle_of(recording)
         if a.stream not in bundle.profile.streams:
             raise InputError(f"--stream {a.stream}: the recording has {', '.join(bundle.profile.streams)}")
         stream = DecodedStream(bundle, a.stream)
-        blocks = (Rows.of(stream.rising(batch)) for batch in recording.raw(a.phase))
+        blocks = _rows(recording, stream, a.phase)
         if a.output is None:
             rows = write_csv(sys.stdout, blocks)
         else:
@@ -108,8 +140,6 @@ def export_command(a: argparse.Namespace) -> int:
                     rows = write_csv(out, blocks)
             except OSError as e:
                 raise InputError(f"{a.output}: cannot be written: {e.strerror}") from e
-        names = {kind: kind for kind in stream.counts} | {"receiver_overflows": "interruptions"}
-        lost = [f"{n} {names[kind]}" for kind, n in stream.counts.items() if n and kind != "samples"]
-        lost += losses_of(recording)
+        lost = _counted(stream) + losses_of(recording)
     say(f"{rows} samples; {', '.join(lost) or 'none lost'}")
     return 0

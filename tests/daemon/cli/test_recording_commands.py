@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,39 @@ def test_export_knows_its_streams(finished_run: Any, triaxcal: Run) -> None:
     triaxcal("log", "export", finished_run.can, "--stream", "reading").failed(
         2, "--stream reading: the recording has readings, corrected"
     )
+
+
+@pytest.fixture
+def readings_alone(tmp_path: Path, triaxcal: Run) -> Path:
+    """Twenty samples of the readings, and no check poses."""
+    log, rec = tmp_path / "a.log", tmp_path / "rec.mcap"
+    frames = (
+        f"({1_700_000_000 + i / 100:.6f}) can0 {identifier:03X}#{(head + struct.pack('<H', i) + tail).hex()}\n"
+        for i in range(20)
+        for identifier, head, tail in ((0x185, bytes(6), b""), (0x285, bytes(5), bytes(1)))
+    )
+    log.write_text("".join(frames))
+    assert triaxcal("log", "import", log, "--profile", "triax-ref-can", "-o", rec).code == 0
+    return rec
+
+
+def test_export_of_a_phase_that_is_not_there_names_those_that_are(
+    readings_alone: Path, tmp_path: Path, triaxcal: Run
+) -> None:
+    out = tmp_path / "a.csv"
+    done = triaxcal("log", "export", readings_alone, "--phase", "verification", "-o", out)
+    done.failed(2, f"--phase verification: {readings_alone} has calibration")
+    assert not out.exists()
+    assert triaxcal("log", "export", readings_alone, "-o", out).code == 0
+
+
+def test_export_of_a_stream_that_never_came_names_those_that_did(
+    readings_alone: Path, tmp_path: Path, triaxcal: Run
+) -> None:
+    out = tmp_path / "a.csv"
+    done = triaxcal("log", "export", readings_alone, "--stream", "corrected", "-o", out)
+    done.failed(2, "--stream corrected: ", "no sample of it in its phase calibration; samples: calibration readings")
+    assert not out.exists()
 
 
 @pytest.mark.slow
