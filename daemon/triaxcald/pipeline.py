@@ -22,7 +22,7 @@ from triaxcal_drivers.profile import READINGS, SCALE_FACTOR_RATIO, Bundle
 
 COUNTS = ("samples", "missing", "duplicates", "incomplete", "errors", "out_of_order", "receiver_overflows")
 _PASSED_ON = ("missing", "duplicates", "incomplete", "errors")
-_SELDOM = ("invalid", "not_finite")
+_SELDOM = ("malformed", "invalid", "not_finite")
 """Counted where there are any: older certificates have no such keys, and are
 compared byte for byte."""
 
@@ -184,6 +184,10 @@ class Pipeline(DecodedStream):
             found["missing_samples"] = f"the stream was interrupted {'once' if times == 1 else f'{times} times'}"
         if self.counts["duplicates"]:
             found["duplicate_samples"] = str(self.counts["duplicates"])
+        if self.counts["malformed"]:
+            found["malformed_records"] = (
+                f"{self.counts['malformed']} too short for the profile's message, or not as it is defined, left out"
+            )
         if self.counts["invalid"]:
             found["invalid_samples"] = f"{self.counts['invalid']} that the unit says are not valid, left out"
         if self.counts["not_finite"]:

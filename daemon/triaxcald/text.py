@@ -78,6 +78,7 @@ def one_of_several(units: Sequence[str], buses: Sequence[str], output: Path) -> 
 
 _NOT_A_SAMPLE = {
     "errors": "replies or frames in error",
+    "malformed": "too short for the profile's message, or not as it is defined",
     "incomplete": "that lack a message or part",
     "duplicates": "that repeat an earlier one",
     "invalid": "that the unit says are not valid",

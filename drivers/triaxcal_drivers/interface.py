@@ -154,10 +154,12 @@ class SampleBlock:
     profile's output unit (for a corrected stream: g). ``channels`` the
     auxiliary ones, each (n,). The counts are of this block: samples missing by
     the counter, repeated samples dropped, samples that could not be put
-    together from their parts, records with an error flag, samples that the
-    device itself says are not valid, and those whose readings are no finite
-    numbers, both of which are dropped; restarts of the device that its counter
-    or stamps show, and nothing else had told.
+    together from their parts, records with an error flag, records of the stream
+    that came whole and are too short for their message or otherwise not
+    as it is defined, samples that the device itself says are not valid, and
+    those whose readings are no finite numbers, all three of which are dropped;
+    restarts of the device that its counter or stamps show, and nothing else had
+    told.
     """
 
     time_ns: NDArray[np.int64]
@@ -168,6 +170,7 @@ class SampleBlock:
     duplicates: int = 0
     incomplete: int = 0
     errors: int = 0
+    malformed: int = 0
     invalid: int = 0
     not_finite: int = 0
     restarts: int = 0

@@ -26,7 +26,7 @@ from triaxcald.recording.writer import RecordingWriter
 BATCH = 4096  # records; a quarter of an hour of a slow unit, 4 s of a fast one
 BATCH_BYTES = 2**20  # of their data; a chunk of a recording may have 16 MiB
 DRAINED_EACH = 32  # batches; the writer's queue has room for 256, and drops what comes beyond
-COUNTED = ("missing", "duplicates", "incomplete", "errors", "invalid", "not_finite")
+COUNTED = ("missing", "duplicates", "incomplete", "errors", "malformed", "invalid", "not_finite")
 
 Record = tuple[int, int, int, bytes]
 """Time, source, flags and bytes of a raw record."""

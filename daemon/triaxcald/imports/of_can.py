@@ -14,6 +14,7 @@ from triaxcal_drivers.logs.kinds import Kind, Log
 from triaxcal_drivers.logs.times import LONGEST_NS
 from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import InputError
+from triaxcald.imports import text
 from triaxcald.imports.importing import Imported, Importing, Record, write_recording
 from triaxcald.imports.selection import Selection
 from triaxcald.imports.times import Ticks, Times
@@ -94,7 +95,7 @@ class _Work:
         try:
             chosen.settle(log.name)
             if not counts["samples"]:
-                why = ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "no sample is whole"
+                why = ", ".join(text.no_samples(counts)) or "no sample is whole"
                 raise InputError(f"{log.name}: no sample in its {chosen.taken} frames of the profile: {why}")
         except InputError as e:
             others = "".join(f"; {count} of kind '{kind}'" for kind, count in account.others.items())

@@ -138,8 +138,8 @@ class _Work:
         counts = importing.counts
         if not counts["samples"]:
             raise InputError(
-                f"{self._log.name}: no sample in its {self._taken} messages of the profile: {counts['errors']} are not"
-                " as they are defined"
+                f"{self._log.name}: no sample in its {self._taken} messages of the profile: {counts['malformed']} are"
+                " not as they are defined"
             )
         return {
             "kind": MCAP_KIND,

@@ -22,6 +22,7 @@ _COUNTS = {
     "duplicates": "repeated",
     "incomplete": "that lack messages",
     "errors": "in error",
+    "malformed": "too short for the profile's message, or not as it is defined",
 }
 
 
@@ -29,8 +30,12 @@ def summary(output: object, detail: Mapping[str, Any], seconds: float) -> str:
     """One line."""
     counts = detail["samples"]
     parts = [f"{output}: {counts['samples']} samples in {seconds:.2f} s from {detail['file']} ({detail['kind']})"]
-    parts += [f"{counts[name]} {what}" for name, what in _COUNTS.items() if counts[name]]
-    return ", ".join(parts)
+    return ", ".join([*parts, *no_samples(counts)])
+
+
+def no_samples(counts: Mapping[str, int]) -> list[str]:
+    """What of the readings gave none, by kind."""
+    return [f"{counts[name]} {what}" for name, what in _COUNTS.items() if counts[name]]
 
 
 def left_out(detail: Mapping[str, Any]) -> str:

@@ -36,6 +36,7 @@ QUALITY = {
     "duplicate_samples": "Samples that came twice",
     "out_of_order_samples": "Samples out of order",
     "bus_errors": "Errors on the bus",
+    "malformed_records": "Records not as the profile defines them",
     "mains_pickup": "Mains hum",
     "coarse_quantization": "Steps of the output too coarse",
     "creeping_pose": "Outputs creep while the pose is held",

@@ -35,6 +35,7 @@ _COUNTED = {
     "duplicates": "Samples that came twice",
     "incomplete": "Samples of which a part was missing",
     "errors": "Error frames and failed requests",
+    "malformed": "Records too short for their message, or not as it is defined",
 }
 _OF_A_BUS = ("errors",)
 """What of them is counted where all frames of a bus are recorded."""

@@ -112,9 +112,10 @@ class CanDecoder:
         self._together = TogetherInTime(len(layout.messages), self._period_ns)
 
     def feed(self, batch: RawBatch) -> SampleBlock:
-        parts, errors = self._extract(batch)
+        parts, errors, malformed = self._extract(batch)
         if not len(parts):
-            return replace(self._block(parts.time_ns, parts.counter, parts.values), errors=errors)
+            block = self._block(parts.time_ns, parts.counter, parts.values)
+            return replace(block, errors=errors, malformed=malformed)
         if not self._started:
             self._start(parts)
         if self._layout.counters:
@@ -123,7 +124,7 @@ class CanDecoder:
             block = self._by_time(parts)
         else:
             block = self._as_they_come(parts)
-        return replace(block, errors=errors)
+        return replace(block, errors=errors, malformed=malformed)
 
     def _start(self, parts: _Parts) -> None:
         self._started = True
@@ -131,7 +132,9 @@ class CanDecoder:
         self._origin_ns = self._last_ns = first_ns
         self._origin = self._last_raw = self._last = self._top = self._settled = first
 
-    def _extract(self, batch: RawBatch) -> tuple[_Parts, int]:
+    def _extract(self, batch: RawBatch) -> tuple[_Parts, int, int]:
+        """Also how many records are in error, and how many of the stream's are
+        too short for their message: the bus carried these well."""
         bad = (batch.flags & (RawFlag.ERROR | RawFlag.INVALID)) != 0
         remote = (batch.flags & (RawFlag.REMOTE | RawFlag.FD)) == RawFlag.REMOTE
         message = self._messages(batch, ~bad & ~remote)
@@ -156,7 +159,7 @@ class CanDecoder:
             if self._layout.counters:
                 counter[mine] = self._layout.counters[number].raw(data).astype(np.int64) % self._range
         after_gap = self._after_gap(batch, rows)
-        return _Parts(batch.time_ns[rows], message, counter, values, after_gap), int(bad.sum() + short.sum())
+        return _Parts(batch.time_ns[rows], message, counter, values, after_gap), int(bad.sum()), int(short.sum())
 
     def _after_gap(self, batch: RawBatch, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Of the records ``rows``, also where the mark is on another's."""

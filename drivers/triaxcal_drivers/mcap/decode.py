@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ class MessageDecoder:
 
     Records of the other streams are passed over: ``source`` is the number of
     the stream in the profile. A message that is not as it is defined counts as
-    an error.
+    malformed.
     """
 
     def __init__(self, stream: MessageStream, read: Read, source: int) -> None:
@@ -34,7 +35,7 @@ class MessageDecoder:
     def feed(self, batch: RawBatch) -> SampleBlock:
         times: list[int] = []
         rows: list[list[float]] = []
-        errors = at = 0
+        errors = malformed = at = 0
         bad = int(RawFlag.ERROR | RawFlag.INVALID)
         columns: Any = zip(
             batch.time_ns.tolist(), batch.source.tolist(), batch.flags.tolist(), batch.length.tolist(), strict=True
@@ -48,10 +49,10 @@ class MessageDecoder:
                     found, stamp_ns = self._read(data)
                     times.append(self._time_ns(time_ns, stamp_ns))
                 except ValueError:
-                    errors += 1
+                    malformed += 1
                     continue
                 rows.append(found)
-        return self._block(times, rows, errors)
+        return replace(self._block(times, rows), errors=errors, malformed=malformed)
 
     def _time_ns(self, logged_ns: int, stamp_ns: int | None) -> int:
         """Raises ValueError where the stamps are too far apart."""
@@ -64,10 +65,10 @@ class MessageDecoder:
             raise ValueError("a time beyond all measure")
         return time_ns
 
-    def _block(self, times: list[int], rows: list[list[float]], errors: int) -> SampleBlock:
+    def _block(self, times: list[int], rows: list[list[float]]) -> SampleBlock:
         values = np.array(rows, dtype=np.float64).reshape(len(rows), len(self._names)) * self._scale + self._offset
         counter = self._count + np.arange(len(rows))
         self._count += len(rows)
         columns = [self._names.index(name) for name in READING_CHANNELS]
         auxiliary = {n: values[:, i] for i, n in enumerate(self._names) if n not in READING_CHANNELS}
-        return SampleBlock(np.array(times, dtype=np.int64), counter, values[:, columns], auxiliary, errors=errors)
+        return SampleBlock(np.array(times, dtype=np.int64), counter, values[:, columns], auxiliary)

@@ -176,6 +176,27 @@ def test_a_log_without_the_units_frames_says_what_is_there(tmp_path: Path, impor
     assert not (tmp_path / "rec.mcap").exists()
 
 
+def test_frames_that_are_too_short_are_said_to_be_that_and_no_errors(
+    tmp_path: Path, triaxcal: Run, imported: Run
+) -> None:
+    frames = [
+        _message(T0_NS + number * 10_000_000, identifier, (head + struct.pack("<H", number) + tail)[:length])
+        for number in range(100)
+        for identifier, head, tail, length in (
+            (0x185, bytes(6), b"", 7 if number % 20 == 3 else 8), (0x285, bytes(5), bytes(1), 8)
+        )
+    ]  # fmt: skip
+    done = imported(written(tmp_path / "a.log", frames))
+    assert "5 too short for the profile's message, or not as it is defined" in done.out
+    assert "in error" not in done.out
+    quality = triaxcal("poses", tmp_path / "rec.mcap", "--json").json["data_quality"]
+    assert "malformed_records: 5 too short for the profile's message, or not as it is defined, left out" in quality
+    assert not any(line.startswith("bus_errors") for line in quality)
+    (tmp_path / "rec.mcap").unlink()
+    short = written(tmp_path / "b.log", [_message(T0_NS + i * 10_000_000, 0x185, bytes(7)) for i in range(20)])
+    imported(short, code=2).failed(2, "no sample in its 20 frames of the profile: 20 too short for the profile's")
+
+
 def test_times_that_go_back_or_jump_are_kept_and_said(
     messages: list[can.Message], tmp_path: Path, triaxcal: Run, imported: Run
 ) -> None:

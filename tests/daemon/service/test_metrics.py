@@ -20,7 +20,7 @@ from triaxcald.errors import InputError, StationError
 from triaxcald.run.recording import State, UnitStatus
 from triaxcald.service.metrics import served
 
-COUNTS = {"samples": 1000, "missing": 7, "errors": 2}
+COUNTS = {"samples": 1000, "missing": 7, "errors": 2, "malformed": 4}
 
 
 def status(
@@ -68,6 +68,7 @@ def test_each_unit_has_its_numbers(tmp_path: Path) -> None:
         "triaxcal_duplicates_total": 0.0,
         "triaxcal_incomplete_total": 0.0,
         "triaxcal_errors_total": 2.0,
+        "triaxcal_malformed_total": 4.0,
     }
     assert found["triaxcal_unit_recording", (("unit", 'b"\\'),)] == 0.0
     assert found["triaxcal_channel", (("channel", "temp_c"), ("unit", "a"))] == 24.5

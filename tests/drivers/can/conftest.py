@@ -79,6 +79,9 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[Played]:
     return made
 
 
+COUNTS = ("missing", "duplicates", "incomplete", "errors", "malformed", "invalid")
+
+
 def joined(blocks: Sequence[SampleBlock]) -> dict[str, Any]:
     """Everything that several blocks say, as one; for comparison."""
     channels: Mapping[str, Any] = {
@@ -89,7 +92,7 @@ def joined(blocks: Sequence[SampleBlock]) -> dict[str, Any]:
         "counter": np.concatenate([b.counter for b in blocks]).tolist(),
         "readings": np.concatenate([b.readings for b in blocks]).tolist(),
         **channels,
-        **{n: sum(getattr(b, n) for b in blocks) for n in ("missing", "duplicates", "incomplete", "errors", "invalid")},
+        **{n: sum(getattr(b, n) for b in blocks) for n in COUNTS},
     }
 
 

@@ -41,12 +41,12 @@ def test_a_message_with_such_a_number_is_none(bad: bytes) -> None:
     with pytest.raises(ValueError):
         read()(bad)
     block = MessageDecoder(STREAM, read(), 0).feed(RawBatch.of([(10, 0, 0, GOOD), (20, 0, 0, bad), (30, 0, 0, GOOD)]))
-    assert (len(block), block.errors) == (2, 1)
+    assert (len(block), block.malformed) == (2, 1)
     assert np.array_equal(block.readings, [[1, 2.5, 3]] * 2)
 
 
-def test_stamps_that_are_further_apart_than_a_time_can_be_count_as_errors() -> None:
+def test_stamps_that_are_further_apart_than_a_time_can_be_count_as_malformed() -> None:
     stamps = (-(2**62) + 1, -(2**62) + 2, 2**62 - 1)
     messages = [json.dumps({"stamp": s, "a": [1, 2, 3]}).encode() for s in stamps]
     block = MessageDecoder(STREAM, read(), 0).feed(RawBatch.of([(10, 0, 0, message) for message in messages]))
-    assert (block.time_ns.tolist(), block.errors) == ([10, 11], 1)
+    assert (block.time_ns.tolist(), block.malformed) == ([10, 11], 1)
