@@ -163,12 +163,9 @@ def find_poses(
     """
     samples = _samples(t, u, channels, time_unit, columns)
     detector, judge = StillnessDetector(), QualityDetector()
-    try:
-        detector.feed(samples.time_ns, samples.readings, samples.channels)
-        detector.finish()
-        windows, spans = detector.windows(), detector.spans()
-    except InvalidData as e:
-        raise InvalidData(f"{len(samples)} samples: {e}") from e
+    detector.feed(samples.time_ns, samples.readings, samples.channels)
+    detector.finish()
+    windows, spans = detector.windows(), detector.spans()
     judge.feed(samples.time_ns, samples.readings)
     judge.finish()
     posterior = judge.findings(windows, spans)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from triaxcal.number_format import counted, plain
+
 
 class TriaxcalError(Exception):
     """Root of everything this package raises on purpose."""
@@ -12,6 +14,22 @@ class TriaxcalError(Exception):
 class InvalidData(TriaxcalError):
     """Numbers that cannot be what they are said to be: shapes, NaN, times that
     run backwards."""
+
+
+class TooShort(InvalidData):
+    """No still pose can be found in so few samples, whatever the unit did.
+
+    ``samples`` in ``span_s`` are those of the whole stream; with ``in_pieces``
+    they would do, and are those of the longest stretch without a gap.
+    ``least`` and ``least_s`` are what the shortest pose takes at their rate;
+    the times are zero where a single sample tells no rate.
+    """
+
+    def __init__(self, samples: int, span_s: float, least: int, least_s: float, *, in_pieces: bool) -> None:
+        takes = counted(least, "sample") + (f" ({plain(least_s)} s at this rate)" if least_s else "")
+        where = "the longest stretch without a gap" if in_pieces else "it"
+        has = f"{samples} in {plain(span_s)} s" if span_s else f"{samples}"
+        super().__init__(f"too short: a still pose takes at least {takes}, and {where} has {has}")
 
 
 class Refused(TriaxcalError):

@@ -7,6 +7,11 @@ P_LEAST = 1e-12
 """Below this a probability says how well the noise is known, and no more."""
 
 
+def counted(count: int, what: str) -> str:
+    """With the noun that is counted, whose plural ends in s."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 def plain(value: float, digits: int = 3, sign: str = "") -> str:
     """To so many significant digits, and with all those before the point;
     ``sign`` "+" also for what is positive."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from triaxcal.documents import Calibration
 from triaxcal.effects import TEMPERATURE
-from triaxcal.errors import InvalidData
+from triaxcal.errors import InvalidData, TooShort
 from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.model.moment import Moment
@@ -49,6 +49,7 @@ VERIFICATION: Phase = "verification"
 @dataclass(frozen=True)
 class Measured:
     """The still poses of a recording. ``windows`` are for pictures.
+    ``too_short`` says why no pose could be among the samples, if so.
 
     ``profile``, ``signs`` of the scale factors and ``reference`` are what the
     recording was made with, where it says; ``unit`` is its name and serial;
@@ -69,6 +70,7 @@ class Measured:
     holds_at: Moment | float | None = None
     output_unit: str = ""
     remarks: tuple[str, ...] = ()
+    too_short: TooShort | None = None
     parted: Callable[[float | None], Measured] | None = None
 
 
@@ -109,7 +111,9 @@ def measure(
     except InvalidData as e:
         raise InputError(f"{name}: {e}") from e
     counted = {"duplicate_samples": str(samples.duplicates)} if samples.duplicates else {}
-    read = Measured(name, [], windows, [], output_unit=table.output_unit, remarks=table.remarks)
+    read = Measured(
+        name, [], windows, [], output_unit=table.output_unit, remarks=table.remarks, too_short=detector.too_short()
+    )
 
     def parted(turn_s: float | None) -> Measured:
         spans = detector.spans(turn_s)
@@ -170,7 +174,10 @@ def _measure_recording(
         reference, stated, at = station.reference, station.stated(bundle.profile), station.moment
     meant = recording.metadata.get("unit", {})
     unit = {"name": meant.get("name", ""), "serial": meant["serial"]} if meant.get("serial") else None
-    read = Measured(recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at)
+    read = Measured(
+        recording.name, [], pipeline.windows, [], bundle.profile, signs, reference, unit, stated, at,
+        too_short=pipeline.too_short(),
+    )  # fmt: skip
 
     def parted(turn_s: float | None) -> Measured:
         poses = pipeline.parted(turn_s)

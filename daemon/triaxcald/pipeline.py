@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triaxcal import text
-from triaxcal.errors import InvalidData
+from triaxcal.errors import InvalidData, TooShort
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
 from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
@@ -138,6 +138,10 @@ class Pipeline(DecodedStream):
             return self._detector.windows()
         except InvalidData:
             return None
+
+    def too_short(self) -> TooShort | None:
+        """Why no pose could be found so far, whatever the unit did."""
+        return self._detector.too_short()
 
     def poses(self) -> list[Pose]:
         """The still poses so far."""

@@ -140,7 +140,12 @@ def test_what_a_stream_is_to_be_blamed_for_is_said(recorded: Recorded) -> None:
 @pytest.mark.parametrize(
     ("t", "u", "more", "said"),
     [
-        (np.arange(9.0), np.zeros((9, 3)), {}, "9 samples: too few samples for one window .at least 64"),
+        (
+            np.arange(9.0),
+            np.zeros((9, 3)),
+            {},
+            "too short: a still pose takes at least 15 samples .14 s at this rate., and it has 9 in 8 s",
+        ),
         (["early", "late"], np.zeros((2, 3)), {}, "t: expected seconds or datetimes, not str"),
         (np.arange(9), np.zeros((9, 3)), {}, "t are integers: say their unit by time_unit, one of s, ms, us, ns"),
         (np.arange(9.0), np.zeros((3, 9)), {}, r"u: expected shape \(n, 3\) or \(3,\), not \(3, 9\); transpose it"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import singledispatch
 
+from triaxcal.number_format import counted
 from triaxcal.poses.quality import finding as of
 
 POSES_NAMED = 8
@@ -25,7 +26,7 @@ def quality(finding: of.Finding, unit: str = "") -> str:
 @quality.register
 def _(found: of.Saturation, unit: str = "") -> str:
     return "; ".join(
-        f"{r.axis} at {r.rail:.7g} in {_counted(r.samples)}, first at {r.first_s:.1f} s{_in_poses(r.touched)}"
+        f"{r.axis} at {r.rail:.7g} in {counted(r.samples, 'sample')}, first at {r.first_s:.1f} s{_in_poses(r.touched)}"
         for r in found.rails
     )
 
@@ -102,7 +103,3 @@ def _in_poses(touched: of.Touched) -> str:
     more = len(touched.starts_s) - POSES_NAMED
     which = "pose that begins" if len(touched.poses) == 1 else "poses that begin"
     return f", in the {which} at {times} s{f' and {more} more' if more > 0 else ''}: take again"
-
-
-def _counted(samples: int) -> str:
-    return f"{samples} sample" if samples == 1 else f"{samples} samples"

@@ -56,7 +56,8 @@ def read_recording(
     for remark in found.remarks:
         say(f"{found.name}: {remark}")
     if not found.poses and moments is None:
-        say(f"{found.name}: the unit never rests; `triaxcal fit --turning` is for a unit that turns all the time")
+        turns = "the unit never rests; `triaxcal fit --turning` is for a unit that turns all the time"
+        say(f"{found.name}: {found.too_short or turns}")
     return found
 
 

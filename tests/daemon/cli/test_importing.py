@@ -197,6 +197,23 @@ def test_frames_that_are_too_short_are_said_to_be_that_and_no_errors(
     imported(short, code=2).failed(2, "no sample in its 20 frames of the profile: 20 too short for the profile's")
 
 
+def test_a_log_of_five_samples_is_too_short_and_not_of_a_unit_that_never_rests(
+    tmp_path: Path, triaxcal: Run, imported: Run
+) -> None:
+    frames = [
+        _message(T0_NS + number * 10_000_000, identifier, head + struct.pack("<H", number) + tail)
+        for number in range(5)
+        for identifier, head, tail in ((0x185, bytes(6), b""), (0x285, bytes(5), bytes(1)))
+    ]
+    imported(written(tmp_path / "a.log", frames))
+    rec = tmp_path / "rec.mcap"
+    for command in ("fit", "poses"):
+        done = triaxcal(command, rec)
+        takes = "a still pose takes at least 70 samples (0.69 s at this rate)"
+        assert f"{rec}: too short: {takes}, and it has 5 in 0.04 s\n" in done.err
+        assert "never rests" not in done.err
+
+
 def test_times_that_go_back_or_jump_are_kept_and_said(
     messages: list[can.Message], tmp_path: Path, triaxcal: Run, imported: Run
 ) -> None:

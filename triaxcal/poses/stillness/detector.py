@@ -20,12 +20,13 @@ import numpy as np
 
 from triaxcal.arrays import Bools, Floats, Ints
 from triaxcal.distributions import chi2_cdf, chi2_isf, chi2_ppf
+from triaxcal.errors import TooShort
 from triaxcal.poses.stillness.allan_deviations import SCALES, NoiseScales, contrast, contrasts, unbroken
 from triaxcal.poses.stillness.quantization import Rounding, resolution
 from triaxcal.poses.stillness.shaken import ALONE_S, MOVE_SIGMA, runs, shaken_noise, shaken_runs
-from triaxcal.poses.stillness.trimming import SPAN_LEAST_WINDOWS, trimmed
+from triaxcal.poses.stillness.trimming import GUARD, SPAN_LEAST_WINDOWS, trimmed
 from triaxcal.poses.stillness.turns import without_turns
-from triaxcal.poses.stillness.windows import WindowCutter, Windows
+from triaxcal.poses.stillness.windows import RATE_LEAST, WindowCutter, Windows, window_size
 
 __all__ = ["Span", "StillnessDetector", "Windows", "find_spans"]
 
@@ -78,9 +79,46 @@ class Span:
 class StillnessDetector(WindowCutter):
     """Feed it blocks of any size; ask for `windows` and `spans` at any time."""
 
+    def windows(self) -> Windows:
+        """Raises TooShort where there is not one whole window yet."""
+        if not self._done:
+            period_ns = self._period_ns or (self.span_ns / (self.samples - 1) if self.samples > 1 else math.inf)
+            raise _too_short(self.samples, self.span_ns, period_ns, in_pieces=False)
+        return super().windows()
+
+    def too_short(self) -> TooShort | None:
+        """Why no pose could be found, whatever the unit did; None where one
+        could."""
+        try:
+            w = self.windows()
+        except TooShort as e:
+            return e
+        begins = np.flatnonzero(~w.joined)
+        longest = w.size * int(np.diff(begins, append=len(w)).max())
+        least = least_samples(self._period_ns)
+        if longest >= least:
+            return None
+        if self.samples < least:
+            return _too_short(self.samples, self.span_ns, self._period_ns, in_pieces=False)
+        return _too_short(longest, (longest - 1) * self._period_ns, self._period_ns, in_pieces=True)
+
     def spans(self, turn_s: float | None = None) -> list[Span]:
         """The still spans so far, in order; ``turn_s`` as for `find_spans`."""
         return find_spans(self.windows(), turn_s)
+
+
+def least_samples(period_ns: float) -> int:
+    """Of a stream in which a pose can be found, at a sample period that may be
+    infinite: its windows and their guards."""
+    size = window_size(period_ns)
+    windows = max(SPAN_LEAST_WINDOWS, math.ceil((SPAN_LEAST_S * 1e9 / period_ns + 1) / size))
+    return max(RATE_LEAST, (windows + 2 * GUARD) * size)
+
+
+def _too_short(samples: int, span_ns: float, period_ns: float, *, in_pieces: bool) -> TooShort:
+    least = least_samples(period_ns)
+    least_s = (least - 1) * period_ns * 1e-9 if math.isfinite(period_ns) else 0.0
+    return TooShort(samples, span_ns * 1e-9, least, least_s, in_pieces=in_pieces)
 
 
 def find_spans(w: Windows, turn_s: float | None = None) -> list[Span]:

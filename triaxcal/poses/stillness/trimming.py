@@ -10,6 +10,9 @@ from triaxcal.poses.stillness.windows import Windows
 
 SPAN_LEAST_WINDOWS = 3
 """Windows in a span: fewer have no middle that ends could differ from."""
+GUARD = 1
+"""Windows at either end of a run that are never used: a move may begin or end
+inside one."""
 EDGE_SIGMA = 3.5
 """At the ends of a run, where a false alarm costs a few windows and nothing
 else."""
@@ -26,7 +29,7 @@ def trimmed(w: Windows, run: Ints, noise: NoiseScales) -> Ints:
     """Without one guard window at either end, nor those where a move sets out
     or settles."""
     late, early = _onset(w, run, noise), _onset(w, run[::-1], noise)
-    run = run[max(early, 1) : len(run) - max(late, 1)]
+    run = run[max(early, GUARD) : len(run) - max(late, GUARD)]
     for direction in (1, -1):
         least = max(len(run) // 2, 2 * SPAN_LEAST_WINDOWS)
         while len(run) > least:

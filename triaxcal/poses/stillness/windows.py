@@ -81,8 +81,12 @@ class Windows:
 
 @dataclass
 class WindowCutter:
-    """Cuts blocks of any size into windows."""
+    """Cuts blocks of any size into windows. ``samples`` have come in
+    ``span_ns``, from the first to the last."""
 
+    samples: int = field(default=0, init=False)
+    span_ns: int = field(default=0, init=False)
+    _begin_ns: int = 0
     _pending: list[tuple[Ints, Floats, dict[str, Floats]]] = field(default_factory=list)
     _held: int = 0
     _size: int = 0
@@ -106,6 +110,10 @@ class WindowCutter:
         if not sound.all():
             at = int(np.flatnonzero(~sound.all(axis=1))[0])
             raise InvalidData(f"the reading at {int(time_ns[at])} ns is not a finite number")
+        if not self.samples:
+            self._begin_ns = int(time_ns[0])
+        self.samples += len(time_ns)
+        self.span_ns = int(time_ns[-1]) - self._begin_ns
         held = {name: np.asarray(v, dtype=float) for name, v in (channels or {}).items()}
         self._pending.append((np.asarray(time_ns, dtype=np.int64), np.asarray(readings, dtype=float), held))
         self._held += len(time_ns)

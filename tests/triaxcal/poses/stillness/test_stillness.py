@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.noise import first_order
-from triaxcal.errors import InvalidData
+from triaxcal.errors import InvalidData, TooShort
 from triaxcal.model.samples import Samples
 from triaxcal.model.sensor import Sensor
 from triaxcal.poses.pose import Pose
@@ -323,7 +323,7 @@ def test_an_output_that_freezes_again_and_again_is_no_pose_and_splits_none(
 
 @pytest.mark.parametrize("count", [0, 1, 5, 11])
 def test_too_few_samples_for_a_window_are_an_error(count: int, detect: Detect) -> None:
-    with pytest.raises(InvalidData, match="too few samples"):
+    with pytest.raises(TooShort, match=f"too short: a still pose takes at least .*, and it has {count}( |$)"):
         detect(np.arange(count) / 100, np.zeros((count, 3)))
 
 
@@ -332,6 +332,36 @@ def test_few_samples_are_too_short_for_a_pose(count: int, detect: Detect) -> Non
     windows, spans, poses = detect(np.arange(count) / 100, np.random.default_rng(0).standard_normal((count, 3)))
     assert len(windows) == count // 10
     assert (spans, poses) == ([], [])
+
+
+def noise_of(t_s: np.ndarray, seed: int = 0) -> StillnessDetector:
+    detector = StillnessDetector()
+    detector.feed(np.rint(t_s * 1e9).astype(np.int64), np.random.default_rng(seed).standard_normal((len(t_s), 3)))
+    detector.finish()
+    return detector
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "least"), [(1, 15), (10, 15), (25, 18), (30, 21), (50, 35), (100, 70), (333, 231), (1000, 700)]
+)
+def test_the_least_samples_are_those_of_the_shortest_pose_that_is_found(rate_hz: int, least: int) -> None:
+    enough = [noise_of(np.arange(least) / rate_hz, seed) for seed in range(5)]
+    assert [d.too_short() for d in enough] == [None] * 5
+    assert any(d.spans() for d in enough)  # of 15 samples one in ten scatters too unevenly
+    for short in (noise_of(np.arange(least - 1) / rate_hz, seed) for seed in range(5)):
+        assert f"at least {least} samples" in str(short.too_short())
+        assert f"and it has {least - 1} in " in str(short.too_short())
+        assert short.spans() == []
+
+
+def test_a_stream_of_short_pieces_is_too_short_by_the_longest() -> None:
+    starts_s = 3.0 * np.arange(20)
+    pieces = noise_of((starts_s[:, None] + np.arange(50) / 100).ravel())
+    assert str(pieces.too_short()) == (
+        "too short: a still pose takes at least 70 samples (0.69 s at this rate), and the longest stretch without a gap"
+        " has 50 in 0.49 s"
+    )
+    assert pieces.spans() == []
 
 
 def test_one_reading_that_is_no_number_is_refused() -> None:
