@@ -25,6 +25,7 @@ from triaxcal.interchange import tables
 from triaxcal.model.directions import FULL, closed, directions
 from triaxcal.model.moment import Moment
 from triaxcal.model.samples import Samples
+from triaxcal.number_format import number_of
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.quality import QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import StillnessDetector
@@ -137,7 +138,8 @@ class Verification:
         return float(np.sqrt(np.mean(self.standard_error**2 + self.uncertainty**2)))
 
     def summary(self) -> str:
-        return text.verification(f"{len(self.poses)} poses", self.rms, self.noise_floor, self.expected, self.reference)
+        judged = number_of(len(self.poses), "pose")
+        return text.verification(judged, self.rms, self.noise_floor, self.expected, self.reference)
 
     def __repr__(self) -> str:
         return self.summary()

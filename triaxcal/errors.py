@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from triaxcal.number_format import counted, plain
+from triaxcal.number_format import number_of, plain
 
 
 class TriaxcalError(Exception):
@@ -26,7 +26,7 @@ class TooShort(InvalidData):
     """
 
     def __init__(self, samples: int, span_s: float, least: int, least_s: float, *, in_pieces: bool) -> None:
-        takes = counted(least, "sample") + (f" ({plain(least_s)} s at this rate)" if least_s else "")
+        takes = number_of(least, "sample") + (f" ({plain(least_s)} s at this rate)" if least_s else "")
         where = "the longest stretch without a gap" if in_pieces else "it"
         has = f"{samples} in {plain(span_s)} s" if span_s else f"{samples}"
         super().__init__(f"too short: a still pose takes at least {takes}, and {where} has {has}")

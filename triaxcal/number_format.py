@@ -7,7 +7,7 @@ P_LEAST = 1e-12
 """Below this a probability says how well the noise is known, and no more."""
 
 
-def counted(count: int, what: str) -> str:
+def number_of(count: int, what: str) -> str:
     """With the noun that is counted, whose plural ends in s."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 

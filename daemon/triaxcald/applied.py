@@ -12,6 +12,7 @@ import numpy as np
 
 from triaxcal.documents import OUT, UNCERTAINTY, Calibration
 from triaxcal.errors import MissingChannel
+from triaxcal.number_format import number_of
 from triaxcal.poses.stream_covariates import InStream
 from triaxcal_drivers.interface import SampleBlock
 from triaxcal_drivers.profile import READINGS
@@ -73,7 +74,7 @@ def applied(
             calibration.require_whole((samples.time_ns - samples.time_ns[0]) * 1e-9)
         found.start_ns, found.remarks = 0, table.remarks
         if samples.duplicates:
-            found.remarks += (f"{samples.duplicates} rows left out that repeat the one before them",)
+            found.remarks += (f"{number_of(samples.duplicates, 'row')} left out, the same as the one before",)
         pieces = iter([(samples.time_ns * 1e-9, samples.channels)])
         blocks = (
             SampleBlock(

@@ -18,6 +18,7 @@ from triaxcal.errors import InvalidData, TooShort
 from triaxcal.estimate.poses_from_means import poses_of_means
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.model.moment import Moment
+from triaxcal.number_format import number_of
 from triaxcal.poses.pose import Pose, poses_of
 from triaxcal.poses.quality import QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import StillnessDetector, Windows
@@ -217,13 +218,17 @@ def losses_of(recording: Contents) -> list[str]:
     """What did not get into the recording, or was lost from it since, one line
     each."""
     lost = sum(loss.records for loss in recording.losses())
-    found = [f"missing_samples: {lost} records were lost between bus and disk"] if lost else []
+    found = [f"missing_samples: {_were(lost)} lost between bus and disk"] if lost else []
     mended = recording.metadata.get(RECOVERY_RECORD, {})
     counts = (mended.get(key, "") for key in ("raw_missing", "raw_dropped"))
     missing = sum(int(count) for count in counts if count.isdecimal())
     if missing:
-        found.append(f"missing_samples: {missing} records were lost when the recording was damaged")
+        found.append(f"missing_samples: {_were(missing)} lost when the recording was damaged")
     return found
+
+
+def _were(records: int) -> str:
+    return f"{number_of(records, 'record')} {'was' if records == 1 else 'were'}"
 
 
 def samples_of(recording: Contents, phases: Iterable[str]) -> dict[str, dict[str, dict[str, Any]]]:

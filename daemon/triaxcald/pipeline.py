@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from triaxcal import text
 from triaxcal.errors import InvalidData, TooShort
+from triaxcal.number_format import number_of
 from triaxcal.poses.pose import Pose, StillSpan, poses_of, still_spans_of
 from triaxcal.poses.quality import Finding, QualityDetector, untrusted_poses
 from triaxcal.poses.stillness.detector import Span, StillnessDetector, Windows
@@ -25,6 +26,13 @@ _PASSED_ON = ("missing", "duplicates", "incomplete", "errors")
 _SELDOM = ("malformed", "invalid", "not_finite")
 """Counted where there are any: older certificates have no such keys, and are
 compared byte for byte."""
+
+_COUNTED = {"duplicates": "duplicate", "errors": "error", "receiver_overflows": "interruption"}
+_CALLED = {
+    "malformed": "malformed (too short for the profile's message, or not as it is defined)",
+    "not_finite": "not finite",
+    "out_of_order": "out of order",
+}
 
 
 def only_finite(block: SampleBlock) -> SampleBlock:
@@ -199,7 +207,7 @@ class Pipeline(DecodedStream):
         if self.counts["out_of_order"]:
             found["out_of_order_samples"] = f"{self.counts['out_of_order']}, left out"
         if self.counts["errors"]:
-            found["bus_errors"] = f"{self.counts['errors']} records"
+            found["bus_errors"] = number_of(self.counts["errors"], "record")
         if absurd := self._implausible():
             found["implausible_readings"] = absurd
         return together(
@@ -245,6 +253,15 @@ def together(counted: Mapping[str, str], seen: Iterable[Finding], unit: str = ""
         elif finding.name != "missing_samples":
             said[finding.name] += f"; {text.quality(finding, unit)}"
     return [f"{name}: {what}" for name, what in said.items()]
+
+
+def beside_samples(counts: Mapping[str, int]) -> list[str]:
+    """What else was counted of a stream, by kind."""
+    return [
+        number_of(n, _COUNTED[kind]) if kind in _COUNTED else f"{n} {_CALLED.get(kind, kind)}"
+        for kind, n in counts.items()
+        if n and kind != "samples"
+    ]
 
 
 def creeping(poses: Sequence[Pose]) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from triaxcal.number_format import micro_g
+from triaxcal.number_format import micro_g, number_of
 from triaxcald.provision.plausible import Doubt
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState, Evidence, Held
@@ -51,10 +51,13 @@ def metrics_at(port: int) -> str:
 
 def recorded(units: int, buses: int, lost: Sequence[str], ended: Sequence[str], records: int) -> str:
     """How recordings stand, in a line."""
-    missing = f", waiting for {', '.join(lost)}" if lost else ""
-    missing += f", ended: {', '.join(ended)}" if ended else ""
+    missing = "".join(
+        f", {what} {', '.join(names)}" for what, names in (("waiting for", lost), ("ended:", ended)) if names
+    )
     kinds = " and ".join(kind for kind, count in (("units", units), ("buses", buses)) if count)
-    return f"{units + buses - len(lost) - len(ended)} of {units + buses} {kinds} recorded, {records} records{missing}"
+    there = units + buses
+    came = f"{there - len(lost) - len(ended)} of {there} {kinds} recorded, {number_of(records, 'record')}"
+    return f"{came}{missing}"
 
 
 def reloaded(changed: Sequence[str]) -> str:
@@ -68,7 +71,7 @@ def not_reloaded(error: str) -> str:
 
 def one_of_several(units: Sequence[str], buses: Sequence[str], output: Path) -> str:
     """Where a single file is to hold what a station records."""
-    there = [f"{len(units)} unit{'s' * (len(units) != 1)}"] if units else []
+    there = [number_of(len(units), "unit")] if units else []
     there += [f"{len(buses)} bus{'es' * (len(buses) != 1)}"] if buses else []
     return (
         f"there are {' and '.join(there)}; name one of {', '.join([*units, *buses])} with --unit, or record all of "
@@ -77,7 +80,7 @@ def one_of_several(units: Sequence[str], buses: Sequence[str], output: Path) -> 
 
 
 _NOT_A_SAMPLE = {
-    "errors": "replies or frames in error",
+    "errors": "in error",
     "malformed": "too short for the profile's message, or not as it is defined",
     "incomplete": "that lack a message or part",
     "duplicates": "that repeat an earlier one",
@@ -106,8 +109,9 @@ def own_seconds(own: float, by_host: float | None) -> str:
 def bus_recorded(name: str, counts: Mapping[str, int], seconds: float) -> str:
     """What the recording of a bus has come to; ``counts`` as
     `triaxcald.station.listening.Listened` has them."""
-    frames = f"{name}: {counts['frames']} frames of {counts['identifiers']} identifiers in {seconds:.1f} s"
-    return f"{frames}, {counts['errors']} error frames" if counts["errors"] else frames
+    frames, identifiers = number_of(counts["frames"], "frame"), number_of(counts["identifiers"], "identifier")
+    came = f"{name}: {frames} of {identifiers} in {seconds:.1f} s"
+    return f"{came}, {number_of(counts['errors'], 'error frame')}" if counts["errors"] else came
 
 
 def switch_supply(off_s: float) -> str:
@@ -156,22 +160,23 @@ def provisioned(p: Provisioning) -> str:
     if not p.written:
         return f"the registers held these values already, and nothing was written; {held(p.held)}"
     stored = "written and stored" if p.stores else "written"
-    return f"{len(p.written)} registers {stored}; {held(p.held)}"
+    return f"{number_of(len(p.written), 'register')} {stored}; {held(p.held)}"
 
 
 def rehearsed(p: Provisioning) -> str:
     """The same where only a dry run was asked for."""
+    differing = number_of(len(p.differing), "register")
     if p.restart_owed:
         return (
-            f"dry run: nothing was written; {len(p.differing)} registers in use differ from the calibration; "
-            "the device would be restarted first, and the registers that differ then would be written"
+            f"dry run: nothing was written; {differing} in use {'differs' if len(p.differing) == 1 else 'differ'} from the "
+            "calibration; the device would be restarted first, and the registers that differ then would be written"
         )
-    return f"dry run: {len(p.differing)} registers would be written, nothing was"
+    return f"dry run: {differing} would be written, nothing was"
 
 
 def put_back(p: Provisioning) -> str:
     """The same of an old calibration."""
-    done = f"{len(p.written)} registers written back" if p.written else "nothing had to be written"
+    done = f"{number_of(len(p.written), 'register')} written back" if p.written else "nothing had to be written"
     return f"{done}; {held(p.held)}"
 
 

@@ -15,7 +15,7 @@ from triaxcal_drivers.interface import RawBatch, SampleBlock
 from triaxcal_drivers.loading import load_bundle, parse_bundle
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
-from triaxcald.pipeline import DecodedStream, Pipeline, only_finite, together
+from triaxcald.pipeline import DecodedStream, Pipeline, beside_samples, only_finite, together
 from triaxcald.recording.schema import cut
 from triaxcald.simulation.bench import DeviceFile, physics_of
 from triaxcald.simulation.can_unit import tpdos
@@ -181,6 +181,15 @@ def test_an_interruption_of_the_stream_is_counted_and_said(records: list[tuple[i
     pipeline = Pipeline(BUNDLE, READINGS).feed_all([RawBatch.of(flagged)])
     assert pipeline.counts["receiver_overflows"] == 1
     assert pipeline.data_quality() == ["missing_samples: the stream was interrupted once"]
+
+
+def test_what_is_counted_beside_samples_is_named_by_kind() -> None:
+    counts = {"samples": 9, "missing": 1, "duplicates": 1, "incomplete": 0, "errors": 1, "receiver_overflows": 2}
+    assert beside_samples(counts) == ["1 missing", "1 duplicate", "1 error", "2 interruptions"]
+    seldom = {"out_of_order": 3, "not_finite": 1, "malformed": 2}
+    assert beside_samples(seldom) == [
+        "3 out of order", "1 not finite", "2 malformed (too short for the profile's message, or not as it is defined)"
+    ]  # fmt: skip
 
 
 def test_samples_that_are_not_valid_are_left_out_and_said(records: list[tuple[int, int, int, bytes]]) -> None:

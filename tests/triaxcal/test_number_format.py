@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from triaxcal.number_format import micro_g, plain, probability
+from triaxcal.number_format import micro_g, number_of, plain, probability
 
 
 @pytest.mark.parametrize(
@@ -42,3 +42,8 @@ def test_a_number_keeps_all_its_digits_before_the_point(value: float, digits: in
 )
 def test_a_probability_is_never_said_to_be_nothing(p: float | None, said: str) -> None:
     assert probability(p) == said
+
+
+@pytest.mark.parametrize(("count", "said"), [(0, "0 frames"), (1, "1 frame"), (2, "2 frames")])
+def test_one_is_told_in_the_singular(count: int, said: str) -> None:
+    assert number_of(count, "frame") == said

@@ -12,7 +12,7 @@ from triaxcal.frames import faces, frames, orientations, standing
 from triaxcal.inputs import attitude_cautions as attitude
 from triaxcal.inputs import datasheet
 from triaxcal.inputs.turning import rotation
-from triaxcal.number_format import micro_g
+from triaxcal.number_format import micro_g, number_of
 from triaxcal.poses.pose_in_words import moment, the_poses
 from triaxcal.uncertainty import extrapolation
 
@@ -174,7 +174,8 @@ def _(c: datasheet.StillOfDatasheet) -> str:
 
 @caution.register
 def _(c: rotation.StretchesExcluded) -> str:
-    return f"excluded as outliers: {c.stretches} stretches of the recording, {c.samples} samples"
+    stretches = "1 stretch" if c.stretches == 1 else f"{c.stretches} stretches"
+    return f"excluded as outliers: {stretches} of the recording, {number_of(c.samples, 'sample')}"
 
 
 @caution.register

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import singledispatch
 
-from triaxcal.number_format import counted
+from triaxcal.number_format import number_of
 from triaxcal.poses.quality import finding as of
 
 POSES_NAMED = 8
@@ -26,7 +26,8 @@ def quality(finding: of.Finding, unit: str = "") -> str:
 @quality.register
 def _(found: of.Saturation, unit: str = "") -> str:
     return "; ".join(
-        f"{r.axis} at {r.rail:.7g} in {counted(r.samples, 'sample')}, first at {r.first_s:.1f} s{_in_poses(r.touched)}"
+        f"{r.axis} at {r.rail:.7g} in {number_of(r.samples, 'sample')}, first at {r.first_s:.1f} s"
+        + _in_poses(r.touched)
         for r in found.rails
     )
 
@@ -46,10 +47,10 @@ def _(found: of.StuckOutput, unit: str = "") -> str:
 def _freeze(f: of.Freeze) -> str:
     if f.times > 1:
         which = f"{f.axis} freezes" if f.axis else "all axes freeze"
-        what = f"{which} {f.times} times, {f.longest} samples at the longest"
+        what = f"{which} {f.times} times, {number_of(f.longest, 'sample')} at the longest"
     else:
         which = f"{f.axis} repeats {f.value:.7g}" if f.axis else "all axes repeat one reading"
-        what = f"{which} for {f.longest} samples"
+        what = f"{which} for {number_of(f.longest, 'sample')}"
     return f"{what}, first at {f.first_s:.1f} s{_in_poses(f.touched)}"
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from triaxcal.effects.contract import SINCE_START, TIME
 from triaxcal.estimate.calibration import Calibration
+from triaxcal.number_format import number_of
 from triaxcal.poses.pose import Pose
 from triaxcal.text.holds import holds
 from triaxcal.units import ErrorUnit, grouped, in_units_of
@@ -102,7 +103,7 @@ def _quality(c: Calibration, reference_unit: str) -> list[str]:
         lines.append(f"residual rms {small.in_full(r.rms_g)}{beside}, noise floor {small.in_full(r.noise_floor_g)}")
     if c.poses:
         excluded = sum(not p.used for p in c.poses)
-        lines.append(f"{len(c.poses)} poses" + (f", {excluded} of them excluded" if excluded else ""))
+        lines.append(number_of(len(c.poses), "pose") + (f", {excluded} of them excluded" if excluded else ""))
     effects = [effect for effect, _ in c.sensor.effects]
     several = any(p.pose.run.of > 1 for p in c.poses)
     if held := holds(effects, c.channel_reference, several=several):

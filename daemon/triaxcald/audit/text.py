@@ -56,7 +56,7 @@ def _what(of: Difference) -> str:
         case Kind.SEQUENCE:
             return f"{_records(of)} with a sequence number, which the station gives none"
         case Kind.RUNNING_INDEX:
-            return f"{of.again} gaps in the running index that are not noted as losses"
+            return f"{of.again} gap{'' if of.again == 1 else 's'} in the running index, not noted as losses"
         case Kind.TOPIC:
             return "a topic that no recording has"
         case Kind.UNDECODABLE:

@@ -8,6 +8,7 @@ import io
 from pathlib import Path
 
 from triaxcal.documents import Calibration
+from triaxcal.number_format import number_of
 from triaxcald.applied import Applied, applied
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import say
@@ -43,7 +44,8 @@ def apply_command(a: argparse.Namespace) -> int:
     with new_beside(a.output) as path:
         samples = _written(found, path, a.output.name)
     warn(found.cautions)
-    say(f"{a.output}: {samples} samples, {', '.join(calibration.terms)}, in {calibration.reference_unit}, {FRAME}")
+    how = f"{', '.join(calibration.terms)}, in {calibration.reference_unit}, {FRAME}"
+    say(f"{a.output}: {number_of(samples, 'sample')}, {how}")
     return 0
 
 

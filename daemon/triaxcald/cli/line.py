@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from triaxcal import text as of_metrology
 from triaxcal.evidence.prior import Odds
+from triaxcal.number_format import number_of
 from triaxcal.rounding import number
 from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal.text.advice import of_creep
@@ -136,7 +137,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     if not o.provisioned and o.certified.document["not_written"]:
         print(f"  no registers written: {o.certified.document['not_written']}")
     if o.lost:
-        print(f"  {o.lost} records were lost between bus and disk")
+        print(f"  {number_of(o.lost, 'record')} lost between bus and disk")
     print(f"  verdict: {o.document['verdict']}: {o.document['reason']}")
     for line in o.certified.document["outside"]:
         print(f"  outside limits: {line}")

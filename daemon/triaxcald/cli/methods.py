@@ -17,7 +17,7 @@ from triaxcal.inputs.datasheet import Refinement, refine
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.inputs.turning.rotation import RotationFit, fit_rotation
 from triaxcal.interchange.calibration_document import Document
-from triaxcal.number_format import probability
+from triaxcal.number_format import number_of, probability
 from triaxcald import methods
 from triaxcald.attitudes import match, read_attitudes
 from triaxcald.cli.console import micro, table
@@ -94,7 +94,7 @@ def _show_turning(found: RotationFit, choice: Choice) -> None:
         print(held_at(t.mean, t.lowest, t.highest, "samples"))
     r, small = found.calibration.residual, choice.small
     noise = ", ".join(f"{v:.3g}" for v in found.noise_g)
-    print(f"{found.samples} samples, whose noise is {noise} {choice.reference_unit} in x, y, z")
+    print(f"{number_of(found.samples, 'sample')}, whose noise is {noise} {choice.reference_unit} in x, y, z")
     print(
         f"{found.stretches} stretches: |a| off by {small.in_full(r.rms_g)} rms, of which noise is "
         f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from triaxcal.number_format import number_of
 from triaxcald import text
 from triaxcald.cli.arguments import writable
 from triaxcald.cli.console import Bars, say
@@ -21,6 +22,7 @@ from triaxcald.cli.json_lines import JsonLines
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import DISK, INTERRUPTED, severest
 from triaxcald.files import require_new, require_recording, unused
+from triaxcald.pipeline import beside_samples
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
 from triaxcald.station.buses import BusPlace
@@ -278,12 +280,12 @@ def _summary(kept: Kept) -> str:
         parts = [text.bus_recorded(kept.unit, kept.counts, kept.seconds), str(kept.path)]
     else:
         parts = [
-            f"{kept.path}: {kept.counts['samples']} samples in {text.own_seconds(kept.seconds, kept.host_seconds)}"
+            f"{kept.path}: {number_of(kept.counts['samples'], 'sample')} in "
+            f"{text.own_seconds(kept.seconds, kept.host_seconds)}"
         ]
-        of_samples = ("samples", "receiver_overflows")
-        parts += [f"{n} {kind}" for kind, n in kept.counts.items() if n and kind not in of_samples]
+        parts += beside_samples({kind: n for kind, n in kept.counts.items() if kind != "receiver_overflows"})
     if kept.gaps:
-        parts.append(f"{kept.gaps} gaps of {kept.gaps_s:.1f} s in all")
+        parts.append(f"{number_of(kept.gaps, 'gap')} of {kept.gaps_s:.1f} s in all")
     if kept.lost:
-        parts.append(f"{kept.lost} records lost between bus and disk")
+        parts.append(f"{number_of(kept.lost, 'record')} lost between bus and disk")
     return ", ".join(parts)

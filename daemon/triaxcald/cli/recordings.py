@@ -12,12 +12,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from triaxcal.number_format import number_of
 from triaxcal_drivers.errors import DriverError
 from triaxcald.cli.console import emit, say
 from triaxcald.errors import InputError
 from triaxcald.files import is_stream, new_file
 from triaxcald.inputs import bundle_of, losses_of, samples_of
-from triaxcald.pipeline import DecodedStream
+from triaxcald.pipeline import DecodedStream, beside_samples
 from triaxcald.recording.contents import Contents
 from triaxcald.recording.export import Rows, write_csv
 from triaxcald.recording.info import describe
@@ -105,7 +106,7 @@ def _rows(recording: Contents, stream: DecodedStream, phase: str) -> Iterator[Ro
     phases = recording.phases()
     if phase not in phases:
         raise InputError(f"--phase {phase}: {recording.name} has {', '.join(phases) or 'no raw records of any phase'}")
-    counted = _counted(stream)
+    counted = beside_samples(stream.counts)
     why = f" ({', '.join(counted)})" if counted else ""
     raise InputError(
         f"--stream {stream.stream}: {recording.name} has no sample of it in its phase {phase}{why}; samples:"
@@ -117,12 +118,6 @@ def _there(samples: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     """Which streams have samples in which phases, of what `samples_of` gives."""
     shown = [f"{phase} {name}" for phase, of in samples.items() for name, found in of.items() if found["samples"]]
     return ", ".join(shown) or "none of any stream"
-
-
-def _counted(stream: DecodedStream) -> list[str]:
-    """Whatever was no sample, by kind."""
-    names = {kind: kind for kind in stream.counts} | {"receiver_overflows": "interruptions"}
-    return [f"{n} {names[kind]}" for kind, n in stream.counts.items() if n and kind != "samples"]
 
 
 def export_command(a: argparse.Namespace) -> int:
@@ -140,6 +135,6 @@ def export_command(a: argparse.Namespace) -> int:
                     rows = write_csv(out, blocks)
             except OSError as e:
                 raise InputError(f"{a.output}: cannot be written: {e.strerror}") from e
-        lost = _counted(stream) + losses_of(recording)
-    say(f"{rows} samples; {', '.join(lost) or 'none lost'}")
+        lost = beside_samples(stream.counts) + losses_of(recording)
+    say(f"{number_of(rows, 'sample')}; {', '.join(lost) or 'none lost'}")
     return 0

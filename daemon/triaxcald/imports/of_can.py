@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
+from triaxcal.number_format import number_of
 from triaxcal_drivers.can.description import stream_layout
 from triaxcal_drivers.can.model import CanProfile
 from triaxcal_drivers.interface import RawFlag
@@ -96,7 +97,9 @@ class _Work:
             chosen.settle(log.name)
             if not counts["samples"]:
                 why = ", ".join(text.no_samples(counts)) or "no sample is whole"
-                raise InputError(f"{log.name}: no sample in its {chosen.taken} frames of the profile: {why}")
+                raise InputError(
+                    f"{log.name}: no sample in its {number_of(chosen.taken, 'frame')} of the profile: {why}"
+                )
         except InputError as e:
             others = "".join(f"; {count} of kind '{kind}'" for kind, count in account.others.items())
             raise InputError(f"{e}{others}" + (f"; damaged: {account.damage}" if account.damaged else "")) from e

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+from triaxcal.number_format import number_of
 from triaxcal_drivers.errors import LogError
 from triaxcal_drivers.logs.frames import Account
 from triaxcal_drivers.logs.kinds import MCAP_KIND, Log
@@ -138,8 +139,8 @@ class _Work:
         counts = importing.counts
         if not counts["samples"]:
             raise InputError(
-                f"{self._log.name}: no sample in its {self._taken} messages of the profile: {counts['malformed']} are"
-                " not as they are defined"
+                f"{self._log.name}: no sample in its {number_of(self._taken, 'message')} of the profile:"
+                f" {counts['malformed']} {'is' if counts['malformed'] == 1 else 'are'} not as defined"
             )
         return {
             "kind": MCAP_KIND,

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from triaxcal.number_format import number_of
 from triaxcal_drivers.can.layout import NODES, Layout, Message
 from triaxcal_drivers.interface import RawFlag
 from triaxcal_drivers.logs.frames import LoggedFrame
@@ -156,5 +157,5 @@ def _identifiers_shown(keys: Iterable[Key]) -> str:
 
 
 def _listed(counted: Mapping[Any, int]) -> str:
-    shown = [f"{clipped(what)} ({count} frames)" for what, count in counted.items()]
+    shown = [f"{clipped(what)} ({number_of(count, 'frame')})" for what, count in counted.items()]
     return ", ".join(shown[:SHOWN]) + (", …" if len(shown) > SHOWN else "")

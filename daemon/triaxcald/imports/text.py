@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from triaxcal.number_format import number_of
+
 _REMARKS = {
     "no_times": "the log tells no times: samples are laid at the profile's rate, from zero",
     "no_date": "the log has no date: times count from its start",
@@ -29,8 +31,8 @@ _COUNTS = {
 def summary(output: object, detail: Mapping[str, Any], seconds: float) -> str:
     """One line."""
     counts = detail["samples"]
-    parts = [f"{output}: {counts['samples']} samples in {seconds:.2f} s from {detail['file']} ({detail['kind']})"]
-    return ", ".join([*parts, *no_samples(counts)])
+    came = f"{number_of(counts['samples'], 'sample')} in {seconds:.2f} s"
+    return ", ".join([f"{output}: {came} from {detail['file']} ({detail['kind']})", *no_samples(counts)])
 
 
 def no_samples(counts: Mapping[str, int]) -> list[str]:
@@ -41,8 +43,8 @@ def no_samples(counts: Mapping[str, int]) -> list[str]:
 def left_out(detail: Mapping[str, Any]) -> str:
     """What of the log is not in the recording; empty where all is."""
     whole, elsewhere = detail["other_frames"], detail["elsewhere"]
-    what = "messages of other topics" if detail["kind"] == "MCAP" else "frames of other identifiers"
-    parts = [f"{whole} {what}"] if whole else []
+    one, of = ("message", "topics") if detail["kind"] == "MCAP" else ("frame", "identifiers")
+    parts = [f"{number_of(whole, one)} of other {of}"] if whole else []
     parts += [f"{elsewhere} of other channels or nodes"] if elsewhere else []
     parts += [f"{count} of kind '{kind}'" for kind, count in detail["other_records"].items()]
     return f"left out: {', '.join(parts)}" if parts else ""
@@ -66,19 +68,19 @@ def remarks(detail: Mapping[str, Any], seconds: float) -> list[str]:
     times = detail["times"]
     if times["back"]:
         lines.append(
-            f"{times['back']} times are before those of records that came earlier, by up to"
-            f" {times['furthest_back_s']:.6g} s; they are kept"
+            f"{number_of(times['back'], 'record')} came with a time before that of an earlier one, by up to"
+            f" {times['furthest_back_s']:.6g} s; these times are kept"
         )
     if times["equal"]:
         lines.append(
-            f"{times['equal']} samples have the time of the one before; the commands that read the recording leave"
-            " them out"
+            f"{number_of(times['equal'], 'sample')} came with the time of the one before; the commands that read the"
+            " recording leave such out"
         )
     if off := _off(detail, seconds):
         lines.append(off)
     if times["pauses"]:
-        lines.append(f"{times['pauses']} pauses, the longest of {times['longest_pause_s']:.6g} s")
+        lines.append(f"{number_of(times['pauses'], 'pause')}, the longest of {times['longest_pause_s']:.6g} s")
     if detail["damaged"]:
-        more = f", and {detail['damaged'] - 1} more places" if detail["damaged"] > 1 else ""
+        more = f", and {number_of(detail['damaged'] - 1, 'more place')}" if detail["damaged"] > 1 else ""
         lines.append(f"damaged: {detail['damage']}{more}; what is whole was taken")
     return lines

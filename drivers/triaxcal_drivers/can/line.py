@@ -148,7 +148,8 @@ class CanLine:
             except BusError as e:
                 if self._adapter is adapter:
                     if missed := adapter.missed():  # which no frame will tell of any more
-                        e = BusError(f"{e}; {missed} frames before it were lost")
+                        lost = "1 frame before it was" if missed == 1 else f"{missed} frames before it were"
+                        e = BusError(f"{e}; {lost} lost")
                     self._adapter = None
                     self._fail(e)
                     adapter.close()

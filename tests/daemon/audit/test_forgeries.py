@@ -234,7 +234,7 @@ ROWS = [
         f"{REGISTERS}: 1 record with other times",
     ),
     Row("an attachment's time shifted", _attached_later, f"{REPORT}: time_ns: the outcome lists "),
-    Row("raw batch taken out", lambda f: f.first(RAW, lambda m: None), f"{RAW}: 1 gaps in the running index"),
+    Row("raw batch taken out", lambda f: f.first(RAW, lambda m: None), f"{RAW}: 1 gap in the running index"),
     Row("raw batch twice", _raw_twice, f"{RAW}: messages: the outcome lists "),
     Row("raw batches in another order", _swapped_raw, f"{RAW}: sha256: the outcome lists "),
     Row("previews taken out", lambda f: f.each("/preview/readings", lambda m: None), f"/preview/readings: {MISSING}"),

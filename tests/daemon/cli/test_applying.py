@@ -268,5 +268,5 @@ def test_rows_that_repeat_the_one_before_are_left_out_and_said(folder: Path, tri
     table = pd.read_csv(folder / "rec.csv").drop(columns="temp_c").rename(columns={"t_s": "time"})
     pd.concat([table[:5], table[4:]]).to_csv(tmp_path / "rec.csv", index=False)
     done = triaxcal("apply", folder / "cal.json", tmp_path / "rec.csv", "-o", tmp_path / "out.csv")
-    assert "1 rows left out that repeat the one before them" in done.err
+    assert "1 row left out, the same as the one before" in done.err
     assert len(pd.read_csv(tmp_path / "out.csv")) == len(table)

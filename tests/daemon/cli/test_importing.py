@@ -172,7 +172,7 @@ def test_a_log_without_the_units_frames_says_what_is_there(tmp_path: Path, impor
         2, "(0x180 + node, 0x280 + node, 0x380 + node, 0x480 + node) is in it; found: 0x700, 0x7FE"
     )
     path = written(tmp_path / "b.blf", [_message(10**18, 0x185, bytes(8))])
-    imported(path, code=2).failed(2, "no sample in its 1 frames of the profile")
+    imported(path, code=2).failed(2, "no sample in its 1 frame of the profile")
     assert not (tmp_path / "rec.mcap").exists()
 
 
@@ -220,8 +220,8 @@ def test_times_that_go_back_or_jump_are_kept_and_said(
     late = [_message(round(m.timestamp * 1e9) + 3600 * 10**9, m.arbitration_id, m.data) for m in messages[100:200]]
     back = [_message(round(m.timestamp * 1e9), m.arbitration_id, m.data) for m in messages[200:300]]
     done = imported(written(tmp_path / "a.blf", [*messages[:100], *late, *back]))
-    assert re.search(r"\d+ times are before those of records that came earlier, by up to 36\d\d", done.err)
-    assert "1 pauses, the longest of 36" in done.err
+    assert re.search(r"\d+ records came with a time before that of an earlier one, by up to 36\d\d", done.err)
+    assert "1 pause, the longest of 36" in done.err
     with Recording.open(tmp_path / "rec.mcap") as recording:
         times = np.concatenate([b.time_ns for b in recording.raw("calibration")])
     assert np.diff(times).min() < -3599e9
@@ -271,7 +271,7 @@ def test_a_pause_in_which_the_counter_wrapped_is_as_long_as_the_log_says(tmp_pat
             data += struct.pack("<H", number & 0xFFFF) + bytes(identifier == 0x285)
             frames.append(_message(T0_NS + number * 10_000_000, identifier, data))
     done = imported(written(tmp_path / "a.log", frames))
-    assert "1 pauses, the longest of 700.01 s" in done.err
+    assert "1 pause, the longest of 700.01 s" in done.err
     assert "400 samples in 703.99 s" in done.out
     assert "70000 missing by the counter" in done.out
 

@@ -33,7 +33,7 @@ def test_an_identifier_is_standard_or_extended() -> None:
 def test_the_node_that_is_there_is_the_units() -> None:
     chosen = Selection({"readings": layout(per_node=True)})
     assert [chosen.takes(frame(s)) for s in (0x180, 0x181, 0x181 + 126, 0x180 + 128)] == [False, True, True, False]
-    with pytest.raises(InputError, match=r"frames of the nodes 1 \(1 frames\), 127 \(1 frames\); --node says"):
+    with pytest.raises(InputError, match=r"frames of the nodes 1 \(1 frame\), 127 \(1 frame\); --node says"):
         chosen.settle("log")
     chosen = Selection({"readings": layout(per_node=True)}, node=127)
     assert [chosen.takes(frame(s)) for s in (0x181, 0x181 + 126)] == [False, True]
@@ -49,7 +49,7 @@ def test_messages_may_come_by_a_bus_each_but_none_by_two() -> None:
     chosen.settle("log")
     assert chosen.from_channels == ["a", "b"]
     assert chosen.takes(frame(0x180, "b"))
-    with pytest.raises(InputError, match=r"0x180 comes on a \(1 frames\), b \(1 frames\); --channel says"):
+    with pytest.raises(InputError, match=r"0x180 comes on a \(1 frame\), b \(1 frame\); --channel says"):
         chosen.settle("log")
     chosen = Selection(layouts, channel="b")
     assert not chosen.takes(frame(0x180, "a"))
