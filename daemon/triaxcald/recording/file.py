@@ -30,12 +30,15 @@ a second, in which the queue fills; it holds several seconds of a busy bus."""
 class Head:
     """What a recording begins with: ``metadata`` are named records of strings,
     ``preview_channels`` those of its previews, None where it has none;
-    ``ends_with`` is the format of the document that it ends with."""
+    ``ends_with`` is the format of the document that it ends with. Where records
+    may be ``of_the_past``, as of a log that is converted, it begins with the
+    first of them and ends with the last, whatever day it is."""
 
     metadata: Mapping[str, Mapping[str, str]]
     preview_channels: Sequence[str] | None = ()
     preview_unit: str = ""
     ends_with: str = ""
+    of_the_past: bool = False
     preview: schema.PreviewEncoder = field(init=False)
 
     def __post_init__(self) -> None:
@@ -63,6 +66,7 @@ class RecordingFile:
         self._chunks = 0
         self._waiting_ns: int | None = None  # when the oldest record not yet flushed was written
         self._end: dict[str, str] = {}
+        self._begun_ns: int | None = self.sound_ns  # None once the file says so
         try:
             self._file = _create(path)
         except FileExistsError:
@@ -80,7 +84,14 @@ class RecordingFile:
                 path.unlink()
             raise disk.not_created(path, e) from e
 
+    @property
+    def told_ns(self) -> int:
+        """The time of what is told of the recording itself."""
+        return self.span_ns[1] if self._head.of_the_past and self.span_ns else self._clock_ns()
+
     def raw(self, phase: str, first: int, batch: RawBatch) -> None:
+        if self._begun_ns is not None and len(batch):
+            self._tell_begun(min(self._begun_ns, int(batch.time_ns.min())))
         for piece in schema.cut(batch):
             time_ns = int(piece.time_ns[-1]) if len(piece) else self._clock_ns()
             self._add(schema.RAW, time_ns, encode_raw(first, phase, piece))
@@ -146,6 +157,8 @@ class RecordingFile:
     def finish(self) -> None:
         """The indexes and the end of the file, which is on the disk then, and
         closed."""
+        if self._begun_ns is not None:
+            self._tell_begun(self._begun_ns)
         raw = {"records": str(self.digest.records), "sha256": self.digest.hexdigest()}
         self._mcap.add_metadata(schema.RAW_RECORD, raw)
         if self._end:
@@ -177,8 +190,13 @@ class RecordingFile:
             self.inventory.metadata(name, record)
             self._mcap.add_metadata(name, dict(record))
         self._channel_ids = self._declare()
-        self.write(schema.EVENTS, schema.Event(self._clock_ns(), "recording_started", "{}"))
+        if not self._head.of_the_past:
+            self._tell_begun(self._clock_ns())
         self.flush()  # schemas and channels are in the first chunk: have it on disk at once
+
+    def _tell_begun(self, time_ns: int) -> None:
+        self.write(schema.EVENTS, schema.Event(time_ns, "recording_started", "{}"))
+        self._begun_ns = None
 
     def _declare(self) -> dict[str, int]:
         """Registers schemas and channels in the order that fixes their ids; the

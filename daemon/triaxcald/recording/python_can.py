@@ -49,7 +49,11 @@ class RecordingMessageWriter(SizedMessageWriter):
             raise ValueError(f"{path}: a recording that exists is never changed, and cannot be appended to")
         by = f"python-can {can.__version__}"
         self._writer = RecordingWriter(
-            path, metadata={BUS_RECORD: bus_record("", recorded_by=by)}, preview_channels=None, waits=True
+            path,
+            metadata={BUS_RECORD: bus_record("", recorded_by=by)},
+            preview_channels=None,
+            waits=True,
+            of_the_past=True,
         )
         self._row_of, self._batches_of, self._most = row_of, batches_of, BATCH * FIELDS
         self._held: deque[Any] = deque()

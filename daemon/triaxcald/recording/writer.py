@@ -39,7 +39,8 @@ class RecordingWriter:
     caller ``waits`` for room. Registers, events and attachments are few and
     never dropped. ``ends_with`` is the format of the document that `seal` will
     be given. A ``provisional`` file is removed by the caller where it does not
-    come to its end, so that nothing is said of how far it is sound.
+    come to its end, so that nothing is said of how far it is sound. Raw records
+    may be ``of_the_past``, as `Head` has it.
 
     Where the disk has hardly room left, the file is ended while there is room
     for its end.
@@ -62,6 +63,7 @@ class RecordingWriter:
         sync_s: float = SYNC_S,
         waits: bool = False,
         provisional: bool = False,
+        of_the_past: bool = False,
     ) -> None:
         self.path = path
         self._provisional = provisional
@@ -76,7 +78,7 @@ class RecordingWriter:
         self._order = threading.Lock()
         self._room = threading.Semaphore(queue_batches)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._file = self._begin(Head(metadata, preview_channels, preview_unit, ends_with))
+        self._file = self._begin(Head(metadata, preview_channels, preview_unit, ends_with, of_the_past))
         self._offered = self._file.raw_end
         # A caller that dies without closing must not be kept alive by it; `log
         # recover` finishes the file.
@@ -306,7 +308,7 @@ class RecordingWriter:
     def _end_for_lack_of_room(self, free: int) -> None:
         """Raises DiskError."""
         detail = json.dumps({"reason": "disk", "free_bytes": free}, sort_keys=True)
-        self._file.write(schema.EVENTS, schema.Event(self._clock_ns(), ENDED, detail))
+        self._file.write(schema.EVENTS, schema.Event(self._file.told_ns, ENDED, detail))
         self._finish()
         raise disk.ended_early(self._told, free, self._sound_ns)
 

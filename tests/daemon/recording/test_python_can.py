@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,6 +21,7 @@ from hypothesis import strategies as st
 
 from triaxcald.errors import RecordingError
 from triaxcald.recording.bus import bus_frames
+from triaxcald.recording.info import describe
 from triaxcald.recording.python_can import BATCH, RecordingMessageReader, RecordingMessageWriter
 from triaxcald.recording.reader import Recording
 
@@ -116,6 +118,29 @@ def test_channels_come_among_each_other_by_their_times(tmp_path: Path) -> None:
     put = [can.Message(T0_S + 1e-3 * i, i % 100, channel=("a", "b", "b")[i % 3]) for i in range(count)]
     write(tmp_path / "x.mcap", put)
     assert_same(read(tmp_path / "x.mcap"), put, delta_s=0.0)
+
+
+def test_a_recording_of_an_old_log_lasts_from_its_first_message_to_its_last(tmp_path: Path) -> None:
+    write(tmp_path / "x.mcap", [can.Message(1_556_000_000.0 + i / 4, 1, channel=i % 2) for i in range(3 * BATCH)])
+    described = describe(tmp_path / "x.mcap")
+    assert described["duration_s"] == (3 * BATCH - 1) / 4
+    assert [(e["kind"], e["time_ns"]) for e in described["events"]] == [("recording_started", 1_556_000_000 * 10**9)]
+
+
+def test_a_recording_of_what_comes_begins_when_the_recorder_did(tmp_path: Path) -> None:
+    before_ns = time.time_ns()
+    with RecordingMessageWriter(tmp_path / "x.mcap") as writer:
+        after_ns = time.time_ns()
+        writer(can.Message(after_ns / 1e9 + 5.0, 1))
+    (started,) = describe(tmp_path / "x.mcap")["events"]
+    assert before_ns <= started["time_ns"] <= after_ns
+
+
+def test_a_recording_without_a_message_says_when_it_was_begun(tmp_path: Path) -> None:
+    before_ns = time.time_ns()
+    RecordingMessageWriter(tmp_path / "x.mcap").stop()
+    (started,) = describe(tmp_path / "x.mcap")["events"]
+    assert before_ns <= started["time_ns"] <= time.time_ns()
 
 
 def test_a_message_that_its_sender_changes_afterwards_is_recorded_as_it_was(tmp_path: Path) -> None:
