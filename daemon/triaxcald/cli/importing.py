@@ -23,8 +23,8 @@ def import_command(a: argparse.Namespace) -> int:
     driver = bundle.profile.driver
     if driver not in ("can", "mcap"):
         raise InputError(f"{a.profile}: driver '{driver}' has no logs that can be imported, expected can or mcap")
-    if driver == "mcap" and (a.node is not None or a.channel is not None):
-        raise InputError(f"--{'channel' if a.channel else 'node'}: of a CAN bus; the profile's driver is 'mcap'")
+    if driver == "mcap" and a.node is not None:
+        raise InputError("--node: of a CAN bus; the profile's driver is 'mcap'")
     own = driver == "can" and is_own(a.log)
     with nullcontext(own_log(a.log)) if own else opened(a.log) as log:
         if isinstance(log.kind, Kind) != (driver == "can"):
@@ -38,7 +38,7 @@ def import_command(a: argparse.Namespace) -> int:
         else:
             from triaxcald.imports.of_mcap import import_mcap
 
-            made = import_mcap(log, bundle, a.output)
+            made = import_mcap(log, bundle, a.output, channel=a.channel)
     for line in (text.left_out(made.document), *text.remarks(made.document, made.seconds)):
         if line:
             say(line)

@@ -356,7 +356,10 @@ def _audits(commands: Any) -> None:
     p.add_argument("log", metavar="LOG", type=Path)
     p.add_argument("--profile", metavar="P", type=Path, required=True, help="of the device whose frames are in it")
     p.add_argument("-o", "--output", metavar="REC.mcap", type=Path, required=True)
-    p.add_argument("--channel", metavar="NAME", help="the bus, where the log has the unit's frames on several")
+    p.add_argument(
+        "--channel", metavar="NAME",
+        help="the bus, where the log has the unit's frames on several; of MCAP the number of the channel",
+    )  # fmt: skip
     p.add_argument(
         "--node", type=count, metavar="N", help="the unit's, where identifiers shift with it and several nodes send"
     )

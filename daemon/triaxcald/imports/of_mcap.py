@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from triaxcal_drivers.mcap.schema import MessageSchema
 from triaxcal_drivers.nearest import clipped, nearest
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
+from triaxcald.imports.channels import Channels, listed
 from triaxcald.imports.importing import Imported, Importing, Record, write_recording
 from triaxcald.imports.times import Times
 
@@ -27,13 +29,14 @@ STAMPS_LOOKED_AT = 10_000  # messages by whose stamps it is told whether they mo
 SHOWN = 12  # topics in a message
 
 
-def import_mcap(log: Log, bundle: Bundle, out: Path) -> Imported:
+def import_mcap(log: Log, bundle: Bundle, out: Path, *, channel: str | None = None) -> Imported:
     """Raises InputError, RecordingError, LogError, ProfileError."""
     profile = cast(McapProfile, bundle.profile)
-    schemas = _schemas(log, profile)
+    only = None if channel is None else _asked_for(log, profile, channel)
+    schemas = _schemas(log, profile, only)
     files = {schema_file(name): schema.to_bytes() for name, schema in schemas.items()}
     whole = replace(bundle, files={**bundle.files, **files})
-    work = _Work(profile, log)
+    work = _Work(profile, log, only)
     still = any(schema.stamp_stands_still for schema in schemas.values())
 
     def describe(importing: Importing) -> dict[str, Any]:
@@ -43,16 +46,30 @@ def import_mcap(log: Log, bundle: Bundle, out: Path) -> Imported:
     return Imported(out, detail, seconds)
 
 
-def _schemas(log: Log, profile: McapProfile) -> dict[str, MessageSchema]:
+def _asked_for(log: Log, profile: McapProfile, number: str) -> Channel:
+    """The channel of that number. Raises InputError where none of the profile's
+    topics has it."""
+    topics = {stream.topic for stream in profile.streams.values()}
+    channels = (message.channel for message in McapFile(log.stream, Account()).messages())
+    counted = Counter(channel for channel in channels if channel.topic in topics)
+    for channel in counted:
+        if str(channel.number) == number:
+            return channel
+    there = listed(counted.items()) or "no message of the profile's topics"
+    raise InputError(f"--channel {number}: {log.name} has {there}")
+
+
+def _schemas(log: Log, profile: McapProfile, only: Channel | None) -> dict[str, MessageSchema]:
     """Of each stream whose topic is there, from the log's first messages.
     Raises InputError."""
     file = McapFile(log.stream, Account())
     first: dict[str, LoggedMessage] = {}
     heads: dict[str, list[bytes]] = {}
     topics = {stream.topic for stream in profile.streams.values()}
+    chosen = Channels(topics, only)
     for message in file.messages():
         topic = message.channel.topic
-        if topic not in topics:
+        if topic not in topics or not chosen.takes(message.channel):
             continue
         first.setdefault(topic, message)
         heads.setdefault(topic, [])
@@ -104,13 +121,14 @@ def _stands_still(profile: McapProfile, name: str, schema: MessageSchema, head: 
 class _Work:
     """What is counted on the way."""
 
-    def __init__(self, profile: McapProfile, log: Log) -> None:
+    def __init__(self, profile: McapProfile, log: Log, only: Channel | None) -> None:
         self._profile, self._log = profile, log
         self._account = Account()
         self._times = Times(1e9 / profile.sampling.rate_hz)
         self._numbers = {stream.topic: i for i, stream in enumerate(profile.streams.values())}
         self._readings = list(profile.streams).index(READINGS)
-        self._schemas: dict[str, Any] = {}
+        self._channels = Channels(self._numbers, only)
+        self._first: dict[str, Channel] = {}  # by topic
         self._messages = self._taken = self._others = 0
 
     def records(self) -> Iterator[Record]:
@@ -121,8 +139,15 @@ class _Work:
             if topic not in self._numbers:
                 self._others += 1
                 continue
-            if self._schemas.setdefault(topic, message.channel.schema) != message.channel.schema:
-                raise LogError(f"{self._log.name}: topic '{clipped(topic)}' has messages of two definitions")
+            if not self._channels.takes(message.channel):
+                continue
+            first = self._first.setdefault(topic, message.channel)
+            if first.schema != message.channel.schema:
+                says = "" if first.number == message.channel.number else "; --channel says which is the unit's"
+                raise LogError(
+                    f"{self._log.name}: topic '{clipped(topic)}' has messages of two definitions, on the channels"
+                    f" {first.number} and {message.channel.number}{says}"
+                )
             where = f"message {self._messages}"
             if len(message.data) > MESSAGE_MOST:
                 self._account.note(where, f"{len(message.data)} bytes, expected at most {MESSAGE_MOST}")
@@ -136,6 +161,7 @@ class _Work:
 
     def described(self, importing: Importing, still: bool) -> dict[str, Any]:
         """Raises InputError."""
+        follow = self._channels.settle(self._log.name)
         counts = importing.counts
         if not counts["samples"]:
             raise InputError(
@@ -149,12 +175,12 @@ class _Work:
             "frames": self._messages,
             "taken": self._taken,
             "error_frames": 0,
-            "elsewhere": 0,
+            "elsewhere": self._channels.elsewhere,
             "other_frames": self._others,
             "other_records": dict(self._account.others),
             "damaged": self._account.damaged,
             "damage": self._account.damage,
-            "remarks": ["stamp_stands_still"] if still else [],
+            "remarks": ["channels_follow"] * follow + ["stamp_stands_still"] * still,
             "seconds_by_log": self._times.seconds,
             "times": importing.times.document(),
         }

@@ -39,9 +39,13 @@ class Schema(NamedTuple):
 
 
 class Channel(NamedTuple):
+    """``metadata`` are names and values that its publisher says of itself."""
+
     schema: Schema | None
     topic: str
     encoding: str
+    number: int
+    metadata: tuple[tuple[str, str], ...] = ()
 
 
 class LoggedMessage(NamedTuple):
@@ -147,10 +151,26 @@ class McapFile:
         else:
             (schema,) = struct.unpack_from("<H", body, 2)
             topic, at = _text(body, 4)
-            encoding, _ = _text(body, at)
-            self._channels[number] = Channel(self._schemas.get(schema), topic, encoding)
+            encoding, at = _text(body, at)
+            self._channels[number] = Channel(self._schemas.get(schema), topic, encoding, number, _pairs(body, at))
             self.topics[topic] = None
         return True
+
+
+def _pairs(body: bytes, at: int) -> tuple[tuple[str, str], ...]:
+    """A map of texts; none where that is not whole, as nothing depends on
+    it."""
+    found = []
+    try:
+        (length,) = struct.unpack_from("<I", body, at)
+        at, end = at + 4, at + 4 + length
+        while at < end:
+            name, at = _text(body, at)
+            value, at = _text(body, at)
+            found.append((name, value))
+    except (struct.error, UnicodeDecodeError):
+        return ()
+    return tuple(found)
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:

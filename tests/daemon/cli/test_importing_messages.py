@@ -234,7 +234,7 @@ def test_a_profile_and_a_log_of_unlike_kinds_are_refused(tmp_path: Path, triaxca
     triaxcal("log", "import", log, "--profile", "triax-ref-can", "-o", tmp_path / "r.mcap").failed(
         2, f"{log}: MCAP, which holds no frames of CAN; the profile's driver is 'can'"
     )
-    imported(log, profile(tmp_path), "--channel", "can0").failed(2, "--channel: of a CAN bus; the profile's driver is")
+    imported(log, profile(tmp_path), "--node", "5").failed(2, "--node: of a CAN bus; the profile's driver is")
     frames = tmp_path / "a.log"
     frames.write_text("(1436509052.249713) vcan0 044#2A366C2B\n")
     imported(frames, profile(tmp_path)).failed(2, "candump, which holds no messages; the profile's driver is 'mcap'")
@@ -252,6 +252,58 @@ def test_there_is_no_bus_to_run_or_record_on(tmp_path: Path, triaxcal: Run) -> N
         assert done.code == 2, done
         assert "driver 'mcap' reads logs and no bus: `triaxcal log import` takes them" in done.err
         assert "Traceback" not in done.err
+
+
+def of_two(
+    path: Path, messages: list[tuple[int, int, bytes]], schemas: tuple[tuple[str, str, bytes], ...] = ()
+) -> Path:
+    """Messages of two publishers on one topic: which, when, what."""
+    with open(path, "wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        numbers = [writer.register_schema(*schema) for schema in schemas or (IMU_SCHEMA,)]
+        channels = [
+            writer.register_channel("/imu", "cdr", numbers[i % len(numbers)], {"callerid": f"/imu_{side}", "qos": "x"})
+            for i, side in enumerate(("left", "right"))
+        ]
+        for which, time_ns, data in messages:
+            writer.add_message(channels[which], time_ns, data, time_ns)
+        writer.finish()
+    return path
+
+
+def test_two_publishers_on_one_topic_are_asked_about(tmp_path: Path, triaxcal: Run, imported: Run) -> None:
+    messages = [(i % 2, time_ns, data) for i, (time_ns, data) in enumerate(drive(21))]
+    log, by = of_two(tmp_path / "bag.mcap", messages), profile(tmp_path)
+    there = "1 (callerid /imu_left, 11 messages), 2 (callerid /imu_right, 10 messages)"
+    imported(log, by).failed(
+        2, f"{log}: topic '/imu' comes on the channels {there}; --channel says which is the unit's"
+    )
+    imported(log, by, "--channel", "7").failed(2, f"--channel 7: {log} has {there}")
+    assert not (tmp_path / "rec.mcap").exists()
+    done = imported(log, by, "--channel", "2")
+    assert (done.code, done.err) == (0, "left out: 11 of other channels or nodes\n")
+    np.testing.assert_allclose(samples(triaxcal, tmp_path)[:, 1:4], wanted(21)[1::2])
+
+
+def test_a_publisher_that_is_started_anew_has_a_second_channel(tmp_path: Path, triaxcal: Run, imported: Run) -> None:
+    messages = [(int(i >= 12), time_ns, data) for i, (time_ns, data) in enumerate(drive())]
+    done = imported(of_two(tmp_path / "bag.mcap", messages), profile(tmp_path))
+    assert (done.code, done.err) == (
+        0, "the messages come on one channel after another, as of a publisher started anew: all are taken\n"
+    )  # fmt: skip
+    np.testing.assert_allclose(samples(triaxcal, tmp_path)[:, 1:4], wanted())
+
+
+def test_a_channel_may_be_asked_for_whose_topic_has_messages_of_two_definitions(
+    tmp_path: Path, triaxcal: Run, imported: Run
+) -> None:
+    messages = [(0, T0 - 1, b"\0\1\0\0"), *((1, time_ns, data) for time_ns, data in drive())]
+    other = ("std_msgs/msg/Float64", "ros2msg", b"float64 data")
+    log, by = of_two(tmp_path / "bag.mcap", messages, (other, IMU_SCHEMA)), profile(tmp_path)
+    assert imported(log, by).code == 2
+    assert imported(log, by, "--channel", "2").code == 0
+    np.testing.assert_allclose(samples(triaxcal, tmp_path)[:, 1:4], wanted())
 
 
 def test_poses_and_fit_take_the_recording(tmp_path: Path, triaxcal: Run, imported: Run) -> None:
