@@ -137,7 +137,7 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
     if not o.provisioned and o.certified.document["not_written"]:
         print(f"  no registers written: {o.certified.document['not_written']}")
     if o.lost:
-        print(f"  {number_of(o.lost, 'record')} lost between bus and disk")
+        print(f"  {number_of(o.lost, 'record')} {'was' if o.lost == 1 else 'were'} lost between bus and disk")
     print(f"  verdict: {o.document['verdict']}: {o.document['reason']}")
     for line in o.certified.document["outside"]:
         print(f"  outside limits: {line}")
