@@ -165,13 +165,13 @@ def provisioned(p: Provisioning) -> str:
 
 def rehearsed(p: Provisioning) -> str:
     """The same where only a dry run was asked for."""
-    differing = number_of(len(p.differing), "register")
+    there = number_of(len(p.differing), "register")
     if p.restart_owed:
         return (
-            f"dry run: nothing was written; {differing} in use {'differs' if len(p.differing) == 1 else 'differ'} from the "
-            "calibration; the device would be restarted first, and the registers that differ then would be written"
+            f"dry run: nothing was written; {there} in use {'differs' if len(p.differing) == 1 else 'differ'} from the "
+            "calibration; the device would be restarted first, and what differs then would be written"
         )
-    return f"dry run: {differing} would be written, nothing was"
+    return f"dry run: {there} would be written, nothing was"
 
 
 def put_back(p: Provisioning) -> str:

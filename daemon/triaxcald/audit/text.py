@@ -129,13 +129,13 @@ def heading(of: Audit) -> str:
 
 
 def summary(of: Sequence[Audited]) -> str:
-    """ "12 recordings: 10 agree, 1 differs, 1 unreadable"."""
+    """ "12 recordings: 10 agree, 1 differs, 1 could not be audited"."""
     counts = _counted(of)
     told = [f"{counts['agree']} agree{'s' if counts['agree'] == 1 else ''}"]
     if counts["differ"]:
         told.append(f"{counts['differ']} differ{'s' if counts['differ'] == 1 else ''}")
     if counts["unreadable"]:
-        told.append(f"{counts['unreadable']} unreadable")
+        told.append(f"{counts['unreadable']} could not be audited")
     return f"{len(of)} recording{'' if len(of) == 1 else 's'}: {', '.join(told)}"
 
 

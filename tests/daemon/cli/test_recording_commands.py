@@ -218,7 +218,7 @@ def test_no_recording_hides_another(finished_run: Any, tmp_path: Path, triaxcal:
     good.with_suffix(".outcome.json").write_text("{}")
     done = triaxcal("audit", tmp_path)
     assert done.code == 2
-    assert done.out.splitlines()[-1] == "3 recordings: 1 agrees, 1 differs, 1 unreadable"
+    assert done.out.splitlines()[-1] == "3 recordings: 1 agrees, 1 differs, 1 could not be audited"
     assert f"{good}: differs" in done.out
     assert "  a.outcome.json: the file beside the recording is not the one in it" in done.out
     assert done.err.startswith(f"triaxcal: {cut}: the file ends, not finished, ")
