@@ -45,6 +45,11 @@ def waits(trouble: str) -> str:
     return f"waiting: {trouble}"
 
 
+def nothing_deleted(document: str | None) -> str:
+    """Of retention that may not delete what a document may name."""
+    return f"nothing is deleted, as {document} cannot be read, and may name any segment"
+
+
 def metrics_at(port: int) -> str:
     return f"http://127.0.0.1:{port}/metrics has the numbers, http://127.0.0.1:{port}/health says how it stands"
 

@@ -170,10 +170,10 @@ class SampleBlock:
     duplicates: int = 0
     incomplete: int = 0
     errors: int = 0
-    malformed: int = 0
     invalid: int = 0
     not_finite: int = 0
     restarts: int = 0
+    malformed: int = 0
 
     def __len__(self) -> int:
         return len(self.time_ns)

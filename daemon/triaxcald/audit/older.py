@@ -54,6 +54,9 @@ def as_searched(certified: Certified, stored: Mapping[str, Any], profile: Profil
     again = poses
     if len(said["poses"]) == len(poses):
         again = [{**p, **{key: q[key] for key in OF_A_POSE}} for p, q in zip(said["poses"], poses, strict=True)]
+    counts = document["recording"]
+    if "malformed" not in stored["recording"]:  # they were counted as errors
+        document["recording"] = counts | {"errors": counts["errors"] + counts.get("malformed", 0)}
     document["result"] = {**stored["result"], "calibration": {**said, "poses": again}}
     outside = over_limits(stored["result"]["after"], limits)
     document |= {"outside": outside, "verdict": verdict_of(outside, limits)}

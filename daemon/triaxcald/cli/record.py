@@ -130,12 +130,13 @@ async def _reload(
     from triaxcald.run.endings import reason_of, trace_of
 
     while True:
-        if not await _is_set(hangup, AGAIN_S):
-            if a.folder and (names := roster.ended_with(DISK)):
-                roster.begin(_recordings(a, chosen, progress, serials, chosen.names - names))
-            continue
+        asked = await _is_set(hangup, AGAIN_S)
         hangup.clear()
         try:
+            if not asked:
+                names = roster.ended_with(DISK) if a.folder and a.seconds is None else set()
+                roster.begin(_recordings(a, chosen, progress, serials, chosen.names - names))
+                continue
             new = await asyncio.to_thread(_load, a)
             leaving = changed(chosen.station, new.station) & (chosen.names | new.names)
             beginning = _recordings(a, new, progress, serials, roster.at_work() - leaving)

@@ -20,6 +20,7 @@ from triaxcal_drivers.mcap.schema import MessageSchema
 from triaxcal_drivers.nearest import clipped, nearest
 from triaxcal_drivers.profile import READINGS, Bundle
 from triaxcald.errors import InputError
+from triaxcald.imports import text
 from triaxcald.imports.channels import Channels, listed
 from triaxcald.imports.importing import Imported, Importing, Record, write_recording
 from triaxcald.imports.times import Times
@@ -164,9 +165,9 @@ class _Work:
         follow = self._channels.settle(self._log.name)
         counts = importing.counts
         if not counts["samples"]:
+            why = ", ".join(text.no_samples(counts)) or "none is of the readings"
             raise InputError(
-                f"{self._log.name}: no sample in its {number_of(self._taken, 'message')} of the profile:"
-                f" {counts['malformed']} {'is' if counts['malformed'] == 1 else 'are'} not as defined"
+                f"{self._log.name}: no sample in its {number_of(self._taken, 'message')} of the profile: {why}"
             )
         return {
             "kind": MCAP_KIND,

@@ -42,9 +42,12 @@ def not_created(path: Path, e: OSError) -> RecordingError:
     return kind(f"{path}: cannot be created: {e.strerror}")
 
 
-def no_room(path: Path, free: int) -> DiskError:
-    """For a file and its end."""
-    return DiskError(f"{path}: cannot be created: {free} bytes are free on the disk")
+def require_room(path: Path) -> None:
+    """For a file and its end: who is started again and again would fill the disk
+    to its last byte. Raises DiskError."""
+    free = free_bytes(path.parent)
+    if free is not None and free < END_BYTES:
+        raise DiskError(f"{path}: cannot be created: {free} bytes are free on the disk")
 
 
 def not_written(path: Path, e: OSError, sound_ns: int | None) -> DiskError:

@@ -32,7 +32,8 @@ class Head:
     ``preview_channels`` those of its previews, None where it has none;
     ``ends_with`` is the format of the document that it ends with. Where records
     may be ``of_the_past``, as of a log that is converted, it begins with the
-    first of them and ends with the last, whatever day it is."""
+    first of those that are written first and ends with the last, whatever day
+    it is."""
 
     metadata: Mapping[str, Mapping[str, str]]
     preview_channels: Sequence[str] | None = ()

@@ -21,7 +21,7 @@ def describe(path: Path) -> dict[str, Any]:
 
     Raises RecordingError.
     """
-    with open_recording(path, unfinished=True) as recording:
+    with open_recording(path, unfinished=True, alike=False) as recording:
         topics, events = _topics(recording), list(recording.events())
         starts = [topic["start_ns"] for topic in topics.values()]
         ends = [topic["end_ns"] for topic in topics.values()]

@@ -80,8 +80,9 @@ class Recording(Contents):
         self.attachments: Attachments = Attachments(self)
         self._stream = stream
         self._chunks: list[int] = []
-        self._topics_in: dict[int, frozenset[str]] = {}
-        """Of the messages of a chunk, once all of them have been read."""
+        self._known: dict[int, tuple[frozenset[str], dict[int, str]]] = {}
+        """Of a chunk that was read to its end: the topics of its messages, and
+        the channels that it declares."""
         self._topics: dict[int, str] = {}
         self._said = 0  # bytes of metadata
         self.size = size_of(stream)
@@ -119,23 +120,26 @@ class Recording(Contents):
         return len(self._chunks)
 
     def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
+        topics = dict(self._topics)
         unpacked = Unpacked(self.name, self.size)
         for offset in self._chunks:
-            if topic is not None and topic not in self._topics_in.get(offset, {topic}):
+            held, declared = self._known.get(offset, (None, {}))
+            topics |= declared
+            if topic is not None and held is not None and topic not in held:
                 continue
-            seen: set[str] = set()
+            seen, channels = set[str](), dict[int, str]()
             for record in self._records(offset):
                 unpacked.record()
                 if isinstance(record, Channel):
-                    self._topics[record.id] = record.topic
+                    topics[record.id] = channels[record.id] = record.topic
                 elif isinstance(record, Message):
-                    if record.channel_id not in self._topics:
+                    if record.channel_id not in topics:
                         raise Damage(self.name, offset, f"message on unknown channel {record.channel_id}")
-                    found = self._topics[record.channel_id]
+                    found = topics[record.channel_id]
                     seen.add(found)
                     if topic is None or found == topic:
                         yield TopicMessage(found, record)
-            self._topics_in[offset] = frozenset(seen)
+            self._known[offset] = frozenset(seen), channels
 
     def frames(self) -> Iterator[Frame]:
         """Every record of the file in its order, as bytes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,9 +80,9 @@ def evidence(manifest: Manifest) -> Evidence:
         for path in manifest.path.parent.glob(pattern):
             try:
                 texts.append((path.name, read_whole(path, EVIDENCE_MOST).decode("utf-8", "replace")))
-            except FileNotFoundError:  # a link to nowhere, or it has just gone
-                continue
             except OSError:
+                if not os.path.lexists(path):  # it has just gone
+                    continue
                 return Evidence(frozenset(s.file for s in manifest.segments), path.name)
     return Evidence(frozenset(s.file for s in manifest.segments if _is_named(s, texts)))
 

@@ -14,6 +14,7 @@ from triaxcal_drivers.files import open_file
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import DiskError, RecordingError
+from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ended_because
 from triaxcald.recording.file import Head, RecordingFile
@@ -77,6 +78,10 @@ class SegmentedWriter(RecordingWriter):
         return self._resumes
 
     @property
+    def keeps_for(self) -> str | None:
+        return self._unread
+
+    @property
     def _told(self) -> Path:
         return self._file.path
 
@@ -91,8 +96,8 @@ class SegmentedWriter(RecordingWriter):
             ends = [s.end_ns for s in self._segments.segments if s.end_ns is not None]
             damaged = bool(self._segments.segments) and self._segments.segments[-1].state == "damaged"
             self._resumes = Gap(ends[-1], None, DAMAGED if damaged else AWAY) if ends else None
-            gone = self._room_made()
-            file = self._next()
+            before, gone = self._segments, self._room_made()
+            file = self._next(before)
             if gone:
                 file.write(schema.EVENTS, self._deleted(gone))
             return file
@@ -100,24 +105,25 @@ class SegmentedWriter(RecordingWriter):
             raise disk.not_created(self.manifest, e) from e
 
     def _room_made(self) -> list[Surplus]:
-        """What had to go so that there is room for a file and its end: a
-        service that is started again and again would fill the disk to its last
-        byte. Raises DiskError."""
-        gone: list[Surplus] = []
-        for last in (False, True):
-            free = disk.free_bytes(self.manifest.parent)
-            if free is None or free >= disk.END_BYTES:
-                break
-            if last:
-                raise disk.no_room(self.manifest, free)
+        """What had to go so that there is room for a file and its end. Raises
+        DiskError."""
+        try:
+            disk.require_room(self.manifest)
+        except DiskError:
             gone = self._take_away()
-        return gone
+            disk.require_room(self.manifest)
+            return gone
+        return []
 
     # What follows runs on the writer's thread, but for the first segment.
 
-    def _next(self) -> RecordingFile:
-        """Raises OSError, RecordingError."""
-        known, number = self._segments.segments, max(self._segments.next_number, self._segments.taken + 1)
+    def _next(self, before: Manifest | None = None) -> RecordingFile:
+        """Behind what was there ``before``, where not all of it is left. Raises
+        OSError, RecordingError."""
+        before = before or self._segments
+        known, number = before.segments, before.next_number
+        if not known or os.path.lexists(before.path.with_name(before.file_name(number))):
+            number = max(number, before.taken + 1)
         first = known[-1].end if known else 0
         told = {"number": str(number), "first": str(first), "of": self.manifest.name}
         if known:
@@ -125,6 +131,7 @@ class SegmentedWriter(RecordingWriter):
         head = replace(self._head, metadata={**self._head.metadata, schema.SEGMENT_RECORD: told})
         segment = Segment(self._segments.file_name(number), number, first)
         path = self._segments.path_of(segment)
+        require_new(path)
         # Before the file is: one that no manifest names would be in the way for ever.
         self._segments = self._segments.with_last(segment)
         self._segments.save()
@@ -181,7 +188,7 @@ class SegmentedWriter(RecordingWriter):
         try:
             super()._end_for_lack_of_room(free)
         except DiskError as e:
-            if self._unread is None:
+            if self._unread is None or all(s.state == "open" for s in self._segments.segments):
                 raise
             raise DiskError(f"{e}; nothing was deleted, as {self._unread} cannot be read") from e
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,18 +15,22 @@ from triaxcald.recording.manifest import Manifest, Segment, is_manifest, load_ma
 from triaxcald.recording.reader import Attachments, Recording
 
 _BLOCK = 2**20
+_MEANT_BY = {"unit": ("name", "serial", "signs"), schema.BUS_RECORD: ("name", "channel")}
+"""What of the metadata says whose records they are, and how they are read."""
 
 
 class Series(Contents):
     """All segments that are there, one open at a time. Metadata and attachments
     are those of the first.
 
-    Each segment is compared with the manifest when it is read. Raises
-    RecordingError: one is missing, or is not as it was.
+    Each segment is compared with the manifest when it is read, and with the
+    first unless they need not be ``alike``: records mean the same in all of
+    them. Raises RecordingError: one is missing, or is not as it was.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, alike: bool = True) -> None:
         self.name = str(path)
+        self._alike = alike
         self.manifest: Manifest = load_manifest(path)
         if not self.manifest.segments:
             raise RecordingError(f"{path}: no segment is left of this recording")
@@ -47,7 +52,8 @@ class Series(Contents):
         yield from self._first.messages(topic)
         for segment in self.manifest.segments[1:]:
             with self._opened(segment) as recording:
-                self._require_alike(recording, segment)
+                if self._alike:
+                    self._require_alike(recording, segment)
                 yield from recording.messages(topic)
 
     def _require_there(self, segment: Segment) -> None:
@@ -66,9 +72,14 @@ class Series(Contents):
         file may have changed in between, and with it profile, signs or bus. One
         that ended before its first record may lack attachments."""
         first, ours, theirs = self.manifest.segments[0].file, self.metadata, recording.metadata
-        named = [name for name in ("unit", schema.BUS_RECORD) if theirs.get(name) != ours.get(name)]
+        named = [
+            f"{key} of the {record}"
+            for record, keys in _MEANT_BY.items()
+            for key in keys
+            if theirs.get(record, {}).get(key) != ours.get(record, {}).get(key)
+        ]
         there = set(self.attachments) & set(recording.attachments) - {schema.STATION_FILE}
-        named += [name for name in sorted(there) if recording.attachments[name] != self.attachments[name]]
+        named += [n for n in sorted(there) if _meaning(recording.attachments[n]) != _meaning(self.attachments[n])]
         if named:
             raise RecordingError(
                 f"{self.name}: segment {segment.file}: {', '.join(named)}: not as in {first}; "
@@ -80,6 +91,14 @@ class Series(Contents):
         if segment.state != "open" and digest_of(path) != segment.sha256:
             raise RecordingError(f"{self.name}: segment {segment.file}: was changed since it was recorded")
         return Recording.open(path, unfinished=segment.state != "closed")
+
+
+def _meaning(data: bytes) -> object:
+    """Of a file of a profile: comments and blanks of TOML mean nothing."""
+    try:
+        return tomllib.loads(data.decode())
+    except ValueError:
+        return data
 
 
 def digest_of(path: Path) -> str:
@@ -94,9 +113,10 @@ def digest_of(path: Path) -> str:
         raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
 
 
-def open_recording(path: Path, *, unfinished: bool = False) -> Recording | Series:
-    """One file, or all that a manifest names. Raises RecordingError."""
-    return Series(path) if is_manifest(path) else Recording.open(path, unfinished=unfinished)
+def open_recording(path: Path, *, unfinished: bool = False, alike: bool = True) -> Recording | Series:
+    """One file, or all that a manifest names, as `Recording` and `Series` have
+    them. Raises RecordingError."""
+    return Series(path, alike=alike) if is_manifest(path) else Recording.open(path, unfinished=unfinished)
 
 
 def is_recording(name: str) -> bool:

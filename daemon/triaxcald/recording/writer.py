@@ -4,6 +4,7 @@ bus."""
 from __future__ import annotations
 
 import json
+import math
 import queue
 import threading
 import time
@@ -24,6 +25,10 @@ from triaxcald.recording.inventory import Document
 LOOK_S = 1.0
 """A writer that is given nothing looks about so often: what was written is due
 to the operating system by then, and a segment grows old in silence too."""
+
+BEHIND_S = 5.0
+"""A disk that is a little slower than the bus costs a batch now and then: so
+long after the last it is said to keep up again."""
 
 
 class RecordingWriter:
@@ -75,6 +80,7 @@ class RecordingWriter:
         self._unreported: list[tuple[str, int, int]] = []  # topic, first, records
         self._failure: RecordingError | None = None
         self._closed = self._finished = False
+        self._dropped_s = -math.inf  # when raw records were last lost
         self._order = threading.Lock()
         self._room = threading.Semaphore(queue_batches)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
@@ -87,6 +93,7 @@ class RecordingWriter:
         add_action(self, self._finish_at_abort)
 
     def _begin(self, head: Head) -> RecordingFile:
+        disk.require_room(self.path)
         return RecordingFile(self.path, head, clock_ns=self._clock_ns, sync_s=self._sync_s)
 
     @property
@@ -100,9 +107,16 @@ class RecordingWriter:
         return self._jobs.qsize()
 
     @property
+    def keeps_for(self) -> str | None:
+        """A document that keeps retention from deleting anything, as it cannot
+        be read."""
+        return None
+
+    @property
     def is_behind(self) -> bool:
-        """Whether records are being lost since the disk does not keep up."""
-        return bool(self._unreported)
+        """Whether raw records are being lost since the disk does not keep up:
+        some were within `BEHIND_S`."""
+        return time.monotonic() - self._dropped_s < BEHIND_S
 
     @property
     def resumes(self) -> Gap | None:
@@ -241,6 +255,8 @@ class RecordingWriter:
             self._jobs.put(partial(self._make_room, job))
             return True
         self.losses[topic] = self.losses.get(topic, 0) + records
+        if topic == schema.RAW:
+            self._dropped_s = time.monotonic()
         for i, (lost, lost_first, lost_records) in enumerate(self._unreported):
             if lost == topic and (topic != schema.RAW or lost_first + lost_records == first):
                 self._unreported[i] = (topic, lost_first, lost_records + records)

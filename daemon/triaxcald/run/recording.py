@@ -93,6 +93,7 @@ class AtRecording(ABC):
         self._state = State.WAITING
         self._trouble: str | None = None
         self._leaves = self._was_behind = False
+        self._kept_for: str | None = None
 
     @property
     def status(self) -> UnitStatus:
@@ -214,6 +215,9 @@ class AtRecording(ABC):
                 self._progress.lost(self.name, text.DISK_IS_BEHIND)
             else:
                 self._progress.stage(self.name, text.DISK_KEEPS_UP)
+        if writer.keeps_for not in (None, self._kept_for):
+            self._progress.stage(self.name, text.nothing_deleted(writer.keeps_for))
+        self._kept_for = writer.keeps_for
 
     async def _end(self, writer: RecordingWriter, e: BaseException) -> None:
         """Where the disk has failed, that is on its way already."""

@@ -32,10 +32,16 @@ class Roster:
 
     def ended_with(self, code: int) -> set[str]:
         """Those whose last recording ended with that exit code."""
-        return {name for name, (_, task) in self._work.items() if task.done() and task.result().exit_code == code}
+        return {
+            name
+            for name, (_, task) in self._work.items()
+            if task.done() and not task.cancelled() and task.result().exit_code == code
+        }
 
     def begin(self, recordings: Iterable[AtRecording]) -> None:
-        """None of a name that is at work."""
+        """None of a name that is at work; nothing, once all are to end."""
+        if self._stopped:
+            return
         for one in recordings:
             self._work[one.name] = one, asyncio.ensure_future(self._record(one))
         self._changed.set()

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from tests.daemon.audit.forging import Forgery
 from triaxcald.audit import audit, text
+from triaxcald.audit.older import as_searched
+from triaxcald.certificate import Certified
+from triaxcald.station.config import Limits
 
 EARLIER = Path(__file__).parents[3] / "recordings" / "by-0.1.0.mcap"
 
@@ -52,3 +55,11 @@ def test_a_certificate_that_was_changed_differs(
     forgery = Forgery.of(EARLIER)
     forgery.edit("certificate.json", change)
     assert any(line.startswith(says) for line in said(forgery.write(tmp_path / "changed.mcap")))
+
+
+def test_frames_too_short_for_their_message_were_errors_then() -> None:
+    result: dict[str, Any] = {"calibration": {"poses": []}, "after": {"rms_g": 1e-5}}
+    stored = {"recording": {"errors": 3}, "result": result, "registers": None}
+    again = {"recording": {"errors": 1, "malformed": 2}, "result": result}
+    made = as_searched(Certified(again, cast(Any, None), None, True), stored, cast(Any, None), Limits())
+    assert made.document["recording"]["errors"] == 3

@@ -5,15 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from triaxcald.cli.json_lines import JsonLines
 from triaxcald.recording import disk
 from triaxcald.recording.reader import Recording
 from triaxcald.simulation.memory import CALIBRATION, TABLE, Stored, factory_calibration
@@ -297,27 +300,33 @@ def test_a_recording_in_segments_goes_on_with_the_next_start_and_is_read_by_its_
 
 
 @pytest.mark.slow
-def test_what_a_full_disk_ended_begins_again_while_another_unit_is_waited_for(
+def test_what_a_full_disk_ended_begins_again_while_another_unit_goes_on(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free = iter([0, 0])
+    free = iter([0, 0])  # as the first segment is to begin, and after retention
     monkeypatch.setattr(disk, "free_bytes", lambda _: next(free, 2**40))
     monkeypatch.setattr("triaxcald.cli.record.AGAIN_S", 0.05)
     folder = workshop.folder / "recordings"
     folder.mkdir()
+    again = threading.Event()
+    told = JsonLines.say
+
+    def said(self: JsonLines, level: str, event: str, **more: Any) -> None:
+        told(self, level, event, **more)
+        if event == "ended" and not again.is_set():
+            again.set()
+        elif again.is_set() and more.get("message") == "recording":
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(JsonLines, "say", said)
     with workshop.serve(workshop.device()) as served:
         station = workshop.station({"bus": served.bus}, {"bus": NOBODY})
-        done = triaxcal(
-            "record", station, "-o", folder, "--seconds", "3", "--give-up-after", "2", "--segment-time", "1h",
-            "--log-format", "json",
-        )  # fmt: skip
-    assert done.code == 4, "of the unit that is not there"
-    ends = [
-        line for line in map(json.loads, done.err.splitlines()) if line["event"] == "ended" and line["unit"] == "unit0"
-    ]
-    assert [end["level"] for end in ends] == ["error", "info"]
-    assert "cannot be created: 0 bytes are free on the disk" in ends[0]["message"]
-    assert ends[1]["samples"] >= 300
+        done = triaxcal("record", station, "-o", folder, "--segment-time", "1h", "--log-format", "json")
+    assert done.code == 130
+    lines = [json.loads(line) for line in done.err.splitlines()]
+    (first, last) = [line for line in lines if line["event"] == "ended" and line["unit"] == "unit0"]
+    assert first["message"].endswith("unit0-4711.segments.json: cannot be created: 0 bytes are free on the disk")
+    assert last["recording"] == str(folder / "unit0-4711.segments.json")
     assert triaxcal("log", "info", folder / "unit0-4711.segments.json", "--json").json["finished"] is True
 
 

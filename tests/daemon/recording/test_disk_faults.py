@@ -127,7 +127,7 @@ def test_a_disk_that_others_fill_leaves_a_file_that_is_whole_up_to_the_second_st
 def test_no_recording_begins_on_a_disk_that_is_full(small_disk: Callable[[int], Path]) -> None:
     folder = small_disk(4096)
     (folder / "filler").write_bytes(bytes(4096))
-    with pytest.raises(DiskError, match=r"rec\.mcap: cannot be created: No space left on device"):
+    with pytest.raises(DiskError, match=r"rec\.mcap: cannot be created: 0 bytes are free on the disk"):
         RecordingWriter(folder / "rec.mcap", metadata={})
     assert not (folder / "rec.mcap").exists()
 

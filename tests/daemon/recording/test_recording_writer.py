@@ -14,9 +14,10 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from triaxcal_drivers.interface import RawBatch, SampleBlock
-from triaxcald.errors import RecordingError
+from triaxcald.errors import DiskError, RecordingError
+from triaxcald.recording import disk, schema
 from triaxcald.recording import file as file_module
-from triaxcald.recording import schema
+from triaxcald.recording import writer as writer_module
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.writer import RecordingWriter
 
@@ -216,6 +217,34 @@ def test_losses_at_two_places_are_two_records(
     writer.close()
     with Recording.open(tmp_path / "rec.mcap") as rec:
         assert [(x.first, x.records) for x in rec.losses()] == [(10, 20), (40, 20)]
+
+
+def test_a_disk_is_behind_while_raw_records_are_lost_and_for_a_while_after(
+    new_writer: NewWriter, disks: list[Disk], batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(writer_module.time, "monotonic", lambda: now_s)
+    with new_writer(queue_batches=1) as writer:
+        writer.drain()
+        disks[0].ready.clear()
+        writer.attach("block", "text/plain", b"")
+        assert writer.raw("calibration", batch_of(0, 10))
+        assert not writer.is_behind
+        assert not writer.raw("calibration", batch_of(10, 10))
+        disks[0].ready.set()
+        writer.drain()
+        assert writer.is_behind, "the loss is noted in the file, and the next may come"
+        now_s += writer_module.BEHIND_S
+        assert not writer.is_behind
+
+
+def test_no_recording_begins_where_there_is_no_room_for_its_end(
+    tmp_path: Path, new_writer: NewWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(disk, "free_bytes", lambda _: disk.END_BYTES - 1)
+    with pytest.raises(DiskError, match=r"rec\.mcap: cannot be created: 4194303 bytes are free on the disk$"):
+        new_writer()
+    assert list(tmp_path.glob("*.mcap")) == []
 
 
 def test_registers_events_and_attachments_are_never_dropped(

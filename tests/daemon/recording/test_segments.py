@@ -16,6 +16,7 @@ from triaxcald.audit import audit_each
 from triaxcald.errors import DiskError, RecordingError
 from triaxcald.recording import disk, schema
 from triaxcald.recording import writer as writer_module
+from triaxcald.recording.info import describe
 from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
@@ -321,23 +322,31 @@ def test_segments_older_than_they_are_kept_go_and_that_is_said(tmp_path: Path, n
     assert told == gone
 
 
-def test_a_link_to_nowhere_keeps_no_segment_and_a_document_that_cannot_be_read_keeps_all(
-    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "old.outcome.json").symlink_to("nowhere")
-    with new(retention=Retention(keep_s=30.0)) as writer:
-        minutes(writer, 2)
-        assert len(writer.deleted) == 1
-    (tmp_path / "other.outcome.json").mkdir()
-    writer = new(retention=Retention(free_bytes=2**62))
-    minutes(writer, 2, first=20)
+def unreadable_folder(path: Path) -> None:
+    path.mkdir()
+
+
+def link_to_nowhere(path: Path) -> None:
+    """As to a share that is not mounted."""
+    path.symlink_to("nowhere")
+
+
+@pytest.mark.parametrize("lay", [unreadable_folder, link_to_nowhere])
+def test_a_document_that_cannot_be_read_keeps_all_and_is_named(
+    tmp_path: Path, new: NewWriter, minutes: Callable[..., None], monkeypatch: pytest.MonkeyPatch,
+    lay: Callable[[Path], None],
+) -> None:  # fmt: skip
+    lay(tmp_path / "other.outcome.json")
+    writer = new(retention=Retention(keep_s=1.0, free_bytes=2**62))
+    assert writer.keeps_for is None
+    minutes(writer, 2)
+    assert (writer.deleted, writer.keeps_for) == ([], "other.outcome.json")
     monkeypatch.setattr(disk, "free_bytes", lambda _: 1000)
     with pytest.raises(DiskError, match=r"; nothing was deleted, as other\.outcome\.json cannot be read$"):
         minutes(writer, 1, first=40)
     with pytest.raises(DiskError):
         writer.close()
-    last = tmp_path / files(tmp_path)[-1]
-    with Recording.open(last) as recording:
+    with Recording.open(tmp_path / files(tmp_path)[-1]) as recording:
         assert [e.detail["unread"] for e in recording.events() if e.kind == "disk_low"] == ["other.outcome.json"]
 
 
@@ -356,6 +365,8 @@ def test_no_segment_begins_where_there_is_no_room_for_its_end(
     with new(retention=Retention(free_bytes=2**23)) as writer:
         minutes(writer, 1, first=30)
     assert files(tmp_path)[0] == "rec-000005.mcap", "those before have made room"
+    first = load_manifest(tmp_path / "rec.segments.json").segments[0]
+    assert (first.number, first.first) == (5, 30), "as if they were there"
     assert kinds(tmp_path / "rec-000005.mcap").count("deleted") == 1
 
 
@@ -462,6 +473,10 @@ def test_files_of_a_manifest_that_was_lost_are_not_in_the_way(
     with new() as writer:
         minutes(writer, 2)
     assert [s.number for s in load_manifest(tmp_path / "rec.segments.json").segments] == [4, 5, 6]
+    (tmp_path / "rec-20240517.mcap").touch()
+    with new() as writer:
+        minutes(writer, 1, first=20)
+    assert load_manifest(tmp_path / "rec.segments.json").segments[-1].number == 8, "no file is in the way of that"
 
 
 @pytest.mark.parametrize(
@@ -497,9 +512,10 @@ def test_a_recording_in_segments_ends_with_no_document(new: NewWriter) -> None:
 @pytest.mark.parametrize(
     ("changed", "profile", "named"),
     [
-        ({"unit": {"serial": "42", "signs": "1,1,1"}}, b"scale = 1", "unit"),
-        ({"bus": {"channel": "can1"}}, b"scale = 1", "bus"),
+        ({"unit": {"serial": "42", "signs": "1,1,1"}}, b"scale = 1", "signs of the unit"),
+        ({"bus": {"channel": "can1"}}, b"scale = 1", "channel of the bus"),
         ({}, b"scale = 2", "profile.toml"),
+        ({}, b"scale = 1 # as ever", None),
         ({"station": {"name": "another"}}, b"scale = 1", None),
     ],
 )
@@ -512,7 +528,9 @@ def test_segments_that_mean_another_thing_are_not_read_as_one(
             writer.attach("profile.toml", "application/toml", text)
             writer.attach("station.toml", "application/toml", repr(metadata).encode())
             minutes(writer, 1)
-    with Series(tmp_path / "rec.segments.json") as series:
+    path = tmp_path / "rec.segments.json"
+    assert len(describe(path)["segments"]) == 4, "what is in them is told all the same"
+    with Series(path) as series:
         if named is None:
             assert sum(len(batch) for batch in series.raw("calibration")) == 20
             return

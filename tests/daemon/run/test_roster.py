@@ -17,7 +17,7 @@ from triaxcald.run.roster import Roster
 from triaxcald.station.coming_back import Patience
 from triaxcald.station.guidance import Guide
 from triaxcald.station.raw_records import RawRecords
-from triaxcald.text import DISK_IS_BEHIND, DISK_KEEPS_UP
+from triaxcald.text import DISK_IS_BEHIND, DISK_KEEPS_UP, nothing_deleted
 
 
 class Shown:
@@ -66,6 +66,7 @@ class Writer:
 
     def __init__(self, path: Path) -> None:
         self.current, self.is_behind, self.queued = path, False, 0
+        self.keeps_for: str | None = None
         self.losses: dict[str, int] = {}
 
     def __enter__(self) -> Writer:
@@ -141,6 +142,16 @@ async def test_what_the_disk_ended_is_told_apart_and_says_why(roster: Roster) ->
     await roster.finish()
 
 
+async def test_nothing_begins_once_all_are_to_end(roster: Roster) -> None:
+    roster.begin([Played("a")])
+    finished = asyncio.ensure_future(roster.finish())
+    await turned()
+    finished.cancel()
+    await asyncio.sleep(0)
+    roster.begin([Played("b")])
+    assert [kept.unit for kept in await finished] == ["a"]
+
+
 async def test_one_that_loses_what_comes_is_not_said_to_be_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -155,6 +166,8 @@ async def test_one_that_loses_what_comes_is_not_said_to_be_recorded(
     one.writer.is_behind = False
     await until(lambda: one.shown.lines[1:] == [DISK_KEEPS_UP])
     assert one.status.state is State.RECORDING
+    one.writer.keeps_for = "x.outcome.json"
+    await until(lambda: one.shown.lines[2:] == [nothing_deleted("x.outcome.json")])
     one.ends.set()
     await work
     assert (one.status.state, one.status.path) == (State.ENDED, tmp_path / "a-000002.mcap")

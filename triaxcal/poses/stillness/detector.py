@@ -83,6 +83,8 @@ class StillnessDetector(WindowCutter):
         """Raises TooShort where there is not one whole window yet."""
         if not self._done:
             period_ns = self._period_ns or (self.span_ns / (self.samples - 1) if self.samples > 1 else math.inf)
+            if self._period_ns and self.samples >= least_samples(period_ns):
+                raise _too_short(self._longest, (self._longest - 1) * period_ns, period_ns, in_pieces=True)
             raise _too_short(self.samples, self.span_ns, period_ns, in_pieces=False)
         return super().windows()
 

@@ -89,6 +89,8 @@ class WindowCutter:
     _begin_ns: int = 0
     _pending: list[tuple[Ints, Floats, dict[str, Floats]]] = field(default_factory=list)
     _held: int = 0
+    _longest: int = 0
+    """Samples without a gap, as long as there is no window."""
     _size: int = 0
     _period_ns: float = 0.0
     _names: tuple[str, ...] = ()
@@ -143,6 +145,7 @@ class WindowCutter:
         gaps = np.flatnonzero(np.diff(time_ns, prepend=before) > GAP * self._period_ns)
         start, torn = 0, set(gaps.tolist())
         for stop in (*gaps[gaps > 0], len(time_ns)):
+            self._longest = max(self._longest, stop - start)
             if start in torn:
                 self._broken = True
             whole = (stop - start) // self._size

@@ -327,6 +327,12 @@ def test_too_few_samples_for_a_window_are_an_error(count: int, detect: Detect) -
         detect(np.arange(count) / 100, np.zeros((count, 3)))
 
 
+def test_many_samples_in_bursts_shorter_than_a_window_are_told_as_such(detect: Detect) -> None:
+    bursts = (np.arange(500) * 17.0)[:, None] + np.arange(6)
+    with pytest.raises(TooShort, match=r", and the longest stretch without a gap has 6 in 0\.0\d+ s$"):
+        detect(bursts.ravel() / 1000, np.zeros((3000, 3)))
+
+
 @pytest.mark.parametrize("count", [12, 30, 63, 64, 65])
 def test_few_samples_are_too_short_for_a_pose(count: int, detect: Detect) -> None:
     windows, spans, poses = detect(np.arange(count) / 100, np.random.default_rng(0).standard_normal((count, 3)))
