@@ -45,7 +45,7 @@ def waits(trouble: str) -> str:
     return f"waiting: {trouble}"
 
 
-def nothing_deleted(document: str | None) -> str:
+def nothing_deleted(document: str) -> str:
     """Of retention that may not delete what a document may name."""
     return f"nothing is deleted, as {document} cannot be read, and may name any segment"
 
@@ -68,6 +68,10 @@ def recorded(units: int, buses: int, lost: Sequence[str], ended: Sequence[str], 
 def reloaded(changed: Sequence[str]) -> str:
     """The station file, while what it names is recorded."""
     return f"the station file was read again; changed: {', '.join(changed) or 'nothing'}"
+
+
+def not_begun_again(error: str) -> str:
+    return f"what the disk ended was not begun again: {error}"
 
 
 def not_reloaded(error: str) -> str:

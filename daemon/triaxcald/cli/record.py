@@ -141,7 +141,8 @@ async def _reload(
             leaving = changed(chosen.station, new.station) & (chosen.names | new.names)
             beginning = _recordings(a, new, progress, serials, roster.at_work() - leaving)
         except Exception as e:  # noqa: BLE001 - a driver of anybody's reads its part; what is recorded goes on
-            _tell(progress, "error", text.not_reloaded(reason_of(e)), trace_of(e))
+            failed = text.not_reloaded if asked else text.not_begun_again
+            _tell(progress, "error", failed(reason_of(e)), trace_of(e))
             continue
         _tell(progress, "info", text.reloaded(sorted(leaving)))
         chosen = new

@@ -20,6 +20,7 @@ from triaxcald.files import new_beside, require_new
 from triaxcald.imports.times import Times
 from triaxcald.inputs import CALIBRATION, PROFILE, preview_channels
 from triaxcald.pipeline import only_finite
+from triaxcald.recording import disk
 from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic
 from triaxcald.recording.writer import RecordingWriter
 
@@ -104,6 +105,7 @@ def write_recording(
     Nothing is left then. Raises InputError, RecordingError, LogError.
     """
     require_new(out)
+    disk.require_room(out)
     try:
         with new_beside(out) as temporary:
             temporary.unlink()

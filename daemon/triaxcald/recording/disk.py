@@ -47,7 +47,11 @@ def require_room(path: Path) -> None:
     to its last byte. Raises DiskError."""
     free = free_bytes(path.parent)
     if free is not None and free < END_BYTES:
-        raise DiskError(f"{path}: cannot be created: {free} bytes are free on the disk")
+        raise no_room(path, free)
+
+
+def no_room(path: Path, free: int) -> DiskError:
+    return DiskError(f"{path}: cannot be created: {free} bytes are free on the disk, {END_BYTES} are needed")
 
 
 def not_written(path: Path, e: OSError, sound_ns: int | None) -> DiskError:

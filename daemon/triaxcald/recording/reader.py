@@ -124,8 +124,8 @@ class Recording(Contents):
         unpacked = Unpacked(self.name, self.size)
         for offset in self._chunks:
             held, declared = self._known.get(offset, (None, {}))
-            topics |= declared
             if topic is not None and held is not None and topic not in held:
+                topics |= declared
                 continue
             seen, channels = set[str](), dict[int, str]()
             for record in self._records(offset):

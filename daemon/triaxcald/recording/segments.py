@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ class SegmentedWriter(RecordingWriter):
         self._kept: list[tuple[int, str, str, bytes]] = []
         self._recorded = self._told_low = False
         self._unread: str | None = None
-        """A document that cannot be read, and may name any segment."""
+        """A document that cannot be read, and keeps what else would go."""
         super().__init__(self.manifest, metadata=metadata, **options)
 
     def seal(self, name: str, media_type: str, make: Callable[[Document], bytes]) -> None:
@@ -105,15 +106,14 @@ class SegmentedWriter(RecordingWriter):
             raise disk.not_created(self.manifest, e) from e
 
     def _room_made(self) -> list[Surplus]:
-        """What had to go so that there is room for a file and its end. Raises
-        DiskError."""
-        try:
-            disk.require_room(self.manifest)
-        except DiskError:
-            gone = self._take_away()
-            disk.require_room(self.manifest)
-            return gone
-        return []
+        """What had to go so that there is room for a file and its end; nothing
+        goes where that would not do. Raises DiskError."""
+        free, chosen = disk.free_bytes(self.manifest.parent), self._surplus()
+        if free is None or free >= disk.END_BYTES:
+            return []
+        if free + sum(one.segment.bytes for one in chosen) < disk.END_BYTES:
+            raise self._with_document(disk.no_room(self.manifest, free))
+        return self._take_away(chosen)
 
     # What follows runs on the writer's thread, but for the first segment.
 
@@ -188,9 +188,11 @@ class SegmentedWriter(RecordingWriter):
         try:
             super()._end_for_lack_of_room(free)
         except DiskError as e:
-            if self._unread is None or all(s.state == "open" for s in self._segments.segments):
-                raise
-            raise DiskError(f"{e}; nothing was deleted, as {self._unread} cannot be read") from e
+            raise self._with_document(e) from e
+
+    def _with_document(self, e: DiskError) -> DiskError:
+        """Also with what keeps segments that could make room."""
+        return DiskError(f"{e}; nothing was deleted, as {self._unread} cannot be read") if self._unread else e
 
     def _lacks(self) -> bool:
         """Whether less of the disk is free than is to be."""
@@ -208,20 +210,25 @@ class SegmentedWriter(RecordingWriter):
 
     def _retain(self) -> list[Surplus]:
         """What it has taken away, also said in the file."""
-        gone = self._take_away()
+        gone = self._take_away(self._surplus())
         if gone:
             self._file.write(schema.EVENTS, self._deleted(gone))
         return gone
 
-    def _take_away(self) -> list[Surplus]:
+    def _surplus(self) -> list[Surplus]:
         self._retained_ns = self._steady_ns()
         if self._retention is None:
             return []
-        kept, self._unread = evidence(self._segments)
-        chosen = surplus(
-            self._segments.segments, self._retention, age_ns=self._age_ns,
-            free_bytes=disk.free_bytes(self.manifest.parent), kept=kept,
+        kept, unread = evidence(self._segments)
+        choose = partial(
+            surplus, self._segments.segments, self._retention, age_ns=self._age_ns,
+            free_bytes=disk.free_bytes(self.manifest.parent),
         )  # fmt: skip
+        self._unread = unread if unread is not None and choose(kept=()) else None
+        return choose(kept=kept)
+
+    def _take_away(self, chosen: list[Surplus]) -> list[Surplus]:
+        """Those that are gone."""
         gone = delete(self._segments, chosen)
         if gone:
             self._segments = self._segments.without([(one.segment, one.reason) for one in gone])

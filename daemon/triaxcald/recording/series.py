@@ -79,7 +79,7 @@ class Series(Contents):
             if theirs.get(record, {}).get(key) != ours.get(record, {}).get(key)
         ]
         there = set(self.attachments) & set(recording.attachments) - {schema.STATION_FILE}
-        named += [n for n in sorted(there) if _meaning(recording.attachments[n]) != _meaning(self.attachments[n])]
+        named += [name for name in sorted(there) if not _alike(recording.attachments[name], self.attachments[name])]
         if named:
             raise RecordingError(
                 f"{self.name}: segment {segment.file}: {', '.join(named)}: not as in {first}; "
@@ -93,12 +93,12 @@ class Series(Contents):
         return Recording.open(path, unfinished=segment.state != "closed")
 
 
-def _meaning(data: bytes) -> object:
-    """Of a file of a profile: comments and blanks of TOML mean nothing."""
+def _alike(one: bytes, other: bytes) -> bool:
+    """Of two files of a profile: comments and blanks of TOML mean nothing."""
     try:
-        return tomllib.loads(data.decode())
-    except ValueError:
-        return data
+        return one == other or tomllib.loads(one.decode()) == tomllib.loads(other.decode())
+    except (ValueError, RecursionError):
+        return False
 
 
 def digest_of(path: Path) -> str:

@@ -17,6 +17,7 @@ from typing import Any, Self
 from triaxcal_drivers.interface import Gap, RawBatch, SampleBlock
 from triaxcald.abort import Left, add_action, discard_action
 from triaxcald.errors import RecordingError
+from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ENDED, EndedBecause
 from triaxcald.recording.file import SYNC_S, Head, RecordingFile
@@ -93,7 +94,9 @@ class RecordingWriter:
         add_action(self, self._finish_at_abort)
 
     def _begin(self, head: Head) -> RecordingFile:
-        disk.require_room(self.path)
+        require_new(self.path)
+        if not self._provisional:
+            disk.require_room(self.path)
         return RecordingFile(self.path, head, clock_ns=self._clock_ns, sync_s=self._sync_s)
 
     @property
@@ -115,8 +118,9 @@ class RecordingWriter:
     @property
     def is_behind(self) -> bool:
         """Whether raw records are being lost since the disk does not keep up:
-        some were within `BEHIND_S`."""
-        return time.monotonic() - self._dropped_s < BEHIND_S
+        some were within `BEHIND_S`, or the disk has not got on since."""
+        hangs = any(topic == schema.RAW for topic, _, _ in self._unreported)
+        return hangs or time.monotonic() - self._dropped_s < BEHIND_S
 
     @property
     def resumes(self) -> Gap | None:

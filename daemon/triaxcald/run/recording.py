@@ -209,15 +209,14 @@ class AtRecording(ABC):
     def _look_after(self, writer: RecordingWriter) -> None:
         """Raises RecordingError."""
         writer.check()
-        if writer.is_behind is not self._was_behind:
-            self._was_behind = writer.is_behind
-            if self._was_behind:
-                self._progress.lost(self.name, text.DISK_IS_BEHIND)
-            else:
-                self._progress.stage(self.name, text.DISK_KEEPS_UP)
-        if writer.keeps_for not in (None, self._kept_for):
-            self._progress.stage(self.name, text.nothing_deleted(writer.keeps_for))
-        self._kept_for = writer.keeps_for
+        is_behind, document = writer.is_behind, writer.keeps_for
+        if is_behind and not self._was_behind:
+            self._progress.lost(self.name, text.DISK_IS_BEHIND)
+        elif self._was_behind and not is_behind:
+            self._progress.stage(self.name, text.DISK_KEEPS_UP)
+        if document is not None and document != self._kept_for:
+            self._progress.stage(self.name, text.nothing_deleted(document))
+        self._was_behind, self._kept_for = is_behind, document
 
     async def _end(self, writer: RecordingWriter, e: BaseException) -> None:
         """Where the disk has failed, that is on its way already."""

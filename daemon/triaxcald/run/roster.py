@@ -72,7 +72,8 @@ class Roster:
         while True:
             pending = [task for _, task in self._work.values() if not task.done()]
             if not pending and not self._changes:
-                return [task.result() for _, task in self._work.values()]
+                # One that was cancelled before its first step has come to nothing.
+                return [task.result() for _, task in self._work.values() if not task.cancelled()]
             self._changed.clear()
             changed = asyncio.ensure_future(self._changed.wait())
             try:

@@ -303,7 +303,7 @@ def test_a_recording_in_segments_goes_on_with_the_next_start_and_is_read_by_its_
 def test_what_a_full_disk_ended_begins_again_while_another_unit_goes_on(
     workshop: Any, triaxcal: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free = iter([0, 0])  # as the first segment is to begin, and after retention
+    free = iter([0])  # as the first segment is to begin
     monkeypatch.setattr(disk, "free_bytes", lambda _: next(free, 2**40))
     monkeypatch.setattr("triaxcald.cli.record.AGAIN_S", 0.05)
     folder = workshop.folder / "recordings"
@@ -325,7 +325,9 @@ def test_what_a_full_disk_ended_begins_again_while_another_unit_goes_on(
     assert done.code == 130
     lines = [json.loads(line) for line in done.err.splitlines()]
     (first, last) = [line for line in lines if line["event"] == "ended" and line["unit"] == "unit0"]
-    assert first["message"].endswith("unit0-4711.segments.json: cannot be created: 0 bytes are free on the disk")
+    assert first["message"].endswith(
+        "unit0-4711.segments.json: cannot be created: 0 bytes are free on the disk, 4194304 are needed"
+    )
     assert last["recording"] == str(folder / "unit0-4711.segments.json")
     assert triaxcal("log", "info", folder / "unit0-4711.segments.json", "--json").json["finished"] is True
 

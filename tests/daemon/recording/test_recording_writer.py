@@ -231,6 +231,9 @@ def test_a_disk_is_behind_while_raw_records_are_lost_and_for_a_while_after(
         assert writer.raw("calibration", batch_of(0, 10))
         assert not writer.is_behind
         assert not writer.raw("calibration", batch_of(10, 10))
+        now_s += writer_module.BEHIND_S
+        assert writer.is_behind, "the disk hangs, and nothing comes that could be lost"
+        assert not writer.raw("calibration", batch_of(20, 10))
         disks[0].ready.set()
         writer.drain()
         assert writer.is_behind, "the loss is noted in the file, and the next may come"
@@ -242,7 +245,9 @@ def test_no_recording_begins_where_there_is_no_room_for_its_end(
     tmp_path: Path, new_writer: NewWriter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(disk, "free_bytes", lambda _: disk.END_BYTES - 1)
-    with pytest.raises(DiskError, match=r"rec\.mcap: cannot be created: 4194303 bytes are free on the disk$"):
+    with pytest.raises(
+        DiskError, match=r"rec\.mcap: cannot be created: 4194303 bytes are free on the disk, 4194304 are needed$"
+    ):
         new_writer()
     assert list(tmp_path.glob("*.mcap")) == []
 

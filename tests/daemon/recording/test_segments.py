@@ -338,7 +338,8 @@ def test_a_document_that_cannot_be_read_keeps_all_and_is_named(
 ) -> None:  # fmt: skip
     lay(tmp_path / "other.outcome.json")
     writer = new(retention=Retention(keep_s=1.0, free_bytes=2**62))
-    assert writer.keeps_for is None
+    writer.drain()
+    assert writer.keeps_for is None, "there is nothing yet that could go"
     minutes(writer, 2)
     assert (writer.deleted, writer.keeps_for) == ([], "other.outcome.json")
     monkeypatch.setattr(disk, "free_bytes", lambda _: 1000)
@@ -358,9 +359,21 @@ def test_no_segment_begins_where_there_is_no_room_for_its_end(
     before = files(tmp_path)
     free = disk.END_BYTES - 1
     monkeypatch.setattr(disk, "free_bytes", lambda _: free)
-    with pytest.raises(DiskError, match=rf"rec\.segments\.json: cannot be created: {free} bytes are free on the disk$"):
+    with pytest.raises(
+        DiskError,
+        match=rf"rec\.segments\.json: cannot be created: {free} bytes are free on the disk, 4194304 are needed$",
+    ):
         new()
     assert files(tmp_path) == before
+    free = disk.END_BYTES - 2**20
+    with pytest.raises(DiskError):
+        new(retention=Retention(free_bytes=2**23))
+    assert files(tmp_path) == before, "all of them together would not make room"
+    free = disk.END_BYTES - 1
+    (tmp_path / "x.certificate.json").mkdir()
+    with pytest.raises(DiskError, match=r"; nothing was deleted, as x\.certificate\.json cannot be read$"):
+        new(retention=Retention(free_bytes=2**23))
+    (tmp_path / "x.certificate.json").rmdir()
     monkeypatch.setattr(disk, "free_bytes", lambda _: 2**30 if len(files(tmp_path)) < 4 else free)
     with new(retention=Retention(free_bytes=2**23)) as writer:
         minutes(writer, 1, first=30)

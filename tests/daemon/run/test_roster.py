@@ -152,6 +152,15 @@ async def test_nothing_begins_once_all_are_to_end(roster: Roster) -> None:
     assert [kept.unit for kept in await finished] == ["a"]
 
 
+async def test_one_that_is_stopped_before_its_first_step_costs_no_result_of_others(roster: Roster) -> None:
+    roster.begin([Played("a")])
+    finished = asyncio.ensure_future(roster.finish())
+    await turned()
+    finished.cancel()
+    roster.begin([Played("b")])
+    assert [kept.unit for kept in await finished] == ["a"]
+
+
 async def test_one_that_loses_what_comes_is_not_said_to_be_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
