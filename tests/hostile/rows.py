@@ -347,7 +347,7 @@ TABLES = [
     Row("900 columns with one name", table(_wide(900)), 2, "no three outputs among the columns"),
     Row("a foreign table in one line", table("a;b;c;d;" + "1;" * 5_000_000), 2, "fields, expected at most 1000"),
     Row("a foreign table of quotes", table("t;x;y;z\n0;1;2;3\n" + '"' * 5_000_000 + "\n0,1;1;2;3\n"), 2, ""),
-    Row("a foreign table of blanks", table("t x y z\n0 1 2 3\n" + " " * 20_000_000 + "\n0.1 1 2 3\n"), 2, "too few"),
+    Row("a foreign table of blanks", table("t x y z\n0 1 2 3\n" + " " * 20_000_000 + "\n0.1 1 2 3\n"), 2, "too short"),
     Row("100,000 words", table("t;x;y;z;w\n" + "".join(f"{i / 100};1;2;3;a{i}\n" for i in range(100_000))), 0, ""),
     Row("a gap after each sample", table(HEADER + "".join(f"{(i + 9 * (i % 3)) / 10!r},1,2,3\n"
         for i in range(0, 60_000, 3))), 0, ""),

@@ -188,7 +188,7 @@ class SegmentedWriter(RecordingWriter):
         try:
             super()._end_for_lack_of_room(free)
         except DiskError as e:
-            raise self._with_document(e) from e
+            raise self._with_document(e) from None
 
     def _with_document(self, e: DiskError) -> DiskError:
         """Also with what keeps segments that could make room."""
