@@ -268,12 +268,23 @@ def verdict_of(outside: Sequence[str], limits: Limits) -> str:
     return "outside limits" if outside else "within limits" if judged else "not judged"
 
 
-def over_limits(measured: Mapping[str, float | None], limits: Limits) -> list[str]:
-    """A line for each figure, by its key, that is above its limit, or that is
-    not known."""
-    out = []
-    for name, limit in (("rms_g", limits.rms_g), ("cross_validated_rms_g", limits.cross_validated_rms_g)):
-        value = measured.get(name)
+LIMITED = ("rms_g", "cross_validated_rms_g")
+"""Figures of the fit that a station can limit, by their keys."""
+
+
+def exceeded(measured: Mapping[str, float | None], limits: Limits) -> list[str]:
+    """The keys of figures that are above their limit, or that are not known."""
+    found = []
+    for name in LIMITED:
+        value, limit = measured.get(name), getattr(limits, name)
         if limit is not None and not (value is not None and value <= limit):
-            out.append(f"{name} {micro_g(value)} is above the limit {micro_g(limit)}")
-    return out
+            found.append(name)
+    return found
+
+
+def over_limits(measured: Mapping[str, float | None], limits: Limits) -> list[str]:
+    """A line for each figure that is above its limit, or that is not known."""
+    return [
+        f"{name} {micro_g(measured.get(name))} is above the limit {micro_g(getattr(limits, name))}"
+        for name in exceeded(measured, limits)
+    ]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from triaxcal.errors import Refused
+
 
 class DaemonError(Exception):
     """Root of what this package raises on purpose; the message is one line."""
@@ -44,8 +46,20 @@ class DeviceInUseElsewhere(DeviceInUse):
     """The command is another process, which comes to its end."""
 
 
+class TwoAnswer(StationError):
+    """Two units answer at one address."""
+
+
+class SerialTwice(StationError):
+    """Two places of a station report one serial number."""
+
+
 class ProvisionError(StationError):
     """Writing to the device failed."""
+
+
+class NoPoses(Refused):
+    """No new still pose came within the patience of the plan."""
 
 
 class Implausible(DaemonError):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from triaxcal.interchange.calibration_document import Document
+from triaxcald.exit_codes import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, REFUSED
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import Held
 
@@ -26,15 +27,82 @@ class Verdict(StrEnum):
     NOT_JUDGED = "not_judged"
 
 
+class Code(StrEnum):
+    """Why the work on a unit ended, for programs. Each code has one verdict and
+    one exit code."""
+
+    WITHIN_LIMITS = "within_limits"
+    NO_LIMIT = "no_limit"
+    NOT_CHECKED = "not_checked"
+    """The device holds a calibration that no check pose has seen."""
+    FIT_OUTSIDE = "fit_outside"
+    CROSS_VALIDATED_OUTSIDE = "cross_validated_outside"
+    VERIFICATION_OUTSIDE = "verification_outside"
+    VERIFICATION_WORSE = "verification_worse"
+    NO_POSES = "no_poses"
+    REFUSED = "refused"
+    IMPLAUSIBLE = "implausible"
+    WRONG_UNIT = "wrong_unit"
+    SERIAL_TWICE = "serial_twice"
+    TWO_ANSWER = "two_answer"
+    """Two units answer at one address."""
+    ABSENT = "absent"
+    LOST = "lost"
+    IN_USE = "in_use"
+    NOT_SETTLED = "not_settled"
+    """The device did not take the calibration, or what it holds is open."""
+    DISK = "disk"
+    MEMORY = "memory"
+    STOPPED = "stopped"
+    INTERNAL = "internal"
+
+    @property
+    def verdict(self) -> Verdict:
+        return _ENDS_WITH[self][0]
+
+    @property
+    def exit_code(self) -> int | None:
+        """None where the process may have died without one."""
+        return _ENDS_WITH[self][1]
+
+
+_ENDS_WITH: Mapping[Code, tuple[Verdict, int | None]] = {
+    Code.WITHIN_LIMITS: (Verdict.PASS, DONE),
+    **dict.fromkeys((Code.NO_LIMIT, Code.NOT_CHECKED), (Verdict.NOT_JUDGED, DONE)),
+    **dict.fromkeys(
+        (Code.FIT_OUTSIDE, Code.CROSS_VALIDATED_OUTSIDE, Code.VERIFICATION_OUTSIDE, Code.VERIFICATION_WORSE),
+        (Verdict.FAIL, OUTSIDE),
+    ),
+    **dict.fromkeys((Code.NO_POSES, Code.REFUSED, Code.IMPLAUSIBLE), (Verdict.ABORTED, REFUSED)),
+    **dict.fromkeys(
+        (
+            Code.WRONG_UNIT, Code.SERIAL_TWICE, Code.TWO_ANSWER, Code.ABSENT, Code.LOST, Code.IN_USE, Code.NOT_SETTLED,
+        ),
+        (Verdict.ABORTED, DEVICE),
+    ),
+    **dict.fromkeys((Code.DISK, Code.MEMORY), (Verdict.ABORTED, DISK)),
+    Code.STOPPED: (Verdict.ABORTED, INTERRUPTED),
+    Code.INTERNAL: (Verdict.ABORTED, None),
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Ending:
-    """How the work on one unit ended. ``reason`` is one sentence for people;
+    """How the work on one unit ended. ``reason`` is one sentence for people,
+    ``code`` is for programs: None after bad input, and after a dry run.
     ``exit_code`` as the command owes it."""
 
     verdict: Verdict
     reason: str
     exit_code: int
+    code: Code | None
     wanted: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(code: Code, reason: str) -> Ending:
+        """With the verdict and the exit code of the code."""
+        assert code.exit_code is not None
+        return Ending(code.verdict, reason, code.exit_code, code)
 
 
 @dataclass(frozen=True)
@@ -79,10 +147,12 @@ def outcome_document(
         "station": station,
         "ended": ended,
         "verdict": ending.verdict.value,
+        "code": ending.code.value if ending.code else None,
         "reason": ending.reason,
-        "exit_code": ending.exit_code,
+        "exit_code": None if ending.code is Code.INTERNAL else ending.exit_code,
         "device_state": held.state.value,
         "evidence": held.evidence.value,
+        "observed": held.observations,
         "registers": papers.registers,
         "forced": forced,
         "journal": journal,
@@ -116,6 +186,7 @@ def registers_told(p: Provisioning) -> Document:
     return {
         "differing": list(p.differing),
         "written": list(p.written),
+        "marked": list(p.link.marked),
         "stored": p.stored,
         "cut_short_before": p.carried,
         "undoing_failed": p.undoing_failed,

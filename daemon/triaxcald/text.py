@@ -164,10 +164,16 @@ def left(p: Provisioning, station: Path) -> str:
 
 def provisioned(p: Provisioning) -> str:
     """What was done, and what the device holds now."""
-    if not p.written and p.held.state is DeviceState.NEW_UNVERIFIED:
-        return "the registers in use held these values already, and nothing was written; no restart shows them stored"
     if not p.written:
-        return f"the registers held these values already, and nothing was written; {held(p.held)}"
+        marked = ", ".join(dict.fromkeys(p.link.marked))
+        wrote = (
+            f"; only {marked} was written, to show a restart, and holds its value again"
+            if marked
+            else ", and nothing was written"
+        )
+        if p.held.state is DeviceState.NEW_UNVERIFIED:
+            return f"the registers in use held these values already{wrote}; no restart shows them stored"
+        return f"the registers held these values already{wrote}; {held(p.held)}"
     stored = "written and stored" if p.stores else "written"
     return f"{number_of(len(p.written), 'register')} {stored}; {held(p.held)}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -64,10 +65,14 @@ def test_a_node_that_beats_and_sends_in_segments_is_provisioned(tmp_path: Path, 
         assert bench.holds_new()
 
 
-def test_a_device_that_holds_the_calibration_is_not_written(tmp_path: Path, triaxcal) -> None:
+def test_a_device_that_holds_the_calibration_gets_only_a_mark(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal, wanted=OLD, timing=PATIENT) as bench:
-        assert bench.provision().code == 0
-        assert (bench.unit.written, bench.unit.memory.bytes_written) == ([], 0)
+        done = bench.provision("--json")
+        assert done.code == 0
+        registers = json.loads(done.out)["outcome"]["registers"]
+        assert (registers["written"], registers["marked"]) == ([], ["scale_factor_x"])
+        assert (bench.unit.written, bench.unit.memory.bytes_written) == (["scale_factor_x"], 0)
+        assert bench.unit.in_use == bench.old
 
 
 def test_a_torn_store_leaves_a_mixture_that_shows(tmp_path: Path, triaxcal) -> None:

@@ -20,15 +20,17 @@ from triaxcald.audit.results import (
     Digests,
     compute,
     digests,
+    exit_codes_in,
+    has_codes,
     held_in,
     outcome_again,
     report_of,
 )
-from triaxcald.audit.traffic import Said, Traffic, check
+from triaxcald.audit.traffic import Rules, Said, Traffic, check
 from triaxcald.certificate import drawn_with, software
 from triaxcald.documents import to_text
 from triaxcald.errors import InputError, RecordingError
-from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, REFUSED
+from triaxcald.exit_codes import DEVICE
 from triaxcald.inputs import losses_of, parse_document
 from triaxcald.outcome import ATTACHMENT, FORMAT, Verdict, digest_of
 from triaxcald.provision.state import DeviceState, Held
@@ -40,7 +42,6 @@ from triaxcald.recording.survey import Survey, survey
 from triaxcald.run.line import CERTIFICATE, REPORT
 from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTERS_EARLIER, VERIFICATION_FILE
 
-ABORTED_WITH = (2, REFUSED, DEVICE, DISK, INTERRUPTED)
 NEW = (DeviceState.NEW_VERIFIED, DeviceState.NEW_UNVERIFIED)
 Compute = Callable[[Recording, Digests], Again]
 
@@ -192,8 +193,9 @@ class _Audit:
             self._add(ATTACHMENT, Kind.NO_DOCUMENT)
             return
         self._outcome = held
-        if self._aborted and held.get("exit_code") not in ABORTED_WITH:
-            self._add(ATTACHMENT, Kind.VALUE, "exit_code", stored=held.get("exit_code"), again=list(ABORTED_WITH))
+        aborted_with = exit_codes_in(held)
+        if self._aborted and held.get("exit_code") not in aborted_with:
+            self._add(ATTACHMENT, Kind.VALUE, "exit_code", stored=held.get("exit_code"), again=list(aborted_with))
         state = held_in(held)
         if state is None:
             self._add(ATTACHMENT, Kind.NOT_SHOWN, "device_state", stored=held.get("device_state"))
@@ -309,6 +311,7 @@ class _Audit:
             forced=self._outcome.get("forced") is not None or not self._outcome,
             aborted=self._aborted,
             provisioned=self._check_events(again),
+            rules=Rules.MARK_OR_SUPPLY if has_codes(self._outcome) else Rules.ACKNOWLEDGED,
         )
         if again.written and not self._aborted and self._outcome and said.told is None:
             self._add(ATTACHMENT, Kind.VALUE, "registers", stored=told, again="what was written")

@@ -3,11 +3,11 @@ again in the register traffic."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from triaxcal_drivers.profile import Profile
-from triaxcald.provision.proof import beside, may_mark, own_steps
+from triaxcald.provision.proof import beside, may_mark, own_steps, writes_of
 from triaxcald.recording.schema import RegisterAccess
 
 
@@ -15,7 +15,8 @@ from triaxcald.recording.schema import RegisterAccess
 class Mark:
     """A register that ``held`` a value was given another one, ``put``, by the
     writes at ``at``, which may have been repeated. ``taken``: read back so
-    before the restart; ``asked``: the restart was asked for, and not refused;
+    before the restart; ``standing``: also right before it, when the device was
+    locked again; ``asked``: the restart was asked for, and not refused;
     ``gone_at``: where the value was read as gone after it. ``refused``: the
     device refused each of the writes."""
 
@@ -25,6 +26,7 @@ class Mark:
     at: list[int]
     refused: bool
     taken: bool = False
+    standing: bool = False
     asked: bool = False
     gone_at: int | None = None
     over: bool = False
@@ -32,6 +34,12 @@ class Mark:
 
     @property
     def shows(self) -> bool:
+        return self.standing and self.gone_at is not None
+
+    @property
+    def showed_before(self) -> bool:
+        """By the rules of versions that did not read it again once the device
+        was locked."""
         return self.taken and self.gone_at is not None
 
 
@@ -53,6 +61,7 @@ def marks_in(accesses: Sequence[RegisterAccess], profile: Profile, asked: Collec
     if not may_mark(profile):
         return found
     store, reset = own_steps(profile, "store"), own_steps(profile, "reset")
+    lock = writes_of(profile, "lock") - writes_of(profile, "reset")
     names = {name for name, _ in asked}
     read: dict[str, bytes] = {}
     in_use: dict[str, Mark] = {}
@@ -62,19 +71,26 @@ def marks_in(accesses: Sequence[RegisterAccess], profile: Profile, asked: Collec
             if not a.error and a.register in names:
                 _read(found, in_use, mark, i, a)
                 read[a.register] = a.raw
+            elif mark is not None and not mark.asked:
+                mark.standing = False
         elif a.register in names:
             if mark is not None and a.raw == mark.put and not mark.asked:
                 mark.at.append(i)
                 mark.refused &= refused
                 found.writes.add(i)
                 continue
+            before = [mark.held] if mark is not None else []
+            if a.register in read:
+                before.append(read[a.register])
             if mark is not None:
                 mark.over = True
                 del in_use[a.register]
                 if a.raw == mark.held:
                     found.writes.add(i)
-            elif _is_mark(profile, a, read, asked):
-                in_use[a.register] = mark = Mark(a.register, read[a.register], a.raw, [i], refused, asked=not reset)
+                    continue
+            held = next((raw for raw in before if _is_mark(profile, a, raw, asked)), None)
+            if held is not None:  # the first mark, or that of a further attempt
+                in_use[a.register] = mark = Mark(a.register, held, a.raw, [i], refused, asked=not reset)
                 found.marks.append(mark)
                 found.writes.add(i)
         elif (a.register, a.raw) in store:
@@ -82,6 +98,9 @@ def marks_in(accesses: Sequence[RegisterAccess], profile: Profile, asked: Collec
                 found.marks.remove(mark)
                 found.writes -= set(mark.at)
             in_use.clear()
+        elif (a.register, a.raw) in lock:
+            for mark in in_use.values():
+                mark.standing &= mark.asked
         elif (a.register, a.raw) in reset and not refused:
             for mark in in_use.values():
                 mark.asked = True
@@ -97,12 +116,9 @@ def _read(found: Marks, in_use: dict[str, Mark], mark: Mark | None, i: int, a: R
         mark.over = True
         del in_use[a.register]
     elif not mark.asked:
-        mark.taken = True
+        mark.taken = mark.standing = True
         found.reads.add(i)
 
 
-def _is_mark(
-    profile: Profile, a: RegisterAccess, read: Mapping[str, bytes], asked: Collection[tuple[str, bytes]]
-) -> bool:
-    held = read.get(a.register)
-    return held is not None and (a.register, a.raw) not in asked and a.raw in beside(profile, a.register, held)
+def _is_mark(profile: Profile, a: RegisterAccess, held: bytes, asked: Collection[tuple[str, bytes]]) -> bool:
+    return (a.register, a.raw) not in asked and a.raw in beside(profile, a.register, held)

@@ -14,10 +14,11 @@ from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald.audit.previews import Previews, Thinned
 from triaxcald.certificate import Certified, certify
 from triaxcald.errors import DaemonError, RecordingError
+from triaxcald.exit_codes import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
-from triaxcald.outcome import Ending, Papers, Verdict, measured_in, outcome_document
+from triaxcald.outcome import Code, Ending, Papers, Verdict, measured_in, outcome_document
 from triaxcald.pipeline import Pipeline
-from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import STATION_FILE, RawDigest
 from triaxcald.report.unit import unit_report
@@ -69,7 +70,7 @@ class Again:
         if self.certified is None:
             return None
         verification = self.verification if self.checked else None
-        return judged(self.certified.document["outside"], verification, self.station.limits)
+        return judged(self.certified.document, verification, self.station.limits)
 
 
 def digests(recording: Recording) -> Digests:
@@ -146,9 +147,16 @@ def held_in(outcome: Mapping[str, Any]) -> Held | None:
     """What the device holds, as an outcome says it; None where it says no such
     thing."""
     try:
-        return Held(DeviceState(str(outcome.get("device_state"))), Evidence(str(outcome.get("evidence"))))
-    except ValueError:
+        state, evidence = DeviceState(str(outcome.get("device_state"))), Evidence(str(outcome.get("evidence")))
+        return Held(state, evidence, {Observation(o) for o in outcome.get("observed") or ()})
+    except (ValueError, TypeError):
         return None
+
+
+def has_codes(outcome: Mapping[str, Any]) -> bool:
+    """Whether the version that wrote the outcome gave it a code, and kept the
+    observations of the device apart; versions before 0.2 did neither."""
+    return "code" in outcome
 
 
 def report_of(again: Again, ending: Ending, held: Held) -> str:
@@ -169,6 +177,7 @@ def outcome_again(
             Verdict.ABORTED,
             str(stored.get("reason")),
             _whole(stored.get("exit_code")),
+            _code_in(stored),
             _texts(stored.get("wanted_poses")),
         )
     certificate = again.certified.document if again.certified else None
@@ -177,7 +186,7 @@ def outcome_again(
     checked = again.checked and not aborted
     unit = recording.metadata.get("unit", {})
     named = recording.metadata.get("software", {})
-    return outcome_document(
+    document = outcome_document(
         ending,
         held_in(stored) or Held(),
         Papers(
@@ -198,6 +207,28 @@ def outcome_again(
         journal=stored.get("journal"),
         forced=stored.get("forced"),
     )
+    if not has_codes(stored):
+        document = {name: value for name, value in document.items() if name not in ("code", "observed")}
+    return document
+
+
+ABORTED_WITH = (BAD_INPUT, REFUSED, DEVICE, DISK, INTERRUPTED)
+
+
+def exit_codes_in(outcome: Mapping[str, Any]) -> tuple[int | None, ...]:
+    """The exit codes that an aborted outcome may have: that of its code, or bad
+    input without one. Earlier versions wrote no code."""
+    if not has_codes(outcome):
+        return ABORTED_WITH
+    code = _code_in(outcome)
+    return (code.exit_code if code else BAD_INPUT,)
+
+
+def _code_in(outcome: Mapping[str, Any]) -> Code | None:
+    try:
+        return Code(str(outcome.get("code")))
+    except ValueError:
+        return None
 
 
 def _whole(value: object) -> int:

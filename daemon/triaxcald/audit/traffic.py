@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 from functools import cached_property
 
 from triaxcal_drivers.profile import Profile
@@ -18,7 +19,7 @@ from triaxcald.provision.plausible import doubts
 from triaxcald.provision.power import MISSED
 from triaxcald.provision.proof import SEQUENCES, may_mark, own_steps, writes_of
 from triaxcald.provision.sequence import Label
-from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.schema import REGISTERS, RegisterAccess
 from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE
 
@@ -125,6 +126,15 @@ class Traffic:
         return longest >= MISSED
 
 
+class Rules(Enum):
+    """What a version of this program took as evidence of a restart."""
+
+    ACKNOWLEDGED = auto()
+    """Also an acknowledgement, where no register could get a mark."""
+    MARK_OR_SUPPLY = auto()
+    """Only a mark that is gone, or a supply that was seen off."""
+
+
 @dataclass(frozen=True)
 class Said:
     """What a recording says of its registers. ``earlier`` is what an undoing
@@ -144,6 +154,7 @@ class Said:
     provisioned: Sequence[str] | None
     """The registers that were written, by the event; None where there is no
     such event."""
+    rules: Rules = Rules.MARK_OR_SUPPLY
 
     @property
     def old(self) -> Raw | None:
@@ -284,7 +295,28 @@ def _state(traffic: Traffic, said: Said) -> list[Difference]:
     proof = _PROVEN.get(said.held.evidence)
     proven = said.held.evidence in _GOES_WITH[said.held.state] and (proof is None or proof(traffic, said))
     found = [] if shown else [Difference(ATTACHMENT, Kind.NOT_SHOWN, "device_state", said.held.state.value)]
-    return found if proven else [*found, Difference(ATTACHMENT, Kind.NOT_SHOWN, "evidence", said.held.evidence.value)]
+    if not proven:
+        found.append(Difference(ATTACHMENT, Kind.NOT_SHOWN, "evidence", said.held.evidence.value))
+    if said.rules is Rules.MARK_OR_SUPPLY:
+        found += _observed(traffic, said)
+    return found
+
+
+def _observed(traffic: Traffic, said: Said) -> list[Difference]:
+    """Observations that the traffic does not show."""
+    assert said.held is not None
+    shows: dict[Observation, bool] = {
+        Observation.ACKNOWLEDGED: any(not traffic.accesses[i].error for i in traffic.own("store")),
+        Observation.COUNTER_ADVANCED: _counted(traffic, said),
+        Observation.READ_BACK: bool(traffic.snapshots),
+        Observation.MARK_GONE: any(m.shows for m in traffic.marks.marks),
+        Observation.SUPPLY_SWITCHED: traffic.silent_since(-1),
+    }
+    return [
+        Difference(ATTACHMENT, Kind.NOT_SHOWN, "observed", observation.value)
+        for observation in said.held.observed
+        if not shows[observation]
+    ]
 
 
 def _new(traffic: Traffic, said: Said) -> bool:
@@ -326,6 +358,8 @@ def _restarted(traffic: Traffic, said: Said) -> bool:
     """A restart after the last write, then all registers read. Where another
     value was put into a register in use before it, that value has to be gone;
     one that nobody acknowledged counts likewise."""
+    if said.rules is Rules.MARK_OR_SUPPLY:
+        return _shown(traffic, said)
     lasting = said.held is not None and said.held.state is DeviceState.OLD
     if not traffic.profile.sequences.reset:  # it may have lost its supply, and started from what is stored
         return lasting
@@ -333,7 +367,7 @@ def _restarted(traffic: Traffic, said: Said) -> bool:
         return True
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
     if _offered(traffic):
-        return _shown(traffic)
+        return _shown(traffic, said)
     image, old = said.new, said.before or {}
     tried = any(a.raw == old.get(a.register) != image.get(a.register) for _, a in traffic.writes)
     if _acknowledged(traffic):
@@ -346,11 +380,13 @@ def _power_cycled(traffic: Traffic, said: Said) -> bool:
 
 
 def _not_restarted(traffic: Traffic, said: Said) -> bool:
-    """Nothing was read after a restart that showed, or that was acknowledged
-    where none can show: else it would have proven the registers."""
+    """Nothing was read after a restart that showed: else it would have proven
+    the registers. The earlier rules also took an acknowledgement for one."""
     if said.held is None or said.held.state is not DeviceState.NEW_UNVERIFIED:
         return True
-    return not (_shown(traffic) if may_mark(traffic.profile) else _acknowledged(traffic))
+    if said.rules is Rules.MARK_OR_SUPPLY:
+        return not _shown(traffic, said)
+    return not (_shown(traffic, said) if may_mark(traffic.profile) else _acknowledged(traffic))
 
 
 def _offered(traffic: Traffic) -> list[Mark]:
@@ -358,11 +394,13 @@ def _offered(traffic: Traffic) -> list[Mark]:
     return [m for m in traffic.marks.marks if m.at[0] > traffic.last_write and not m.refused]
 
 
-def _shown(traffic: Traffic) -> bool:
+def _shown(traffic: Traffic, said: Said) -> bool:
     """Whether one of them was gone before all registers were read, and none is
     left in use."""
     last = traffic.snapshots[-1].at if traffic.snapshots else -1
-    gone = [m.gone_at for m in _offered(traffic) if m.shows and m.gone_at is not None]
+    strict = said.rules is Rules.MARK_OR_SUPPLY
+    shows = [m for m in _offered(traffic) if (m.shows if strict else m.showed_before)]
+    gone = [m.gone_at for m in shows if m.gone_at is not None]
     return any(at < last for at in gone) and all(m.over for m in _offered(traffic))
 
 

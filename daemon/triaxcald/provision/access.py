@@ -65,6 +65,8 @@ class RegisterLink:
         self._not_opened: str | None = None
         self.touched: set[str] = set()
         """Registers that somebody has tried to write."""
+        self.marked: list[str] = []
+        """Registers that got a mark, or their value back, for each such write."""
 
     async def open(self) -> None:
         try:

@@ -18,11 +18,11 @@ from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.provision.image import RegisterImage, calibration_registers
 from triaxcald.provision.journal import Entry, Journal, Step
 from triaxcald.provision.plausible import Doubt, doubts, unstable
-from triaxcald.provision.proof import proven_restart
+from triaxcald.provision.proof import Restart, proven_restart
 from triaxcald.provision.restore import restore
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
-from triaxcald.provision.state import DeviceState, Evidence, Held
+from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.provision.unfinished import was_cut_short
 
 T = TypeVar("T")
@@ -69,6 +69,7 @@ class Provisioning:
     """What is in use is the image, and the provisioning that was cut short may
     not have stored it."""
     _restarted: bool = False
+    """Whether a mark was gone before the registers were read at first."""
     _journal_lies: bool = False
     _journaled: bool = False
     _unlocked: bool = False
@@ -127,11 +128,11 @@ class Provisioning:
         self.found = await self._read("reading the old calibration")
         self.restart_owed = self.resets and (entry is not None or not self.found.differing(self.image.raw))
         if restart and self.restart_owed:
-            if entry is None:  # what nothing is to be written to is not written for a proof
-                self._restarted = await self._sequence("reset")
+            if entry is None:  # `write` shows a restart with a mark, once the doubts are answered
+                await self._sequence("reset")
             else:
                 self.steps.append("reset")
-                self._restarted = await self._restart(entry.before, entry.wanted)
+                self._restarted = (await self._restart(entry.before, entry.wanted)).mark_gone
             self.found = await self._read("reading the stored calibration")
             self.restart_owed = False
         self.before = self.after = self.found
@@ -165,9 +166,8 @@ class Provisioning:
                 await self._write()
                 await self._store()
                 await self._prove()
-            elif self._restarted and not self._journal_lies:
-                self.held.now(DeviceState.NEW_VERIFIED, Evidence.RESTART)
             else:
+                self.held.saw(Observation.READ_BACK)
                 self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
                 await self._prove()
         except (DriverError, StationError) as e:
@@ -218,6 +218,7 @@ class Provisioning:
             return
         self.steps.append("power cycle")
         if await self.power_cycle():
+            self.held.saw(Observation.SUPPLY_SWITCHED)
             self.after = await self._look()
             if lost := self.after.differing(self.before.raw):
                 self.undoing_failed = f"after the power cycle {', '.join(lost)} no longer held the old calibration"
@@ -274,11 +275,18 @@ class Provisioning:
             count = await self._times_stored()
             self._store_asked = True
             self.stored = await self._sequence("store")
-            if not self.stored:
+            if self.stored:
+                self.held.saw(Observation.ACKNOWLEDGED)
+            else:
                 await self._reach()
-                self._by_counter(count, await self._times_stored())
+            self._by_counter(count, await self._times_stored())
+            # The supply may have failed in the store: then the device has started
+            # from half of it.
+            self.after = await self._read_after_store()
+            self._require_image()
         else:
             self.stored = True
+        self.held.saw(Observation.READ_BACK)
         if self.stored and self.held.state is not DeviceState.NEW_UNVERIFIED:
             self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
         if self.stored:
@@ -286,12 +294,20 @@ class Provisioning:
         self.steps.append("lock")
         await lock_quietly(self.link, self.bundle)
 
+    async def _read_after_store(self) -> Snapshot:
+        self.steps.append("reading after the store")
+        try:
+            return await self._look()
+        except NO_CONTACT:
+            await self._reach()
+            return await self._look()
+
     async def _prove(self) -> None:
         self._decided = True  # whatever happens now, writing more would not make it any surer
         if self.resets:
             await self._prove_by_restart()
-        elif not self.stored:
-            await self._decide(Evidence.READ_BACK)  # it may have lost its supply, and started from what is stored
+        else:
+            await self._decide(Evidence.READ_BACK)  # it may have dropped the registers when it was locked
         if self.held.state is not DeviceState.NEW_VERIFIED:
             await self._prove_by_power_cycle()
         if self.held.state is DeviceState.UNKNOWN:
@@ -302,12 +318,13 @@ class Provisioning:
             return
         self.steps.append("power cycle")
         if await self.power_cycle():
+            self.held.saw(Observation.SUPPLY_SWITCHED)
             await self._decide(Evidence.POWER_CYCLE)
 
     async def _prove_by_restart(self) -> None:
         self.steps.append("reset")
         try:
-            shown = await self._restart(self.image.raw, self.before.raw, self.found.raw)
+            restart = await self._restart(self.image.raw, self.before.raw, self.found.raw)
         except RegisterRefused:
             if self.power_cycle is None:
                 raise
@@ -316,10 +333,10 @@ class Provisioning:
             self._decided = False  # a value that nobody wants is in use
             raise
         self.steps.append("identity after the reset")
-        await self._decide(Evidence.RESTART if shown else Evidence.READ_BACK)
+        await self._decide(Evidence.RESTART if restart.mark_gone else Evidence.READ_BACK)
 
     async def _decide(self, evidence: Evidence) -> None:
-        """What the device holds, by reading it. Raises ProvisionError where
+        """State what the device holds, by reading it. Raises ProvisionError if
         that is not the image."""
         try:
             self.after = await self._look()
@@ -330,13 +347,11 @@ class Provisioning:
             if evidence is not Evidence.READ_BACK:
                 self.held.now(DeviceState.NEW_VERIFIED, evidence)
             return
-        if not self.after.differing(self.before.raw):
-            # Read from what is stored: what was in use before the restart was
-            # the image.
-            self.held.now(DeviceState.OLD, Evidence.RESTART if evidence is Evidence.READ_BACK else evidence)
+        if not self.after.differing(self.before.raw) and evidence is not Evidence.READ_BACK:
+            self.held.now(DeviceState.OLD, evidence)
             raise ProvisionError("after the restart the registers hold the old calibration: nothing was stored")
-        self._decided = False
-        self.held.now(DeviceState.MIXED, evidence)
+        self._decided = False  # what is stored is unknown until the old calibration is written and stored
+        self.held.now(DeviceState.MIXED if self.after.differing(self.before.raw) else DeviceState.UNKNOWN, evidence)
         self._require_image()
 
     # Backwards.
@@ -355,11 +370,16 @@ class Provisioning:
         lasting = self._store_asked or not self.stores or self.carried
         was = self.held.state, self.held.evidence
         self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+        self.held.observed.clear()
         self.link.refresh()
         self.link.go_on_unrecorded()
         self.link.touched.clear()
         try:
-            self.held.now(DeviceState.OLD, await restore(self.link, self.bundle, self.before, stored=lasting))
+            evidence = await restore(self.link, self.bundle, self.before, stored=lasting, wanted=self.image.raw)
+            self.held.saw(Observation.READ_BACK)
+            if evidence is Evidence.RESTART:
+                self.held.saw(Observation.MARK_GONE)
+            self.held.now(DeviceState.OLD, evidence)
         except StationError as e:
             self.undoing_failed = str(e)
             if not self.link.touched & set(self.before.raw):
@@ -371,7 +391,7 @@ class Provisioning:
         """What an undoing that failed has left. Raises DriverError,
         StationError."""
         await self._require_same_unit()
-        restarted = self.resets and await self._restart(self.before.raw, self.image.raw)
+        restarted = self.resets and (await self._restart(self.before.raw, self.image.raw)).mark_gone
         held = self.after = await self._look()
         state = self._state_of(held)
         if not restarted and state is DeviceState.OLD and lasting:
@@ -392,8 +412,11 @@ class Provisioning:
         self.steps.append(label)
         return await run_sequence(self.link, self.bundle, label)
 
-    async def _restart(self, *known: Mapping[str, bytes]) -> bool:
-        return await proven_restart(self.link, self.bundle, self.identity.serial, *known)
+    async def _restart(self, *known: Mapping[str, bytes]) -> Restart:
+        restart = await proven_restart(self.link, self.bundle, self.identity.serial, *known)
+        if restart.mark_gone:
+            self.held.saw(Observation.MARK_GONE)
+        return restart
 
     async def _read(self, step: str) -> Snapshot:
         self.steps.append(step)
@@ -419,12 +442,14 @@ class Provisioning:
         return None if name is None else await self.link.read(name)
 
     def _by_counter(self, before: bytes | None, after: bytes | None) -> None:
-        """What came of a store that went unanswered, where the device counts
-        its stores."""
+        """Whether the device counted the store. Raises ProvisionError if a store
+        without an answer was not counted, and no restart can show more."""
         if before is not None and before != after:
-            self.stored = True
-            self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.WRITE_COUNTER)
-        elif before is not None and not self.resets:
+            self.held.saw(Observation.COUNTER_ADVANCED)
+            if not self.stored:
+                self.stored = True
+                self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.WRITE_COUNTER)
+        elif not self.stored and before is not None and not self.resets:
             raise ProvisionError("the store went unanswered, and by its counter the device has not stored")
 
     def _require_image(self) -> None:

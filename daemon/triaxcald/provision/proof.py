@@ -1,4 +1,4 @@
-"""Restarts a device so that the restart shows."""
+"""Restarts a device and shows whether it restarted."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
 
 from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, WriteStep
@@ -16,17 +15,30 @@ from triaxcald.provision.identity import WrongUnit, check_identity
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 
 ATTEMPTS = 2
-"""The request of a restart is lost at times, and is not repeated by itself."""
+"""A restart command is lost at times, and is not repeated by the link. The
+second attempt uses another mark."""
 SEQUENCES: tuple[Label, ...] = ("unlock", "store", "lock", "reset")
-TRIED = 3
-"""Values that a device is offered; one may lie beyond limits that its profile
-does not tell."""
+BITS = (1, 2, 4)
+"""Bits that a mark may differ by: one for each attempt, and one in reserve for
+a value that equals a stored one."""
+REGISTERS_TRIED = 3
+"""A register may refuse a value beyond limits that its profile does not state."""
+
+
+@dataclass(frozen=True)
+class Restart:
+    """What a restart command showed. ``acknowledged`` alone proves nothing:
+    `proven_restart` says why. ``mark_gone``: a value that was in use, and
+    stored nowhere, was gone afterwards."""
+
+    acknowledged: bool
+    mark_gone: bool
 
 
 @dataclass(frozen=True)
 class _Mark:
-    """A register that ``held`` a value and is to hold another one, ``put``.
-    ``taken``: whether it is known to."""
+    """A register that ``held`` a value and was given another one, ``put``.
+    ``taken``: the register read back ``put``."""
 
     name: str
     held: bytes
@@ -34,28 +46,29 @@ class _Mark:
     taken: bool
 
 
-async def proven_restart(link: RegisterLink, bundle: Bundle, serial: str | None, *known: Mapping[str, bytes]) -> bool:
-    """Restart the unit of that serial number; whether it shows that it did.
+async def proven_restart(
+    link: RegisterLink, bundle: Bundle, serial: str | None, *known: Mapping[str, bytes]
+) -> Restart:
+    """Restart the unit of that serial number, and show whether it restarted.
 
-    An acknowledgement does not show it: the command may go to a wrong register,
-    be ignored by a device that is locked, or be carried out later. So before it
-    a register in use is given a value that is stored nowhere, off by one bit
-    from the one that it holds: only a restart takes it away. The value is put
-    back where the restart did not, or failed.
+    An acknowledgement is no proof: the command may reach a wrong register, a
+    locked device may ignore it, or the device may carry it out later. So one
+    register in use first gets a mark: a value that is stored nowhere, one bit
+    off from the value that it holds. Only a restart takes the mark away. The
+    register gets its value back if the restart fails or does not show.
 
-    ``known`` are the values by register of which one is stored. Where writes
-    last without a store, or the device refuses such values, its acknowledgement
-    has to do; where the value is not known to be in use, nothing is shown.
-    Raises ProvisionError where the register does not take its value again;
-    WrongUnit; RegisterRefused, other DriverError, SequenceStalled of the
-    restart.
+    ``known`` are register images, one of which is stored: no mark equals them.
+    No register gets a mark where writes last without a store, or where the
+    device refuses the values. Raises ProvisionError if the register does not
+    take its value again; WrongUnit; RegisterRefused, other DriverError,
+    SequenceStalled of the restart.
     """
     touched = set(link.touched)
     mark = await _marked(link, bundle, serial, known)
     if mark is None:
-        return await run_sequence(link, bundle, "reset")
+        return Restart(await run_sequence(link, bundle, "reset"), mark_gone=False)
     try:
-        gone = await _taken_away(link, bundle, mark)
+        restart, mark = await _restarted(link, bundle, serial, mark, known)
     except BaseException as e:
         try:
             await _put_back(link, bundle, serial, mark)
@@ -63,48 +76,74 @@ async def proven_restart(link: RegisterLink, bundle: Bundle, serial: str | None,
             if isinstance(e, RegisterRefused):  # it answers, and keeps a value that nobody wants
                 raise
         raise
-    if not gone:
+    if not restart.mark_gone and await _read_again(link, bundle.profile, mark.name) == mark.put:
         await _put_back(link, bundle, serial, mark)
-    if mark.name not in touched:  # it holds what it would without the proof
+    if mark.name not in touched:  # the register holds what it would hold without the mark
         link.touched.discard(mark.name)
-    return gone and mark.taken
+    return restart
 
 
-async def _taken_away(link: RegisterLink, bundle: Bundle, mark: _Mark) -> bool:
-    for _ in range(ATTEMPTS):
-        await run_sequence(link, bundle, "reset")
+async def _restarted(
+    link: RegisterLink, bundle: Bundle, serial: str | None, mark: _Mark, known: Collection[Mapping[str, bytes]]
+) -> tuple[Restart, _Mark]:
+    """Send the restart command until the mark is gone; the mark that was used
+    last."""
+    used = [mark.put]
+    while True:
+        # A device may drop what is not stored when it is locked. Then the mark
+        # is gone before the restart, and shows nothing.
+        standing = mark.taken and await _is(link, mark.name, mark.put)
+        link.refresh()
+        acknowledged = await run_sequence(link, bundle, "reset")
         if await _read_again(link, bundle.profile, mark.name) != mark.put:
-            return True
-    return False
+            return Restart(acknowledged, mark_gone=standing), mark
+        # Either the device did not restart, or its store spoiled just this bit.
+        # Another mark tells these apart.
+        other = next(_others(bundle.profile, mark.name, mark.held, known, used), None)
+        if len(used) == ATTEMPTS or other is None:
+            return Restart(acknowledged, mark_gone=False), mark
+        used.append(other)
+        try:
+            mark = _Mark(mark.name, mark.held, other, await _put(link, bundle, serial, mark.name, other))
+        except RegisterRefused:
+            return Restart(acknowledged, mark_gone=False), mark
 
 
 async def _marked(
     link: RegisterLink, bundle: Bundle, serial: str | None, known: Collection[Mapping[str, bytes]]
 ) -> _Mark | None:
-    """None where no register may have another value, or the device refuses
-    each."""
+    """None where no register may get another value, or the device refuses all
+    that are offered."""
     if not may_mark(bundle.profile):
         return None
-    for name in islice(_names(bundle.profile, known), TRIED):
+    for name in list(_names(bundle.profile, known))[:REGISTERS_TRIED]:
         held = await link.read(name)
-        taken = [registers.get(name) for registers in known]
-        put = next((other for other in beside(bundle.profile, name, held) if other not in taken), None)
+        put = next(_others(bundle.profile, name, held, known), None)
         if put is not None:
             with suppress(RegisterRefused):
                 return _Mark(name, held, put, await _put(link, bundle, serial, name, put))
     return None
 
 
+def _others(
+    profile: Profile, name: str, held: bytes, known: Collection[Mapping[str, bytes]], used: Collection[bytes] = ()
+) -> Iterator[bytes]:
+    """Values for a mark: none that is stored, or was used before."""
+    taken = [*used, *(registers.get(name) for registers in known)]
+    return (other for other in beside(profile, name, held) if other not in taken)
+
+
 def _names(profile: Profile, known: Collection[Mapping[str, bytes]]) -> Iterator[str]:
-    """Better one that was written anyhow, and never the checksum."""
+    """Registers for a mark: first those that are written anyhow, never the
+    checksum."""
     checksum = profile.crc.register_name if profile.crc else None
     names = dict.fromkeys(name for registers in known for name in registers if name != checksum)
     yield from sorted(names, key=lambda name: len({registers.get(name) for registers in known}) == 1)
 
 
 def may_mark(profile: Profile) -> bool:
-    """Whether a value may be written that is not to stay: nothing lasts without
-    the store, and no other sequence stores."""
+    """Whether a register may get a mark: no write lasts without the store, and
+    no other sequence stores."""
     elsewhere = writes_of(profile, "lock") | writes_of(profile, "reset")
     store = writes_of(profile, "store") - writes_of(profile, "unlock")
     return bool(store) and not store & elsewhere
@@ -124,21 +163,23 @@ def writes_of(profile: Profile, label: Label) -> set[tuple[str, bytes]]:
 
 
 def beside(profile: Profile, name: str, raw: bytes) -> list[bytes]:
-    """Values within the register's limits that differ from ``raw`` by one bit,
-    the nearest first: of the last byte, or of the first where the least
-    significant one comes first."""
+    """Values within the register's limits that differ from ``raw`` by one of
+    the three lowest bits, the nearest first. The lowest bits lie in the last
+    byte, or in the first one if the least significant byte comes first."""
     register, value = profile.registers[name], profile.decode(name, raw)
     low = -math.inf if register.minimum is None else register.minimum
     high = math.inf if register.maximum is None else register.maximum
-    near = [bytes([*raw[:-1], raw[-1] ^ bit]) for bit in (1, 2)] + [bytes([raw[0] ^ bit, *raw[1:]]) for bit in (1, 2)]
+    last = [bytes([*raw[:-1], raw[-1] ^ bit]) for bit in BITS]
+    first = [bytes([raw[0] ^ bit, *raw[1:]]) for bit in BITS]
+    near = dict.fromkeys([*last, *first])  # the same values in a register of one byte
     off = [(abs(profile.decode(name, other) - value), other) for other in near]
     allowed = sorted((far, other) for far, other in off if far > 0 and low <= profile.decode(name, other) <= high)
-    return [other for _, other in allowed[:2]]
+    return [other for _, other in allowed[: len(BITS)]]
 
 
 async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str, raw: bytes) -> bool:
-    """Whether the register is known to hold the value now. Raises WrongUnit,
-    with nothing written; RegisterRefused of the write."""
+    """Whether the register read back the value. Raises WrongUnit, with nothing
+    written; RegisterRefused of the write."""
     try:
         await check_identity(link, bundle, serial)
         await run_sequence(link, bundle, "unlock")
@@ -148,6 +189,7 @@ async def _put(link: RegisterLink, bundle: Bundle, serial: str | None, name: str
     except (*NO_CONTACT, RegisterRefused, StationError):
         link.refresh()
         return False
+    link.marked.append(name)
     try:
         await link.write(name, raw)
         taken = await _is(link, name, raw)

@@ -3,6 +3,7 @@ device is in."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 from triaxcal_drivers.errors import DriverError, RegisterRefused
@@ -15,25 +16,38 @@ from triaxcald.provision.sequence import lock_quietly, reconnect, run_sequence, 
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.provision.state import Evidence
 
+Images = Sequence[Mapping[str, bytes]]
 
-async def restore(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, *, stored: bool = True) -> Evidence:
+
+async def restore(
+    link: RegisterLink,
+    bundle: Bundle,
+    snapshot: Snapshot,
+    *,
+    stored: bool = True,
+    wanted: Mapping[str, bytes] | None = None,
+) -> Evidence:
     """Make the device hold ``snapshot``, also permanently where ``stored`` says
-    that it may have been overwritten.
+    that it may have been overwritten; ``wanted`` is what may have been stored
+    in its place.
 
-    First a restart, since that brings back whatever is stored without writing;
-    then, only where it is not the snapshot, the registers that differ. Returns
-    once every register reads back as the snapshot's raw bytes, and what shows
-    it: with ``stored`` a restart, where the device has one. Raises
-    ProvisionError that says why not; WrongUnit, with nothing written, where
-    another unit answers.
+    First a restart: it brings back what is stored, and writes nothing. Then the
+    registers that differ are written, and stored if ``stored``. The store is
+    also sent if no restart has shown what is stored: the registers in use may
+    differ from it. Returns once every register reads back as the snapshot's raw
+    bytes; the evidence is a restart only if a mark was gone after it. Raises
+    ProvisionError that says why not; WrongUnit, with nothing written, if another
+    unit answers.
     """
+    known = [snapshot.raw, wanted or {}]
     try:
         await _contact(link, bundle, snapshot)
         if stored:
             await let_a_store_end(link, bundle)
-        restarted = await _restart(link, bundle, snapshot)
-        if await differing(link, bundle, snapshot):
-            restarted = await _write_back(link, bundle, snapshot, stored)
+        restarted = await _restart(link, bundle, snapshot, known)
+        doubtful = stored and not restarted and bool(bundle.profile.sequences.store)
+        if await differing(link, bundle, snapshot) or doubtful:
+            restarted = await _write_back(link, bundle, snapshot, known, stored)
     except DriverError as e:
         raise ProvisionError(str(e)) from e
     if not stored:
@@ -66,20 +80,20 @@ async def _contact(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> No
         await check_identity(link, bundle, snapshot.serial)
 
 
-async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot) -> bool:
-    """Whether the device is known to have restarted."""
+async def _restart(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known: Images) -> bool:
+    """Whether a mark shows that the device restarted."""
     if not bundle.profile.sequences.reset:
         return False
     await lock_quietly(link, bundle)
     try:
-        return await proven_restart(link, bundle, snapshot.serial, snapshot.raw)
+        return (await proven_restart(link, bundle, snapshot.serial, *known)).mark_gone
     except WrongUnit:
         raise
     except (RegisterRefused, ProvisionError):
         return False  # writing back may still do
 
 
-async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, stored: bool) -> bool:
+async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, known: Images, stored: bool) -> bool:
     acknowledged, theirs = True, False
     try:
         await run_sequence(link, bundle, "unlock")
@@ -88,6 +102,7 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, st
         await _require_equal(link, bundle, snapshot)  # before anything wrong is made permanent
         if stored:
             acknowledged = await run_sequence(link, bundle, "store")
+            await _require_equal(link, bundle, snapshot)  # the supply may have failed in the store
     except WrongUnit:
         theirs = True
         raise
@@ -96,9 +111,9 @@ async def _write_back(link: RegisterLink, bundle: Bundle, snapshot: Snapshot, st
             await lock_quietly(link, bundle)
     if not stored:
         return False
-    restarted = bool(bundle.profile.sequences.reset) and await proven_restart(
-        link, bundle, snapshot.serial, snapshot.raw
-    )
+    restarted = False
+    if bundle.profile.sequences.reset:
+        restarted = (await proven_restart(link, bundle, snapshot.serial, *known)).mark_gone
     await _require_equal(link, bundle, snapshot)
     if not acknowledged and not restarted:
         raise ProvisionError("the store of the old calibration went unanswered, and no read decides what it did")

@@ -1,9 +1,9 @@
-"""What a device holds, and what shows it. Values alone: `triaxcald.text` puts
-them into words."""
+"""What a device holds, and the evidence for it. Values alone: `triaxcald.text`
+puts them into words."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 
@@ -16,7 +16,8 @@ class DeviceState(StrEnum):
     OLD = "old"
     """Something was written, and the old calibration is back."""
     NEW_VERIFIED = "new_verified"
-    """Read back equal after a restart."""
+    """All registers read back equal after a restart that took a mark away, or
+    after the supply was seen off."""
     NEW_UNVERIFIED = "new_unverified"
     """The store was acknowledged and the registers read back equal; no restart
     has proven it."""
@@ -24,6 +25,22 @@ class DeviceState(StrEnum):
     """The registers are known to be neither the old ones nor the new ones."""
     UNKNOWN = "unknown"
     """The link died, or a store went unanswered, and no read decided."""
+
+
+class Observation(StrEnum):
+    """What was seen of a device since its registers were last written. Each is
+    kept apart: none stands for another."""
+
+    ACKNOWLEDGED = "acknowledged"
+    """The device acknowledged the store."""
+    COUNTER_ADVANCED = "counter_advanced"
+    """The device's counter of stores advanced with the store."""
+    READ_BACK = "read_back"
+    """All calibration registers read back as wanted."""
+    MARK_GONE = "mark_gone_after_restart"
+    """A value that was in use, and stored nowhere, was gone after a restart."""
+    SUPPLY_SWITCHED = "supply_switched"
+    """The device went silent, as it does without supply, and answered again."""
 
 
 class Evidence(StrEnum):
@@ -35,7 +52,9 @@ class Evidence(StrEnum):
     READ_BACK = "read_back"
     """The registers read back equal, with no restart since they were written."""
     RESTART = "read_after_restart"
+    """All registers were read after a restart that took a mark away."""
     POWER_CYCLE = "read_after_power_cycle"
+    """All registers were read after the supply was seen off."""
     WRITE_COUNTER = "write_counter"
     """The store went unanswered; the device's counter of stores shows that it
     took place, or did not."""
@@ -49,9 +68,18 @@ class Held:
 
     state: DeviceState = DeviceState.UNTOUCHED
     evidence: Evidence = Evidence.NOTHING_WRITTEN
+    observed: set[Observation] = field(default_factory=set)
 
     def now(self, state: DeviceState, evidence: Evidence) -> None:
         self.state, self.evidence = state, evidence
+
+    def saw(self, observation: Observation) -> None:
+        self.observed.add(observation)
+
+    @property
+    def observations(self) -> list[str]:
+        """In the order of `Observation`, for a document."""
+        return [o.value for o in Observation if o in self.observed]
 
     @property
     def settled(self) -> bool:

@@ -6,16 +6,28 @@ from __future__ import annotations
 import asyncio
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
 from triaxcal.errors import TriaxcalError
-from triaxcal_drivers.errors import DriverError
-from triaxcald import text
-from triaxcald.errors import DaemonError
-from triaxcald.exit_codes import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, exit_code_of
-from triaxcald.outcome import Ending, Verdict
+from triaxcal.interchange.calibration_document import Document
+from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceSilent, DriverError, SecondAnswer
+from triaxcald import exit_codes, text
+from triaxcald.certificate import exceeded
+from triaxcald.errors import (
+    DaemonError,
+    DeviceInUse,
+    DiskError,
+    Implausible,
+    NoPoses,
+    SerialTwice,
+    StationError,
+    TwoAnswer,
+)
+from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, exit_code_of
+from triaxcald.outcome import Code, Ending, Verdict
+from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
 from triaxcald.station.config import Limits
@@ -23,31 +35,81 @@ from triaxcald.verification import OUTSIDE as VERIFIED_OUTSIDE
 from triaxcald.verification import WORSE
 
 
-def judged(outside: Sequence[str], verification: Mapping[str, Any] | None, limits: Limits) -> Ending:
-    """The verdict on the figures: on those of the fit, ``outside`` where they
-    are outside a limit, and on the device's own output where it was written.
-    Nothing else enters, so that an audit comes to the same."""
-    if outside:
-        return Ending(Verdict.FAIL, "; ".join(outside), OUTSIDE)
+def judged(certificate: Document, verification: Mapping[str, Any] | None, limits: Limits) -> Ending:
+    """The verdict on the figures: on those of the fit in the ``certificate``,
+    and on the device's own output if it was written. Nothing else enters, so
+    that an audit finds the same."""
+    if outside := certificate["outside"]:
+        names = exceeded(certificate["result"]["after"], limits)
+        only_cross_validated = names == ["cross_validated_rms_g"]
+        code = Code.CROSS_VALIDATED_OUTSIDE if only_cross_validated else Code.FIT_OUTSIDE
+        return Ending.of(code, "; ".join(outside))
     if verification is not None and verification["verdict"] in (VERIFIED_OUTSIDE, WORSE):
-        return Ending(Verdict.FAIL, text.verification_failed(verification), OUTSIDE)
+        worse = verification["verdict"] == WORSE
+        code = Code.VERIFICATION_WORSE if worse else Code.VERIFICATION_OUTSIDE
+        return Ending.of(code, text.verification_failed(verification))
     checked = limits.verification_rms_g is not None and verification is not None
     if limits.rms_g is None and limits.cross_validated_rms_g is None and not checked:
-        return Ending(Verdict.NOT_JUDGED, text.NO_LIMIT, DONE)
-    return Ending(Verdict.PASS, text.passed(verification), DONE)
+        return Ending.of(Code.NO_LIMIT, text.NO_LIMIT)
+    return Ending.of(Code.WITHIN_LIMITS, text.passed(verification))
 
 
 def aborted(e: BaseException, p: Provisioning | None) -> Ending:
     """Once registers were written any error is one of the device, unless it is
     settled and only the disk failed or somebody interrupted."""
-    code = exit_code_of(e)
+    exit_code, code = exit_code_of(e), code_of(e)
     if (trace := trace_of(e)) is not None:
         with suppress(OSError, ValueError):  # a closed standard error
             sys.stderr.write(trace)
     written = p is not None and p.held.state is not DeviceState.UNTOUCHED
-    if p is not None and written and not (p.settled and code in (INTERRUPTED, DISK)):
-        code = DEVICE
-    return Ending(Verdict.ABORTED, reason_of(e), code, getattr(e, "wanted", ()))
+    if p is not None and written and not (p.settled and exit_code in (INTERRUPTED, DISK)):
+        exit_code = DEVICE
+        if code is None or code.exit_code != DEVICE or not p.settled:
+            code = code if code in _WHO_IS_THERE else Code.NOT_SETTLED
+    return Ending(Verdict.ABORTED, reason_of(e), exit_code, code, getattr(e, "wanted", ()))
+
+
+_WHO_IS_THERE = (Code.WRONG_UNIT, Code.TWO_ANSWER)
+"""Codes that say more than that the device is not settled."""
+
+
+def code_of(e: BaseException) -> Code | None:
+    """The code of an error: of the first cause that has one of its own. None of
+    bad input."""
+    causes = [e]
+    while (cause := causes[-1].__cause__) is not None:
+        causes.append(cause)
+    for cause in causes:
+        for kind, code in _CODES:
+            if isinstance(cause, kind):
+                return code
+    if _internal(e):
+        return Code.INTERNAL
+    match exit_code_of(e):
+        case exit_codes.REFUSED:
+            return Code.REFUSED
+        case exit_codes.DEVICE:
+            return Code.NOT_SETTLED if isinstance(e, StationError) else Code.LOST
+    return None
+
+
+_CODES: tuple[tuple[type[BaseException], Code], ...] = (
+    (asyncio.CancelledError, Code.STOPPED),
+    (KeyboardInterrupt, Code.STOPPED),
+    (MemoryError, Code.MEMORY),
+    (DiskError, Code.DISK),
+    (TwoAnswer, Code.TWO_ANSWER),
+    (SecondAnswer, Code.TWO_ANSWER),
+    (WrongUnit, Code.WRONG_UNIT),
+    (SerialTwice, Code.SERIAL_TWICE),
+    (DeviceInUse, Code.IN_USE),
+    (Implausible, Code.IMPLAUSIBLE),
+    (NoPoses, Code.NO_POSES),
+    (DeviceAbsent, Code.ABSENT),
+    (DeviceSilent, Code.LOST),
+    (BusError, Code.LOST),
+)
+"""In the order in which they are looked for."""
 
 
 def reason_of(e: BaseException) -> str:

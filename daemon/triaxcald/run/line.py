@@ -27,6 +27,7 @@ from triaxcald.inputs import CALIBRATION, VERIFICATION
 from triaxcald.outcome import (
     ATTACHMENT,
     FORMAT,
+    Code,
     Ending,
     Papers,
     Verdict,
@@ -142,7 +143,8 @@ class UnitRun(UnitSession):
             self._write_papers()
         except InputError as e:
             failed = f"{ending.reason}; {e}" if ending.exit_code else str(e)
-            ending = replace(ending, reason=failed, exit_code=ending.exit_code or DISK)
+            code = ending.code if ending.exit_code else Code.DISK
+            ending = replace(ending, reason=failed, exit_code=ending.exit_code or DISK, code=code)
         return self._outcome(ending)
 
     async def _ending(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
@@ -283,7 +285,7 @@ class UnitRun(UnitSession):
         if certified.image is not None and self.station.file.provisioning.write and certified.within_limits:
             await self._write(device, writer, certified.image, identity, tumble)
         ending = judged(
-            certified.document["outside"],
+            certified.document,
             self._write_back.verification if self._write_back else None,
             self.station.file.limits,
         )

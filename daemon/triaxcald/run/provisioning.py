@@ -20,13 +20,13 @@ from triaxcald.abort import Left, at_abort
 from triaxcald.certificate import software
 from triaxcald.documents import to_text
 from triaxcald.errors import Implausible, InputError, RecordingError
-from triaxcald.exit_codes import BAD_INPUT, DISK, DONE
+from triaxcald.exit_codes import BAD_INPUT
 from triaxcald.files import write_new
 from triaxcald.outcome import (
     SUFFIX,
+    Code,
     Ending,
     Papers,
-    Verdict,
     latest_of,
     outcome_document,
     registers_told,
@@ -87,7 +87,9 @@ class ProvisionRun:
             with at_abort(self.left):
                 async with self.place.opened() as device:
                     await self._work(device)
-                    ending = Ending(Verdict.NOT_JUDGED, self._done(), DONE)
+                    ending = Ending.of(Code.NOT_CHECKED, self._done())
+                    if self.dry_run:
+                        ending = replace(ending, code=None)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the outcome is owed whatever happens
             if ending is None:  # what only the closing was stopped in is done
                 ending = aborted(e, self.provisioning)
@@ -98,7 +100,7 @@ class ProvisionRun:
             try:
                 path = self._write(document)
             except InputError as e:
-                failed = ending if ending.exit_code else Ending(Verdict.ABORTED, str(e), DISK)
+                failed = ending if ending.exit_code else Ending.of(Code.DISK, str(e))
                 ending = replace(failed, reason=f"{failed.reason}; {e}" if ending.exit_code else str(e))
                 document = self._document(ending)
         return Provisioned(ending.exit_code, document, self.provisioning, self._error(ending), path)

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 from triaxcal.arrays import Floats
-from triaxcal.errors import Refused
 from triaxcal.model.directions import directions
 from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald import text
+from triaxcald.errors import NoPoses
 from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
@@ -142,7 +142,7 @@ class Collection(Recorded):
         told how it goes. ``apart_from`` as in `guide`. A device that sends, but
         no whole sample of ``stream``, hears of it.
 
-        Raises Refused when no new pose has come for the plan's patience, and
+        Raises NoPoses when no new pose has come for the plan's patience, and
         what the device's stream raises. Where only the repeat does not come, it
         goes on without.
         """
@@ -186,7 +186,7 @@ class Collection(Recorded):
                 if now_s - news_s > plan.patience_s:
                     if state.repeat_due:
                         return
-                    raise Refused(
+                    raise NoPoses(
                         f"no new still pose for {plan.patience_s:g} s; {found} of {wanted} are there",
                         wanted=state.missing,
                     )

@@ -132,7 +132,7 @@ async def test_a_value_that_was_put_in_to_show_a_restart_does_not_stay(bench) ->
             raise DeviceSilent("no reply")
         if request == ("write", "scale_factor_x"):
             puts.append(request[1])
-            if len(puts) == 3:  # the new value, another for the proof, the new one again
+            if len(puts) == 4:  # the new value, a mark for each attempt, the new value again
                 raise RegisterRefused("locked", register=request[1], code=1)
 
     bench.device.trouble = deaf_to_resets

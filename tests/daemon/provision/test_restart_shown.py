@@ -13,11 +13,13 @@ from triaxcald.provision.access import RegisterAccess
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.image import build_image
 from triaxcald.provision.procedure import Provisioning
-from triaxcald.provision.proof import may_mark, proven_restart
+from triaxcald.provision.proof import Restart, may_mark, proven_restart
 from triaxcald.provision.sequence import SequenceStalled
 from triaxcald.provision.state import DeviceState, Evidence
 from triaxcald.recording import schema
 from triaxcald.simulation.unit import Faults
+
+NOT_SHOWN = Restart(acknowledged=True, mark_gone=False)
 
 
 def marked(bench) -> tuple[int, RegisterAccess]:
@@ -101,7 +103,7 @@ async def test_a_proof_that_nobody_answers_prevents_no_restart(bench, struck: st
             raise DeviceSilent("no reply")
 
     bench.device.trouble = deaf
-    assert await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw) is False
+    assert await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw) == NOT_SHOWN
     assert ("write", "reset") in bench.device.log
     bench.assert_holds(bench.old)
 
@@ -162,7 +164,7 @@ async def test_a_value_does_not_stay_in_use_where_the_restart_stalls(bench) -> N
 async def test_a_value_that_is_acknowledged_and_not_kept_shows_nothing(make_bench) -> None:
     """As of a device that is locked, and ignores writes and restarts in silence."""
     bench = make_bench(faults=Faults(corrupt_write={"scale_factor_x": 0x01}))
-    assert await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw) is False
+    assert await proven_restart(bench.link, bench.bundle, "0007", bench.image.raw) == NOT_SHOWN
     assert ("write", "reset") in bench.device.log
 
 
