@@ -85,6 +85,11 @@ class Bench(Generic[DoneT]):
         """The calibration registers as they are to be after provisioning today."""
         return self.wanted.image(self.habits, date_days=int(time.time() // DAY_S))
 
+    @property
+    def journal(self) -> Path:
+        """Where the journal of this unit lies while a provisioning of it is not settled."""
+        return self.folder / "journal" / f"misbehaving_unit-{SERIAL_NUMBER}.json"
+
     # Commands.
 
     def provision(self, *arguments: Any) -> DoneT:

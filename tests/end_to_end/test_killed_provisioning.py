@@ -38,7 +38,7 @@ def test_it_is_finished_or_taken_back_by_another(
         process.wait()
         bench.server.settle()  # what the dead process has asked is answered to nobody
         assert bench.holds_mixture()
-        journal = tmp_path / "journal" / "4711.json"
+        journal = tmp_path / "journal" / "misbehaving_unit-4711.json"
         assert journal.exists()
         if finish == "resume":
             done = triaxcal("provision", "--resume", bench.station)

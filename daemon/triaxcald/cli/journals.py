@@ -11,7 +11,7 @@ from triaxcald.station.config import Station
 def of_a_journal(station: Station, unit: str, serial: str | None) -> str | None:
     """What there is to warn of, where an earlier provisioning of the unit is
     not settled."""
-    journal = open_journal(station.folder, unit, serial)
+    journal = open_journal(station.folder, station.place(unit).bundle.profile, unit, serial)
     return text.unfinished(journal, unit, station.path) if journal else None
 
 

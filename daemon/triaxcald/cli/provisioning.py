@@ -196,7 +196,7 @@ def restore_command(a: argparse.Namespace) -> int:
     if snapshot.serial is not None and expected is not None and not same_serial(snapshot.serial, expected):
         raise Refused(f"{a.source}: is of the unit with serial {snapshot.serial}, the station expects {expected}")
     ask = _ask if a.power_cycle or station.file.provisioning.power_cycle else None
-    run = RestoreRun(station, place, ask=ask, snapshot=snapshot)
+    run = RestoreRun(station, place, ask=ask, snapshot=snapshot, source=a.source)
     done = run_interruptible(run.run())
     p = done.provisioning
     if done.error is not None:

@@ -4,13 +4,16 @@ written, until the device is settled."""
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from triaxcal_drivers.profile import Profile
 from triaxcald.errors import DiskError, InputError
 from triaxcald.files import synchronise, write_durably
+from triaxcald.provision.image import calibration_registers
 
 FORMAT, FOLDER = "triaxcal.journal/1", "journal"
 Step = Literal["writing", "storing", "stored", "unverified"]
@@ -18,10 +21,34 @@ Step = Literal["writing", "storing", "stored", "unverified"]
 hold it."""
 
 
+_UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
+_RUN = "[0-9a-f]" * 8 + "-*"
+"""How the identifier of a run begins."""
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Whose journal it is: a unit by its product and serial number, or, without
+    a serial number, whatever unit is in the ``slot``."""
+
+    product: str
+    serial: str | None
+    slot: str
+
+    @staticmethod
+    def of(profile: Profile, slot: str, serial: str | None) -> Owner:
+        """``serial`` as a station file or a device states it."""
+        number = serial.strip() if serial else None
+        if number and number.isdigit():
+            number = f"{int(number):04d}"
+        return Owner(profile.identity.product, number, slot)
+
+
 @dataclass(frozen=True)
 class Entry:
     """``before`` and ``wanted`` are raw register bytes as on the wire, in the
-    order in which they are written."""
+    order in which they are written. ``product`` and ``run`` are empty in a
+    journal of a version before 0.2."""
 
     unit: str
     serial: str | None
@@ -30,6 +57,8 @@ class Entry:
     before: Mapping[str, bytes]
     wanted: Mapping[str, bytes]
     step: Step = "writing"
+    product: str = ""
+    run: str = ""
 
 
 @dataclass(frozen=True)
@@ -39,10 +68,22 @@ class Journal:
     path: Path
 
     @staticmethod
-    def of(folder: Path, unit: str, serial: str | None) -> Journal:
-        """By serial number; by the unit's name in the station file where the
-        device has none."""
-        return Journal(folder / FOLDER / f"{serial or f'unit-{unit}'}.json")
+    def of(folder: Path, owner: Owner, run: str) -> Journal:
+        """Where a provisioning by that run keeps its journal."""
+        return Journal(folder / FOLDER / f"{_own_name(owner, run)}.json")
+
+    @staticmethod
+    def existing(folder: Path, owner: Owner) -> list[Journal]:
+        """Those that may be of the unit, the newest first; the names of earlier
+        versions last. Without a serial number they may be of other units that
+        were in the same slot."""
+        within = folder / FOLDER
+        if owner.serial is None:
+            runs = sorted(within.glob(f"{_safe(owner.slot)}-{_RUN}.json"), reverse=True)
+            paths = [*runs, within / f"unit-{owner.slot}.json"]
+        else:
+            paths = [within / f"{_own_name(owner, '')}.json", within / f"{owner.serial}.json"]
+        return [Journal(path) for path in paths if path.exists()]
 
     def read(self) -> Entry | None:
         """None where nothing was cut short. Raises InputError on a file that is
@@ -65,6 +106,8 @@ class Journal:
         document = {
             "format": FORMAT,
             "unit": entry.unit,
+            "product": entry.product,
+            "run": entry.run,
             "serial": entry.serial,
             "profile_sha256": entry.profile_sha256,
             "started": entry.started,
@@ -88,10 +131,47 @@ class Journal:
             raise DiskError(f"{self.path}: cannot be removed: {e.strerror}") from e
 
 
-def open_journal(folder: Path, unit: str, serial: str | None) -> Path | None:
-    """The path of a unit's journal, where one lies in the station's folder."""
-    path = Journal.of(folder, unit, serial).path
-    return path if path.exists() else None
+def _own_name(owner: Owner, run: str) -> str:
+    name = f"{owner.slot}-{run}" if owner.serial is None else f"{owner.product}-{owner.serial}"
+    return _safe(name)
+
+
+def _safe(name: str) -> str:
+    return _UNSAFE.sub("_", name)
+
+
+def journals_of(folder: Path, owner: Owner, profile: Profile) -> list[tuple[Journal, Entry]]:
+    """The journals in the station's folder that may be of the unit, the newest
+    first, without those that are known to be of another product.
+
+    Raises InputError on a file that is no journal, and on one under the unit's
+    own name that is of another unit or has other registers.
+    """
+    found = []
+    for journal in Journal.existing(folder, owner):
+        entry = journal.read()
+        if entry is None:  # removed since
+            continue
+        alike = set(entry.before) == set(calibration_registers(profile))
+        if not entry.product and owner.serial is not None:  # by serial number alone: of any product
+            if alike:
+                found.append((journal, entry))
+        elif (entry.product or owner.product, entry.serial) != (owner.product, owner.serial):
+            raise InputError(f"{journal.path}: is the journal of {entry.product} with serial number {entry.serial}")
+        elif not alike:
+            raise InputError(f"{journal.path}: its registers are not those of profile {profile.name}")
+        else:
+            found.append((journal, entry))
+    return found
+
+
+def open_journal(folder: Path, profile: Profile, slot: str, serial: str | None) -> Path | None:
+    """The path of the newest journal that may be of the unit. None if there is
+    none, or if the serial number of the unit is not known yet."""
+    if serial is None and profile.identity.serial_register is not None:
+        return None
+    found = Journal.existing(folder, Owner.of(profile, slot, serial))
+    return found[0].path if found else None
 
 
 def parse(text: bytes, *, where: str) -> Entry:
@@ -111,6 +191,8 @@ def parse(text: bytes, *, where: str) -> Entry:
             before=registers_of(held["before"]),
             wanted=registers_of(held["wanted"]),
             step=held["step"],
+            product=str(held.get("product") or ""),
+            run=str(held.get("run") or ""),
         )
     except (ValueError, RecursionError) as e:
         raise InputError(f"{where}: no journal of a provisioning: {e}") from e

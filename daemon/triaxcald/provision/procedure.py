@@ -15,8 +15,8 @@ from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import DiskError, InputError, ProvisionError, StationError
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
-from triaxcald.provision.image import RegisterImage, calibration_registers
-from triaxcald.provision.journal import Entry, Journal, Step
+from triaxcald.provision.image import RegisterImage
+from triaxcald.provision.journal import Entry, Journal, Owner, Step, journals_of
 from triaxcald.provision.plausible import Doubt, doubts, unstable
 from triaxcald.provision.proof import Restart, proven_restart
 from triaxcald.provision.restore import restore
@@ -24,6 +24,7 @@ from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_seq
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.provision.unfinished import was_cut_short
+from triaxcald.run_id import new_run_id
 
 T = TypeVar("T")
 
@@ -50,6 +51,11 @@ class Provisioning:
     expected_serial: str | None
     where: str
     started: str = ""
+    run: str = field(default_factory=new_run_id)
+    """The identifier of this run. It names the journal of a unit without a
+    serial number."""
+    source: Path | None = None
+    """The journal that `put_back` was asked to go by."""
     power_cycle: Callable[[], Awaitable[bool]] | None = None
     """Has the supply switched off and on, where nothing else shows what is
     stored; whether that was seen."""
@@ -70,13 +76,15 @@ class Provisioning:
     not have stored it."""
     _restarted: bool = False
     """Whether a mark was gone before the registers were read at first."""
-    _journal_lies: bool = False
     _journaled: bool = False
+    _earlier: list[Journal] = field(default_factory=list)
+    """Journals of this unit that earlier provisionings left, the newest first."""
     _unlocked: bool = False
     _store_asked: bool = False
     _decided: bool = False
 
     identity: IdentityRead = field(init=False)
+    owner: Owner = field(init=False)
     journal: Journal = field(init=False)
     found: Snapshot = field(init=False)
     before: Snapshot = field(init=False)
@@ -106,7 +114,11 @@ class Provisioning:
     @property
     def open_journal(self) -> Path | None:
         """The journal, where one lies and is still needed."""
-        return self.journal.path if self._journal_lies and not self.settled else None
+        if self.settled:
+            return None
+        if self._journaled:
+            return self.journal.path
+        return self._earlier[0].path if self._earlier else None
 
     async def examine(self, *, restart: bool = True) -> None:
         """Who is there, and what it holds. Nothing is written, but what shows
@@ -118,26 +130,25 @@ class Provisioning:
         SequenceStalled.
         """
         await self.identify()
-        entry = self.journal.read()
-        if entry is not None:
-            if set(entry.before) != set(calibration_registers(self.bundle.profile)):
-                name = self.bundle.profile.name
-                raise InputError(f"{self.journal.path}: its registers are not those of profile {name}")
-            self._journal_lies = True
+        journals = journals_of(self.folder, self.owner, self.bundle.profile)
+        if journals:
+            self._earlier = [journal for journal, _ in journals]
             self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         self.found = await self._read("reading the old calibration")
-        self.restart_owed = self.resets and (entry is not None or not self.found.differing(self.image.raw))
+        self.restart_owed = self.resets and (bool(journals) or not self.found.differing(self.image.raw))
         if restart and self.restart_owed:
-            if entry is None:  # `write` shows a restart with a mark, once the doubts are answered
+            if not journals:  # `write` shows a restart with a mark, once the doubts are answered
                 await self._sequence("reset")
             else:
                 self.steps.append("reset")
-                self._restarted = (await self._restart(entry.before, entry.wanted)).mark_gone
+                known = [image for _, entry in journals for image in (entry.before, entry.wanted)]
+                self._restarted = (await self._restart(*known)).mark_gone
             self.found = await self._read("reading the stored calibration")
             self.restart_owed = False
+        entry = self._entry_of_this_unit(journals)
         self.before = self.after = self.found
         self.differing = self.found.differing(self.image.raw)
-        if entry is not None and was_cut_short(entry, self.bundle.profile, self.found, self.image, self._restarted):
+        if entry is not None:
             self.carried, self.before = True, Snapshot(entry.before, self.identity.serial)
             self._store_owed = self.stores and entry.step not in ("stored", "unverified") and not self._restarted
             if self.found.differing(entry.wanted) and self.found.differing(entry.before):
@@ -148,11 +159,32 @@ class Provisioning:
             profile = self.bundle.profile
             self.doubts = unstable(profile, self.found, again) or doubts(profile, self.found, self.image)
 
+    def _entry_of_this_unit(self, journals: list[tuple[Journal, Entry]]) -> Entry | None:
+        """The journal that was cut short in this device. Those of other units,
+        as far as they are known to be, are none of this provisioning's."""
+        profile = self.bundle.profile
+        fits = [
+            (journal, entry)
+            for journal, entry in journals
+            if was_cut_short(entry, profile, self.found, self.image, self._restarted)
+        ]
+        # A provisioning that went on with an earlier journal left one of its own.
+        same = [journal for journal, entry in fits if entry.before == fits[0][1].before]
+        self._earlier = list(dict.fromkeys([*same, *self._named_for_it(journals)]))
+        return fits[0][1] if fits else None
+
+    def _named_for_it(self, journals: list[tuple[Journal, Entry]]) -> list[Journal]:
+        """Journals with the product and the serial number of this unit. An
+        earlier version did not name the product, but the profile."""
+        mine = self.bundle.digest()
+        return [j for j, e in journals if e.serial is not None and (e.product or e.profile_sha256 == mine)]
+
     async def identify(self) -> None:
         """Who is there. Raises WrongUnit, DriverError."""
         self.steps.append("identity")
         self.identity = await check_identity(self.link, self.bundle, self.expected_serial, where=self.where)
-        self.journal = Journal.of(self.folder, self.unit, self.identity.serial)
+        self.owner = Owner.of(self.bundle.profile, self.unit, self.identity.serial)
+        self.journal = Journal.of(self.folder, self.owner, self.run)
 
     async def write(self) -> None:
         """Write what differs, store it, restart the device, and read it back.
@@ -192,9 +224,13 @@ class Provisioning:
         await self.identify()
         self.found = self.before = self.after = await self._read("reading the registers")
         self.differing = self.found.differing(snapshot.raw)
-        with suppress(InputError):  # one that cannot be read is of no use
-            self._journal_lies = self.journal.read() is not None
-        if self.differing and not self._journal_lies:
+        with suppress(InputError):  # a journal that cannot be read is of no use
+            journals = journals_of(self.folder, self.owner, self.bundle.profile)
+            mine = [j for j, entry in journals if entry.serial is not None and entry.before == snapshot.raw]
+            self._earlier = list(dict.fromkeys([*mine, *self._named_for_it(journals)]))
+        if self.source is not None and self.source.exists():
+            self._earlier = list(dict.fromkeys([Journal(self.source), *self._earlier]))
+        if self.differing and not self._earlier:
             self._note("writing")
         self.before, self.carried = snapshot, True
         await self.undo()
@@ -246,8 +282,9 @@ class Provisioning:
         if not self.examined:
             return
         if self.settled:
-            self.journal.remove()
-            self._journal_lies = False
+            for journal in (*self._earlier, *([self.journal] if self._journaled else [])):
+                journal.remove()
+            self._earlier, self._journaled = [], False
         elif self._journaled and self.held.state is DeviceState.NEW_UNVERIFIED:
             self._note("unverified")
 
@@ -459,10 +496,12 @@ class Provisioning:
             )
 
     def _note(self, step: Step) -> None:
-        self._journaled = self._journal_lies = True
+        self._journaled = True
         self.journal.write(
             Entry(
                 unit=self.unit,
+                product=self.owner.product,
+                run=self.run,
                 serial=self.identity.serial,
                 profile_sha256=self.bundle.digest(),
                 started=self.started,

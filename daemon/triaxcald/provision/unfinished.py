@@ -9,9 +9,9 @@ from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import check_identity
 from triaxcald.provision.image import RegisterImage, image_of
-from triaxcald.provision.journal import Entry, Journal
+from triaxcald.provision.journal import Entry, Journal, Owner, journals_of
 from triaxcald.provision.plausible import fits_its_checksum
-from triaxcald.provision.snapshot import Snapshot
+from triaxcald.provision.snapshot import Snapshot, take_snapshot
 
 
 async def journaled_image(
@@ -24,13 +24,23 @@ async def journaled_image(
     profile; WrongUnit, DriverError.
     """
     identity = await check_identity(link, bundle, expected_serial, where=where)
-    journal = Journal.of(folder, unit, identity.serial)
-    entry = journal.read()
-    if entry is None:
-        raise InputError(f"{journal.path}: no such file: no provisioning of this unit was cut short")
+    owner = Owner.of(bundle.profile, unit, identity.serial)
+    found = journals_of(folder, owner, bundle.profile)
+    if not found:
+        path = Journal.of(folder, owner, "RUN").path
+        raise InputError(f"{path}: no such file: no provisioning of this unit was cut short")
+    journal, entry = found[0]
+    if len(found) > 1:  # of several units, one after the other in this slot
+        held = await take_snapshot(link, bundle)
+        journal, entry = next(((j, e) for j, e in found if _fits(e, held)), found[0])
     if entry.profile_sha256 != bundle.digest():
         raise InputError(f"{journal.path}: was begun with another version of the profile {bundle.profile.name}")
     return image_of(bundle.profile, entry.wanted), identity.serial
+
+
+def _fits(entry: Entry, held: Snapshot) -> bool:
+    """Whether each register holds its old value or its new one."""
+    return all(raw in (entry.before.get(name), entry.wanted.get(name)) for name, raw in held.raw.items())
 
 
 def was_cut_short(entry: Entry, profile: Profile, found: Snapshot, image: RegisterImage, restarted: bool) -> bool:

@@ -40,7 +40,7 @@ from triaxcald.outcome import (
 from triaxcald.pipeline import Pipeline
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.provision.image import RegisterImage
-from triaxcald.provision.journal import Journal, open_journal
+from triaxcald.provision.journal import Owner, journals_of, open_journal
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.writer import RecordingWriter
@@ -107,7 +107,7 @@ class UnitRun(UnitSession):
         super().__init__(station, place, progress, serials=serials, clock_ns=clock_ns)
         self.others, self.force = others or AtWork(1), force
         self._serial: str | None = None
-        self._open_journal = open_journal(station.folder, self.name, place.unit.serial)
+        self._open_journal = open_journal(station.folder, self.profile, self.name, place.unit.serial)
         self._recording: Path | None = None
         self._papers: dict[str, str] = {}
         self._paths: dict[str, Path] = {}
@@ -125,7 +125,7 @@ class UnitRun(UnitSession):
             async with self.place.opened(Patience(others=self.others), self.waits) as device:
                 identity = await self.identify(device)
                 self._serial = identity.serial
-                self._open_journal = open_journal(self.station.folder, self.name, identity.serial)
+                self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)
                 path = self.recording_path(identity)
                 self._require_readable_journal(identity)
                 self._recording = path
@@ -268,7 +268,7 @@ class UnitRun(UnitSession):
     def _require_readable_journal(self, identity: IdentityRead) -> None:
         """Before any pose is taken. Raises InputError."""
         try:
-            Journal.of(self.station.folder, self.name, identity.serial).read()
+            journals_of(self.station.folder, Owner.of(self.profile, self.name, identity.serial), self.profile)
         except InputError:
             self._open_journal = None  # no command goes by it
             raise

@@ -163,7 +163,8 @@ class ProvisionRun:
         still needed."""
         if self._begun is not None and self._begun.identified:
             return self._begun.open_journal
-        return open_journal(self.station.folder, self.place.unit.name, self.serial or self.place.unit.serial)
+        serial = self.serial or self.place.unit.serial
+        return open_journal(self.station.folder, self.place.bundle.profile, self.place.unit.name, serial)
 
     def _now(self) -> str:
         return datetime.fromtimestamp(self.clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds")
@@ -210,14 +211,17 @@ class ProvisionRun:
 
 @dataclass
 class RestoreRun(ProvisionRun):
-    """Puts ``snapshot`` back into the device at ``place``."""
+    """Puts ``snapshot`` back into the device at ``place``. ``source`` is the
+    recording or the journal that kept it."""
 
     snapshot: Snapshot = field(default_factory=lambda: Snapshot({}))
+    source: Path | None = None
 
     async def _work(self, device: Device) -> None:
         profile = self.place.bundle.profile
         self.serial = self.snapshot.serial
         p = self._begin(RegisterLink(device, profile), image_of(profile, self.snapshot.raw))
+        p.source = self.source if self.source is not None and self.source.suffix == ".json" else None
         try:
             with p.finishing():
                 await p.put_back(self.snapshot)

@@ -32,7 +32,7 @@ def cut_short(bench: Bench) -> Path:
     """The journal that is left."""
     done = bench.provision()
     assert done.code == 4
-    journal = bench.folder / "journal" / "4711.json"
+    journal = bench.journal
     assert f"provision --resume {bench.station} --unit unit" in done.err
     assert f"restore {journal} {bench.station} --unit unit" in done.err
     assert bench.holds_mixture()
@@ -69,7 +69,7 @@ def test_the_outcome_of_a_resumed_provisioning_replaces_that_of_the_one_cut_shor
     with Bench(tmp_path, triaxcal, habits=CUT, timing=QUICK) as bench:
         cut_short(bench)
         first = json.loads(next(tmp_path.glob("*.outcome.json")).read_text())
-        assert (first["device_state"], first["journal"]) == ("unknown", str(bench.folder / "journal/4711.json"))
+        assert (first["device_state"], first["journal"]) == ("unknown", str(bench.journal))
         outcome = triaxcal("provision", "--resume", bench.station, "--json").json["outcome"]
         assert outcome["supersedes"] is not None
         assert outcome["registers"]["cut_short_before"]
@@ -221,7 +221,9 @@ def test_who_reads_or_records_a_unit_in_between_is_warned(tmp_path: Path, triaxc
 
 def test_there_is_nothing_to_resume_where_nothing_was_cut_short(tmp_path: Path, triaxcal) -> None:
     with Bench(tmp_path, triaxcal) as bench:
-        triaxcal("provision", "--resume", bench.station).failed(2, "journal/4711.json", "no provisioning of this unit")
+        triaxcal("provision", "--resume", bench.station).failed(
+            2, "journal/misbehaving_unit-4711.json", "no provisioning of this unit"
+        )
         assert bench.unit.written == []
 
 
@@ -242,11 +244,12 @@ def test_a_journal_is_for_its_own_unit_alone(tmp_path: Path, triaxcal) -> None:
         ('{"format": "triaxcal.journal/1", "step": "writing"}', "serial is missing"),
     ],
 )
+@pytest.mark.parametrize("name", ["misbehaving_unit-4711.json", "4711.json"])
 def test_a_journal_that_cannot_be_read_is_named_and_nothing_written(
-    tmp_path: Path, triaxcal, spoilt: str, said: str
+    tmp_path: Path, triaxcal, spoilt: str, said: str, name: str
 ) -> None:
     with Bench(tmp_path, triaxcal) as bench:
-        journal = tmp_path / "journal" / "4711.json"
+        journal = tmp_path / "journal" / name
         journal.parent.mkdir()
         journal.write_text(spoilt)
         triaxcal("provision", "--resume", bench.station).failed(2, str(journal), said)

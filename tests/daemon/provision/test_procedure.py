@@ -154,7 +154,7 @@ async def test_a_unit_exchanged_before_the_last_reading_is_not_taken_for_the_pro
     wrong = "the unit on the bench is serial 0008, expected 0007"
     assert str(caught.value) == f"provisioning failed at identity after the reset: {wrong}"
     assert bench.held.state is DeviceState.NEW_UNVERIFIED
-    assert bench.journals == ["0007.json"]
+    assert bench.journals == ["TRIAX-REF-0007.json"]
     assert {kind for kind, _ in bench.device.log} == {"open", "read"}
 
 

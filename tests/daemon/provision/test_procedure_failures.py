@@ -78,7 +78,7 @@ async def test_a_refused_reset_leaves_a_stored_calibration_that_no_restart_has_p
     bench = make_bench(faults=refusing("reset"))
     assert await fail(bench) == "reset: register reset: locked"
     assert (bench.held.state, bench.held.evidence) == (DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
-    assert bench.journals == ["0007.json"]
+    assert bench.journals == ["TRIAX-REF-0007.json"]
     bench.assert_stored(bench.new)
 
 
@@ -92,7 +92,7 @@ async def test_a_unit_that_dies_before_the_store_keeps_its_old_calibration(make_
     else:
         assert message.startswith(f"writing {name}: ")
         assert (bench.held.state, bench.held.evidence) == (UNKNOWN, Evidence.NO_ANSWER)
-        assert bench.journals == ["0007.json"]
+        assert bench.journals == ["TRIAX-REF-0007.json"]
     bench.assert_stored(bench.old)
 
 
@@ -145,7 +145,7 @@ async def test_a_unit_that_dies_on_the_reset_holds_the_new_calibration_unverifie
     bench = make_bench(faults=Faults(die_on_write="reset"))
     assert (await fail(bench)).startswith("reset: ")
     assert (bench.held.state, bench.held.evidence) == (DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
-    assert bench.journals == ["0007.json"]
+    assert bench.journals == ["TRIAX-REF-0007.json"]
     bench.assert_stored(bench.new)
 
 
