@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, field_validator, model_validator
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.nearest import nearest
@@ -155,6 +155,22 @@ class Crc(Strict):
     over: Annotated[tuple[str, ...], Field(min_length=1)]
 
 
+class Correction(Strict):
+    """How the device corrects its readings by its calibration registers."""
+
+    readings: Annotated[
+        Literal["before"] | None,
+        Field(description='"before": streams.readings are not corrected by the calibration registers'),
+    ] = None
+
+    @field_validator("readings", mode="before")
+    @classmethod
+    def _supported(cls, given: object) -> object:
+        if given == "after":
+            raise ValueError('readings after the device\'s correction are not supported yet: expected "before"')
+        return given
+
+
 class Profile(Strict):
     """The part of a profile that every device has."""
 
@@ -172,6 +188,7 @@ class Profile(Strict):
     registers: Mapping[str, Any] = {}
     sequences: Sequences = Sequences()
     crc: Crc | None = None
+    correction: Correction | None = None
 
     @model_validator(mode="after")
     def _names_resolve(self) -> Self:

@@ -16,6 +16,7 @@ from triaxcald import text
 from triaxcald.errors import DaemonError
 from triaxcald.exit_codes import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, exit_code_of
 from triaxcald.outcome import Ending, Verdict
+from triaxcald.provision.correction import ReadingsNotStated
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
 from triaxcald.station.config import Limits
@@ -45,7 +46,8 @@ def aborted(e: BaseException, p: Provisioning | None) -> Ending:
         with suppress(OSError, ValueError):  # a closed standard error
             sys.stderr.write(trace)
     written = p is not None and p.held.state is not DeviceState.UNTOUCHED
-    if p is not None and written and not (p.settled and code in (INTERRUPTED, DISK)):
+    refused = isinstance(e, ReadingsNotStated)  # an earlier provisioning wrote, not this one
+    if p is not None and written and not refused and not (p.settled and code in (INTERRUPTED, DISK)):
         code = DEVICE
     return Ending(Verdict.ABORTED, reason_of(e), code, getattr(e, "wanted", ()))
 
