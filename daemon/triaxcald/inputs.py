@@ -30,6 +30,7 @@ from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import DecodedStream, Pipeline, creeping, together
+from triaxcald.provision.identity import same_serial
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents
 from triaxcald.recording.schema import RECOVERY_RECORD, STATION_FILE, Phase
@@ -193,7 +194,7 @@ def require_unit(document: Mapping[str, Any], measured: Measured, *, where: str)
     unit than the recording."""
     held = document.get("unit")
     theirs, ours = held.get("serial") if isinstance(held, Mapping) else None, (measured.unit or {}).get("serial")
-    if theirs and ours and theirs != ours:
+    if theirs and ours and not (isinstance(theirs, str) and same_serial(theirs, ours)):
         raise InputError(f"{where}: unit.serial is {theirs}; {measured.name} is of {ours}")
 
 

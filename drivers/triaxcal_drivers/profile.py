@@ -12,9 +12,9 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, field_validator, model_validator
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.nearest import nearest
@@ -83,17 +83,18 @@ class Register(Strict):
     ``bias.x`` [g], any effect's coefficient (``second_order_nonlinearity.x``,
     ``temperature_bias.y``…), ``reference_temperature`` [°C],
     ``calibration_date`` (days since 1970-01-01), ``calibration_crc``,
-    ``serial_number``, ``write_counter``. The value is ``raw * scale + offset``.
+    ``serial_number``, ``write_counter``. The value is ``raw * scale + offset``;
+    it is an exact integer where type, scale and offset are integers.
     """
 
     type: RawType
     role: str | None = None
     access: Literal["ro", "rw", "wo"] = "rw"
     unit: str = ""
-    scale: float = 1.0
-    offset: float = 0.0
-    minimum: float | None = None
-    maximum: float | None = None
+    scale: int | float = 1.0
+    offset: int | float = 0.0
+    minimum: int | float | None = None
+    maximum: int | float | None = None
     description: str = ""
 
     @model_validator(mode="after")
@@ -154,8 +155,27 @@ class Crc(Strict):
     over: Annotated[tuple[str, ...], Field(min_length=1)]
 
 
+class Correction(Strict):
+    """How the device corrects its readings by its calibration registers."""
+
+    readings: Annotated[
+        Literal["before"] | None,
+        Field(description='"before": streams.readings are not corrected by the calibration registers'),
+    ] = None
+
+    @field_validator("readings", mode="before")
+    @classmethod
+    def _supported(cls, given: object) -> object:
+        if given == "after":
+            raise ValueError('readings after the device\'s correction are not supported yet: expected "before"')
+        return given
+
+
 class Profile(Strict):
     """The part of a profile that every device has."""
+
+    wire_order: ClassVar[codec.ByteOrder] = "big"
+    """Of the bytes that a driver reads and writes for a register."""
 
     format: Literal["triaxcal.profile/1"]
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
@@ -168,6 +188,7 @@ class Profile(Strict):
     registers: Mapping[str, Any] = {}
     sequences: Sequences = Sequences()
     crc: Crc | None = None
+    correction: Correction | None = None
 
     @model_validator(mode="after")
     def _names_resolve(self) -> Self:
@@ -204,14 +225,23 @@ class Profile(Strict):
         return next((name for name, r in self.registers.items() if r.role == role), None)
 
     def encode(self, name: str, value: float) -> bytes:
-        """``value`` as the bytes of register ``name`` on the wire: most
-        significant first, where the transport's profile does not say otherwise.
-        Raises RegisterValueError."""
-        return codec.encode(self.registers[name], value, order="big", name=name)
+        """``value`` as the bytes of register ``name`` in `wire_order`. Raises
+        RegisterValueError."""
+        return codec.encode(self.registers[name], value, order=self.wire_order, name=name)
 
     def decode(self, name: str, raw: bytes) -> float:
         """The inverse of `encode`. Raises RegisterValueError on a wrong length."""
-        return codec.decode(self.registers[name], raw, order="big", name=name)
+        return codec.decode(self.registers[name], raw, order=self.wire_order, name=name)
+
+    def raw_number(self, name: str, raw: bytes) -> int | None:
+        """The bytes of register ``name`` as the device counts, without scale
+        and offset; None where they are no number. Raises RegisterValueError on
+        a wrong length."""
+        return codec.raw_number(self.registers[name], raw, order=self.wire_order, name=name)
+
+    def most_significant_first(self, raw: bytes) -> bytes:
+        """The bytes of a register, whatever their order on the wire."""
+        return raw if self.wire_order == "big" else raw[::-1]
 
 
 @dataclass(frozen=True)

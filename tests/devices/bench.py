@@ -37,9 +37,9 @@ DAY_S = 86_400
 class Bench(Generic[DoneT]):
     """``triaxcal`` runs a command in this process and gives what it left, as the fixture of that name does.
 
-    ``serial`` is the one that the station file demands, None for none. ``swapped`` is a unit that takes this one's
-    place from a request on. ``node`` are further settings of `CanopenNode`: interface, channel, heartbeat_s…
-    ``segmented``: the node sends also short objects in segments.
+    ``serial_number`` is the unit's, ``serial`` the one that the station file demands, None for none. ``swapped`` is a
+    unit that takes this one's place from a request on. ``node`` are further settings of `CanopenNode`: interface,
+    channel, heartbeat_s… ``segmented``: the node sends also short objects in segments.
     """
 
     folder: Path
@@ -52,13 +52,14 @@ class Bench(Generic[DoneT]):
     motion: Motion = field(default_factory=Motion)
     before: Coefficients = OLD
     wanted: Coefficients = NEW
+    serial_number: int = SERIAL_NUMBER
     serial: str | None = str(SERIAL_NUMBER)
     swapped: tuple[int, Electronics] | None = None
     node: Mapping[str, Any] = field(default_factory=dict)
     segmented: bool = False
 
     def __post_init__(self) -> None:
-        self.unit = Electronics(self.habits, self.before.image(self.habits))
+        self.unit = Electronics(self.habits, self.before.image(self.habits), self.serial_number)
         self.old = self.unit.eeprom
         """The calibration registers as they were at first, raw, most significant byte first."""
         self.place = Place(self.unit, self.trouble)

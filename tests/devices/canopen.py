@@ -118,8 +118,8 @@ class CanopenNode(Serving):
         with place.lock:
             if self.state == OPERATIONAL and place.unit.up(due_s):
                 self._count += 1
-                corrected = self.motion.corrected(place.unit, due_s)
-                self._send(READINGS + self.node_id, packed(self.motion.readings(due_s), READINGS_UNIT_V, self._count))
+                shown, corrected = self.motion.shown(place.unit, due_s), self.motion.corrected(place.unit, due_s)
+                self._send(READINGS + self.node_id, packed(shown, READINGS_UNIT_V, self._count))
                 self._send(CORRECTED + self.node_id, packed(corrected, CORRECTED_UNIT_G, self._count))
         following_s = due_s + 1 / self.rate_hz
         self.later(max(following_s - self.now(), 1e-6), lambda: self._sample(following_s), recurs=True)

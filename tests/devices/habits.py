@@ -36,6 +36,8 @@ class Habits:
     """A register for the calibration date, days since 1970-01-01; not under the checksum."""
     number: Literal["float32", "int32"] = "float32"
     """Type of the nine registers; as int32 in units of 1e-6."""
+    serial_type: Literal["uint32", "uint64", "int64"] = "uint32"
+    """Type of the serial number."""
     word_order: Literal["big", "little"] = "big"
     """Modbus: the order of the words of a value on the wire."""
 

@@ -116,7 +116,7 @@ class InMemoryDevice:
             records = []
             for name in names:
                 readings = name == "readings"
-                values = self._motion.readings(now) if readings else self._motion.corrected(self.place.unit, now)
+                values = (self._motion.shown if readings else self._motion.corrected)(self.place.unit, now)
                 source = READ_INPUT << 16 | (READINGS if readings else CORRECTED)
                 records.append((round(now * 1e9), source, 0, b"".join(self._motion.encode(values))))
             yield self._batch(records)

@@ -238,7 +238,7 @@ class Electronics:
             "write_counter": lambda: self.memory.jobs_done,
             "status": self._status,
         }
-        return facts[register]().to_bytes(entry.size, "big")
+        return facts[register]().to_bytes(entry.size, "big", signed=entry.type == "int64")
 
     def _status(self) -> int:
         return (

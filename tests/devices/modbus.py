@@ -87,8 +87,8 @@ class _Answer:
     def _input(self, address: int, count: int) -> bytes:
         if self.motion is None or address not in (READINGS, CORRECTED) or count > BLOCK_WORDS:
             raise Refused("unknown")
-        triple = self.motion.readings if address == READINGS else lambda now: self.motion.corrected(self.unit, now)
-        return b"".join(map(self._ordered, self.motion.encode(triple(self.now))))[: 2 * count]
+        triple = self.motion.shown if address == READINGS else self.motion.corrected
+        return b"".join(map(self._ordered, self.motion.encode(triple(self.unit, self.now))))[: 2 * count]
 
     def _ordered(self, raw: bytes) -> bytes:
         if self.unit.habits.word_order == "big":

@@ -33,11 +33,17 @@ def correct(readings: Triple, entries: Mapping[str, Entry], image: Mapping[str, 
 @dataclass(frozen=True)
 class Motion:
     """``readings`` [V] by the device's clock. With ``follows_registers`` False the device corrects with what lies in
-    its ROM, whatever its registers hold. ``number``: type of both blocks on Modbus; int32 in units of 1e-6."""
+    its ROM, whatever its registers hold. With ``corrects_all`` it has no output but the corrected one, and sends it as
+    its readings. ``number``: type of both blocks on Modbus; int32 in units of 1e-6."""
 
     readings: Callable[[float], Triple] = at_rest
     follows_registers: bool = True
     number: str = "float32"
+    corrects_all: bool = False
+
+    def shown(self, unit: Electronics, now: float) -> Triple:
+        """What the device sends as its readings."""
+        return self.corrected(unit, now) if self.corrects_all else self.readings(now)
 
     def corrected(self, unit: Electronics, now: float) -> Triple:
         """In g."""

@@ -57,6 +57,9 @@ class Wording:
     """Whether it names the register of the serial number."""
     corrected: bool = True
     """Whether it has the stream of samples that the device corrects."""
+    readings: Literal["before", "after"] | None = None
+    """What it says of the readings: before or after the device's own correction."""
+    nominal: float = -2.4
 
 
 def profile_text(driver: Driver, habits: Habits, timing: Timing | None = None, wording: Wording | None = None) -> str:
@@ -70,7 +73,7 @@ def profile_text(driver: Driver, habits: Habits, timing: Timing | None = None, w
         _lines({"format": "triaxcal.profile/1", "name": "misbehaving", "driver": driver}),
         _lines({"word_order": wording.word_order or habits.word_order}) if driver == "modbus" else "",
         _table("identity", identity),
-        _table("output", {"unit": "V", "nominal_scale_factor": [-2.4, -2.4, -2.4]}),
+        _table("output", {"unit": "V", "nominal_scale_factor": [wording.nominal] * 3}),
         _table(
             "sampling",
             {"rate_hz": 50.0, "reply_timeout_s": timing.reply_s, "silence_timeout_s": timing.silence_s},
@@ -79,6 +82,8 @@ def profile_text(driver: Driver, habits: Habits, timing: Timing | None = None, w
         _table("registers", {name: _register(driver, e, wording) for name, e in registers_of(habits).items()}),
         _table("sequences", _sequences(habits, timing, wording)),
     ]
+    if wording.readings:
+        parts.append(_table("correction", {"readings": wording.readings}))
     if habits.checksum:
         parts.append(_table("crc", {"register": CHECKSUM, "algorithm": "crc-16/modbus", "over": NINE}))
     return "\n".join(part for part in parts if part)

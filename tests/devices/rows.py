@@ -23,7 +23,7 @@ PATIENT = Timing(reply_s=5.0, silence_s=10.0, store_poll_s=10.0, reconnect_s=10.
 QUICK = Timing(reply_s=0.3, silence_s=0.6)
 """For devices that do not answer: the wait is over soon."""
 ABSURD = Coefficients((-2.4e6, -2.38e6, -2.42e6), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-NO_OUTPUT = Wording(corrected=False)
+NO_OUTPUT = Wording(corrected=False, readings="before")
 """Requests then come in one order, each time: the 28th to the 37th write the registers."""
 BARE = Habits(store_command=False, reset_command=False, unlock=False)
 

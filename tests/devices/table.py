@@ -20,7 +20,8 @@ UNLOCK_KEY, STORE_COMMAND, RESET_COMMAND = 0xC0DE, 0x65766173, 0x5253
 INT32_UNIT = 1e-6
 UNITS = {"scale_factor": "V/g", "misalignment": "rad", "bias": "g"}
 LIMITS = {"scale_factor": 10.0, "misalignment": 0.1, "bias": 0.5}
-_FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
+_FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q", "uint64": ">Q",
+            "float32": ">f"}  # fmt: skip
 
 Access = Literal["ro", "rw", "wo"]
 
@@ -56,8 +57,10 @@ class Entry:
 
 def registers_of(habits: Habits) -> dict[str, Entry]:
     """The registers of a device with these habits, in order."""
+    short = habits.serial_type == "uint32"
+    where = (0x0000, (0x1018, 4)) if short else (0x0010, (0x2F03, 0))  # four words; CANopen's own has 32 bits
     held = {
-        "serial_number": Entry("uint32", 0x0000, (0x1018, 4), role="serial_number"),
+        "serial_number": Entry(habits.serial_type, *where, role="serial_number"),
         "product_code": Entry("uint32", 0x0002, (0x1018, 2)),
     }
     if habits.status:

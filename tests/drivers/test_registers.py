@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from triaxcal_drivers.errors import RegisterValueError
 from triaxcal_drivers.profile import Register
-from triaxcal_drivers.registers import crc, decode, encode, step
+from triaxcal_drivers.registers import crc, decode, encode, raw_number, step
 
 ORDERS = st.sampled_from(["big", "little"])
 
@@ -89,3 +89,70 @@ def test_whole_numbers_are_decoded_whole():
 )
 def test_the_step_of_a_register_is_that_of_its_type_in_the_unit_of_the_register(type_, scale, value, step_):
     assert step(Register(type=type_, scale=scale), value) == pytest.approx(step_, rel=1e-12)
+
+
+EDGES = [
+    0,
+    1,
+    -1,
+    2**53 - 1,
+    2**53,
+    2**53 + 1,
+    -(2**53) - 1,
+    2**62 + 1,
+    2**63 - 1,
+    -(2**63),
+    2**63,
+    2**63 + 1,
+    2**64 - 1,
+]
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1, 0), (-1.0, 0.0), (3.0, -7.0), (2, 2**53 + 1)])
+@pytest.mark.parametrize(
+    ("type_", "number"),
+    [(t, n) for t, low, high in (("int64", -(2**63), 2**63), ("uint64", 0, 2**64)) for n in EDGES if low <= n < high],
+)
+def test_integers_of_64_bits_are_exact_both_ways(type_, number, scale, offset, order):
+    raw = struct.pack(("<" if order == "little" else ">") + {"int64": "q", "uint64": "Q"}[type_], number)
+    register = Register(type=type_, scale=scale, offset=offset)
+    value = decode(register, raw, order=order, name="r")
+    assert isinstance(value, int)
+    assert value == number * int(scale) + int(offset)
+    assert encode(register, value, order=order, name="r") == raw
+    assert raw_number(register, raw, order=order, name="r") == number
+
+
+@pytest.mark.parametrize(("value", "raw"), [(6, 2), (7, 2), (8, 3), (-8, -3), (4.5, 2)])
+def test_an_integer_between_two_steps_goes_to_the_nearer(value, raw):
+    register = Register(type="int16", scale=3.0)
+    assert encode(register, value, order="big", name="r") == raw.to_bytes(2, "big", signed=True)
+
+
+@pytest.mark.parametrize("value", [2**64, -1, 2.0**64])
+def test_an_integer_beyond_its_type_is_refused(value):
+    with pytest.raises(RegisterValueError, match="does not fit uint64"):
+        encode(Register(type="uint64"), value, order="big", name="r")
+
+
+def test_a_limit_is_as_exact_as_the_register():
+    register = Register(type="uint64", minimum=2**53 + 1, maximum=2**53 + 3)
+    for beyond in (2**53, 2**53 + 4):
+        with pytest.raises(RegisterValueError, match="outside its limits"):
+            encode(register, beyond, order="big", name="r")
+    assert encode(register, 2**53 + 1, order="big", name="r") == (2**53 + 1).to_bytes(8, "big")
+
+
+@pytest.mark.parametrize(
+    ("type_", "scale", "raw", "number"),
+    [
+        ("uint64", 0.001, struct.pack(">Q", 2**53 + 1), 2**53 + 1),
+        ("int16", 0.5, struct.pack(">h", -3), -3),
+        ("float32", 2.0, struct.pack(">f", 777.0), 777),
+        ("float32", 1.0, b"\xff" * 4, None),
+        ("float64", 1.0, struct.pack(">d", math.inf), None),
+    ],
+)
+def test_a_raw_number_is_what_the_device_counts(type_, scale, raw, number):
+    assert raw_number(Register(type=type_, scale=scale, offset=1.0), raw, order="big", name="r") == number

@@ -13,7 +13,7 @@ from triaxcald.audit.differences import Difference, Kind
 from triaxcald.audit.marks import Mark, Marks, marks_in
 from triaxcald.outcome import ATTACHMENT
 from triaxcald.provision import snapshot
-from triaxcald.provision.identity import raw_number
+from triaxcald.provision.identity import serial_text
 from triaxcald.provision.image import RegisterImage, calibration_registers
 from triaxcald.provision.plausible import doubts
 from triaxcald.provision.power import MISSED
@@ -187,10 +187,9 @@ def _identity(traffic: Traffic, serial: str | None) -> list[Difference]:
     found: dict[str, Difference] = {}
     for a in traffic.accesses:
         if a.operation == "read" and not a.error and a.register in meant:
-            register = traffic.profile.registers[a.register]
-            number = raw_number(register, traffic.profile.decode(a.register, a.raw))
-            is_serial = number is not None and a.register == identity.serial_register
-            answered: object = f"{number:04d}" if is_serial else number
+            number = traffic.profile.raw_number(a.register, a.raw)
+            is_serial = a.register == identity.serial_register
+            answered: object = serial_text(number) if number is not None and is_serial else number
             if answered != meant[a.register]:
                 found[a.register] = Difference(REGISTERS, Kind.NOT_READ, a.register, meant[a.register], answered)
     return list(found.values())

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal_drivers.interface import Device
-from triaxcal_drivers.profile import Bundle, Register
+from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import ProvisionError
 
 
@@ -17,8 +17,8 @@ class WrongUnit(ProvisionError):
 
 @dataclass(frozen=True)
 class IdentityRead:
-    """``serial``: the serial register as text of at least four digits, None
-    where the profile has none.
+    """``serial``: the integer in the serial register as text of at least four
+    characters, None where the profile has none.
 
     ``values``: the raw numbers of the registers that the profile's identity
     expects, by name.
@@ -56,24 +56,28 @@ async def read_serial(device: Device, bundle: Bundle) -> str | None:
     """The serial number as `IdentityRead` has it. Raises RegisterRefused,
     DeviceSilent; WrongUnit where the register holds no number."""
     name = bundle.profile.identity.serial_register
-    return f"{await _read_raw_number(device, bundle, name):04d}" if name else None
+    return serial_text(await _read_raw_number(device, bundle, name)) if name else None
 
 
 async def _read_raw_number(device: Device, bundle: Bundle, name: str) -> int:
-    register: Register = bundle.profile.registers[name]
     raw = await device.read(name)
-    number = raw_number(register, bundle.profile.decode(name, raw))
+    number = bundle.profile.raw_number(name, raw)
     if number is None:
-        raise WrongUnit(f"register {name} holds {raw.hex()}, which is no {register.type} number")
+        kind = bundle.profile.registers[name].type
+        raise WrongUnit(f"register {name} holds {raw.hex()}, which is no {kind} number")
     return number
 
 
-def raw_number(register: Register, value: float) -> int | None:
-    """As the device counts, of what a register was decoded to; None of no
-    number, as an erased EEPROM holds it."""
-    return round((value - register.offset) / register.scale) if math.isfinite(value) else None
+def serial_text(number: int) -> str:
+    """A serial number as every document has it."""
+    return f"{number:04d}"
 
 
 def same_serial(serial: str | None, expected: str) -> bool:
-    """Leading zeros do not count: the device holds a number."""
-    return serial is not None and expected.strip().lstrip("0") == serial.lstrip("0")
+    """Leading zeros do not count, also after a minus sign: the device holds a
+    number."""
+    return serial is not None and _without_zeros(serial) == _without_zeros(expected)
+
+
+def _without_zeros(serial: str) -> str:
+    return re.sub("^(-?)0+", r"\1", serial.strip())

@@ -3,11 +3,12 @@ I/O."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triaxcal_drivers import registers as codec
-from triaxcal_drivers.errors import ProfileError
+from triaxcal_drivers.errors import ProfileError, RegisterValueError
 from triaxcal_drivers.profile import Profile
 from triaxcald.errors import InputError
 
@@ -75,7 +76,7 @@ def build_image(profile: Profile, coefficients: Mapping[str, float], *, date_day
     words = [_word(profile, name, wanted.get(profile.registers[name].role, 0.0)) for name in names if name != checksum]
     if checksum:
         value = checksum_of(profile, {word.register: word.raw for word in words})
-        words.append(_word(profile, checksum, float(value)))
+        words.append(_word(profile, checksum, value))
     return RegisterImage(tuple(words), tuple(role for role in coefficients if role not in roles))
 
 
@@ -111,7 +112,8 @@ def checksum_of(profile: Profile, raw: Mapping[str, bytes]) -> int:
     """The profile's checksum over registers' raw bytes (as on the wire), by
     name.
 
-    Raises ProfileError where it covers a register that is not given.
+    Raises ProfileError where it covers a register that is not given,
+    RegisterValueError where one holds no number or has a wrong length.
     """
     if profile.crc is None:
         raise ProfileError(f"profile {profile.name}: crc: none is described")
@@ -120,10 +122,7 @@ def checksum_of(profile: Profile, raw: Mapping[str, bytes]) -> int:
             raise ProfileError(
                 f"profile {profile.name}: crc: covers register {name}, which is no writable register with a role"
             )
-    covered = b"".join(_most_significant_first(profile, name, raw[name]) for name in profile.crc.over)
+        if not math.isfinite(profile.decode(name, raw[name])):
+            raise RegisterValueError(f"register {name}: {raw[name].hex()} is no number")
+    covered = b"".join(profile.most_significant_first(raw[name]) for name in profile.crc.over)
     return codec.crc(profile.crc.algorithm, covered)
-
-
-def _most_significant_first(profile: Profile, name: str, raw: bytes) -> bytes:
-    register = profile.registers[name].model_copy(update={"minimum": None, "maximum": None})
-    return codec.encode(register, profile.decode(name, raw), order="big", name=name)

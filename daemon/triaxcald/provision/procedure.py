@@ -83,6 +83,8 @@ class Provisioning:
     _store_asked: bool = False
     _decided: bool = False
 
+    _journals: list[tuple[Journal, Entry]] = field(default_factory=list)
+
     identity: IdentityRead = field(init=False)
     owner: Owner = field(init=False)
     journal: Journal = field(init=False)
@@ -129,13 +131,9 @@ class Provisioning:
         stored. Raises ProvisionError, WrongUnit, InputError (the journal), DriverError,
         SequenceStalled.
         """
-        await self.identify()
-        journals = journals_of(self.folder, self.owner, self.bundle.profile)
-        if journals:
-            self._earlier = [journal for journal, _ in journals]
-            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
-        self.found = await self._read("reading the old calibration")
-        self.restart_owed = self.resets and (bool(journals) or not self.found.differing(self.image.raw))
+        if not self.examined:
+            await self.look()
+        journals = self._journals
         if restart and self.restart_owed:
             if not journals:  # `write` shows a restart with a mark, once the doubts are answered
                 await self._sequence("reset")
@@ -145,9 +143,8 @@ class Provisioning:
                 self._restarted = (await self._restart(*known)).mark_gone
             self.found = await self._read("reading the stored calibration")
             self.restart_owed = False
+            self._compare()
         entry = self._entry_of_this_unit(journals)
-        self.before = self.after = self.found
-        self.differing = self.found.differing(self.image.raw)
         if entry is not None:
             self.carried, self.before = True, Snapshot(entry.before, self.identity.serial)
             self._store_owed = self.stores and entry.step not in ("stored", "unverified") and not self._restarted
@@ -158,6 +155,22 @@ class Provisioning:
             again = await self._read("reading the old calibration again")
             profile = self.bundle.profile
             self.doubts = unstable(profile, self.found, again) or doubts(profile, self.found, self.image)
+
+    async def look(self) -> None:
+        """Who is there, and what its registers hold. Nothing is written, and the
+        device is not restarted. Raises as `examine` does."""
+        await self.identify()
+        self._journals = journals_of(self.folder, self.owner, self.bundle.profile)
+        if self._journals:
+            self._earlier = [journal for journal, _ in self._journals]
+            self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+        self.found = await self._read("reading the old calibration")
+        self._compare()
+        self.restart_owed = self.resets and (bool(self._journals) or not self.differing)
+
+    def _compare(self) -> None:
+        self.before = self.after = self.found
+        self.differing = self.found.differing(self.image.raw)
 
     def _entry_of_this_unit(self, journals: list[tuple[Journal, Entry]]) -> Entry | None:
         """The journal that was cut short in this device. Those of other units,

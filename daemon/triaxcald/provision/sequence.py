@@ -81,7 +81,8 @@ async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollSt
             held = profile.decode(step.poll, await link.read_once(step.poll))
             value = held if step.mask is None or not math.isfinite(held) else int(held) & step.mask
             late: Exception = SequenceStalled(
-                f"{label}: register {step.poll} holds {value:g} after {step.timeout_s:g} s, expected {step.until:g}"
+                f"{label}: register {step.poll} holds {_shown(value)} after {step.timeout_s:g} s, "
+                f"expected {_shown(step.until)}"
             )
             if value == step.until:
                 return
@@ -90,6 +91,11 @@ async def _poll(link: RegisterLink, profile: Profile, label: Label, step: PollSt
         if link.pace.clock_s() >= deadline_s:
             raise late
         await link.pace.sleep(POLL_S)
+
+
+def _shown(value: float) -> str:
+    """Every digit of an integer."""
+    return str(value) if isinstance(value, int) else f"{value:g}"
 
 
 async def reconnect(link: RegisterLink, profile: Profile, timeout_s: float | None = None) -> None:

@@ -27,6 +27,7 @@ from triaxcald.errors import (
 )
 from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, exit_code_of
 from triaxcald.outcome import Code, Ending, Verdict
+from triaxcald.provision.correction import ReadingsNotStated
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
@@ -62,7 +63,8 @@ def aborted(e: BaseException, p: Provisioning | None) -> Ending:
         with suppress(OSError, ValueError):  # a closed standard error
             sys.stderr.write(trace)
     written = p is not None and p.held.state is not DeviceState.UNTOUCHED
-    if p is not None and written and not (p.settled and exit_code in (INTERRUPTED, DISK)):
+    refused = isinstance(e, ReadingsNotStated)  # an earlier provisioning wrote, not this one
+    if p is not None and written and not refused and not (p.settled and exit_code in (INTERRUPTED, DISK)):
         exit_code = DEVICE
         if code is None or code.exit_code != DEVICE or not p.settled:
             code = code if code in _WHO_IS_THERE else Code.NOT_SETTLED

@@ -14,11 +14,12 @@ from typing import Any
 
 from triaxcal.arrays import Floats
 from triaxcal.interchange.calibration_document import Document
+from triaxcal_drivers.errors import RegisterRefused
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import CORRECTED, READINGS
 from triaxcald import text
 from triaxcald.abort import Left, at_abort
-from triaxcald.certificate import Certified, certify, software
+from triaxcald.certificate import Certified, certify, software, why_not_written
 from triaxcald.documents import to_text
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.exit_codes import DISK, REFUSED
@@ -38,6 +39,7 @@ from triaxcald.outcome import (
     registers_told,
 )
 from triaxcald.pipeline import Pipeline
+from triaxcald.provision.correction import leaves_open, require_readings_before
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.journal import Owner, journals_of, open_journal
@@ -128,6 +130,7 @@ class UnitRun(UnitSession):
                 self._open_journal = open_journal(self.station.folder, self.profile, self.name, identity.serial)
                 path = self.recording_path(identity)
                 self._require_readable_journal(identity)
+                await self._require_readings_before(device)
                 self._recording = path
                 with self.writer(self._recording, identity, ends_with=FORMAT) as writer:
                     ending = await self._ending(device, identity, writer)
@@ -272,6 +275,13 @@ class UnitRun(UnitSession):
         except InputError:
             self._open_journal = None  # no command goes by it
             raise
+
+    async def _require_readings_before(self, device: Device) -> None:
+        """Before any pose is taken. Raises Refused, DriverError."""
+        written = self.station.file.provisioning.write and why_not_written(self.profile) is None
+        if written and leaves_open(self.profile):
+            with suppress(RegisterRefused):  # what cannot be read is not written either
+                require_readings_before(self.profile, await self.registers(device))
 
     async def _line(self, device: Device, identity: IdentityRead, writer: RecordingWriter) -> Ending:
         plan = self.station.file.plan

@@ -32,6 +32,7 @@ from triaxcald.outcome import (
     registers_told,
 )
 from triaxcald.provision.access import RegisterLink
+from triaxcald.provision.correction import leaves_open, require_readings_before
 from triaxcald.provision.image import RegisterImage, image_of
 from triaxcald.provision.journal import open_journal, parse, registers_of
 from triaxcald.provision.plausible import Doubt
@@ -113,7 +114,12 @@ class ProvisionRun:
     async def _work(self, device: Device) -> None:
         bundle = self.place.bundle
         link = RegisterLink(device, bundle.profile)
-        p = self._begin(link, self.image or await self._image_of_journal(link))
+        image = self.image or await self._image_of_journal(link)
+        p = self._begin(link, image)
+        if self.image is not None and leaves_open(bundle.profile):  # a resume finishes what was begun
+            await p.look()
+            self.provisioning = p
+            require_readings_before(bundle.profile, p.found)
         await p.examine(restart=not self.dry_run)
         self.provisioning = p
         self.doubts = p.doubts

@@ -16,6 +16,7 @@ from triaxcald.errors import InputError
 from triaxcald.inputs import PROFILE, preview_channels
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
+from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.recording.retention import Retention
 from triaxcald.recording.schema import STATION_FILE
 from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
@@ -107,6 +108,11 @@ class UnitSession:
         identity = await check_identity(link, self.place.bundle, self.place.unit.serial, where=where)
         self.serials.add(identity.serial, self.name, where)
         return identity
+
+    async def registers(self, device: Device) -> Snapshot:
+        """All calibration registers, as they are in use. Raises WrongUnit,
+        DriverError."""
+        return await take_snapshot(RegisterLink(device, self.profile), self.place.bundle)
 
     def recording_name(self, identity: IdentityRead) -> str:
         return f"{self.name}-{identity.serial or 'unknown'}-{stamp(self.clock_ns())}.mcap"

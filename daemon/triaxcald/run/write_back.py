@@ -23,6 +23,7 @@ from triaxcald.errors import DaemonError, DiskError, Implausible, StationError
 from triaxcald.inputs import VERIFICATION
 from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.corrected import LEAST, departure_g, doubt_of_departure
+from triaxcald.provision.correction import require_readings_before
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.plausible import Doubt, is_blank
 from triaxcald.provision.procedure import Provisioning
@@ -74,8 +75,8 @@ class WriteBack:
         """Whatever is raised on the way, the old calibration has been put back
         before, or `held` says what is not.
 
-        Raises Implausible, with nothing written, ProvisionError, StationError,
-        DiskError.
+        Raises Implausible, Refused, with nothing written; ProvisionError,
+        StationError, DiskError.
         """
         link = RegisterLink(device, self.place.bundle.profile, _recorder(self.writer))
         asked = power_cycle_asked(self.ask, link, self.place, self.station)
@@ -92,6 +93,7 @@ class WriteBack:
         )
         await p.examine()
         self.provisioning = p
+        require_readings_before(self.place.bundle.profile, p.found)
         self.doubts = [*p.doubts, *self._doubts_of_output(tumble)]
         if self.doubts and self.force is None:
             raise Implausible(text.doubted(self.doubts))

@@ -327,11 +327,7 @@ def _check_distinct(places: Sequence[Place], *, where: str) -> None:
             raise InputError(
                 f"{where}: units.{i}.bus: unit {b.unit.name} is in the place of unit {a.unit.name} ({a.address})"
             )
-        if (
-            a.unit.serial is not None
-            and b.unit.serial is not None
-            and same_serial(a.unit.serial.strip(), b.unit.serial)
-        ):
+        if a.unit.serial is not None and b.unit.serial is not None and same_serial(a.unit.serial, b.unit.serial):
             raise InputError(
                 f"{where}: units.{i}.serial: unit {b.unit.name} has the serial number of unit {a.unit.name}, "
                 f"{a.unit.serial}"

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from triaxcal_drivers import registers as codec
 from triaxcal_drivers.can.claim import bus_name, claim_on_can, claim_to_listen
 from triaxcal_drivers.claim import Claim
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.profile import AXES, CHANNELS_MOST, STREAMS_MOST, Profile, Register, Strict
+from triaxcal_drivers.registers import ByteOrder
 from triaxcal_drivers.validation import validate
 
 READING_CHANNELS = tuple("u" + axis for axis in AXES)
@@ -171,6 +171,7 @@ class CanProfile(Profile):
     """A device on CAN. With registers, or streams laid out by an EDS, it is
     taken for a CANopen node."""
 
+    wire_order: ClassVar[ByteOrder] = "little"
     streams: Annotated[Mapping[str, CanStream], Field(max_length=STREAMS_MOST)]
     registers: Mapping[str, CanRegister] = {}
     busy_codes: Annotated[
@@ -185,15 +186,6 @@ class CanProfile(Profile):
 
     def files(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(stream.file for stream in self.streams.values()))
-
-    def encode(self, name: str, value: float) -> bytes:
-        """``value`` as register bytes on the wire, least significant first.
-        Raises RegisterValueError."""
-        return codec.encode(self.registers[name], value, order="little", name=name)
-
-    def decode(self, name: str, raw: bytes) -> float:
-        """The inverse of `encode`. Raises RegisterValueError on a wrong length."""
-        return codec.decode(self.registers[name], raw, order="little", name=name)
 
 
 LISTEN_ONLY: Mapping[str, Mapping[str, str | int | bool]] = {

@@ -5,12 +5,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
 from triaxcal_drivers import registers as codec
 from triaxcal_drivers.errors import DeviceAbsent, DeviceSilent, RegisterRefused
 from triaxcal_drivers.profile import Bundle, Profile, Register
+from triaxcal_drivers.registers import ByteOrder
 from triaxcald.audit.differences import Difference
 from triaxcald.audit.traffic import Said, Traffic, check
 from triaxcald.outcome import registers_told
@@ -79,11 +81,7 @@ def profile_data() -> dict[str, object]:
 class LittleEndianProfile(Profile):
     """A transport that sends the least significant byte first."""
 
-    def encode(self, name: str, value: float) -> bytes:
-        return codec.encode(self.registers[name], value, order="little", name=name)
-
-    def decode(self, name: str, raw: bytes) -> float:
-        return codec.decode(self.registers[name], raw, order="little", name=name)
+    wire_order: ClassVar[ByteOrder] = "little"
 
 
 def coefficients(scale: float, step: float) -> dict[str, float]:

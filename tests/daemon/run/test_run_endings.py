@@ -170,6 +170,7 @@ def _without_corrected(workshop: Any) -> str:
     text = (workshop.folder / workshop.impatient_profile()).read_text()
     kept = [part for part in re.split(r"(?m)^(?=\[)", text) if not part.startswith("[streams.corrected")]
     assert len(kept) < len(re.split(r"(?m)^(?=\[)", text))
+    kept.append('[correction]\nreadings = "before"\n')
     name: str = workshop.write("uncorrected.toml", "".join(kept)).name
     return name
 
