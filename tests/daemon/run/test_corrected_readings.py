@@ -12,7 +12,7 @@ import pytest
 
 from tests.devices.habits import Habits
 from tests.devices.in_memory import Errors, InMemoryDevice, VirtualClock
-from tests.devices.memory import Electronics
+from tests.devices.memory import SERIAL_NUMBER, Electronics
 from tests.devices.motion import Motion, Triple, correct
 from tests.devices.place import Place as At
 from tests.devices.profiles import Wording, profile_text, station_text
@@ -26,6 +26,7 @@ from triaxcald.station import collection
 from triaxcald.station.config import Place
 
 START_S, HELD_S, TURN_S, POSES, NOISE = 1_772_442_000.0, 2.0, 0.5, 16, 5e-5
+SERIAL = 2**53 + 1  # no float holds it
 ERRORS = Errors(DeviceSilent, DeviceAbsent, BusError, DeviceSilent, RegisterRefused, DeviceBusy)
 KEY = '[correction] readings = "before"'
 NEUTRAL = Coefficients((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -63,7 +64,9 @@ class Line:
 
     def __init__(self, folder: Path, habits: Habits, *, before: Coefficients, corrects_all: bool) -> None:
         self.folder, self.habits = folder, habits
-        self.unit = Electronics(habits, before.image(habits))
+        self.unit = Electronics(
+            habits, before.image(habits), SERIAL if habits.serial_type == "uint64" else SERIAL_NUMBER
+        )
         self.place = At(self.unit)
         self.clock = VirtualClock(START_S)
         self.motion = Motion(tumbling, corrects_all=corrects_all)
@@ -129,12 +132,15 @@ def test_a_second_run_does_not_take_the_calibration_from_a_device_that_corrects_
 def test_a_device_that_is_known_to_deliver_raw_readings_is_calibrated_again(
     line: Callable[..., Line], triaxcal: Run
 ) -> None:
-    unit = line(corrects_all=False, before=Coefficients((1.5, 0.8, 1.1), (0.01, 0.02, 0.03), (0.1, 0.2, 0.3)))
+    habits = Habits(serial_type="uint64")
+    unit = line(habits, corrects_all=False, before=Coefficients((1.5, 0.8, 1.1), (0.01, 0.02, 0.03), (0.1, 0.2, 0.3)))
     assert triaxcal("run", unit.station(), "--json").code == 3  # as its registers are not neutral at first
     for _ in range(2):
         done = triaxcal("run", unit.station("before"), "--json")
         assert done.code == 0, done.err
-        assert done.json["units"][0]["outcome"]["device_state"] == "new_verified"
+        outcome = done.json["units"][0]["outcome"]
+        assert (outcome["device_state"], outcome["serial"]) == ("new_verified", str(SERIAL))
+        assert triaxcal("audit", done.json["units"][0]["recording"]).code == 0
         assert unit.own_error_g < 1e-4
     entries, image = unit.unit.table, unit.unit.starts_with()
     assert [entries[f"bias_{axis}"].decode(image[f"bias_{axis}"]) for axis in "xyz"] == pytest.approx(
