@@ -43,22 +43,7 @@ class DeviceSilent(DriverError):
 
 
 class SecondAnswer(DriverError):
-    """An answer came that no request explains: another unit has the same
-    address, or another program asks the same unit.
-
-    ``register`` is the one that was asked for, and ``answers`` are the raw
-    bytes that came, in order; both empty if the answer was no register's.
-    ``differs``: the answers contradict each other, so that one unit alone
-    cannot have sent them. Else an answer came twice, byte for byte.
-    """
-
-    def __init__(
-        self, message: str, *, register: str = "", answers: tuple[bytes, ...] = (), differs: bool = True
-    ) -> None:
-        super().__init__(message)
-        self.register = register
-        self.answers = answers
-        self.differs = differs
+    """Two units answer at one address."""
 
 
 class DeviceRestarted(DeviceSilent):

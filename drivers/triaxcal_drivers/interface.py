@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.profile import Bundle, Profile
 
 
@@ -228,7 +229,18 @@ class Device(Protocol):
 
     async def write(self, register: str, raw: bytes, *, timeout_s: float | None = None) -> None:
         """One request; ``timeout_s`` takes the place of the profile's
-        ``reply_timeout_s``. Raises as `read` does."""
+        ``reply_timeout_s``. Raises as `read` does.
+
+        A driver that can tell has a method ``listen`` as `Listens` does."""
+
+
+class Listens(Protocol):
+    """A device that tells of answers too many."""
+
+    async def listen(self, seconds: float) -> list[ExtraAnswer]:
+        """Waits so long by the host's clock. Returns the answers since the last
+        call that no request explains: of a second unit at the same address, or
+        to another program."""
 
 
 class Driver(Protocol):

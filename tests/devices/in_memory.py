@@ -53,7 +53,8 @@ class InMemoryDevice:
 
     Registers go most significant byte first, or least with ``little_endian``. ``blind_open`` does not ask the unit,
     as on a bus; otherwise a connection does not survive a restart of it where the place's trouble says so. ``batch``
-    makes what a stream yields of its records (time_ns, source, flags, payload).
+    makes what a stream yields of its records (time_ns, source, flags, payload). ``extra`` makes what `listen` gives of
+    an answer too many: register, answer, and the answer before it.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class InMemoryDevice:
         blind_open: bool = False,
         motion: Motion | None = None,
         batch: Callable[[list[Record]], Any] = list,
+        extra: Callable[[str, bytes, bytes], Any] | None = None,
     ) -> None:
         self.place = place
         self._errors = errors
@@ -76,6 +78,8 @@ class InMemoryDevice:
         self._blind_open = blind_open
         self._motion = motion or Motion()
         self._batch = batch
+        self._extra_of = extra
+        self._extra: list[tuple[float, str, bytes, bytes]] = []
         self._connection: tuple[int, int] | None = None
         self._restarted_s = -float("inf")
         self._restarts = self._incarnation()
@@ -133,31 +137,45 @@ class InMemoryDevice:
         self._notice_restart()
         if self.place.trouble.restart_drops and self._connection != self._incarnation():
             raise self._errors.bus("the connection was lost")
-        refusal: list[Refused] = []
+        refusal: dict[bytes, Refused] = {}
 
         def refuse(refused: Refused) -> bytes:
-            refusal.append(refused)
-            return b""
+            token = b"refused %d" % len(refusal)
+            refusal[token] = refused
+            return token
 
         exchange = self.place.exchange(self._clock.now(), carry_out, refuse)
         await self._clock.sleep(REQUEST_S)  # and here after it
         return await self._received(register, exchange, refusal, timeout_s or self._timeout_s)
 
-    async def _received(self, register: str, exchange: Exchange, refusal: list[Refused], timeout_s: float) -> bytes:
+    async def listen(self, seconds: float) -> list[Any]:
+        """The answers too many that have come by then."""
+        await self._clock.sleep(seconds)
+        due = [e for e in self._extra if e[0] <= self._clock.now()]
+        self._extra = [e for e in self._extra if e[0] > self._clock.now()]
+        return [self._extra_of(*e[1:]) for e in due] if self._extra_of else []
+
+    async def _received(
+        self, register: str, exchange: Exchange, refusal: dict[bytes, Refused], timeout_s: float
+    ) -> bytes:
         if exchange.drop:
             self._connection = None
             raise self._errors.bus("the connection was lost")
-        if not exchange.replies or exchange.replies[0].after_s > timeout_s:
+        if not exchange.replies or min(r.after_s for r in exchange.replies) > timeout_s:
             await self._clock.sleep(timeout_s)
             raise self._errors.silent(f"no reply from register {register}")
-        reply = exchange.replies[0]
+        reply, *further = sorted(exchange.replies, key=lambda reply: reply.after_s)
+        now = self._clock.now()
+        order = -1 if self._little_endian else 1
+        self._extra += [(now + r.after_s, register, r.data[::order], reply.data[::order]) for r in further]
         await self._clock.sleep(reply.after_s)
         if reply.garbage is not None:
             raise self._errors.malformed(f"register {register}: {reply.garbage}")
-        if refusal:
-            code = refusal[0].code or EXCEPTIONS[refusal[0].why]
-            kind = self._errors.busy if refusal[0].why == "busy" and self._errors.busy else self._errors.refused
-            raise kind(f"register {register}: {refusal[0].why}", register=register, code=code)
+        if reply.data in refusal:
+            refused = refusal[reply.data]
+            code = refused.code or EXCEPTIONS[refused.why]
+            kind = self._errors.busy if refused.why == "busy" and self._errors.busy else self._errors.refused
+            raise kind(f"register {register}: {refused.why}", register=register, code=code)
         return reply.data
 
     def _incarnation(self) -> tuple[int, int]:

@@ -6,7 +6,7 @@ import math
 import random
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tests.devices.memory import Electronics, Refused, Silent
 
@@ -79,16 +79,25 @@ class Place:
 
     def __init__(self, unit: Electronics, trouble: Trouble | None = None) -> None:
         self.unit = unit
+        self.second: Electronics | None = None
+        """Another unit with the same address, which hears every request and answers ``second_after_s`` later."""
+        self.second_after_s = 0.04
         self.trouble = trouble or Trouble()
         self.requests = 0
         self.lock = threading.RLock()
         self._random = random.Random(self.trouble.seed)
         self._swaps: dict[int, Electronics] = {}
+        self._seconds: dict[int, Electronics] = {}
         self._first_s = self._last_alive_s = 0.0
 
     def swap_at(self, request: int, other: Electronics) -> None:
         """From that request on another unit answers here."""
         self._swaps[request] = other
+
+    def second_at(self, request: int, other: Electronics, after_s: float = 0.04) -> None:
+        """From that request on another unit answers beside this one."""
+        self._seconds[request] = other
+        self.second_after_s = after_s
 
     def exchange(
         self, now: float, carry_out: Callable[[Electronics], tuple[bytes, float]], refuse: Callable[[Refused], bytes]
@@ -98,9 +107,11 @@ class Place:
         with self.lock:
             self.requests += 1
             self.unit = self._swaps.get(self.requests, self.unit)
+            self.second = self._seconds.get(self.requests, self.second)
             if self.requests == 1:
                 self._first_s = self._last_alive_s = now
-            return self._exchange(now, carry_out, refuse)
+            exchange = self._exchange(now, carry_out, refuse)
+            return replace(exchange, replies=(*exchange.replies, *self._of_the_second(now, carry_out, refuse)))
 
     def _exchange(
         self, now: float, carry_out: Callable[[Electronics], tuple[bytes, float]], refuse: Callable[[Refused], bytes]
@@ -128,6 +139,20 @@ class Place:
             return Exchange(drop=drop)
         reply = Reply(data, after_s + late * t.late_s, kind if garbled else None)
         return Exchange((reply,) * (1 + twice))
+
+    def _of_the_second(
+        self, now: float, carry_out: Callable[[Electronics], tuple[bytes, float]], refuse: Callable[[Refused], bytes]
+    ) -> tuple[Reply, ...]:
+        """Its line is sound."""
+        if self.second is None:
+            return ()
+        try:
+            data, after_s = carry_out(self.second) if self.second.up(now) else (None, 0.0)
+        except Refused as e:
+            data, after_s = refuse(e), 0.0
+        except Silent:
+            data, after_s = None, 0.0
+        return () if data is None else (Reply(data, after_s + self.second_after_s),)
 
     def _answered(
         self,

@@ -8,10 +8,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
+from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError
 from triaxcal_drivers.interface import BUSY_PAUSE_S, BUSY_S, Device, RawBatch
 from triaxcal_drivers.profile import Profile, WriteStep
-from triaxcald.errors import DaemonError
+from triaxcald.errors import DaemonError, TwoAnswer
 from triaxcald.provision.pace import REAL_PACE, Pace
 
 T = TypeVar("T")
@@ -46,6 +47,10 @@ class RegisterLink:
     reset sequence writes is sent once. Once a kind of request has failed for
     good, no more patience is spent on that kind until one succeeds, or until
     `refresh`. ``record`` is told of every request that has ended.
+
+    Once `watch` was called, an answer that no request explains raises TwoAnswer
+    at the request before or after it, and at every further one until
+    `tolerate`.
     """
 
     def __init__(
@@ -63,6 +68,12 @@ class RegisterLink:
         self._once = {step.write for step in steps if isinstance(step, WriteStep)}
         self._tired: set[Kind] = set()
         self._not_opened: str | None = None
+        self._watched: str | None = None
+        self._second: TwoAnswer | None = None
+        self.two_answered = self.tolerant = False
+        """Whether an answer too many came, and whether it stops nothing."""
+        self.doubled = 0
+        """Answers that came twice, byte for byte, since the last `listen`."""
         self.touched: set[str] = set()
         """Registers that somebody has tried to write."""
         self.marked: list[str] = []
@@ -96,6 +107,27 @@ class RegisterLink:
                 record(access)
 
         self._record = lenient
+
+    def watch(self, where: str) -> None:
+        """From now on no answer too many goes unnoticed; ``where`` names the
+        place in messages."""
+        self._watched = where
+
+    def tolerate(self) -> None:
+        """Puts a device in order also while two units answer."""
+        self._watched = self._second = None
+        self.tolerant = True
+
+    async def listen(self, seconds: float) -> list[ExtraAnswer]:
+        """Waits so long by the host's clock. Returns the answers that no request
+        explains and that contradict the first answer; counts the others in
+        ``doubled``. None of a device whose driver cannot tell."""
+        listen = getattr(self._device, "listen", None)
+        extra: list[ExtraAnswer] = [] if listen is None else await listen(seconds)
+        self.doubled += sum(e.same for e in extra)
+        contradicting = [e for e in extra if not e.same]
+        self.two_answered |= bool(contradicting)
+        return contradicting
 
     async def read(self, register: str) -> bytes:
         return await self._patiently("read", lambda: self._read(register))
@@ -140,18 +172,33 @@ class RegisterLink:
             elif not isinstance(failure, DeviceSilent):
                 await self.renew()
 
+    async def _require_one_answer(self) -> None:
+        if self._watched is None:
+            return
+        if self._second is None and (found := await self.listen(0.0)):
+            e = found[0]
+            of = f"register {e.register}" if e.register else "a request of another program"
+            first = "" if e.first is None else f"{e.first.hex()}, then "
+            self._second = TwoAnswer(f"two units answer at {self._watched}: {of}: {first}{e.answer.hex()}")
+        if self._second is not None:
+            raise self._second
+
     async def _read(self, register: str) -> bytes:
+        await self._require_one_answer()
         with self._failure_told("read", register, b""):
             raw = await self._device.read(register)
         self._record(RegisterAccess("read", register, raw))
+        await self._require_one_answer()
         return raw
 
     async def _write(self, register: str, raw: bytes, timeout_s: float | None) -> None:
+        await self._require_one_answer()
         self.touched.add(register)
         given = {} if timeout_s is None else {"timeout_s": timeout_s}  # a driver may know nothing of it
         with self._failure_told("write", register, raw):
             await self._device.write(register, raw, **given)
         self._record(RegisterAccess("write", register, raw))
+        await self._require_one_answer()
 
     @contextmanager
     def _failure_told(self, kind: Kind, register: str, raw: bytes) -> Iterator[None]:

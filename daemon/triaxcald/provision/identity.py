@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
+from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Bundle
-from triaxcald.errors import ProvisionError
+from triaxcal_drivers.register_types import TYPES
+from triaxcald.errors import ProvisionError, TwoAnswer
+from triaxcald.provision.access import RegisterLink
+from triaxcald.provision.sequence import probe
 
 
 class WrongUnit(ProvisionError):
@@ -47,9 +52,76 @@ async def check_identity(
             )
     serial = await read_serial(device, bundle)
     if expected_serial is not None and not same_serial(serial, expected_serial):
+        if isinstance(device, RegisterLink) and device.tolerant and await _also(device, bundle, expected_serial):
+            return IdentityRead(expected_serial, values)
         answers = f"is serial {serial}" if serial else "tells no serial (its profile has no serial_register)"
         raise WrongUnit(f"the unit on {where} {answers}, expected {expected_serial}")
     return IdentityRead(serial, values)
+
+
+async def identified(link: RegisterLink, bundle: Bundle, expected_serial: str | None, *, where: str) -> IdentityRead:
+    """As `check_identity`, and no other unit answers at the same address.
+    Raises TwoAnswer too."""
+    try:
+        identity = await check_identity(link, bundle, expected_serial, where=where)
+    except WrongUnit:
+        with suppress(DriverError):  # the answer may be that of a second unit
+            await require_alone(link, bundle, where)
+        raise
+    await require_alone(link, bundle, where)
+    return identity
+
+
+async def _also(link: RegisterLink, bundle: Bundle, serial: str) -> bool:
+    """Whether the unit of that serial number answers behind another one."""
+    name = bundle.profile.identity.serial_register
+    size = 0 if name is None else TYPES[bundle.profile.registers[name].type].size
+    late = [e.answer for e in await link.listen(LISTEN_S) if e.register == name and len(e.answer) == size]
+    numbers = [bundle.profile.raw_number(name, raw) for raw in late if name is not None]
+    return any(same_serial(serial_text(n), serial) for n in numbers if n is not None)
+
+
+LISTEN_S = 0.2
+"""By the host's clock: longer than a node takes that answers slowly, and short
+beside the time that an operator takes to put a unit in place."""
+ASKED = 3
+"""A line doubles so many answers in a row by chance once in ten thousand times,
+if it doubles one in twenty."""
+
+
+async def require_alone(link: RegisterLink, bundle: Bundle, where: str) -> None:
+    """Ask the unit for its serial number, and listen whether another unit
+    answers too.
+
+    Raises TwoAnswer if two serial numbers come, or if each of `ASKED` requests
+    is answered twice; RegisterRefused, DeviceSilent. A device whose driver
+    cannot tell passes.
+    """
+    profile = bundle.profile
+    name = profile.identity.serial_register or probe(profile)
+    if name is None:
+        return
+    for _ in range(ASKED):
+        link.doubled = 0
+        answers = [await link.read(name)]
+        found = await link.listen(LISTEN_S)
+        answers += [e.answer for e in found if e.register == name]
+        if found:
+            raise TwoAnswer(f"two units answer at {where}: {_who(bundle, name, answers)}")
+        if not link.doubled:
+            return
+    raise TwoAnswer(f"two units answer at {where}: each request was answered twice, byte for byte")
+
+
+def _who(bundle: Bundle, name: str, answers: Sequence[bytes]) -> str:
+    """The serial numbers, as far as they are any."""
+    known = bundle.profile.registers[name]
+    size = TYPES[known.type].size
+    numbers = [bundle.profile.raw_number(name, raw) for raw in answers if len(raw) == size]
+    if name != bundle.profile.identity.serial_register:
+        return ", ".join(f"register {name} holds {raw.hex()}" for raw in dict.fromkeys(answers))
+    told = dict.fromkeys(serial_text(n) for n in numbers if n is not None)
+    return ", ".join(told) if len(told) > 1 else ", ".join([*told, "and one that answers otherwise"])
 
 
 async def read_serial(device: Device, bundle: Bundle) -> str | None:

@@ -12,14 +12,14 @@ from typing import TypeVar
 
 from triaxcal_drivers.errors import DriverError, RegisterRefused
 from triaxcal_drivers.profile import Bundle
-from triaxcald.errors import DiskError, InputError, ProvisionError, StationError
+from triaxcald.errors import DiskError, InputError, ProvisionError, StationError, TwoAnswer
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
-from triaxcald.provision.identity import IdentityRead, check_identity
+from triaxcald.provision.identity import IdentityRead, check_identity, identified, require_alone
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.journal import Entry, Journal, Owner, Step, journals_of
 from triaxcald.provision.plausible import Doubt, doubts, unstable
 from triaxcald.provision.proof import Restart, proven_restart
-from triaxcald.provision.restore import restore
+from triaxcald.provision.restore import differing, restore
 from triaxcald.provision.sequence import Label, lock_quietly, reconnect, run_sequence
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
@@ -193,9 +193,11 @@ class Provisioning:
         return [j for j, e in journals if e.serial is not None and (e.product or e.profile_sha256 == mine)]
 
     async def identify(self) -> None:
-        """Who is there. Raises WrongUnit, DriverError."""
+        """Who is there, and whether alone. Raises WrongUnit, TwoAnswer,
+        DriverError."""
         self.steps.append("identity")
-        self.identity = await check_identity(self.link, self.bundle, self.expected_serial, where=self.where)
+        self.identity = await identified(self.link, self.bundle, self.expected_serial, where=self.where)
+        self.link.watch(self.where)
         self.owner = Owner.of(self.bundle.profile, self.unit, self.identity.serial)
         self.journal = Journal.of(self.folder, self.owner, self.run)
 
@@ -215,7 +217,8 @@ class Provisioning:
                 self.held.saw(Observation.READ_BACK)
                 self.held.now(DeviceState.NEW_UNVERIFIED, Evidence.READ_BACK)
                 await self._prove()
-        except (DriverError, StationError) as e:
+        except (DriverError, StationError) as trouble:
+            e = await to_its_end(self._named(trouble))
             await to_its_end(self._give_up())
             if not self.written and isinstance(e, ProvisionError):
                 raise
@@ -422,25 +425,46 @@ class Provisioning:
         self.held.now(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
         self.held.observed.clear()
         self.link.refresh()
+        self.link.tolerate()
         self.link.go_on_unrecorded()
         self.link.touched.clear()
         try:
+            two_answered = self.link.two_answered
             evidence = await restore(self.link, self.bundle, self.before, stored=lasting, wanted=self.image.raw)
             self.held.saw(Observation.READ_BACK)
             if evidence is Evidence.RESTART:
                 self.held.saw(Observation.MARK_GONE)
+            if two_answered and lasting:  # what was read may be the other unit's
+                await require_alone(self.link, self.bundle, self.where)
+                if await differing(self.link, self.bundle, self.before):
+                    raise ProvisionError("the old calibration is not back")
             self.held.now(DeviceState.OLD, evidence)
-        except StationError as e:
+        except (StationError, DriverError) as e:
             self.undoing_failed = str(e)
             if not self.link.touched & set(self.before.raw):
                 self.held.now(*was)
             with suppress(DriverError, StationError):
                 await self._judge(lasting)
 
+    async def _named(self, e: DriverError | StationError) -> DriverError | StationError:
+        """Two units that answer, with the serial numbers of both."""
+        if not isinstance(e, TwoAnswer):
+            return e
+        self.link.tolerate()
+        try:
+            await require_alone(self.link, self.bundle, self.where)
+        except TwoAnswer as named:
+            return named
+        except DriverError:
+            pass
+        return e
+
     async def _judge(self, lasting: bool) -> None:
         """What an undoing that failed has left. Raises DriverError,
         StationError."""
         await self._require_same_unit()
+        if self.link.two_answered:
+            await require_alone(self.link, self.bundle, self.where)
         restarted = self.resets and (await self._restart(self.before.raw, self.image.raw)).mark_gone
         held = self.after = await self._look()
         state = self._state_of(held)
@@ -474,7 +498,7 @@ class Provisioning:
 
     async def _same_unit(self, step: str) -> None:
         self.steps.append(step)
-        await self._require_same_unit()
+        await identified(self.link, self.bundle, self.identity.serial, where=self.where)
 
     async def _require_same_unit(self) -> None:
         await check_identity(self.link, self.bundle, self.identity.serial, where=self.where)

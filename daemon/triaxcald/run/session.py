@@ -15,7 +15,7 @@ from triaxcald.certificate import drawn_with, software
 from triaxcald.errors import InputError
 from triaxcald.inputs import PROFILE, preview_channels
 from triaxcald.provision.access import RegisterLink
-from triaxcald.provision.identity import IdentityRead, check_identity
+from triaxcald.provision.identity import IdentityRead, check_identity, identified
 from triaxcald.provision.snapshot import Snapshot, take_snapshot
 from triaxcald.recording.retention import Retention
 from triaxcald.recording.schema import STATION_FILE
@@ -105,7 +105,7 @@ class UnitSession:
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")
         link, where = RegisterLink(device, self.profile), self.place.address
-        identity = await check_identity(link, self.place.bundle, self.place.unit.serial, where=where)
+        identity = await identified(link, self.place.bundle, self.place.unit.serial, where=where)
         self.serials.add(identity.serial, self.name, where)
         return identity
 

@@ -15,6 +15,7 @@ import canopen
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from triaxcal_drivers.answers import Answers, ExtraAnswer
 from triaxcal_drivers.attention import TICK_S, Attention
 from triaxcal_drivers.can.adapter import Frame, Identifier
 from triaxcal_drivers.can.layout import Layout
@@ -42,6 +43,8 @@ _BOOT_LOOK_S = 0.1
 """How often a stream that brings nothing looks whether the node has booted."""
 _ABORTED = 0x80
 _DOWNLOAD, _UPLOAD = 1, 2
+_BEGINS = (2, 3)
+"""The server's command specifiers of answers that begin an upload or a download."""
 _ANSWERED_BY = {_DOWNLOAD: 3, _UPLOAD: 2, 0: 1, 3: 0}
 """The server's command specifier for the client's (CiA 301): starts of
 transfers, then segments."""
@@ -57,6 +60,8 @@ class PatientSdo(SdoClient):
     """
 
     def __init__(self, node_id: int, attention: Attention) -> None:
+        self.answers: Answers[bytes] = Answers()
+        """By object: index and sub-index as on the wire."""
         nothing_known = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
         super().__init__(0x600 + node_id, 0x580 + node_id, nothing_known)  # type: ignore[no-untyped-call]
         self._attention = attention
@@ -66,7 +71,20 @@ class PatientSdo(SdoClient):
         self._asked = request[0] >> 5
         if self._asked in (_DOWNLOAD, _UPLOAD):
             self._object = bytes(request[1:4])
+            self.answers.asked(self._object)
         super().send_request(request)  # type: ignore[no-untyped-call]
+
+    def receive(self, response: bytes) -> None:
+        """From the receive thread: each answer of the node, whoever asked."""
+        # Segments name no object: only the answer that begins a transfer counts.
+        if response and (response[0] == _ABORTED or response[0] >> 5 in _BEGINS):
+            self.answers.answered(self._named_by(response), response)
+        self.responses.put(response)
+
+    def _named_by(self, response: bytes) -> bytes:
+        """Some nodes name no object when they refuse one."""
+        named = response[1:4]
+        return self._object if response[0] == _ABORTED and named == bytes(3) else named
 
     def read_response(self) -> bytes:
         """Raises SdoAbortedError, SdoCommunicationError; struct.error for one
@@ -147,7 +165,7 @@ class CanDevice:
         started = False
         try:
             if self._profile.canopen:
-                line.listen(sdo.tx_cobid, lambda frame: sdo.responses.put(frame.data))
+                line.listen(sdo.tx_cobid, lambda frame: sdo.receive(frame.data))
                 line.listen(self._boot_up, self._on_heartbeat)
                 await self._start()
             started = True
@@ -281,6 +299,18 @@ class CanDevice:
         address = object_address(self._profile.registers[register].object)
         await self._transfer(register, lambda sdo: sdo.download(*address, raw), timeout_s)
 
+    async def listen(self, seconds: float) -> list[ExtraAnswer]:
+        """Waits so long by the host's clock. Returns the answers since the last
+        call that no request explains."""
+        await asyncio.sleep(seconds)
+        if self._connection is None:
+            return []
+        names = {_on_the_wire(entry.object): name for name, entry in self._profile.registers.items()}
+        return [
+            ExtraAnswer(names.get(e.key, ""), _data(e.answer), None if e.first is None else _data(e.first))
+            for e in self._connection.sdo.answers.take()
+        ]
+
     async def _transfer(self, register: str, transfer: Callable[[SdoClient], T], timeout_s: float | None = None) -> T:
         connection = self._connected()
         place = f"register {register} ({self._profile.registers[register].object}) of {self._settings}"
@@ -304,3 +334,16 @@ class CanDevice:
 
     async def _send(self, identifier: int, data: bytes) -> None:
         await asyncio.to_thread(self._connected().line.send, identifier, data)
+
+
+def _on_the_wire(name: str) -> bytes:
+    """An object as SDO frames name it."""
+    return struct.pack("<HB", *object_address(name))
+
+
+def _data(response: bytes) -> bytes:
+    """The data of an expedited upload; any other answer as it came."""
+    expedited, size_told = response[0] & 2, response[0] & 1
+    if response[0] >> 5 != 2 or not expedited:
+        return response
+    return response[4 : 8 - (response[0] >> 2 & 3)] if size_told else response[4:]

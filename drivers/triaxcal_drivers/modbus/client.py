@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import struct
 
+from triaxcal_drivers.answers import Extra
 from triaxcal_drivers.errors import BusError
 from triaxcal_drivers.modbus.line import Line, join, leave
 from triaxcal_drivers.modbus.protocol import (
@@ -59,6 +60,11 @@ class ModbusClient:
     def alone(self) -> bool:
         """Whether no other unit uses the line."""
         return self._line.users < 2
+
+    def extra(self) -> list[Extra[tuple[int, int]]]:
+        """The replies of the unit since the last call that no request
+        explains."""
+        return self._line.extra(self._unit_id)
 
     async def close(self) -> None:
         if not self._closed:

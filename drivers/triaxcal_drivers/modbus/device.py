@@ -7,6 +7,7 @@ import math
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 
+from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import (
     BusError,
     DeviceAbsent,
@@ -15,6 +16,7 @@ from triaxcal_drivers.errors import (
     ProfileError,
     RegisterRefused,
     RegisterValueError,
+    SecondAnswer,
 )
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import RawBatch, RawFlag
@@ -40,6 +42,10 @@ empty: it may fill as fast as it is read. 4096 records of 20 bytes take 48 s at
 _DOUBLINGS = 10
 """Of the pause before a unit that does not answer is asked again: a thousand
 time-outs at most."""
+
+_CONTRADICTIONS = 3
+"""So many replies to a poll that no request explains, each with other bytes
+than the one before it, come from another unit. One may be a very late reply."""
 
 _EMPTY = "it answers, but its FIFO stays empty"
 
@@ -80,6 +86,7 @@ class ModbusDevice:
         self._now_ns = now_ns
         self._client: ModbusClient | None = None
         self._owed_s = 0.0
+        self._asked = ""
         self.discarded = 0
 
     async def open(self) -> None:
@@ -142,8 +149,8 @@ class ModbusDevice:
         for a missing reply. A reply from an empty FIFO is none: the unit
         answers, and brings nothing. What FIFOs hold by now is discarded first.
 
-        Raises DeviceSilent, BusError; ProfileError where the profile has no
-        such stream.
+        Raises DeviceSilent, BusError; SecondAnswer if two units answer the
+        polls; ProfileError where the profile has no such stream.
         """
         loop = asyncio.get_running_loop()
         for name in names:
@@ -152,12 +159,16 @@ class ModbusDevice:
         for name in names:
             await self._discard(self._polled(name))
         polled = [self._polled(name) for name in names]
+        contradictions = 0
         while polled:
             await asyncio.sleep(min(p.due_s for p in polled) - loop.time())
             for p in [p for p in polled if p.due_s <= loop.time()]:
                 p.due_s = max(p.due_s + p.stream.poll_period_s, loop.time())
                 records = await self._drain(p)
                 yield RawBatch.of(records)
+                contradictions += sum(not e.same for e in await self.listen(0.0))
+                if contradictions >= _CONTRADICTIONS:
+                    raise SecondAnswer(f"two units answer at {self._connected().where}")
                 self._check_heard(p, polled)
                 if p.unanswered and not self._connected().alone:
                     p.due_s = max(p.due_s, loop.time() + self._pause_s(p))
@@ -269,8 +280,29 @@ class ModbusDevice:
             return count, number(stream.header.remaining)
         return count, int(count >= stream.record_capacity)
 
+    async def listen(self, seconds: float) -> list[ExtraAnswer]:
+        """Waits so long by the host's clock. Returns the replies since the last
+        call that no request explains."""
+        await asyncio.sleep(seconds)
+        if self._client is None:
+            return []
+        entry = self._profile.registers.get(self._asked)
+
+        def told(pdu: bytes) -> bytes:
+            """The bytes of the register that was asked for last, if it may be
+            its reply."""
+            if entry is None or pdu[0] != _function(entry) or len(pdu) != 2 + 2 * words_of(entry.type):
+                return pdu
+            return self._ordered(entry, pdu[2:])
+
+        return [
+            ExtraAnswer(self._asked, told(e.answer), None if e.first is None else told(e.first))
+            for e in self._client.extra()
+        ]
+
     async def read(self, register: str) -> bytes:
         entry = self._register(register)
+        self._asked = register
         try:
             raw = await self._connected().read(_function(entry), entry.address, words_of(entry.type))
         except ModbusRefusal as e:
@@ -288,6 +320,7 @@ class ModbusDevice:
             raise RegisterValueError(f"register {register}: {len(raw)} bytes, expected {size} ({entry.type})")
         if entry.table == "input":
             raise RegisterValueError(f"register {register}: an input register cannot be written")
+        self._asked = register
         single = self._profile.single_write and words_of(entry.type) == 1
         try:
             await self._connected().write(entry.address, self._ordered(entry, raw), single=single, timeout_s=timeout_s)

@@ -15,6 +15,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from weakref import WeakKeyDictionary
 
+from triaxcal_drivers.answers import Answers, Extra
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.claim import canonical_host, canonical_port
 from triaxcal_drivers.errors import BusError, DeviceSilent
@@ -42,6 +43,9 @@ class Line:
         self._transaction = 0
         self._asked = 0
         self._expected: asyncio.Future[bytes] | None = None
+        self._answers: Answers[tuple[int, int]] = Answers()
+        """By unit and, where the frames have one, transaction."""
+        self._extra: dict[int, list[Extra[tuple[int, int]]]] = {}
         self._other: str | None = None
         """A reply that came while another was expected, in words."""
 
@@ -117,6 +121,7 @@ class Line:
             if not self._frame_gap_s:
                 self._transaction = self._transaction % 0xFFFF + 1
             until_s = self.attention.now_s() + patience_s
+            self._answers.asked(self._key(unit, self._transaction))
             self._link.send(unit, self._transaction, pdu)
             try:
                 async with self.attention.timeout(patience_s):
@@ -160,6 +165,10 @@ class Line:
         if link is not self._link:
             return
         self._mute = False
+        # A reply in another transaction than any that was sent is no answer.
+        key = self._key(unit, transaction)
+        if self._answers.was_asked(key):
+            self._answers.answered(key, pdu)
         if transaction != self._transaction:
             self._other = f"a reply came as transaction {transaction}, expected {self._transaction}"
             return
@@ -168,6 +177,17 @@ class Line:
             self._other = f"a reply came as unit {unit}"
         elif not self._expected.done():
             self._expected.set_result(pdu)
+
+    def _key(self, unit: int, transaction: int) -> tuple[int, int]:
+        """RTU frames have no transaction."""
+        return unit, 0 if self._frame_gap_s else transaction
+
+    def extra(self, unit: int) -> list[Extra[tuple[int, int]]]:
+        """The replies of the unit since the last call that no request
+        explains."""
+        for e in self._answers.take():
+            self._extra.setdefault(e.key[0], []).append(e)
+        return self._extra.pop(unit, [])
 
     def _on_lost(self) -> None:
         if self._expected is not None and not self._expected.done():

@@ -14,6 +14,7 @@ from tests.devices.memory import Electronics
 from tests.devices.place import Place, Trouble
 from tests.devices.profiles import Timing, profile_text
 from tests.devices.table import NEW, OLD
+from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import BusError, DeviceAbsent, DeviceBusy, DeviceSilent, DriverError, RegisterRefused
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.profile import Bundle
@@ -84,7 +85,8 @@ class Host:
 
     async def _process(self, work: Any, kill_at: int | None, kill_after: bool) -> bool:
         self.requests = 0
-        device = _Mortal(self, InMemoryDevice(self.place, ERRORS, self.clock), kill_at, kill_after)
+        in_memory = InMemoryDevice(self.place, ERRORS, self.clock, extra=ExtraAnswer)
+        device = _Mortal(self, in_memory, kill_at, kill_after)
         self._link = RegisterLink(device, self.bundle.profile, pace=Pace(self.clock.sleep, self.clock.now))
         try:
             with suppress(Killed):
@@ -152,6 +154,9 @@ class _Mortal:
         self._count(after=False)
         await self._device.write(register, raw, timeout_s=timeout_s)
         self._count(after=True)
+
+    async def listen(self, seconds: float) -> list[Any]:
+        return await self._device.listen(seconds)
 
     def stream(self, names: Sequence[str]) -> AsyncIterator[Any]:
         return self._device.stream(names)
