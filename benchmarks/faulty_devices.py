@@ -17,15 +17,17 @@ import tempfile
 import time
 from collections import Counter
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.table import Table
 from tests.daemon.provision.host import Host
 from tests.devices.bench import TRANSPORTS, Bench
 from tests.devices.habits import Habits
+from tests.devices.memory import SERIAL_NUMBER, Electronics
 from tests.devices.place import Trouble
 from tests.devices.profiles import Timing
+from tests.devices.table import FACTORY
 from triaxcald.cli.commands import main as command
 from triaxcald.provision.state import DeviceState, Evidence, Held
 
@@ -48,10 +50,14 @@ class Result:
     took_s: float
     habits: Habits
     trouble: Trouble
+    second_overwritten: bool = False
+    """Whether a second unit at the same address no longer holds its own calibration."""
 
     @property
     def false(self) -> bool:
-        """Whether a sentence is, or a mixture goes without a word."""
+        """Whether a sentence is, or a mixture or a second unit goes without a word."""
+        if self.second_overwritten and not self.failed:
+            return True
         if self.evidence is Evidence.READ_BACK or (self.said is DeviceState.MIXED and self.habits.flips):
             return False  # said to be unproven; what is read is not what is stored
         said_nothing = not self.failed and self.said is not DeviceState.NEW_UNVERIFIED
@@ -85,7 +91,7 @@ def habits_of(draw: random.Random) -> Habits:
         power_back_s=draw.choice([0.2, 2.0]),
         restart_s=draw.choice([0.0, 0.05, 0.3]),
         reset_reply=draw.random() < 0.7,
-        reset_ignored=bool(rarely(stores, False)),  # without a store no value can show it (decision 0056)
+        reset_ignored=bool(rarely(True, False)),
     )  # fmt: skip
 
 
@@ -109,15 +115,28 @@ def trouble_of(draw: random.Random) -> Trouble:
     )
 
 
+def second_of(draw: random.Random, habits: Habits) -> tuple[int, Electronics, float] | None:
+    """A second unit at the same address, if there is one: from which request on, and how much later it answers."""
+    if draw.random() >= 0.15:
+        return None
+    habits = replace(habits, cut_at_byte=None)
+    number = draw.choice([SERIAL_NUMBER + 1, 888])
+    other = Electronics(habits, FACTORY.image(habits), serial_number=number)
+    return draw.choice([1, 1, draw.randrange(1, 90)]), other, draw.choice([0.002, 0.04, 0.15])
+
+
 async def results_of(seed: int, folder: Path) -> list[Result]:
     """One device: it is provisioned, and where that leaves a journal, a further process finishes it or takes it back,
     over a line that is sound by then."""
     draw = random.Random(seed)
     habits, trouble = habits_of(draw), trouble_of(draw)
     host = Host(folder, habits, trouble)
+    if (second := second_of(draw, habits)) is not None:
+        host.place.second_at(*second)
     made = [await _one(host, "provision", seed, habits, trouble)]
     if host.journals:
         host.place.trouble = Trouble()
+        host.place.second = None
         host.power_on()
         made.append(await _one(host, draw.choice(PROCESSES[1:]), seed, habits, trouble))
     return made
@@ -129,13 +148,16 @@ def result_over_a_bus(seed: int, folder: Path) -> Result:
     habits, trouble = habits_of(draw), trouble_of(draw)
     timing = Timing(reply_s=0.15, silence_s=0.5, reconnect_s=1.5)
     with Bench(folder, _command, draw.choice(TRANSPORTS), habits, trouble, timing) as bench:
+        if (second := second_of(draw, habits)) is not None:
+            bench.place.second_at(*second)
         began_s = time.monotonic()
         code, printed = bench.provision("--json")
         took_s = time.monotonic() - began_s
         outcome = json.loads(printed)["outcome"]
         starts = "old" if bench.holds_old() else "new" if bench.holds_new() else "mixture"
+        overwritten = second is not None and second[1].eeprom != FACTORY.image(habits)
     said, evidence = DeviceState(outcome["device_state"]), Evidence(outcome["evidence"])
-    return Result(seed, "over a bus", said, evidence, starts, code != 0, took_s, habits, trouble)
+    return Result(seed, "over a bus", said, evidence, starts, code != 0, took_s, habits, trouble, overwritten)
 
 
 def _command(*arguments: object) -> tuple[int, str]:
@@ -148,11 +170,16 @@ def _command(*arguments: object) -> tuple[int, str]:
 async def _one(host: Host, process: str, seed: int, habits: Habits, trouble: Trouble) -> Result:
     began_s = host.clock.now()
     host.provisioning = None
+    second = host.place.second
     failed = not await getattr(host, process)()
     p = host.provisioning
     held = p.held if p else Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
     took_s = host.clock.now() - began_s
-    return Result(seed, process, held.state, held.evidence, host.starts_with(), failed, took_s, habits, trouble)
+    second = second or host.place.second
+    overwritten = second is not None and second.eeprom != FACTORY.image(second.habits)
+    return Result(
+        seed, process, held.state, held.evidence, host.starts_with(), failed, took_s, habits, trouble, overwritten
+    )
 
 
 def main() -> int:

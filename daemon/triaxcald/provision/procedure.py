@@ -15,7 +15,7 @@ from triaxcal_drivers.profile import Bundle
 from triaxcald.errors import DiskError, InputError, ProvisionError, StationError, TwoAnswer
 from triaxcald.provision.access import NO_CONTACT, RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity, identified, require_alone
-from triaxcald.provision.image import RegisterImage
+from triaxcald.provision.image import RegisterImage, image_of
 from triaxcald.provision.journal import Entry, Journal, Owner, Step, journals_of
 from triaxcald.provision.plausible import Doubt, doubts, unstable
 from triaxcald.provision.proof import Restart, proven_restart
@@ -242,10 +242,10 @@ class Provisioning:
         self.differing = self.found.differing(snapshot.raw)
         with suppress(InputError):  # a journal that cannot be read is of no use
             journals = journals_of(self.folder, self.owner, self.bundle.profile)
-            mine = [j for j, entry in journals if entry.serial is not None and entry.before == snapshot.raw]
-            self._earlier = list(dict.fromkeys([*mine, *self._named_for_it(journals)]))
-        if self.source is not None and self.source.exists():
-            self._earlier = list(dict.fromkeys([Journal(self.source), *self._earlier]))
+            mine = [(j, e) for j, e in journals if j.path == self.source or (e.serial and e.before == snapshot.raw)]
+            self._earlier = list(dict.fromkeys([*(j for j, _ in mine), *self._named_for_it(journals)]))
+            if mine:  # what was to be written is known: a device that holds it holds no mixture
+                self.image = image_of(self.bundle.profile, mine[0][1].wanted)
         if self.differing and not self._earlier:
             self._note("writing")
         self.before, self.carried = snapshot, True
@@ -478,6 +478,8 @@ class Provisioning:
         """What a device holds that started with these registers."""
         if not held.differing(self.before.raw):
             return DeviceState.OLD
+        if not self.before.differing(self.image.raw) and not held.differing(self.found.raw):
+            return DeviceState.UNKNOWN  # a restoration did not change it, and nobody knows what is new
         return DeviceState.MIXED if held.differing(self.image.raw) else DeviceState.NEW_VERIFIED
 
     # Steps of both.

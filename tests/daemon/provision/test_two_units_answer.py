@@ -1,0 +1,148 @@
+"""Two units at one address: neither loses its calibration, and the message names both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.provision.host import Host
+from tests.devices.bench import TRANSPORTS, Bench, Transport
+from tests.devices.habits import Habits
+from tests.devices.memory import Electronics
+from tests.devices.profiles import Timing, Wording
+from tests.devices.table import FACTORY, OLD
+from triaxcal_drivers.answers import KEYS_MOST, OPEN_MOST, Answers, Extra
+from triaxcald.provision.state import DeviceState
+
+PATIENT = Timing(reply_s=10.0, silence_s=20.0, store_poll_s=20.0, reconnect_s=20.0)
+every_transport = pytest.mark.parametrize("transport", TRANSPORTS)
+
+
+def another(habits: Habits, serial: int = 888, **more: int) -> Electronics:
+    return Electronics(habits, FACTORY.image(habits), serial_number=serial, **more)
+
+
+@every_transport
+@pytest.mark.parametrize("after_s", [0.01, 0.04, 0.15])
+def test_nothing_is_unlocked_where_two_units_answer(
+    tmp_path: Path, triaxcal, transport: Transport, after_s: float
+) -> None:
+    with Bench(tmp_path, triaxcal, transport, timing=PATIENT) as bench:
+        other = bench.place.second = another(bench.habits)
+        bench.place.second_after_s = after_s
+        done = bench.provision("--json")
+        outcome = done.json["outcome"]
+        assert (done.code, outcome["code"], outcome["exit_code"]) == (4, "two_answer", 4)
+        assert (outcome["verdict"], outcome["device_state"]) == ("aborted", "untouched")
+        assert "two units answer at" in outcome["reason"]
+        assert "4711, 0888" in outcome["reason"]
+        for unit in (bench.unit, other):
+            assert [r for r in unit.log if r.kind == "write"] == []
+        assert other.eeprom == FACTORY.image(bench.habits)
+        assert bench.holds_old()
+
+
+@every_transport
+def test_the_faster_unit_may_be_the_wrong_one(tmp_path: Path, triaxcal, transport: Transport) -> None:
+    with Bench(tmp_path, triaxcal, transport, timing=PATIENT) as bench:
+        bench.place.unit, bench.place.second = another(bench.habits), bench.unit
+        done = bench.provision("--json")
+        outcome = done.json["outcome"]
+        assert (done.code, outcome["code"]) == (4, "two_answer")
+        assert "0888, 4711" in outcome["reason"]
+        assert [r for r in bench.unit.log if r.kind == "write"] == []
+
+
+@every_transport
+def test_two_units_that_answer_alike_are_two(tmp_path: Path, triaxcal, transport: Transport) -> None:
+    with Bench(tmp_path, triaxcal, transport, serial=None, wording=Wording(serial=False), timing=PATIENT) as bench:
+        other = bench.place.second = Electronics(bench.habits, OLD.image(bench.habits))
+        done = bench.provision("--json")
+        assert (done.code, done.json["outcome"]["code"]) == (4, "two_answer")
+        assert [r for r in other.log if r.kind == "write"] == []
+
+
+HABITS = [
+    Habits(),
+    Habits(reset_command=False),
+    Habits(unlock=False),
+    Habits(store_command=False),
+    Habits(counter=True, store_seconds=0.3, while_storing="busy"),
+]
+
+
+async def requests_of_a_clean_run(folder: Path, habits: Habits) -> list[tuple[str, str]]:
+    host = Host(folder, habits)
+    assert await host.provision()
+    return [(r.kind, r.register) for r in host.unit.log]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("habits", HABITS)
+async def test_whenever_a_second_unit_appears_the_state_is_as_told(tmp_path: Path, habits: Habits) -> None:
+    asked = await requests_of_a_clean_run(tmp_path / "clean", habits)
+    store = next((i for i, r in enumerate(asked, 1) if r == ("write", "store")), len(asked))
+    for at in range(1, len(asked) + 1):
+        host = Host(tmp_path / str(at), habits)
+        other = another(habits)
+        host.place.second_at(at, other)
+        done = await host.provision()
+        assert host.provisioning is not None
+        held, starts_with = host.provisioning.held, host.starts_with()
+        match held.state:
+            case DeviceState.UNTOUCHED | DeviceState.OLD:
+                assert starts_with == "old", at
+            case DeviceState.NEW_VERIFIED:
+                assert starts_with == "new", at
+        # Until the last look before the store, the second unit keeps its calibration, and the first its old one.
+        if at < store - 3 and habits.store_command:
+            assert not done
+            assert other.eeprom == FACTORY.image(habits), at
+            assert starts_with == "old", at
+
+
+def test_answers_are_counted_against_requests() -> None:
+    answers: Answers[str] = Answers()
+    answers.asked("serial")
+    answers.answered("serial", b"777")
+    assert answers.take() == []
+    answers.answered("serial", b"888")
+    answers.answered("serial", b"777")
+    assert answers.take() == [Extra("serial", b"888", b"777"), Extra("serial", b"777", b"777")]
+    assert answers.take() == []
+
+
+def test_a_late_answer_to_a_request_that_was_repeated_is_explained() -> None:
+    answers: Answers[str] = Answers()
+    for _ in range(2):
+        answers.asked("bias")
+    for raw in (b"1", b"2"):
+        answers.answered("bias", raw)
+    assert answers.take() == []
+
+
+def test_lost_requests_do_not_explain_answers_for_ever() -> None:
+    answers: Answers[str] = Answers()
+    for _ in range(100):
+        answers.asked("bias")
+    for _ in range(OPEN_MOST + 1):
+        answers.answered("bias", b"1")
+    assert len(answers.take()) == 1
+
+
+def test_an_answer_that_nobody_asked_for_has_no_first() -> None:
+    answers: Answers[str] = Answers()
+    answers.answered("bias", b"1")
+    assert answers.take() == [Extra("bias", b"1", None)]
+
+
+def test_answers_take_bounded_memory() -> None:
+    answers: Answers[int] = Answers()
+    for key in range(3 * KEYS_MOST):
+        answers.asked(key)
+        answers.answered(key, b"1")
+        answers.answered(-1 - key, b"1")
+    assert len(answers.take()) == KEYS_MOST
+    assert not answers.was_asked(0)
+    assert answers.was_asked(3 * KEYS_MOST - 1)
