@@ -16,6 +16,7 @@ from triaxcald import text
 from triaxcald.errors import DaemonError
 from triaxcald.exit_codes import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, exit_code_of
 from triaxcald.outcome import Ending, Verdict
+from triaxcald.printable import printable_lines
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
 from triaxcald.station.config import Limits
@@ -43,7 +44,7 @@ def aborted(e: BaseException, p: Provisioning | None) -> Ending:
     code = exit_code_of(e)
     if (trace := trace_of(e)) is not None:
         with suppress(OSError, ValueError):  # a closed standard error
-            sys.stderr.write(trace)
+            sys.stderr.write(printable_lines(trace))
     written = p is not None and p.held.state is not DeviceState.UNTOUCHED
     if p is not None and written and not (p.settled and code in (INTERRUPTED, DISK)):
         code = DEVICE
