@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import NamedTuple, NoReturn
 
+from triaxcald.printable import printable
+
 STOP_SIGNALS = [s for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None)) is not None]
 DEVICE, INTERRUPTED = 4, 130
 CLOSING_S = 1.0
@@ -78,7 +80,12 @@ def abort(reason: str) -> NoReturn:
 def tell(line: str) -> None:
     """A line to standard error, also in the midst of a write to it; nowhere,
     where it is closed or nobody reads."""
+    steer(f"{printable(line)}\n")
+
+
+def steer(text: str) -> None:
+    """The same of a text of our own as it is, which the terminal may obey."""
     with suppress(AttributeError, OSError, ValueError):
         descriptor = sys.stderr.fileno()
         if select.select([], [descriptor], [], 0)[1]:
-            os.write(descriptor, f"{line}\n".encode(sys.stderr.encoding, "backslashreplace"))
+            os.write(descriptor, text.encode(sys.stderr.encoding, "backslashreplace"))

@@ -14,6 +14,7 @@ from triaxcal.model.moment import Moment
 from triaxcal_drivers.nearest import closest
 from triaxcald.errors import InputError
 from triaxcald.files import require_writable
+from triaxcald.printable import printable
 from triaxcald.tables.naming import TIME_UNITS, parse_columns
 
 RECORDING = ".mcap or .segments.json, a table (.csv, .csv.gz, .txt, .parquet) or - for text on standard input"
@@ -45,7 +46,7 @@ class OneLineParser(argparse.ArgumentParser):
         for option, example in (("--sign", "-,-,-"), ("--faces", "-X,-X"), ("--datum", "-Z,-X")):
             if option in message and "expected one argument" in message:
                 message += f"; write it with an equals sign: {option}={example}"
-        sys.stderr.write(f"{self.prog}: {message}\n")
+        sys.stderr.write(printable(f"{self.prog}: {message}") + "\n")
         sys.exit(2)
 
 

@@ -4,7 +4,6 @@ standard error."""
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -14,12 +13,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from triaxcald.abort import add_action, discard_action, tell
+from triaxcald.abort import add_action, discard_action, steer
+from triaxcald.printable import printable, printable_json
 from triaxcald.text import waits
 
 LINE_MOST = 4000  # characters of a line; the longest of ours list a thousand poses' labels
-
-_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 if TYPE_CHECKING:  # every command says something, few show poses
     from triaxcald.recording.schema import Phase
@@ -28,7 +26,13 @@ if TYPE_CHECKING:  # every command says something, few show poses
 
 def emit(document: Mapping[str, Any] | Sequence[Any]) -> None:
     """One JSON document on standard output, nothing else."""
-    sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    sys.stdout.write(printable_json(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)) + "\n")
+
+
+def show(line: str) -> None:
+    """A line of what came of the work, to standard output; what a file holds
+    may be quoted in it, as in `say`."""
+    sys.stdout.write(printable(line) + "\n")
 
 
 class Unshown(Exception):
@@ -59,7 +63,7 @@ def say(text: str) -> None:
     What a file holds may be quoted in it: that can neither begin a second line
     nor steer the terminal.
     """
-    line = _CONTROL.sub(lambda c: c[0].encode("unicode_escape").decode(), text)
+    line = printable(text)
     if len(line) > LINE_MOST:
         line = f"{line[: LINE_MOST // 2]} … {line[-LINE_MOST // 2 :]}"
     with suppress(OSError, ValueError):
@@ -68,14 +72,21 @@ def say(text: str) -> None:
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """To standard output; columns of numbers are the caller's text."""
-    shown = Table(title=title, title_justify="left", header_style="bold")
+    """To standard output; columns of numbers are the caller's text, and a tuple
+    has a line for each of its texts."""
+    shown = Table(title=printable(title), title_justify="left", header_style="bold")
     for i, name in enumerate(columns):
-        shown.add_column(name, justify="left" if i == 0 else "right", overflow="fold")
+        shown.add_column(printable(name), justify="left" if i == 0 else "right", overflow="fold")
     for row in rows:
-        shown.add_row(*("—" if v is None else str(v) for v in row))
+        shown.add_row(*map(_cell, row))
     width = None if sys.stdout.isatty() else 160
     _Output(file=sys.stdout, width=width, markup=False, highlight=False).print(shown)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "—"
+    return "\n".join(map(printable, value)) if isinstance(value, tuple) else printable(str(value))
 
 
 class _Output(Console):
@@ -132,15 +143,15 @@ class Bars:
         """The bars hide it. Anything else of theirs could wait for a lock that
         the main thread holds."""
         if self._console.is_terminal:
-            tell(SHOW_CURSOR)
+            steer(SHOW_CURSOR)
 
     def _task(self, unit: str) -> TaskID:
         if unit not in self._tasks:
-            self._tasks[unit] = self._progress.add_task("", total=1, unit=unit)
+            self._tasks[unit] = self._progress.add_task("", total=1, unit=printable(unit))
         return self._tasks[unit]
 
     def stage(self, unit: str, what: str) -> None:
-        self._show(unit, description=what)
+        self._show(unit, description=printable(what))
         self._plain(unit, what)
 
     def lost(self, unit: str, trouble: str) -> None:
@@ -148,7 +159,7 @@ class Bars:
 
     def poses(self, unit: str, phase: Phase, guide: Guide) -> None:
         what = "check poses" if phase == "verification" else "poses"
-        self._show(unit, completed=guide.found, total=guide.wanted, description=f"{what}: {guide.hint}")
+        self._show(unit, completed=guide.found, total=guide.wanted, description=printable(f"{what}: {guide.hint}"))
         # Seconds that go by are for a terminal; a log gets a line for each
         # pose, and where to turn next.
         if not guide.hint.startswith("hold still"):

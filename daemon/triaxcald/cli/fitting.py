@@ -17,7 +17,7 @@ from triaxcal.pooled_units import pooled_analysis
 from triaxcal.poses.pose import Pose
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
-from triaxcald.cli.console import emit
+from triaxcald.cli.console import emit, show
 from triaxcald.cli.methods import Way, chosen_way, default_signs, telling_default_signs
 from triaxcald.cli.results import show_calibration, show_loop, show_summary, text_of_held_out
 from triaxcald.cli.several import (
@@ -105,7 +105,7 @@ def diagnose_command(a: argparse.Namespace) -> int:
             show_loop(loop, choice)
             show_calibration(loop.after, choice)
         elif loop.held_out:
-            print(text_of_held_out(loop.held_out, choice.small))
+            show(text_of_held_out(loop.held_out, choice.small))
         warn([*document["calibration"]["warnings"], *measured.data_quality, *default_signs(a, measured)])
     return judge(a.limit, loop.after.residual.rms_g)
 

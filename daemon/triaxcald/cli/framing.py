@@ -26,7 +26,7 @@ from triaxcal.poses.stillness.turns import TURN_S
 from triaxcal.units import reference_unit_of
 from triaxcald import documents
 from triaxcald.cli.arguments import writable
-from triaxcald.cli.console import emit, say, table
+from triaxcald.cli.console import emit, say, show, table
 from triaxcald.cli.showing import chosen, read_recording, warn
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import DONE, OUTSIDE
@@ -229,12 +229,12 @@ def _show(sources: Sequence[Source], result: Frames) -> None:
     ]
     table("errors of the faces' outward normals, mrad ± standard error", ["face", "x", "y", "z"], faces)
     for axes, q in fixture.squareness.items():
-        print(f"squareness {axes}: {_mrad(q.value)} ± {_mrad(q.standard_error)} mrad")
+        show(f"squareness {axes}: {_mrad(q.value)} ± {_mrad(q.standard_error)} mrad")
     if fixture.offset is not None:
         known = _mrad(float(np.max(fixture.offset)))
-        print(f"the datum against the frame that the fixture's maker meant: ± {known} mrad about an axis at most")
+        show(f"the datum against the frame that the fixture's maker meant: ± {known} mrad about an axis at most")
     if result.left:
-        print(f"do the units agree on the faces: p {result.lack_of_fit_p:.2g} in {result.left} degrees of freedom")
+        show(f"do the units agree on the faces: p {result.lack_of_fit_p:.2g} in {result.left} degrees of freedom")
 
 
 def _mrad(value: float | None) -> str:

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from triaxcal_drivers.loading import load_bundle
 from triaxcal_drivers.logs.kinds import Kind, opened
 from triaxcald.cli.arguments import writable
-from triaxcald.cli.console import emit, say
+from triaxcald.cli.console import emit, say, show
 from triaxcald.errors import InputError
 from triaxcald.files import require_new, require_recording
 from triaxcald.imports import text
@@ -45,5 +45,5 @@ def import_command(a: argparse.Namespace) -> int:
     if a.json:
         emit({"format": "triaxcal.import/1", "output": str(a.output), "duration_s": made.seconds, **made.document})
     else:
-        print(text.summary(a.output, made.document, made.seconds))
+        show(text.summary(a.output, made.document, made.seconds))
     return 0

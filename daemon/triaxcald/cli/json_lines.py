@@ -9,6 +9,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, TextIO
 
+from triaxcald.printable import printable_json
 from triaxcald.recording.schema import Phase
 from triaxcald.station.guidance import Guide
 
@@ -38,5 +39,5 @@ class JsonLines:
         """Nowhere, where nobody reads any more: no work may fail for it."""
         line = {"time": self._now().isoformat(timespec="milliseconds"), "level": level, "event": event, **more}
         with suppress(OSError, ValueError):
-            self._out.write(json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n")
+            self._out.write(printable_json(json.dumps(line, ensure_ascii=False, allow_nan=False)) + "\n")
             self._out.flush()

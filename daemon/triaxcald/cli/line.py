@@ -19,7 +19,7 @@ from triaxcal.text import diagnosis as of_diagnosis
 from triaxcal.text.advice import of_creep
 from triaxcal_drivers.extras import absent
 from triaxcald import text
-from triaxcald.cli.console import Bars, emit, micro, say, showing, table
+from triaxcald.cli.console import Bars, emit, micro, say, show, showing, table
 from triaxcald.cli.interrupt import Interrupted, run_interruptible
 from triaxcald.cli.showing import counted
 from triaxcald.errors import InputError
@@ -114,43 +114,43 @@ def show_outcome(o: Outcome, extra: Sequence[Sequence[str]] = ()) -> None:
         [*rows, *extra],
     )
     for line in o.certified.document["result"]["summary"]:
-        print(f"  {line}")
+        show(f"  {line}")
     least = Odds().reported
     likely = [effect for effect, _ in loop.after.sensor.effects if loop.after.weights[effect.name] >= least]
     rest = {e.name: loop.after.weights[e.name] for e, _ in loop.after.sensor.effects if e not in likely}
     if rest:
         each = ", ".join(f"{name} ({of_diagnosis.chance(p)})" for name, p in rest.items())
-        print(f"  corrected as far as it is probable: {each}")
+        show(f"  corrected as far as it is probable: {each}")
     for effect in likely:
-        print(f"  corrected: {effect.name} (probability {of_diagnosis.chance(loop.after.weights[effect.name])})")
+        show(f"  corrected: {effect.name} (probability {of_diagnosis.chance(loop.after.weights[effect.name])})")
         for name, (value, error, unit) in loop.after.coefficients_of(effect.name).items():
             told = unit if error is None else f"± {error:.1g} {unit}"
-            print(f"    {name} {value:+.4g} {told}")
+            show(f"    {name} {value:+.4g} {told}")
     if o.provisioned:
-        print(f"  {text.provisioned(o.provisioned)}")
+        show(f"  {text.provisioned(o.provisioned)}")
     if o.settling and o.error is None:
-        print(f"  {o.settling}")
+        show(f"  {o.settling}")
     if v:
         left_out = sum(not p["used"] for p in v["poses"])
         poses = f"; {counted(len(v['poses']), left_out, 'check poses')}" if left_out else ""
-        print(f"  verified by physics: {v['verdict']}{poses}")
+        show(f"  verified by physics: {v['verdict']}{poses}")
     if not o.provisioned and o.certified.document["not_written"]:
-        print(f"  no registers written: {o.certified.document['not_written']}")
+        show(f"  no registers written: {o.certified.document['not_written']}")
     if o.lost:
-        print(f"  {number_of(o.lost, 'record')} {'was' if o.lost == 1 else 'were'} lost between bus and disk")
-    print(f"  verdict: {o.document['verdict']}: {o.document['reason']}")
+        show(f"  {number_of(o.lost, 'record')} {'was' if o.lost == 1 else 'were'} lost between bus and disk")
+    show(f"  verdict: {o.document['verdict']}: {o.document['reason']}")
     for line in o.certified.document["outside"]:
-        print(f"  outside limits: {line}")
+        show(f"  outside limits: {line}")
     for line in o.certified.document["result"]["data_quality"]:
-        print(f"  warning: {line}")
+        show(f"  warning: {line}")
     if creep := of_creep([p.pose for p in loop.after.poses]):
-        print(f"  creeping poses: {creep}")
+        show(f"  creeping poses: {creep}")
     for caution in loop.after.cautions:
-        print(f"  warning: {of_metrology.caution(caution)}")
+        show(f"  warning: {of_metrology.caution(caution)}")
     papers = {"recording": o.recording, "certificate": o.certificate, "report": o.report, "outcome": o.outcome}
     for what, path in papers.items():
         if path is not None:
-            print(f"  {what:<12}{path}")
+            show(f"  {what:<12}{path}")
 
 
 def demo_command(a: argparse.Namespace) -> int:
@@ -187,13 +187,13 @@ def _demo_document(u: DemoUnit) -> dict[str, Any]:
 
 def _show_next(folder: Path, units: Sequence[DemoUnit]) -> None:
     reports = [u.outcome.report for u in units if u.outcome.report is not None]
-    print("next:")
+    show("next:")
     if reports:
-        print(f"  open {reports[0]} in a browser: what was found, with pictures")
+        show(f"  open {reports[0]} in a browser: what was found, with pictures")
     command = "triaxcal" if shutil.which("triaxcal") else sys.argv[0]
-    print(f"  {command} audit {folder}: both results recomputed from the recordings alone")
+    show(f"  {command} audit {folder}: both results recomputed from the recordings alone")
     tutorial = "docs/tutorial/first-calibration.md"
-    print(f"  {command} diagnose and {command} apply: the same with a recording of your own ({tutorial})")
+    show(f"  {command} diagnose and {command} apply: the same with a recording of your own ({tutorial})")
 
 
 def _show_demo(u: DemoUnit) -> None:
@@ -204,8 +204,9 @@ def _show_demo(u: DemoUnit) -> None:
     show_outcome(u.outcome, extra)
     for name, values in u.hidden.items():
         truth = ", ".join(f"{axis} {value:+.4g}" for axis, value in values.items())
-        print(f"  hidden in it: {name} ({truth}): {'found' if u.found else 'NOT found'}")
-    print(f"  after a power cycle: {'still within limits' if u.kept else 'NOT within limits'}\n")
+        show(f"  hidden in it: {name} ({truth}): {'found' if u.found else 'NOT found'}")
+    show(f"  after a power cycle: {'still within limits' if u.kept else 'NOT within limits'}")
+    show("")
 
 
 def sim_command(a: argparse.Namespace) -> int:

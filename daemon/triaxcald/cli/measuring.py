@@ -18,7 +18,7 @@ from triaxcal.interchange.calibration_document import poses_document
 from triaxcal.interchange.calibration_reading import calibration_part, reference_unit_in
 from triaxcal.rounding import error
 from triaxcal.units import ErrorUnit
-from triaxcald.cli.console import emit
+from triaxcald.cli.console import emit, show
 from triaxcald.cli.showing import counted, judge, read_recording, show_poses, telling_data_quality, warn
 from triaxcald.errors import InputError
 from triaxcald.inputs import Measured, read_document
@@ -94,7 +94,7 @@ def verify_command(a: argparse.Namespace) -> int:
     else:
         _show_verified(found, f"|a| − {reference:g} {unit} under {a.calibration}", ErrorUnit.of(unit, reference))
         poses = counted(len(found.poses), len(found.untrusted))
-        print(text.verification(poses, found.rms_g, found.noise_floor_g, expected, (unit, reference)))
+        show(text.verification(poses, found.rms_g, found.noise_floor_g, expected, (unit, reference)))
         warn([*warnings, *measured.data_quality])
     return judge(a.limit, found.rms_g)
 

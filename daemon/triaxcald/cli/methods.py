@@ -20,7 +20,7 @@ from triaxcal.interchange.calibration_document import Document
 from triaxcal.number_format import number_of, probability
 from triaxcald import methods
 from triaxcald.attitudes import match, read_attitudes
-from triaxcald.cli.console import micro, table
+from triaxcald.cli.console import micro, show, table
 from triaxcald.cli.results import cross_validated, held_at, show_coefficients, temperature_of
 from triaxcald.cli.showing import Choice, chosen, read_recording, telling_data_quality
 from triaxcald.errors import InputError
@@ -91,11 +91,11 @@ def _turning(a: argparse.Namespace) -> Way:
 def _show_turning(found: RotationFit, choice: Choice) -> None:
     show_coefficients(found.calibration, choice)
     if t := found.temperature:
-        print(held_at(t.mean, t.lowest, t.highest, "samples"))
+        show(held_at(t.mean, t.lowest, t.highest, "samples"))
     r, small = found.calibration.residual, choice.small
     noise = ", ".join(f"{v:.3g}" for v in found.noise_g)
-    print(f"{number_of(found.samples, 'sample')}, whose noise is {noise} {choice.reference_unit} in x, y, z")
-    print(
+    show(f"{number_of(found.samples, 'sample')}, whose noise is {noise} {choice.reference_unit} in x, y, z")
+    show(
         f"{found.stretches} stretches: |a| off by {small.in_full(r.rms_g)} rms, of which noise is "
         f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
     )
@@ -123,7 +123,7 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
     c = found.calibration
     show_coefficients(c, choice)
     if said := temperature_of(c):
-        print(said)
+        show(said)
     table(
         "attitudes",
         ["", "start s", "off µrad", "off, standard errors", f"|a| off {choice.small}", "used"],
@@ -149,13 +149,13 @@ def _show_attitudes(found: AttitudeFit, choice: Choice) -> None:
     )
     how = "estimated from the residuals" if found.estimated else "as declared" if found.attitude_error_rad else "none"
     cost = float(np.max(c.standard_errors[:9] / found.noise_error))
-    print(
+    show(
         f"error of the attitudes by axis: {micro(found.attitude_error_rad)} µrad ({how}); with what residuals say it "
         f"raises the standard errors by a factor of up to {cost:.2f}"
     )
     small = choice.small
     r = c.residual
-    print(
+    show(
         f"{len(c.poses)} poses: |a| off by {small.in_full(r.rms_g)} rms, {cross_validated(r, small)}, noise floor "
         f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
     )
@@ -205,7 +205,7 @@ def _show_datasheet(found: Refinement, choice: Choice) -> None:
         ],
     )
     r, small = c.residual, choice.small
-    print(
+    show(
         f"|a| off by {small.in_full(r.rms_g)} rms, noise floor {small.in_full(r.noise_floor_g)}; datasheet and poses "
         f"agree with p {probability(found.conflict_p)}"
     )

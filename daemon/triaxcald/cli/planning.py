@@ -30,7 +30,7 @@ from triaxcal.planning.design import Asked, ask, needs_time
 from triaxcal.planning.optimal import OptimalPlan, optimal
 from triaxcal.planning.visibility import Sight, sight, unseen_effects
 from triaxcal.rounding import number, numbers, uncertainty
-from triaxcald.cli.console import emit, say, table
+from triaxcald.cli.console import emit, say, show, table
 from triaxcald.cli.lacking import Lacking, lacking
 from triaxcald.cli.showing import chosen, counted, read_recording, telling_data_quality, warn
 from triaxcald.errors import InputError
@@ -112,12 +112,12 @@ def _plan_for(a: argparse.Namespace, effects: Sequence[Effect]) -> int:
         emit(document)
     else:
         _show(plan, document)
-        print(f"{found.efficiency:.0%} of what any plan of as many poses could tell of {', '.join(document['for'])}")
+        show(f"{found.efficiency:.0%} of what any plan of as many poses could tell of {', '.join(document['for'])}")
         _show_errors(
             found.errors, 1.0, "in poses' standard errors" + (", by half the range" if document["moves"] else "")
         )
         for name, text in document["moves"].items():
-            print(f"{name}: {text}")
+            show(f"{name}: {text}")
     for line in _never_seen(document):
         say(f"warning: {line}")
     return 0
@@ -244,22 +244,22 @@ def _plan_for_recording(a: argparse.Namespace, effects: Sequence[Effect]) -> int
         emit(document)
         return 0
     if document["left_out"]:
-        print(f"{measured.name}: {counted(len(measured.poses), document['left_out'])}")
+        show(f"{measured.name}: {counted(len(measured.poses), document['left_out'])}")
     title = f"the {len(had)} of {measured.name}"
     if found.wanted:
         _show_wanted(f"poses worth adding to {title}", found)
     elif not found.absent:
-        print(f"{title.replace('of', 'poses of', 1)} are well spread; none is wanted")
+        show(f"{title.replace('of', 'poses of', 1)} are well spread; none is wanted")
     if effects and found.noise is not None:
         _show_errors(found.now, found.noise, "by the poses there")
         if found.wanted:
             _show_errors(found.wanted[-1].errors, found.noise, "with them")
     for why in document.get("cannot_show", {}).values():
-        print(why)
+        show(why)
     for name, text in found.moves.items():
-        print(f"{name}: {text}")
+        show(f"{name}: {text}")
     if sights is not None:
-        print(f"the {len(had)} there are cannot show: {_list(document['blind_to'])}")
+        show(f"the {len(had)} there are cannot show: {_list(document['blind_to'])}")
     warn(measured.data_quality)
     return 0
 
@@ -327,20 +327,20 @@ def _show_wanted(title: str, found: Lacking) -> None:
 def _show_errors(errors: Mapping[str, Mapping[str, float | None]], scale: float | None, note: str) -> None:
     for name, of in errors.items():
         values = ", ".join(f"{c} {'—' if e is None or scale is None else f'{e * scale:.3g}'}" for c, e in of.items())
-        print(f"standard errors of {name} ({note}): {values}")
+        show(f"standard errors of {name} ({note}): {values}")
 
 
 def _show(plan: Sequence[Direction], document: Document) -> None:
     title = f"{document['directions']} directions, the first repeated at the end"
     rows = [[i + 1, label, *(f"{c:+.3f}" for c in v)] for i, (label, v) in enumerate(plan)]
     table(title, ["pose", "up", "x", "y", "z"], rows)
-    print(f"worst parameter: {document['worst_standard_error']:.2f} standard errors of one pose")
-    print(f"cannot show: {_list(document['blind_to'])}")
+    show(f"worst parameter: {document['worst_standard_error']:.2f} standard errors of one pose")
+    show(f"cannot show: {_list(document['blind_to'])}")
     for name in document["blind_to"]:
         s = document["sees"][name]
         if s["visible"]:
             hidden = "; ".join(" ".join(f"{w:+.2f} {k}" for k, w in h["coefficients"].items()) for h in s["hidden"])
-            print(f"{name}: {s['visible']} of {s['of']} coefficients show; not {hidden}")
+            show(f"{name}: {s['visible']} of {s['of']} coefficients show; not {hidden}")
 
 
 def _list(names: Sequence[str]) -> str:

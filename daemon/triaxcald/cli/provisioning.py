@@ -19,7 +19,7 @@ from triaxcal_drivers.profile import Profile
 from triaxcald import text
 from triaxcald.certificate import held_by_device, image_of, why_not_written
 from triaxcald.choices import is_passing
-from triaxcald.cli.console import emit, say, showing, table
+from triaxcald.cli.console import emit, say, show, showing, table
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.errors import InputError
 from triaxcald.inputs import read_document
@@ -105,11 +105,11 @@ def _show(done: Provisioned, place: Place, station: Path, *, dry_run: bool) -> N
     table(f"unit {place.unit.name}, serial {p.identity.serial}", columns, rows)
     for doubt in p.doubts:
         say(f"warning: {text.doubt(doubt)}")
-    print(done.document["reason"])
+    show(done.document["reason"])
     if settling := text.settling(p, station):
-        print(settling)
+        show(settling)
     if done.path is not None:
-        print(f"outcome {done.path}")
+        show(f"outcome {done.path}")
 
 
 def image_from(path: str, place: Place) -> tuple[RegisterImage, str | None]:
@@ -217,6 +217,6 @@ def restore_command(a: argparse.Namespace) -> int:
                 }
             )
         elif p is not None and done.error is None:
-            print(f"unit {place.unit.name}, serial {p.identity.serial}: {_told(done, station.path)}")
-            print(f"outcome {done.path}")
+            show(f"unit {place.unit.name}, serial {p.identity.serial}: {_told(done, station.path)}")
+            show(f"outcome {done.path}")
     return done.exit_code

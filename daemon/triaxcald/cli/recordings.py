@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 from triaxcal.number_format import number_of
 from triaxcal_drivers.errors import DriverError
-from triaxcald.cli.console import emit, say
+from triaxcald.cli.console import emit, say, show
 from triaxcald.errors import InputError
 from triaxcald.files import is_stream, new_file
 from triaxcald.inputs import bundle_of, losses_of, samples_of
@@ -35,16 +35,16 @@ def audit_command(a: argparse.Namespace) -> int:
         if one.audit is None:
             say(f"triaxcal: {one.error}")
         elif not a.json:
-            print(text.heading(one.audit))
+            show(text.heading(one.audit))
             for line in map(text.difference, one.audit.differences):
-                print(f"  {line}")
+                show(f"  {line}")
             for line in text.notes(one.audit.notes):
-                print(f"  note: {line}")
+                show(f"  note: {line}")
     if a.json:
         emit({"format": "triaxcal.audit/1", "audits": [text.document(x) for x in audited],
               "summary": text.counts(audited)})  # fmt: skip
     elif len(audited) > 1:
-        print(text.summary(audited))
+        show(text.summary(audited))
     return worst(audited)
 
 
@@ -73,10 +73,10 @@ def _samples(path: Path, phases: Iterable[str]) -> dict[str, Any]:
 def _show(value: Any, indent: str = "") -> None:
     for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
         if isinstance(inner, (dict, list)) and inner:
-            print(f"{indent}{key}:")
+            show(f"{indent}{key}:")
             _show(inner, indent + "  ")
         else:
-            print(f"{indent}{key}: {'—' if inner in (None, {}, []) else inner}")
+            show(f"{indent}{key}: {'—' if inner in (None, {}, []) else inner}")
 
 
 def recover_command(a: argparse.Namespace) -> int:
@@ -85,7 +85,7 @@ def recover_command(a: argparse.Namespace) -> int:
     if a.json:
         emit({"format": "triaxcal.recovery/1", "output": str(out), **dataclasses.asdict(recovery)})
     else:
-        print(f"{out}: written")
+        show(f"{out}: written")
         _show(dataclasses.asdict(recovery), "  ")
     return 0
 

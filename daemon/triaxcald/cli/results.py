@@ -16,7 +16,7 @@ from triaxcal.number_format import probability
 from triaxcal.text import diagnosis
 from triaxcal.uncertainty import Budget, Combined, budget
 from triaxcal.units import ErrorUnit, grouped, in_units_of
-from triaxcald.cli.console import table
+from triaxcald.cli.console import show, table
 from triaxcald.cli.showing import Choice, counted
 from triaxcald.remarks import assumption
 
@@ -29,10 +29,10 @@ def show_calibration(c: Calibration, choice: Choice) -> None:
     b = budget(c, choice.stated)
     show_coefficients(c, choice, b.parameters)
     if said := temperature_of(c):
-        print(said)
+        show(said)
     r, small = c.residual, choice.small
     poses = counted(len(c.poses), sum(not p.used for p in c.poses))
-    print(
+    show(
         f"{poses}: residual rms {small.in_full(r.rms_g)}, {cross_validated(r, small)}, noise floor "
         f"{small.in_full(r.noise_floor_g)}, lack of fit p {probability(r.lack_of_fit_p)}"
     )
@@ -83,7 +83,7 @@ def show_coefficients(c: Calibration, choice: Choice, whole: Combined | None = N
     expanded_at = [f"expanded ({whole.level:.0%})"] if whole else []
     table("coefficients", ["", "value", "standard error", *expanded_at, "unit"], rows)
     if held := holds_of(c):
-        print(f"scale factor, misalignment and bias hold {'; '.join(held)}")
+        show(f"scale factor, misalignment and bias hold {'; '.join(held)}")
 
 
 def _percent(share: float) -> str:
@@ -102,17 +102,19 @@ def show_budget(b: Budget, choice: Choice) -> None:
     )
     table(f"uncertainty of the magnitude, {small}", ["source", "type", "standard", "share"], rows)
     by = text.remedy(b.dominant.halved_by, small.figure)
-    print(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
+    show(f"dominant: {b.dominant.source}; to halve it: {by} (combined then {small.in_full(b.magnitude_if_halved)})")
     if assumed := assumption(assumed_in(b.dominant.basis), choice.reference_unit):
-        print(f"{b.dominant.source}: {assumed}")
+        show(f"{b.dominant.source}: {assumed}")
     for source in b.not_evaluated:
-        print(f"not evaluated: {text.not_evaluated(source, small.figure)}")
+        show(f"not evaluated: {text.not_evaluated(source, small.figure)}")
 
 
 def show_summary(lines: Sequence[str]) -> None:
     """The four lines of a diagnosis (`triaxcal.text.diagnosis.lines`)."""
     for name, line in zip(("verdict", "cause", "error", "next"), lines, strict=True):
-        print(textwrap.fill(f"{name:<9}{line}", WIDTH, subsequent_indent=" " * 9, break_long_words=False))
+        text_of = f"{name:<9}{line}"
+        for part in textwrap.wrap(text_of, WIDTH, subsequent_indent=" " * 9, break_long_words=False):
+            show(part)
 
 
 def text_of_held_out(held: HoldOut, small: ErrorUnit) -> str:
@@ -138,6 +140,6 @@ def show_loop(loop: Loop, choice: Choice) -> None:
     rest += [["something that no effect describes", diagnosis.chance(loop.found.unexplained.probability)]]
     table("what acts", ["", "probability"], [*likely, *rest])
     for finding in loop.findings:
-        print(f"{finding.verdict}: {finding.effect} ({diagnosis.reason(finding, loop.refusal)})")
+        show(f"{finding.verdict}: {finding.effect} ({diagnosis.reason(finding, loop.refusal)})")
     for line in diagnosis.advice(loop, small):
-        print(f"advice: {line}")
+        show(f"advice: {line}")

@@ -16,7 +16,7 @@ from triaxcal.number_format import plain
 from triaxcal.pooled_units import Answer, PooledAnalysis
 from triaxcal.text import diagnosis
 from triaxcal.text.pooled_units import verdict
-from triaxcald.cli.console import table
+from triaxcald.cli.console import show, table
 from triaxcald.cli.results import WORTH_A_LINE
 from triaxcald.cli.showing import Choice, chosen, read_recording, warn
 from triaxcald.errors import InputError
@@ -176,9 +176,9 @@ def show_agreement(
         [
             [
                 name,
-                "\n".join(f.effect for f in loop.findings) or "none",
-                "\n".join(diagnosis.chance(f.probability) for f in loop.findings),
-                "\n".join(", ".join(f.alternatives) for f in loop.findings),
+                tuple(f.effect for f in loop.findings) or "none",
+                tuple(diagnosis.chance(f.probability) for f in loop.findings),
+                tuple(", ".join(f.alternatives) for f in loop.findings),
                 small.written(loop.before.residual.rms_g),
                 small.written(loop.after.residual.rms_g),
                 small.written(loop.after.residual.noise_floor_g),
@@ -201,11 +201,11 @@ def show_agreement(
         ],
     )
     for column, meaning in COLUMNS.items():
-        print(f"{column}: {meaning}")
+        show(f"{column}: {meaning}")
     said = verdict(found)
-    print(said if found.answer is Answer.NOTHING else f"the units {said}")
+    show(said if found.answer is Answer.NOTHING else f"the units {said}")
     for c in found.effects:
         if any(c.effect in group for group in found.agreed):
             for name, s in c.shapes.items():
                 known = "" if s.shared.standard_error is None else f" ± {plain(s.shared.standard_error, 2)}"
-                print(f"{c.effect}: {name} {plain(s.shared.value, 4)}{known} {s.shared.unit}")
+                show(f"{c.effect}: {name} {plain(s.shared.value, 4)}{known} {s.shared.unit}")

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from triaxcal_drivers.answers import ExtraAnswer
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.interface import Device
 from triaxcal_drivers.profile import Bundle
@@ -103,14 +104,21 @@ async def require_alone(link: RegisterLink, bundle: Bundle, where: str) -> None:
         return
     for _ in range(ASKED):
         link.doubled = 0
-        answers = [await link.read(name)]
-        found = await link.listen(LISTEN_S)
-        answers += [e.answer for e in found if e.register == name]
+        answers, found = await _answers(link, name)
         if found:
+            with suppress(DriverError, TwoAnswer):  # late answers to earlier requests have come by now
+                answers, _ = await _answers(link, name)
             raise TwoAnswer(f"two units answer at {where}: {_who(bundle, name, answers)}")
         if not link.doubled:
             return
     raise TwoAnswer(f"two units answer at {where}: each request was answered twice, byte for byte")
+
+
+async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[ExtraAnswer]]:
+    """What a register was answered with, and the answers that contradict."""
+    answers = [await link.read(name)]
+    found = await link.listen(LISTEN_S)
+    return answers + [e.answer for e in found if e.register == name], found
 
 
 def _who(bundle: Bundle, name: str, answers: Sequence[bytes]) -> str:

@@ -20,6 +20,8 @@ from triaxcald.files import write_durably
 FORMAT = "triaxcal.segments/1"
 SUFFIX = ".segments.json"
 MANIFEST_MOST = 64 * 2**20  # bytes; an entry has some 400: 18 years of hours, four months of minutes
+NUMBER_MOST = 10**18 - 1  # file names have up to 18 digits
+_REMEDY = "its segments can be read one by one, and the next `triaxcal record` to it rebuilds it"
 State = Literal["open", "closed", "cut_short", "damaged"]
 
 
@@ -64,12 +66,9 @@ class Manifest:
 
     @property
     def taken(self) -> int:
-        """The highest number that the name of a file beside it has: an earlier
-        manifest may have been lost."""
-        name = re.compile(re.escape(self.path.name.removesuffix(SUFFIX)) + r"-(\d{6,18})\.mcap")
+        """The highest number that the name of a file beside it has."""
         with suppress(OSError):  # a folder that one may write to, and not read
-            found = map(name.fullmatch, os.listdir(self.path.parent))
-            return max((int(match[1]) for match in found if match), default=0)
+            return max(numbered_files(self.path), default=0)
         return 0
 
     def path_of(self, segment: Segment) -> Path:
@@ -106,8 +105,26 @@ def is_manifest(path: Path | str) -> bool:
     return str(path).endswith(SUFFIX)
 
 
+def numbered_files(path: Path) -> dict[int, str]:
+    """The names in the folder of the manifest ``path`` that a segment of it may
+    have, by number, in order. Raises OSError."""
+    name = re.compile(re.escape(path.name.removesuffix(SUFFIX)) + r"-([0-9]{6,18})\.mcap")
+    found = sorted((int(match[1]), match[0]) for match in map(name.fullmatch, os.listdir(path.parent)) if match)
+    return dict(found)
+
+
 def load_manifest(path: Path) -> Manifest:
-    """Raises RecordingError."""
+    """Raises RecordingError, which also says what can be done."""
+    try:
+        return parsed_manifest(path)
+    except RecordingError as e:
+        if not os.path.lexists(path):
+            raise
+        raise RecordingError(f"{e}; {_REMEDY}") from e
+
+
+def parsed_manifest(path: Path) -> Manifest:
+    """As `load_manifest`. Raises RecordingError, which says only what is wrong."""
     try:
         document = json.loads(read_whole(path, MANIFEST_MOST))
     except OSError as e:
@@ -126,6 +143,8 @@ def load_manifest(path: Path) -> Manifest:
     if len({s.file for s in segments}) < len(segments):
         raise RecordingError(f"{path}: segments: a file is named twice")
     counts = {str(reason): _count(n, f"{path}: deleted") for reason, n in deleted.items()}
+    if sum(counts.values()) > NUMBER_MOST:
+        raise RecordingError(f"{path}: deleted: expected at most {NUMBER_MOST} segments")
     return Manifest(path, segments, counts)
 
 
@@ -147,9 +166,21 @@ def _segment(entry: Any, where: str) -> Segment:
         elif not (value is None and kind == "int | None"):
             held[name] = _count(value, f"{where}: {name}")
     file = held["file"]
-    if Path(file).name != file or not file.endswith(".mcap"):
+    if Path(file).name != file or not file.endswith(".mcap") or not _can_be_a_name(file):
         raise RecordingError(f"{where}: file: expected the name of an .mcap beside it")
-    return Segment(**held)
+    segment = Segment(**held)
+    if segment.number > NUMBER_MOST:
+        raise RecordingError(f"{where}: number: expected at most {NUMBER_MOST}")
+    if segment.state != "open" and segment.end < segment.first + segment.records:
+        raise RecordingError(f"{where}: end: expected at least first and records, {segment.first + segment.records}")
+    return segment
+
+
+def _can_be_a_name(file: str) -> bool:
+    try:
+        return b"\0" not in os.fsencode(file)
+    except UnicodeEncodeError:  # half of a pair, which JSON can write
+        return False
 
 
 def _text(value: Any, where: str) -> str:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from triaxcal_drivers.files import open_file
 from triaxcal_drivers.host_clock import HOST
 from triaxcal_drivers.interface import Gap, RawBatch
 from triaxcald.errors import DiskError, RecordingError
@@ -19,10 +17,9 @@ from triaxcald.files import require_new
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ended_because
 from triaxcald.recording.file import Head, RecordingFile
-from triaxcald.recording.frames import size_of, written_to
 from triaxcald.recording.inventory import Document
-from triaxcald.recording.manifest import Manifest, Segment, State, load_manifest, manifest_path
-from triaxcald.recording.reader import Recording
+from triaxcald.recording.manifest import Manifest, Segment, manifest_path
+from triaxcald.recording.rebuild import open_manifest, settled
 from triaxcald.recording.retention import Retention, Surplus, delete, evidence, surplus
 from triaxcald.recording.series import digest_of
 from triaxcald.recording.writer import RecordingWriter
@@ -30,6 +27,7 @@ from triaxcald.recording.writer import RecordingWriter
 SEGMENT_BYTES, SEGMENT_S = 256 * 2**20, 3600.0
 """What damage to one file costs at most, and the least that retention takes: an
 hour of a busy bus is some hundred MiB."""
+REBUILT = "manifest_rebuilt"  # an event
 AWAY = "nothing was being recorded meanwhile"
 DAMAGED = "what was recorded before is damaged, and nothing was being recorded meanwhile"
 
@@ -38,7 +36,8 @@ class SegmentedWriter(RecordingWriter):
     """As `RecordingWriter`, into one file after the other: a new one begins when
     the last has ``size_bytes`` or is ``time_s`` old. ``manifest`` is the file
     that names them; where it is there already, the recording goes on behind
-    what it names. ``path`` is the manifest, or an `.mcap` of that name.
+    what it names, and where it cannot be used, behind the segments that are
+    there. ``path`` is the manifest, or an `.mcap` of that name.
 
     Attachments that come before the first raw record are in every segment.
     ``retention`` takes the oldest segments away; ``deleted`` are those, and
@@ -91,14 +90,16 @@ class SegmentedWriter(RecordingWriter):
 
     def _begin(self, head: Head) -> RecordingFile:
         self._head = replace(head, metadata={name: dict(record) for name, record in head.metadata.items()})
-        self._segments = load_manifest(self.manifest) if self.manifest.exists() else Manifest(self.manifest)
         try:
-            self._segments = _settled(self._segments)
+            opened = open_manifest(self.manifest)
+            self._segments, self.warning = settled(opened.manifest), opened.warning
             ends = [s.end_ns for s in self._segments.segments if s.end_ns is not None]
             damaged = bool(self._segments.segments) and self._segments.segments[-1].state == "damaged"
             self._resumes = Gap(ends[-1], None, DAMAGED if damaged else AWAY) if ends else None
             before, gone = self._segments, self._room_made()
             file = self._next(before)
+            if opened.warning is not None:
+                file.write(schema.EVENTS, self._event(REBUILT, {"because": opened.warning, "kept_as": opened.kept}))
             if gone:
                 file.write(schema.EVENTS, self._deleted(gone))
             return file
@@ -124,7 +125,7 @@ class SegmentedWriter(RecordingWriter):
         known, number = before.segments, before.next_number
         if not known or os.path.lexists(before.path.with_name(before.file_name(number))):
             number = max(number, before.taken + 1)
-        first = known[-1].end if known else 0
+        first = max((s.end for s in known), default=0)
         told = {"number": str(number), "first": str(first), "of": self.manifest.name}
         if known:
             told |= {"previous": known[-1].file, "previous_sha256": known[-1].sha256}
@@ -257,47 +258,3 @@ class SegmentedWriter(RecordingWriter):
 def _told(one: Surplus) -> dict[str, Any]:
     s = one.segment
     return {"file": s.file, "because": one.reason, "bytes": s.bytes, "start_ns": s.start_ns, "end_ns": s.end_ns}
-
-
-def _nothing_reached(path: Path) -> bool:
-    """Whether of this file the disk has its name alone: the power failed right
-    after it was created."""
-    with open_file(path) as stream:
-        return written_to(stream, size_of(stream)) == 0
-
-
-def _settled(manifest: Manifest) -> Manifest:
-    """Its last segment as it lies on the disk, where it was not closed: what
-    became of it is no reason not to record. Raises OSError."""
-    if not manifest.segments or manifest.segments[-1].state != "open":
-        return manifest
-    last = manifest.segments[-1]
-    path = manifest.path_of(last)
-    if not os.path.lexists(path) or _nothing_reached(path):
-        with suppress(FileNotFoundError):
-            path.unlink()
-        return replace(manifest, segments=manifest.segments[:-1])
-    try:
-        found = _as_it_lies(path, last)
-    except RecordingError:
-        found = replace(last, state="damaged", end=last.first)
-    with suppress(RecordingError):
-        found = replace(found, sha256=digest_of(path))
-    status = path.stat()
-    return manifest.with_last(replace(found, bytes=status.st_size, closed_ns=status.st_mtime_ns))
-
-
-def _as_it_lies(path: Path, segment: Segment) -> Segment:
-    """What is in it, of one that was not closed. Raises RecordingError."""
-    with Recording.open(path, unfinished=True) as recording:
-        digest, span = schema.RawDigest(), list[int]()
-        for phase, batch in recording.joined_batches():
-            digest.update(phase, batch)
-            if len(batch):
-                span = [min([*span, int(batch.time_ns.min())]), max([*span, int(batch.time_ns.max())])]
-        lost = sum(loss.records for loss in recording.losses() if loss.where == schema.RAW)
-        state: State = "closed" if recording.finished else "cut_short"
-    return replace(
-        segment, state=state, end=segment.first + digest.records + lost, records=digest.records,
-        start_ns=span[0] if span else None, end_ns=span[1] if span else None, raw_sha256=digest.hexdigest(),
-    )  # fmt: skip

@@ -74,6 +74,8 @@ class RecordingWriter:
         self.path = path
         self._provisional = provisional
         self.losses: dict[str, int] = {}
+        self.warning: str | None = None
+        """What was wrong with the earlier recording that it goes on behind."""
         self.ends_with = ends_with
         self._clock_ns, self._sync_s, self._waits = clock_ns, sync_s, waits
         self._decimators = {topic: schema.Decimator(preview_hz) for topic in schema.PREVIEWS}

@@ -27,6 +27,7 @@ from triaxcald.errors import (
 )
 from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, exit_code_of
 from triaxcald.outcome import Code, Ending, Verdict
+from triaxcald.printable import printable_lines
 from triaxcald.provision.correction import ReadingsNotStated
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.procedure import Provisioning
@@ -61,7 +62,7 @@ def aborted(e: BaseException, p: Provisioning | None) -> Ending:
     exit_code, code = exit_code_of(e), code_of(e)
     if (trace := trace_of(e)) is not None:
         with suppress(OSError, ValueError):  # a closed standard error
-            sys.stderr.write(trace)
+            sys.stderr.write(printable_lines(trace))
     written = p is not None and p.held.state is not DeviceState.UNTOUCHED
     refused = isinstance(e, ReadingsNotStated)  # an earlier provisioning wrote, not this one
     if p is not None and written and not refused and not (p.settled and exit_code in (INTERRUPTED, DISK)):

@@ -36,8 +36,8 @@ except ImportError:
     fcntl = None  # type: ignore[assignment]
 
 FOLDER_VARIABLE = "TRIAXCAL_LOCK_FOLDER"
-"""For processes that share neither /run/lock nor /tmp, as in containers. All of
-them must be given the same folder."""
+"""For processes that share neither /run/lock nor /tmp, as in containers, and
+where neither can be written to. All of them must be given the same folder."""
 _FOLDERS = ("/run/lock", "/tmp")
 _LOOKUP_S = 2.0
 """A name that takes longer to look up is locked by its spelling; connecting by
@@ -131,7 +131,7 @@ def _taken(name: str, shared: bool) -> bool:
         try:
             descriptor = _flocked(path, {"lock": name, **asdict(holder)})
         except OSError as e:
-            raise StationError(f"{name} cannot be locked: {path}: {e.strerror}") from e
+            raise StationError(f"{name} cannot be locked: {path}: {e.strerror}{_remedy(e)}") from e
         except _Locked as e:
             if e.holder is None:
                 return False
@@ -150,6 +150,17 @@ def _release(name: str) -> None:
         with suppress(OSError):
             os.ftruncate(held.descriptor, 0)
         os.close(held.descriptor)
+
+
+def _remedy(e: OSError) -> str:
+    """Where no file can be made. No other folder is tried: a command for which
+    this one is read-only, as in a container, would hold the device beside one
+    that can write to it."""
+    if e.errno == errno.EEXIST:
+        return ""
+    if os.environ.get(FOLDER_VARIABLE):
+        return f"; {FOLDER_VARIABLE} has to name a folder to which every command on this station can write"
+    return f"; set {FOLDER_VARIABLE}, for every command on this station alike, to a folder that can be written to"
 
 
 class _Locked(Exception):

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
-from triaxcal_drivers.can.layout import Message, Signal
+from triaxcal_drivers.can.layout import FRAME_MOST, Message, Signal
 from triaxcal_drivers.errors import ProfileError
 from triaxcal_drivers.nearest import clipped
 
+J1939_MOST = 1785  # bytes of a J1939 message in 255 packets of seven
 ENTRIES_MOST = 100_000  # messages and signals; a vehicle has tens of thousands
 TOKENS_MOST = 1_000_000  # statements and quoted texts; a vehicle's value tables have some hundred thousand
 
@@ -40,6 +41,13 @@ _SIGNAL = re.compile(
 _VALUE_TYPE = re.compile(rb"(\d{1,10})\s+(\w+)\s*:?\s*([0-3])\b")
 _LONG_NAME = re.compile(
     rb'^[ \t]*BA_\s+"System(?:Signal|Message)LongSymbol"\s+(?:BO_|SG_)\s+(\d{1,10})(?:\s+(\w+))?\s*"(\w+)"',
+    re.MULTILINE,
+)
+_FORMATS = re.compile(
+    rb'^[ \t]*BA_DEF_\s+BO_\s+"VFrameFormat"\s+ENUM\s+((?:"[^"\r\n]{0,100}"\s*,?\s*){1,100})', re.MULTILINE
+)
+_FORMAT = re.compile(
+    rb'^[ \t]*BA_(?:DEF_DEF_\s+"VFrameFormat"\s|\s+"VFrameFormat"\s+BO_\s+(\d{1,10})\s)\s*(?:(\d{1,3})|"(\w{1,100})")',
     re.MULTILINE,
 )
 _EXTENDED = 1 << 31
@@ -65,6 +73,7 @@ def dbc_messages(data: bytes, *, base_node_id: int | None, where: str) -> list[M
     found = _File(data, where).messages()
     if not found:
         raise ProfileError(f"{where}: not a DBC file: there is no message in it (BO_)")
+    _check_lengths(found, data, where)
     long = {(int(m[1]), m[2]): m[3].decode() for m in _LONG_NAME.finditer(data)}
     messages = []
     for m in found:
@@ -78,7 +87,9 @@ def dbc_messages(data: bytes, *, base_node_id: int | None, where: str) -> list[M
         if identifier > (0x1FFFFFFF if extended else 0x7FF):
             raise ProfileError(f"{where}: message '{clipped(m.name)}' has the identifier {m.number}, which CAN has not")
         name = long.get((m.number, None), m.name)
-        messages.append(Message(name, identifier - (base_node_id or 0), signals, extended, base_node_id is not None))
+        messages.append(
+            Message(name, identifier - (base_node_id or 0), signals, extended, base_node_id is not None, m.length)
+        )
     return messages
 
 
@@ -147,10 +158,42 @@ class _File:
         raise ProfileError(f"{self._where}: not a DBC file: line {line}: {what}")
 
 
+def _check_lengths(messages: Sequence[_Described], data: bytes, where: str) -> None:
+    """Raises ProfileError where a message is longer than CAN can carry it."""
+    longer = [m for m in messages if m.length > FRAME_MOST]
+    j1939 = _j1939(data, longer) if longer else frozenset()
+    for m in longer:
+        most = J1939_MOST if m.number in j1939 else FRAME_MOST
+        if m.length > most:
+            kind = "a J1939 message" if m.number in j1939 else "a frame of CAN FD"
+            raise ProfileError(
+                f"{where}: message '{clipped(m.name)}' has {m.length} bytes, expected at most {most} as {kind}"
+            )
+
+
+def _j1939(data: bytes, messages: Sequence[_Described]) -> frozenset[int]:
+    """The numbers of those whose attribute ``VFrameFormat`` is ``J1939PG``,
+    their own or by default; all of J1939 have identifiers of 29 bits."""
+    names = [name for found in _FORMATS.finditer(data) for name in re.findall(rb'"([^"]*)"', found[1])]
+    formats: dict[int | None, bytes] = {}
+    for m in _FORMAT.finditer(data):
+        said = m[3] if m[2] is None else dict(enumerate(names)).get(int(m[2]), b"")
+        formats[None if m[1] is None else int(m[1])] = said
+    default = formats.get(None, b"")
+    return frozenset(
+        m.number for m in messages if m.number & _EXTENDED and formats.get(m.number, default) == b"J1939PG"
+    )
+
+
 def _check(signal: Signal, message: _Described, where: str) -> None:
+    if not 1 <= signal.length <= 64:
+        raise ProfileError(
+            f"{where}: signal '{clipped(signal.name)}' of message '{clipped(message.name)}' has {signal.length} bits,"
+            " expected 1 to 64"
+        )
     if signal.is_float and signal.length not in (16, 32, 64):
         raise ProfileError(f"{where}: signal '{clipped(signal.name)}' is a float of {signal.length} bits")
-    if not 1 <= signal.length <= 64 or signal.size > message.length:
+    if signal.size > message.length:
         raise ProfileError(
             f"{where}: signal '{clipped(signal.name)}' does not fit the {message.length} bytes of message"
             f" '{clipped(message.name)}'"

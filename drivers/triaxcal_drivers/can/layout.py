@@ -18,6 +18,7 @@ from triaxcal_drivers.nearest import clipped, nearest
 
 NODES = 127
 SHORTEST_COUNTER = 4
+FRAME_MOST = 64  # bytes of a CAN FD frame
 STANDARD_MOST = 0x7FF  # the highest identifier of 11 bits
 _IDENTIFIER = re.compile("0[xX]([0-9A-Fa-f]{1,8})([xX]?)")
 _FLOATS = {16: np.uint16, 32: np.uint32, 64: np.uint64}
@@ -83,13 +84,15 @@ class Signal:
 @dataclass(frozen=True)
 class Message:
     """A CAN message. Where it is ``per_node``, a unit at node N sends it as
-    ``identifier`` + N."""
+    ``identifier`` + N. ``length`` in bytes, 0 where it is not known; one of
+    J1939 may be longer than a frame."""
 
     name: str
     identifier: int
     signals: Mapping[str, Signal]
     extended: bool = False
     per_node: bool = False
+    length: int = 0
 
     def identifier_of(self, node_id: int) -> int:
         return self.identifier + node_id if self.per_node else self.identifier
@@ -149,6 +152,7 @@ def arrange(messages: Sequence[Message], stream: CanStream, *, where: str) -> La
     counters = _counters(used, stream.counter, by_time, where)
     valid = _valid(index, order, stream.validity(), where)
     _check_identifiers(used, where)
+    _check_lengths(used, where)
     return Layout(used, channels, counters, *valid, by_time)
 
 
@@ -264,6 +268,15 @@ def _counters(used: Sequence[Message], counter: str | None, by_time: bool, where
             f"expected an integer of the same {SHORTEST_COUNTER} to 32 bits in every message"
         )
     return found
+
+
+def _check_lengths(used: Sequence[Message], where: str) -> None:
+    for message in used:
+        if message.length > FRAME_MOST:
+            raise ProfileError(
+                f"{where}: message '{clipped(message.name)}' has {message.length} bytes, which J1939 sends in several "
+                f"frames; expected one of a single frame, at most {FRAME_MOST} bytes"
+            )
 
 
 def _check_identifiers(used: Sequence[Message], where: str) -> None:

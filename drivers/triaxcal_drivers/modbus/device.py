@@ -29,6 +29,7 @@ from triaxcal_drivers.modbus.protocol import (
     MalformedReply,
     Misanswered,
     ModbusRefusal,
+    Spoiled,
 )
 from triaxcal_drivers.register_types import TYPES
 
@@ -64,6 +65,9 @@ class _Polled:
     trouble: str = "no reply"
     unanswered: int = 0
     """Requests in a row to which no reply came."""
+    again: bool = False
+    """Whether the last reply was spoiled and the one before was not: it is
+    asked for again at once."""
 
     @property
     def source(self) -> int:
@@ -170,7 +174,9 @@ class ModbusDevice:
                 if contradictions >= _CONTRADICTIONS:
                     raise SecondAnswer(f"two units answer at {self._connected().where}")
                 self._check_heard(p, polled)
-                if p.unanswered and not self._connected().alone:
+                if p.again:
+                    p.due_s = loop.time()
+                elif p.unanswered and not self._connected().alone:
                     p.due_s = max(p.due_s, loop.time() + self._pause_s(p))
 
     def _check_heard(self, p: _Polled, polled: Sequence[_Polled] = ()) -> None:
@@ -250,7 +256,7 @@ class ModbusDevice:
         return min(now_ns, asked_ns + round(waited_s * 1e9)) if math.isfinite(waited_s) else now_ns
 
     async def _request(self, p: _Polled) -> tuple[RawFlag, bytes]:
-        unanswered, p.unanswered = p.unanswered, 0
+        unanswered, p.unanswered, p.again = p.unanswered, 0, False
         try:
             data = await self._connected().read(p.stream.function, p.stream.address, p.stream.words)
         except ModbusRefusal as e:
@@ -264,6 +270,7 @@ class ModbusDevice:
         except DeviceSilent as e:
             p.trouble = _cause(e) if isinstance(e, Misanswered) else "no reply"
             p.unanswered = unanswered + 1
+            p.again = isinstance(e, Spoiled) and not unanswered
             return RawFlag.ERROR, b""
         return RawFlag(0), data
 

@@ -19,11 +19,15 @@ from triaxcal_drivers.answers import Answers, Extra
 from triaxcal_drivers.attention import Attention
 from triaxcal_drivers.claim import canonical_host, canonical_port
 from triaxcal_drivers.errors import BusError, DeviceSilent
-from triaxcal_drivers.modbus.protocol import Misanswered, SerialLine, TcpAddress
+from triaxcal_drivers.modbus.protocol import Misanswered, SerialLine, Spoiled, TcpAddress, read_reply_bytes
 from triaxcal_drivers.modbus.stack import Link, connect_serial, connect_tcp, reason_of
 
 _LOOK_S = 0.01
-"""How often a unit that owes a late reply looks whether it has come."""
+"""How often a unit that owes a late reply looks whether it has come, and
+whether a line has fallen silent."""
+_QUIET_S = 0.03
+"""After bytes that are no reply, an RTU line that is silent for so long brings
+no more of it: twice as long as a USB adapter holds bytes back."""
 
 
 class Line:
@@ -38,6 +42,13 @@ class Line:
         self._opening, self._turn = asyncio.Lock(), asyncio.Lock()
         self._link: Link | None = None
         self._late_until_s: dict[int, float] = {}
+        self._spoiled: dict[int, bytes] = {}
+        """Of a unit, the read whose reply was spoiled, to which a reply is
+        owed."""
+        self._request = b""
+        self._latency_s: dict[int, float] = {}
+        """How long a unit takes to reply: the longest, of which a tenth is
+        forgotten with each reply."""
         self._waited_s: dict[int, float] = {}
         self._mute = False
         self._transaction = 0
@@ -94,6 +105,17 @@ class Line:
         now_s = self.attention.now_s()
         if seconds > 0 and math.isfinite(now_s):
             self._late_until_s[unit] = now_s + seconds
+            self._spoiled.pop(unit, None)
+
+    def _owed_before_s(self, unit: int, pdu: bytes) -> float:
+        """As `owed_s`, before this request. After a reply that was spoiled the
+        same read may be asked again at once, as may a read whose reply has
+        another length: `_on_frame` tells a late reply from that."""
+        spoiled = self._spoiled.get(unit)
+        length = read_reply_bytes(pdu)
+        if spoiled is not None and length is not None and (pdu == spoiled or length != read_reply_bytes(spoiled)):
+            return 0.0
+        return self.owed_s(unit)
 
     def waited_s(self, unit: int) -> float:
         """So long a unit's requests have waited, all in all, while other units
@@ -110,14 +132,14 @@ class Line:
         """The reply to a request, function code first. A reply that does not
         come within ``patience_s`` may come ``late_s`` later still. Raises
         DeviceSilent, BusError."""
-        async with self._turn_of(unit):
+        async with self._turn_of(unit, pdu):
             if self._link is None or self._link.transport is None:
                 raise BusError(f"{self.name} unit {unit}: the connection is closed")
             await self._keep_the_gap(self._link)
             if self._link.transport is None:
                 raise BusError(f"{self.name} unit {unit}: the connection was lost")
             expected = self._expected = asyncio.get_running_loop().create_future()
-            self._asked, self._other = unit, None
+            self._asked, self._request, self._other = unit, pdu, None
             if not self._frame_gap_s:
                 self._transaction = self._transaction % 0xFFFF + 1
             until_s = self.attention.now_s() + patience_s
@@ -125,7 +147,7 @@ class Line:
             self._link.send(unit, self._transaction, pdu)
             try:
                 async with self.attention.timeout(patience_s):
-                    reply: bytes = await expected
+                    reply = await self._reply(self._link, expected, unit, pdu)
             except TimeoutError as e:
                 self._mute = not self._frame_gap_s  # by TCP: until another frame comes
                 silent = f"{self.name} unit {unit}: no reply in {patience_s:g} s"
@@ -135,22 +157,50 @@ class Line:
             finally:
                 self._expected = None
                 if not expected.done() or expected.cancelled():
-                    self.owe(unit, late_s + max(until_s - self.attention.now_s(), 0.0))
+                    self._owe_after(self._link, unit, pdu, late_s + max(until_s - self.attention.now_s(), 0.0))
         return reply
 
+    async def _reply(self, link: Link, expected: asyncio.Future[bytes], unit: int, pdu: bytes) -> bytes:
+        """Raises Spoiled."""
+        loop = asyncio.get_running_loop()
+        usual_s = self._latency_s.get(unit, math.inf)
+        quiet_s = max(_QUIET_S, 2 * self._frame_gap_s)
+        # By TCP no bytes are spoiled; a write is waited for: the unit may store.
+        watched = self._frame_gap_s and math.isfinite(usual_s) and read_reply_bytes(pdu) is not None
+        while watched and not expected.done():
+            await asyncio.wait([expected], timeout=_LOOK_S)
+            # Noise may come before the reply: then the unit still has its time.
+            until_s = link.last_byte_s if _was_the_reply(link, pdu) else link.sent_s + 2 * usual_s
+            since_s = loop.time() - max(link.last_byte_s, until_s)
+            if not expected.done() and link.bytes_came and since_s >= quiet_s:
+                raise Spoiled(f"{self.name} unit {unit}: no reply; {self._other or link.came()}")
+        reply = await expected
+        self._latency_s[unit] = max(0.9 * self._latency_s.get(unit, 0.0), loop.time() - link.sent_s)
+        return reply
+
+    def _owe_after(self, link: Link, unit: int, pdu: bytes, seconds: float) -> None:
+        """After a request that got no reply. Where the bytes that came were the
+        reply, no other is to come; else they may have come before it."""
+        spoiled = self._frame_gap_s and link.bytes_came and read_reply_bytes(pdu) is not None
+        if spoiled and _was_the_reply(link, pdu):
+            return
+        self.owe(unit, seconds)
+        if spoiled:
+            self._spoiled[unit] = pdu
+
     @asynccontextmanager
-    async def _turn_of(self, unit: int) -> AsyncIterator[None]:
+    async def _turn_of(self, unit: int, pdu: bytes) -> AsyncIterator[None]:
         """The line, once no late reply of this unit is to come; the others have
         it meanwhile. RTU frames have no transaction number: a late reply would
         pass for the next one's."""
         while True:
-            while (left_s := self.owed_s(unit)) > 0:
+            while (left_s := self._owed_before_s(unit, pdu)) > 0:
                 await asyncio.sleep(min(left_s, _LOOK_S))
             begun_s = self.attention.now_s()
             async with self._turn:
                 if math.isfinite(waited_s := self.attention.now_s() - begun_s):
                     self._waited_s[unit] = self._waited_s.get(unit, 0.0) + waited_s
-                if self.owed_s(unit) == 0:
+                if self._owed_before_s(unit, pdu) == 0:
                     yield
                     return
 
@@ -175,8 +225,18 @@ class Line:
         if self._expected is None or unit != self._asked:
             self._late_until_s.pop(unit, None)  # the late reply has come
             self._other = f"a reply came as unit {unit}"
+        elif self._is_late(unit, pdu):
+            self._spoiled.pop(unit)
+            self._other = "a late reply came"
         elif not self._expected.done():
             self._expected.set_result(pdu)
+
+    def _is_late(self, unit: int, pdu: bytes) -> bool:
+        """Whether a reply on RTU, where one is owed, is not of the length that
+        was asked for."""
+        length = read_reply_bytes(self._request)
+        refused = pdu[0] == self._request[0] | 0x80
+        return unit in self._spoiled and length is not None and len(pdu) + 3 != length and not refused
 
     def _key(self, unit: int, transaction: int) -> tuple[int, int]:
         """RTU frames have no transaction."""
@@ -192,6 +252,13 @@ class Line:
     def _on_lost(self) -> None:
         if self._expected is not None and not self._expected.done():
             self._expected.set_exception(BusError(f"{self.name} unit {self._asked}: the connection was lost"))
+
+
+def _was_the_reply(link: Link, pdu: bytes) -> bool:
+    """Whether as many bytes came as the reply to a read has, to within the one
+    that noise adds or takes away."""
+    length = read_reply_bytes(pdu)
+    return length is not None and abs(link.bytes_came - length) <= 1
 
 
 _lines: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, Line]] = WeakKeyDictionary()

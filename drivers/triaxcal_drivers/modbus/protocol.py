@@ -49,6 +49,11 @@ class Misanswered(DeviceSilent):
     """Something came while a reply was waited for, and it was not the reply."""
 
 
+class Spoiled(Misanswered):
+    """Bytes came in place of the reply to a read, and then the line was silent:
+    noise has spoiled it. Nobody waited for the time-out."""
+
+
 @dataclass(frozen=True)
 class TcpAddress:
     """``port`` 0, for a unit that is served: one that is free."""
@@ -86,6 +91,11 @@ class SerialLine:
         request and reply with their gaps, of a unit that answers at once."""
         request, reply = 8, 5 + 2 * words
         return (request + reply) * self.character_s + 2 * self.frame_gap_s
+
+
+def read_reply_bytes(pdu: bytes) -> int | None:
+    """Length of the RTU frame that answers a read; None for other requests."""
+    return 5 + 2 * int.from_bytes(pdu[3:5], "big") if pdu[0] in (READ_HOLDING, READ_INPUT) else None
 
 
 class Unanswered(Exception):

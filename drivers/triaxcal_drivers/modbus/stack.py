@@ -57,6 +57,12 @@ class Link(asyncio.Protocol):
         self._received = received
         self._buffer = b""
         self._sent, self._head, self._came = b"", b"", 0
+        self.sent_s = 0.0
+
+    @property
+    def bytes_came(self) -> int:
+        """Since the last request."""
+        return self._came
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
@@ -92,6 +98,7 @@ class Link(asyncio.Protocol):
     def send(self, unit: int, transaction: int, pdu: bytes) -> None:
         if self.transport is not None:
             self._sent, self._head, self._came = self.framer.encode(pdu, unit, transaction), b"", 0
+            self.sent_s = asyncio.get_running_loop().time()
             self.transport.write(self._sent)
 
     def came(self) -> str | None:

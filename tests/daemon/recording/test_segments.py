@@ -475,7 +475,7 @@ def test_a_segment_that_was_taken_away_meanwhile_is_a_fault_of_the_disk(
     assert e.value.exit_code == 5
 
 
-def test_files_of_a_manifest_that_was_lost_are_not_in_the_way(
+def test_a_manifest_that_was_lost_is_rebuilt_from_its_segments_alone(
     tmp_path: Path, new: NewWriter, minutes: Callable[..., None]
 ) -> None:
     with new() as writer:
@@ -485,7 +485,7 @@ def test_files_of_a_manifest_that_was_lost_are_not_in_the_way(
     (tmp_path / "other-000099.mcap").touch()
     with new() as writer:
         minutes(writer, 2)
-    assert [s.number for s in load_manifest(tmp_path / "rec.segments.json").segments] == [4, 5, 6]
+    assert [s.number for s in load_manifest(tmp_path / "rec.segments.json").segments] == [1, 2, 3, 4, 5, 6]
     (tmp_path / "rec-20240517.mcap").touch()
     with new() as writer:
         minutes(writer, 1, first=20)

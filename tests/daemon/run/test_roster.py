@@ -67,6 +67,7 @@ class Writer:
     def __init__(self, path: Path) -> None:
         self.current, self.is_behind, self.queued = path, False, 0
         self.keeps_for: str | None = None
+        self.warning: str | None = None
         self.losses: dict[str, int] = {}
 
     def __enter__(self) -> Writer:
@@ -159,6 +160,16 @@ async def test_one_that_is_stopped_before_its_first_step_costs_no_result_of_othe
     finished.cancel()
     roster.begin([Played("b")])
     assert [kept.unit for kept in await finished] == ["a"]
+
+
+async def test_what_was_wrong_with_the_manifest_is_shown(tmp_path: Path) -> None:
+    one = Written("a")
+    one.writer = Writer(tmp_path / "a-000002.mcap")
+    one.writer.warning = "a.segments.json: not JSON"
+    work = asyncio.ensure_future(one.run(None, Patience()))
+    await until(lambda: one.shown.lines == ["a.segments.json: not JSON"])
+    one.ends.set()
+    await work
 
 
 async def test_one_that_loses_what_comes_is_not_said_to_be_recorded(

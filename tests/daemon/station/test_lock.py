@@ -240,6 +240,52 @@ async def test_a_folder_that_is_not_there_is_named(locks: Path) -> None:
         await taken(NODE)
 
 
+READ_ONLY = "mount -t tmpfs -o ro,mode=1777 none "
+"""In a namespace of its own, where the command that follows runs."""
+
+
+def in_read_only(folder: Path, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Runs it where ``folder`` is a file system that is read-only, for the superuser too."""
+    shell = f'{READ_ONLY}"$1" && shift && exec "$@"'
+    command = ["unshare", "-rm", "sh", "-c", shell, "sh", str(folder), sys.executable, "-c", program, *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, input="")
+    except FileNotFoundError:
+        pytest.skip("there is no unshare")
+    if "unshare" in done.stderr or "mount" in done.stderr:
+        pytest.skip(f"no namespace of its own: {done.stderr}")
+    return done
+
+
+HOLDING_IN = HOLDING.replace("import asyncio, sys", "import asyncio, sys\nfrom triaxcald.station import lock").replace(
+    "asyncio.run(hold())", "lock._FOLDERS = tuple(sys.argv[2:])\nasyncio.run(hold())"
+)
+
+
+def test_a_read_only_folder_is_told_with_what_mends_it(locks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    claim = repr({"device": NODE.device})
+    chosen = in_read_only(locks, HOLDING, claim)
+    assert "Read-only file system; TRIAXCAL_LOCK_FOLDER has to name a folder" in chosen.stderr
+    monkeypatch.delenv(FOLDER_VARIABLE)
+    usual = in_read_only(locks, HOLDING_IN, claim, str(locks))
+    assert "Read-only file system; set TRIAXCAL_LOCK_FOLDER, for every command" in usual.stderr
+    assert (chosen.stdout, usual.stdout) == ("", "")
+
+
+def test_who_cannot_write_to_the_folder_does_not_lock_elsewhere(
+    locks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would hold the device beside another command, for which the folder is not read-only."""
+    monkeypatch.delenv(FOLDER_VARIABLE)
+    other = tmp_path / "other"
+    other.mkdir()
+    for folder_of_all in (locks, other):
+        folder_of_all.chmod(0o1777)
+    done = in_read_only(locks, HOLDING_IN, repr({"device": NODE.device}), str(locks), str(other))
+    assert done.stdout == ""
+    assert list(other.iterdir()) == []
+
+
 async def test_a_file_that_is_cleaned_away_under_its_holder_is_made_anew(
     locks: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -131,3 +131,68 @@ def test_a_vehicle_of_tens_of_thousands_of_signals_is_read() -> None:
     values = "".join(f'VAL_ {2**31 + i} S0 0 "off" 1 "on" 2 "faulty" ;\n' for i in range(2500))
     messages = read(HEAD + "".join(f"BO_ {2**31 + i} M{i}: 8 A\n{per}\n" for i in range(2500)) + values)
     assert (len(messages), sum(len(m.signals) for m in messages)) == (2500, 20_000)
+
+
+FORMATS = (
+    'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
+    'BA_DEF_DEF_ "VFrameFormat" "{default}";\n'
+)
+PGN = 2**31 + 0x18FEF100
+
+
+@pytest.mark.parametrize("length", [65, 1785, 1786, 65536, 4294967295, 9999999999])
+def test_a_message_that_is_longer_than_a_frame_is_refused_by_its_name(length: int) -> None:
+    message = refusal(HEAD + f"BO_ 100 X: {length} A\n")
+    assert f"message 'X' has {length} bytes, expected at most 64" in message
+
+
+@pytest.mark.parametrize("length", [0, 8, 10, 64])
+def test_a_message_that_fits_a_frame_is_read(length: int) -> None:
+    assert [m.length for m in read(HEAD + f"BO_ 100 X: {length} A\n")] == [length]
+
+
+@pytest.mark.parametrize("said", ['BA_ "VFrameFormat" BO_ {n} 3;', 'BA_ "VFrameFormat" BO_ {n} "J1939PG";', ""])
+@pytest.mark.parametrize("length", [65, 1785, 1786])
+def test_a_message_of_j1939_may_have_all_that_its_transport_carries(length: int, said: str) -> None:
+    text = HEAD + f"BO_ {PGN} X: {length} A\n"
+    text += FORMATS.format(default="StandardCAN" if said else "J1939PG") + said.format(n=PGN) + "\n"
+    if length <= 1785:
+        assert [m.length for m in read(text)] == [length]
+        if "J1939PG" in said:  # cantools takes only the number
+            return
+        (theirs,) = cantools.database.load_string(text, "dbc", strict=False).messages
+        assert theirs.protocol == "j1939"
+    else:
+        assert "message 'X' has 1786 bytes, expected at most 1785 as a J1939 message" in refusal(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"BO_ {PGN} X: 100 A\n" + FORMATS.format(default="J1939PG") + f'BA_ "VFrameFormat" BO_ {PGN} 1;\n',
+        f"BO_ {PGN} X: 100 A\n" + FORMATS.format(default="StandardCAN") + f'BA_ "VFrameFormat" BO_ {PGN + 1} 3;\n',
+        "BO_ 100 X: 100 A\n" + FORMATS.format(default="J1939PG"),  # an identifier of 11 bits
+        f"BO_ {PGN} X: 100 A\n" + 'BA_ "ProtocolType" "J1939";\n',
+    ],
+)
+def test_a_message_that_is_none_of_j1939_may_not(text: str) -> None:
+    assert "message 'X' has 100 bytes, expected at most 64" in refusal(HEAD + text)
+
+
+@pytest.mark.parametrize("at", ["64|8@1+", "63|2@1+", "71|8@0+", "56|2@0+", "4294967295|1@1+", "9999999999|8@0-"])
+def test_a_signal_outside_of_its_message_is_refused(at: str) -> None:
+    message = refusal(HEAD + f'BO_ 1 M: 8 A\n SG_ S : {at} (1,0) [0|0] "" A\n')
+    assert "signal 'S' does not fit the 8 bytes of message 'M'" in message
+
+
+@pytest.mark.parametrize("length", [0, 65, 4000000000, 9999999999])
+@pytest.mark.parametrize("value_type", ["", "SIG_VALTYPE_ 1 S : 1;\n"])
+def test_a_signal_of_no_size_that_a_number_has_is_refused(length: int, value_type: str) -> None:
+    message = refusal(HEAD + f'BO_ 1 M: 64 A\n SG_ S : 0|{length}@1+ (1,0) [0|0] "" A\n' + value_type)
+    assert f"signal 'S' of message 'M' has {length} bits, expected 1 to 64" in message
+
+
+@pytest.mark.parametrize("at", ["0|64@1+", "63|1@1+", "7|64@0+", "56|1@0+"])
+def test_a_signal_at_the_edge_of_its_message_is_read(at: str) -> None:
+    (message,) = read(HEAD + f'BO_ 1 M: 8 A\n SG_ S : {at} (1,0) [0|0] "" A\n')
+    assert [*message.signals] == ["S"]

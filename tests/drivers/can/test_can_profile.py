@@ -125,6 +125,15 @@ def test_a_signal_that_its_message_cannot_hold_is_refused(edited: Edited) -> Non
     assert message == "triax-ref-can.dbc: signal 'Counter' does not fit the 7 bytes of message 'ReadingsXY'"
 
 
+def test_a_message_that_j1939_sends_in_several_frames_is_in_no_stream(edited: Edited) -> None:
+    said = 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
+    said += 'BA_DEF_DEF_ "VFrameFormat" "J1939PG";\nCM_ BO_ 901 '
+    number = 2**31 + 389
+    changed = edited(dbc=[("BO_ 389 ReadingsXY: 8", f"BO_ {number} ReadingsXY: 100"), ("CM_ BO_ 901 ", said)])
+    message = refusal(opened(changed))
+    assert "message 'ReadingsXY' has 100 bytes, which J1939 sends in several frames" in message
+
+
 def test_a_stream_that_the_profile_lacks_is_named_with_the_nearest_one(bundle: Bundle) -> None:
     message = refusal(lambda: CanDriver().decoder(bundle, "correct"))
     assert message == "profile triax-ref-can: no stream 'correct'; did you mean 'corrected'?"

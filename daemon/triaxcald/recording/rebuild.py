@@ -1,0 +1,329 @@
+"""Makes the manifest of a recording in segments anew from the files beside it.
+
+A manifest that cannot be used keeps nobody from recording. It is renamed, never
+removed, and a new one lists the segments that are there.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import zlib
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Message, MetadataIndex, Statistics
+from mcap.records import Metadata as MetadataRecord
+
+from triaxcal.number_format import number_of
+from triaxcal_drivers.files import open_file
+from triaxcald.errors import RecordingError
+from triaxcald.files import unused
+from triaxcald.recording import schema
+from triaxcald.recording.frames import (
+    HEAD,
+    MAGIC,
+    check_magic,
+    chunk_data,
+    chunk_records,
+    footer_fits,
+    frame_at,
+    parse,
+    size_of,
+    written_to,
+)
+from triaxcald.recording.manifest import Manifest, Segment, State, numbered_files, parsed_manifest
+from triaxcald.recording.raw_batch import decode_raw
+from triaxcald.recording.reader import Recording
+from triaxcald.recording.series import digest_of
+
+_KEPT = ".replaced"
+_FOOTER_BYTES = 20  # of the body of a footer record
+_DIGITS = re.compile(r"[0-9]{1,18}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+
+Told = Mapping[str, str]
+"""What a segment's metadata say of its place: number, first, and the one before
+with its digest."""
+
+
+class Opened(NamedTuple):
+    """A manifest to record behind. ``warning`` says what was wrong with the
+    file that was there, ``kept`` is the name it has now."""
+
+    manifest: Manifest
+    warning: str | None = None
+    kept: str | None = None
+
+
+def open_manifest(path: Path) -> Opened:
+    """The manifest at ``path``; one rebuilt from the segments where there is
+    none, where it cannot be used, or where it does not list the files that are
+    there. Writes nothing but the new name of a manifest that was replaced.
+    Raises OSError."""
+    if not os.path.lexists(path):
+        rebuilt = _from_files(path, reading=False)
+        return Opened(rebuilt, f"{path}: was missing; {_by(rebuilt)}" if rebuilt.segments else None)
+    try:
+        found = parsed_manifest(path)
+    except RecordingError as e:
+        rebuilt, wrong = _from_files(path), str(e)
+    else:
+        rebuilt, wrong = _reconciled(found)
+        if not wrong:
+            return Opened(found)
+        wrong = f"{path}: {wrong}"
+    aside = unused(path.with_name(path.name + _KEPT))
+    path.rename(aside)
+    return Opened(rebuilt, f"{wrong}; it is kept as {aside.name}; {_by(rebuilt)}", aside.name)
+
+
+def _by(rebuilt: Manifest) -> str:
+    return f"the manifest was rebuilt from {number_of(len(rebuilt.segments), 'segment')}"
+
+
+def settled(manifest: Manifest) -> Manifest:
+    """Its last segment as it lies on the disk, where it was not closed: what
+    became of it is no reason not to record. Raises OSError."""
+    if not manifest.segments or manifest.segments[-1].state != "open":
+        return manifest
+    last = manifest.segments[-1]
+    path = manifest.path_of(last)
+    if not os.path.lexists(path) or _nothing_reached(path):
+        with suppress(FileNotFoundError):
+            path.unlink()
+        return replace(manifest, segments=manifest.segments[:-1])
+    return manifest.with_last(_with_digest(path, _on_disk(path, last)))
+
+
+# Which files belong to it
+
+
+def _from_files(path: Path, *, reading: bool = True) -> Manifest:
+    """Of all segments beside ``path``. ``deleted`` counts the numbers that are
+    missing before the last. A folder that cannot be read has no segments unless
+    it has to be ``reading``. Raises OSError."""
+    try:
+        found = _inspected(path, numbered_files(path))
+    except PermissionError:
+        if reading:
+            raise
+        found = []
+    missing = found[-1].number - len(found) if found else 0
+    return Manifest(path, tuple(found), {"unknown": missing} if missing > 0 else {})
+
+
+def _reconciled(manifest: Manifest) -> tuple[Manifest, str]:
+    """The manifest of the files that are there, and what was wrong with it in
+    words; empty where nothing was. The last segment may be missing if it is
+    open: the manifest names it before it exists. Raises OSError."""
+    try:
+        there = numbered_files(manifest.path)
+    except PermissionError:
+        return manifest, ""
+    last = manifest.segments[-1:]
+    missing = [s for s in manifest.segments if not os.path.lexists(manifest.path_of(s))]
+    missing = [s for s in missing if s.state != "open" or (s,) != last]
+    listed = {s.number for s in manifest.segments} | {
+        number for number, name in there.items() if any(s.file == name for s in manifest.segments)
+    }
+    added = _inspected(manifest.path, {number: name for number, name in there.items() if number not in listed})
+    unsettled = [s for s in manifest.segments[: -1 if not added else None] if s.state == "open" and s not in missing]
+    if not (missing or added or unsettled):
+        return manifest, ""
+    kept = [s for s in manifest.segments if s not in missing]
+    for segment in unsettled:
+        file = manifest.path_of(segment)
+        kept[kept.index(segment)] = _with_digest(file, _on_disk(file, segment))
+    merged = tuple(sorted([*kept, *added], key=lambda s: s.number))
+    wrong = [
+        f"{what} {', '.join(s.file for s in some[:3])}{f' and {len(some) - 3} more' if len(some) > 3 else ''}"
+        for what, some in (("lists missing", missing), ("does not list", added), ("lists as open", unsettled))
+        if some
+    ]
+    counts = Counter(manifest.deleted) + Counter({"missing": len(missing)})
+    return replace(manifest, segments=merged, deleted=dict(counts)), "; ".join(wrong)
+
+
+def _inspected(path: Path, names: Mapping[int, str]) -> list[Segment]:
+    """Those of the numbered files that are segments of the manifest ``path``,
+    as they lie on the disk, in order. Raises OSError."""
+    found: list[tuple[Segment, Told]] = []
+    for number, name in names.items():
+        file = path.with_name(name)
+        if not stat.S_ISREG(file.stat().st_mode if file.exists() else 0) or _nothing_reached(file):
+            continue
+        told = _told(file)
+        if told is not None and told.get("number") != str(number):
+            continue  # another recording has this name
+        first = _number(told or {}, "first", found[-1][0].end if found else 0)
+        found.append((_on_disk(file, Segment(name, number, first)), told or {}))
+    return [_with_digest(path.with_name(s.file), replace(s, sha256=sha256)) for s, sha256 in _with_known_digests(found)]
+
+
+def _with_known_digests(found: list[tuple[Segment, Told]]) -> list[tuple[Segment, str]]:
+    """Each segment with the digest that the next one was given of it when it
+    was closed, so that a later change is still found; empty where there is none."""
+    known = []
+    for (segment, _), (_, after) in pairwise([*found, *([(found[-1][0], {})] if found else [])]):
+        said = after.get("previous_sha256", "") if after.get("previous") == segment.file else ""
+        known.append((segment, said if _SHA256.fullmatch(said) else ""))
+    return known
+
+
+def _number(told: Told, key: str, default: int) -> int:
+    return int(told[key]) if _DIGITS.fullmatch(told.get(key, "")) else default
+
+
+# What is in a file
+
+
+def _on_disk(path: Path, segment: Segment) -> Segment:
+    """The segment as it is in its file, without the digest of the file: from
+    the summary of a finished one, else from its records. Raises OSError."""
+    try:
+        found = _by_summary(path, segment) or _by_records(path, segment)
+    except (RecordingError, ValueError):
+        found = replace(segment, state="damaged", end=segment.first)
+    status = path.stat()
+    return replace(found, bytes=status.st_size, closed_ns=status.st_mtime_ns)
+
+
+def _with_digest(path: Path, segment: Segment) -> Segment:
+    if not segment.sha256:
+        with suppress(RecordingError):
+            return replace(segment, sha256=digest_of(path))
+    return segment
+
+
+def _nothing_reached(path: Path) -> bool:
+    """Whether of this file the disk has its name alone: the power failed right
+    after it was created."""
+    try:
+        with open_file(path) as stream:
+            return written_to(stream, size_of(stream)) == 0
+    except PermissionError:
+        return False
+
+
+def _by_records(path: Path, segment: Segment) -> Segment:
+    """Reads the whole file. Raises RecordingError."""
+    with Recording.open(path, unfinished=True) as recording:
+        digest, span = schema.RawDigest(), list[int]()
+        for phase, batch in recording.joined_batches():
+            digest.update(phase, batch)
+            if len(batch):
+                span = [min([*span, int(batch.time_ns.min())]), max([*span, int(batch.time_ns.max())])]
+        lost = sum(loss.records for loss in recording.losses() if loss.where == schema.RAW)
+        state: State = "closed" if recording.finished else "cut_short"
+    return replace(
+        segment, state=state, end=segment.first + digest.records + lost, records=digest.records,
+        start_ns=span[0] if span else None, end_ns=span[1] if span else None, raw_sha256=digest.hexdigest(),
+    )  # fmt: skip
+
+
+def _told(path: Path) -> Told | None:
+    """What the file says of its place among the segments; empty where it says
+    nothing, None where it cannot be read."""
+    with suppress(RecordingError, OSError), open_file(path) as stream:
+        check_magic(stream, str(path))
+        size, offset = size_of(stream), len(MAGIC)
+        # The metadata stand before the first chunk.
+        while offset < size:
+            frame = frame_at(stream, str(path), offset, size)
+            if frame.opcode == Opcode.METADATA:
+                record = parse(frame, str(path))
+                assert isinstance(record, MetadataRecord)
+                if record.name == schema.SEGMENT_RECORD:
+                    return dict(record.metadata)
+            if frame.opcode in (Opcode.CHUNK, Opcode.DATA_END):
+                return {}
+            offset = frame.end
+    return None
+
+
+class _Summary(NamedTuple):
+    """The summary of a finished file."""
+
+    statistics: Statistics
+    channels: dict[int, str]
+    chunks: list[ChunkIndex]
+    metadata: dict[str, int]  # offset by name
+
+
+def _by_summary(path: Path, segment: Segment) -> Segment | None:
+    """From the end of a finished file, and the chunks in which its raw records
+    begin and end: to read all of a week of segments would take minutes. None
+    where the whole file has to be read. Raises RecordingError."""
+    try:
+        with open_file(path) as stream:
+            name, size = str(path), size_of(stream)
+            summary = _summary(stream, name, size)
+            if summary is None or schema.RAW_RECORD not in summary.metadata:
+                return None
+            record = parse(frame_at(stream, name, summary.metadata[schema.RAW_RECORD], size), name)
+            counts = {summary.channels.get(i): n for i, n in summary.statistics.channel_message_counts.items()}
+            if not isinstance(record, MetadataRecord) or counts.get(schema.LOSS, 0):
+                return None
+            records, sha256 = _number(record.metadata, "records", -1), record.metadata.get("sha256", "")
+            span = _span_ns(stream, name, size, summary)
+    except OSError as e:
+        raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
+    if records < 0 or not _SHA256.fullmatch(sha256) or (span is None) != (records == 0):
+        return None
+    return replace(
+        segment, state="closed", end=segment.first + records, records=records,
+        start_ns=span[0] if span else None, end_ns=span[1] if span else None, raw_sha256=sha256,
+    )  # fmt: skip
+
+
+def _summary(stream: BinaryIO, name: str, size: int) -> _Summary | None:
+    """None where the file has none, as one that is not finished. Raises
+    RecordingError."""
+    footer_at = size - len(MAGIC) - HEAD.size - _FOOTER_BYTES
+    stream.seek(size - len(MAGIC))
+    if footer_at < len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
+        return None
+    footer = frame_at(stream, name, footer_at, size)
+    if footer.opcode != Opcode.FOOTER or footer.end != size - len(MAGIC):
+        return None
+    end = parse(footer, name)
+    assert isinstance(end, Footer)
+    offset, crc, records = end.summary_start, 0, list[McapRecord]()
+    if not len(MAGIC) <= offset < footer_at:
+        return None
+    while offset < footer_at:
+        frame = frame_at(stream, name, offset, size)
+        crc = zlib.crc32(frame.body, zlib.crc32(frame.head, crc))
+        if frame.opcode in (Opcode.STATISTICS, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX):
+            records.append(parse(frame, name))
+        offset = frame.end
+    statistics = [r for r in records if isinstance(r, Statistics)]
+    if offset != footer_at or not footer_fits(footer, crc) or not statistics:
+        return None
+    return _Summary(
+        statistics[0],
+        {r.id: r.topic for r in records if isinstance(r, Channel)},
+        [r for r in records if isinstance(r, ChunkIndex)],
+        {r.name: r.offset for r in records if isinstance(r, MetadataIndex)},
+    )
+
+
+def _span_ns(stream: BinaryIO, name: str, size: int, summary: _Summary) -> tuple[int, int] | None:
+    """Host times of the first and the last raw record. Raises RecordingError."""
+    raw = {i for i, topic in summary.channels.items() if topic == schema.RAW}
+    chunks = [chunk for chunk in summary.chunks if raw & set(chunk.message_index_offsets)]
+    times = list[int]()
+    for offset in dict.fromkeys(chunk.chunk_start_offset for chunk in chunks[:1] + chunks[-1:]):
+        for record in chunk_records(chunk_data(frame_at(stream, name, offset, size), name)):
+            if isinstance(record, Message) and record.channel_id in raw:
+                _, _, batch = decode_raw(record.data)
+                times += batch.time_ns.tolist()
+    return (min(times), max(times)) if times else None
