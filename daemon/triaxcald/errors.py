@@ -35,6 +35,11 @@ class StationError(DaemonError):
     exit_code = 4
 
 
+class TwoAnswer(StationError):
+    """Two units answer, or send, where there is to be one; the message says
+    where."""
+
+
 class DeviceInUse(StationError):
     """Another command works with the device, or with the serial port that it is
     on; the message says which."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,15 @@ class DecodedStream:
     def seconds(self) -> float:
         """From the first sample to the latest."""
         return 0.0 if self._last_ns is None or self._begin_ns is None else (self._last_ns - self._begin_ns) * 1e-9
+
+    def mark(self) -> tuple[Counter[str], tuple[Any, ...]]:
+        """What it has come to so far, for `back_to`."""
+        return self.counts.copy(), (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns)
+
+    def back_to(self, mark: tuple[Counter[str], tuple[Any, ...]]) -> None:
+        """As if nothing had come since. No more records may be fed."""
+        counts, (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns) = mark
+        self.counts = counts.copy()
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         """Takes raw records; gives the samples that they complete."""

@@ -40,6 +40,11 @@ DISK_IS_BEHIND = "records are lost: the disk does not keep up"
 DISK_KEEPS_UP = "the disk keeps up again"
 
 
+def unidentified(why: str) -> str:
+    """Of a unit that is asked again who it is."""
+    return f"does not say whether it is still the same unit, and is asked again later: {why}"
+
+
 def waits(trouble: str) -> str:
     """Of a unit or a bus that is lost for now."""
     return f"waiting: {trouble}"

@@ -70,7 +70,9 @@ class RawBatch:
     record; ``payload`` the records' bytes, one after the other (CAN data;
     Modbus register bytes as on the wire, most significant first). ``gap`` is
     what was lost just before the first record; a batch without records may
-    have one that is not over.
+    have one that is not over. ``unconfirmed``: that these records are the
+    unit's was never confirmed, and another unit answered later. A recording's
+    reader says so; a device does not know.
     """
 
     time_ns: NDArray[np.int64]
@@ -79,6 +81,7 @@ class RawBatch:
     length: NDArray[np.uint16]
     payload: bytes
     gap: Gap | None = None
+    unconfirmed: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.time_ns)
@@ -116,12 +119,13 @@ class RawBatch:
             self.length[piece],
             self.payload[int(ends[start]) : int(ends[stop])],
             self.gap if start == 0 else None,
+            self.unconfirmed,
         )
 
     @staticmethod
     def joined(batches: Sequence[RawBatch]) -> RawBatch:
         """One after the other as one. Their gaps are lost: the flags tell of
-        them."""
+        them. One that is ``unconfirmed`` makes the whole so."""
         if len(batches) == 1:
             return batches[0]
         return RawBatch(
@@ -130,6 +134,7 @@ class RawBatch:
             np.concatenate([b.flags for b in batches]),
             np.concatenate([b.length for b in batches]),
             b"".join(b.payload for b in batches),
+            unconfirmed=any(b.unconfirmed for b in batches),
         )
 
     @staticmethod

@@ -16,10 +16,10 @@ from triaxcald.certificate import Certified, certify
 from triaxcald.errors import DaemonError, RecordingError
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
 from triaxcald.outcome import Ending, Papers, Verdict, measured_in, outcome_document
-from triaxcald.pipeline import Pipeline
+from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.schema import STATION_FILE, RawDigest
+from triaxcald.recording.schema import STATION_FILE, UNCONFIRMED, RawDigest
 from triaxcald.report.unit import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.write_back import VERIFICATION_FILE
@@ -93,9 +93,14 @@ def compute(recording: Recording, raw: Digests) -> Again:
     tumble, check = ({s: Pipeline(bundle, s) for s in streams} for _ in range(2))
     previews = Previews(bundle.profile)
     phases: dict[str, dict[str, Pipeline]] = {CALIBRATION: tumble, VERIFICATION: check}
+    # Nothing is computed from unconfirmed records, but the station had drawn
+    # their previews before it knew, with a decoder that had seen all before.
+    drawn = {phase: {s: DecodedStream(bundle, s) for s in streams} for phase in phases}
+    any_unconfirmed = UNCONFIRMED in recording.metadata
     for phase, batch in recording.joined_batches():
         for stream, pipeline in phases.get(phase, {}).items():
-            previews.feed(stream, pipeline.feed(batch))
+            block = None if batch.unconfirmed else pipeline.feed(batch)
+            previews.feed(stream, drawn[phase][stream].feed(batch) if any_unconfirmed or block is None else block)
     certified, why_not = None, ""
     try:
         certified = _certified(recording, bundle, station, text, tumble[READINGS], raw.calibration)

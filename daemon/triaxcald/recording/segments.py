@@ -247,6 +247,13 @@ class SegmentedWriter(RecordingWriter):
             self._kept.append((time_ns, name, media_type, data))
         super()._write_attachment(time_ns, name, media_type, data)
 
+    def _write_unconfirmed(self, first: int, told: Mapping[str, str]) -> None:
+        """Also of segments that are closed already, in the manifest: the bytes
+        of their files stay as they are."""
+        super()._write_unconfirmed(first, told)
+        self._segments = self._segments.unconfirmed_from(first)
+        self._segments.save()
+
     def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:
         self._recorded = True
         if not self._file.digest.records:  # the age of a segment counts from here: before was silence
@@ -284,7 +291,9 @@ def _settled(manifest: Manifest) -> Manifest:
     with suppress(RecordingError):
         found = replace(found, sha256=digest_of(path))
     status = path.stat()
-    return manifest.with_last(replace(found, bytes=status.st_size, closed_ns=status.st_mtime_ns))
+    settled = manifest.with_last(replace(found, bytes=status.st_size, closed_ns=status.st_mtime_ns))
+    # Killed after the file said so, and before the manifest did.
+    return settled if found.unconfirmed is None else settled.unconfirmed_from(found.unconfirmed)
 
 
 def _as_it_lies(path: Path, segment: Segment) -> Segment:
@@ -297,7 +306,9 @@ def _as_it_lies(path: Path, segment: Segment) -> Segment:
                 span = [min([*span, int(batch.time_ns.min())]), max([*span, int(batch.time_ns.max())])]
         lost = sum(loss.records for loss in recording.losses() if loss.where == schema.RAW)
         state: State = "closed" if recording.finished else "cut_short"
+        unconfirmed = schema.unconfirmed_from(recording.metadata)
     return replace(
         segment, state=state, end=segment.first + digest.records + lost, records=digest.records,
         start_ns=span[0] if span else None, end_ns=span[1] if span else None, raw_sha256=digest.hexdigest(),
+        unconfirmed=unconfirmed,
     )  # fmt: skip

@@ -69,6 +69,15 @@ class Recorded(RawRecords):
     def _decoded(self, stream: str) -> DecodedStream:
         return DecodedStream(self.bundle, stream)
 
+    def mark(self) -> dict[str, Any]:
+        """What the streams have come to so far, for `back_to`."""
+        return {name: stream.mark() for name, stream in self.streams.items()}
+
+    def back_to(self, mark: dict[str, Any]) -> None:
+        """As if nothing had come since. No more records may come."""
+        for name, stream in self.streams.items():
+            stream.back_to(mark[name])
+
     async def records(self, device: Streaming, writer: RecordingWriter | None) -> AsyncGenerator[RawBatch]:
         """What comes off the bus, once it is on its way to disk and decoded.
 
