@@ -45,6 +45,13 @@ def unidentified(why: str) -> str:
     return f"does not say whether it is still the same unit, and is asked again later: {why}"
 
 
+def unconfirmed(records: int) -> str:
+    return (
+        f"{number_of(records, 'record')} not used, which came after the unit was last confirmed to be there; "
+        "another one answered later"
+    )
+
+
 def waits(trouble: str) -> str:
     """Of a unit or a bus that is lost for now."""
     return f"waiting: {trouble}"

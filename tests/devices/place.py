@@ -90,6 +90,11 @@ class Place:
         """From that request on another unit answers here."""
         self._swaps[request] = other
 
+    def swap(self, other: Electronics) -> None:
+        """From now on another unit answers here."""
+        with self.lock:
+            self.unit = other
+
     def exchange(
         self, now: float, carry_out: Callable[[Electronics], tuple[bytes, float]], refuse: Callable[[Refused], bytes]
     ) -> Exchange:

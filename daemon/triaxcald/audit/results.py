@@ -19,7 +19,7 @@ from triaxcald.outcome import Ending, Papers, Verdict, measured_in, outcome_docu
 from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.provision.state import DeviceState, Evidence, Held
 from triaxcald.recording.reader import Recording
-from triaxcald.recording.schema import STATION_FILE, UNCONFIRMED, RawDigest
+from triaxcald.recording.schema import STATION_FILE, RawDigest
 from triaxcald.report.unit import unit_report
 from triaxcald.run.endings import judged
 from triaxcald.run.write_back import VERIFICATION_FILE
@@ -96,11 +96,13 @@ def compute(recording: Recording, raw: Digests) -> Again:
     # Nothing is computed from unconfirmed records, but the station had drawn
     # their previews before it knew, with a decoder that had seen all before.
     drawn = {phase: {s: DecodedStream(bundle, s) for s in streams} for phase in phases}
-    any_unconfirmed = UNCONFIRMED in recording.metadata
     for phase, batch in recording.joined_batches():
         for stream, pipeline in phases.get(phase, {}).items():
-            block = None if batch.unconfirmed else pipeline.feed(batch)
-            previews.feed(stream, drawn[phase][stream].feed(batch) if any_unconfirmed or block is None else block)
+            blocks = [] if batch.unconfirmed else [pipeline.feed(batch)]
+            if recording.any_unconfirmed:
+                blocks = [drawn[phase][stream].feed(batch)]
+            for block in blocks:
+                previews.feed(stream, block)
     certified, why_not = None, ""
     try:
         certified = _certified(recording, bundle, station, text, tumble[READINGS], raw.calibration)

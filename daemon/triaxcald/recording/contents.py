@@ -45,6 +45,16 @@ class Contents(ABC):
         """Whether the raw records of the message that begins with this running
         index are the unit's for all that is known."""
 
+    @property
+    @abstractmethod
+    def any_unconfirmed(self) -> bool: ...
+
+    def unconfirmed_records(self) -> int:
+        """How many raw records are unconfirmed."""
+        if not self.any_unconfirmed:
+            return 0
+        return sum(len(batch) for _, batch in self.joined_batches() if batch.unconfirmed)
+
     @abstractmethod
     def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
         """Every message with its topic, undecoded, in the order of the file;

@@ -131,6 +131,10 @@ class Recording(Contents):
                     known = segment.unconfirmed if self._unconfirmed is None else self._unconfirmed
                     self._unconfirmed = min(known, segment.unconfirmed)
 
+    @property
+    def any_unconfirmed(self) -> bool:
+        return self._unconfirmed is not None
+
     def is_confirmed(self, first: int) -> bool:
         return self._unconfirmed is None or first < self._unconfirmed
 

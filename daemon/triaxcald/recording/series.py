@@ -54,6 +54,10 @@ class Series(Contents):
     def size(self) -> int:
         return sum(segment.bytes for segment in self.manifest.segments)
 
+    @property
+    def any_unconfirmed(self) -> bool:
+        return bool(self._unconfirmed)
+
     def is_confirmed(self, first: int) -> bool:
         return not any(first in indices for indices in self._unconfirmed)
 
