@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,13 @@ from tests.devices.bench import Bench, Transport
 from tests.devices.memory import Electronics, Silent
 from tests.devices.motion import Motion, Triple
 from tests.devices.profiles import Timing
+from triaxcald.audit import audit
 from triaxcald.recording.manifest import load_manifest
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import UNCONFIRMED
+from triaxcald.run.line import run_station
 from triaxcald.station import confirmation
+from triaxcald.station.config import load_station
 
 OURS_V, THEIRS_V = -2.4, -2.1
 OTHER_SERIAL = 888
@@ -174,3 +178,74 @@ def test_a_unit_that_does_not_say_who_it_is_while_it_streams_is_recorded(
     info = info_of(triaxcal, out)
     assert "unconfirmed" not in info["raw"]["calibration"]
     assert [e["kind"] for e in info["events"]] == ["recording_started", "identity_unanswered", "ended"]
+
+
+class Changing:
+    """In the place of the operator: another unit is put in at ``moment`` of the unit of that name."""
+
+    def __init__(self, unit: str, moment: Callable[[str, str, int], bool], change: Callable[[], None]) -> None:
+        self._unit, self._moment, self._change = unit, moment, change
+
+    def stage(self, unit: str, text: str) -> None:
+        self._at(unit, text, 0)
+
+    def lost(self, unit: str, trouble: str) -> None: ...
+
+    def poses(self, unit: str, phase: str, guide: Any) -> None:
+        self._at(unit, phase, guide.found)
+
+    def _at(self, unit: str, what: str, found: int) -> None:
+        if unit == self._unit and self._moment(unit, what, found):
+            self._change()
+
+
+MOMENTS: Mapping[str, Callable[[str, str, int], bool]] = {
+    "among the poses": lambda _, what, found: what == "calibration" and found >= 5,
+    "at the last pose": lambda _, what, found: what == "calibration" and found >= 12,
+    "while it is fitted": lambda _, what, found: what == "fitting",
+    "among the check poses": lambda _, what, found: what == "verification",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["modbus", "can"])
+@pytest.mark.parametrize("moment", MOMENTS)
+async def test_the_run_of_a_unit_that_was_exchanged_is_aborted_and_the_others_go_on(
+    workshop: Any, moment: str, kind: str, request: pytest.FixtureRequest
+) -> None:
+    quick = {"speed": 60.0, "fixture": {"poses": 12, "hold_s": 1.4, "move_s": 0.6}}
+    places = []
+    with ExitStack() as stack:
+        served = []
+        for i in range(2):
+            on_can = {"interface": "virtual", "channel": f"{request.node.name}-{i}", "node_id": 5}
+            device = {"profile": "triax-ref-can", "bus": on_can} if kind == "can" else {}
+            path = workshop.device(f"device{i}.toml", serial=777 + 111 * i, **device, **quick)
+            served.append(stack.enter_context(workshop.serve(path)))
+            places.append({"bus": served[i].bus, "profile": f"triax-ref-{kind}"})
+        plan = {"poses": 12, "hold_s": 0.6, "check_poses": 2, "comes_back_s": 0.5}
+        station = load_station(workshop.station(*places, plan=plan))
+        ours = served[0].unit.eeprom
+        told = Changing("unit0", MOMENTS[moment], lambda: setattr(served[0].unit, "serial_number", 999))
+        outcome, other = await run_station(station, told)
+    assert other.error is None
+    assert (outcome.exit_code, outcome.document["verdict"]) == (4, "aborted")
+    assert "0999" in str(outcome.error)
+    recording = outcome.recording
+    assert recording is not None
+    if moment == "among the check poses":
+        assert outcome.document["measured"] is not None, "its poses were confirmed before it was written"
+    else:
+        assert served[0].unit.eeprom == ours, "nothing was written"
+        assert outcome.document["device_state"] == "untouched"
+    with Recording.open(recording) as held:
+        phases = {phase for phase, batch in held.joined_batches() if batch.unconfirmed}
+        events = [e.kind for e in held.events()]
+    expected = {"among the poses": {"calibration"}, "among the check poses": {"verification"}}
+    if moment == "while it is fitted":
+        assert phases == set(), "the poses were the right unit's"
+    elif moment in expected:
+        assert phases == expected[moment]
+        assert outcome.certificate is None
+    assert (UNCONFIRMED in events) == bool(phases)
+    assert audit(recording).differences == ()
