@@ -58,6 +58,8 @@ class DecodedStream:
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
         self._host_span_ns: tuple[int, int] | None = None
+        self.two_senders = False
+        """Whether records of two units were among those that came."""
 
     @property
     def first_host_ns(self) -> int | None:
@@ -100,6 +102,7 @@ class DecodedStream:
             self._first_host_ns = int(batch.time_ns[0])
         self.counts["receiver_overflows"] += int(np.count_nonzero(batch.flags & RawFlag.LOST_BEFORE))
         block = only_finite(self._decoder.feed(batch))
+        self.two_senders = self.two_senders or block.two_senders
         for name in _PASSED_ON:
             self.counts[name] += getattr(block, name)
         for name in _SELDOM:
@@ -198,6 +201,8 @@ class Pipeline(DecodedStream):
     def data_quality(self) -> list[str]:
         """What the raw stream is to be blamed for, one line each."""
         found: dict[str, str] = {}
+        if self.two_senders:
+            found["two_senders"] = "two units send on this stream, and their samples are mixed"
         if self.counts["missing"] or self.counts["incomplete"]:
             lost = self.counts["missing"] + self.counts["incomplete"]
             found["missing_samples"] = f"{lost} of {self.counts['samples'] + lost}"

@@ -52,6 +52,13 @@ def unconfirmed(records: int) -> str:
     )
 
 
+def two_senders(where: str, stream: str) -> str:
+    return (
+        f"two units answer at {where}: stream {stream} has two senders, each with samples of its own; "
+        "disconnect one of them, or give it another address"
+    )
+
+
 def waits(trouble: str) -> str:
     """Of a unit or a bus that is lost for now."""
     return f"waiting: {trouble}"

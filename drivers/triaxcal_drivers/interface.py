@@ -164,7 +164,7 @@ class SampleBlock:
     as it is defined, samples that the device itself says are not valid, and
     those whose readings are no finite numbers, all three of which are dropped;
     restarts of the device that its counter or stamps show, and nothing else had
-    told.
+    told. ``two_senders``: the latest records are those of two units.
     """
 
     time_ns: NDArray[np.int64]
@@ -179,6 +179,7 @@ class SampleBlock:
     not_finite: int = 0
     restarts: int = 0
     malformed: int = 0
+    two_senders: bool = False
 
     def __len__(self) -> int:
         return len(self.time_ns)
