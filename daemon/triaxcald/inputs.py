@@ -28,6 +28,7 @@ from triaxcal_drivers.files import read_whole
 from triaxcal_drivers.loading import parse_bundle
 from triaxcal_drivers.nearest import clipped
 from triaxcal_drivers.profile import READINGS, Bundle, Profile
+from triaxcald import text
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.pipeline import DecodedStream, Pipeline, creeping, together
 from triaxcald.provision.identity import same_serial
@@ -216,8 +217,8 @@ def preview_channels(profile: Profile) -> list[str]:
 
 
 def losses_of(recording: Contents) -> list[str]:
-    """What did not get into the recording, or was lost from it since, one line
-    each."""
+    """What did not get into the recording, was lost from it since, or is not used,
+    one line each."""
     lost = sum(loss.records for loss in recording.losses())
     found = [f"missing_samples: {_were(lost)} lost between bus and disk"] if lost else []
     mended = recording.metadata.get(RECOVERY_RECORD, {})
@@ -225,6 +226,8 @@ def losses_of(recording: Contents) -> list[str]:
     missing = sum(int(count) for count in counts if count.isdecimal())
     if missing:
         found.append(f"missing_samples: {_were(missing)} lost when the recording was damaged")
+    if unconfirmed := recording.unconfirmed_records():
+        found.append(f"unconfirmed_records: {text.unconfirmed(unconfirmed)}")
     return found
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,8 @@ class DecodedStream:
         self._begin_ns: int | None = None
         self._first_host_ns: int | None = None
         self._host_span_ns: tuple[int, int] | None = None
+        self.two_senders = False
+        """Whether records of two units were among those that came."""
 
     @property
     def first_host_ns(self) -> int | None:
@@ -75,6 +78,15 @@ class DecodedStream:
         """From the first sample to the latest."""
         return 0.0 if self._last_ns is None or self._begin_ns is None else (self._last_ns - self._begin_ns) * 1e-9
 
+    def mark(self) -> tuple[Counter[str], tuple[Any, ...]]:
+        """What it has come to so far, for `back_to`."""
+        return self.counts.copy(), (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns)
+
+    def back_to(self, mark: tuple[Counter[str], tuple[Any, ...]]) -> None:
+        """As if nothing had come since. No more records may be fed."""
+        counts, (self._last_ns, self._begin_ns, self._first_host_ns, self._host_span_ns) = mark
+        self.counts = counts.copy()
+
     def feed(self, batch: RawBatch) -> SampleBlock:
         """Takes raw records; gives the samples that they complete."""
         return self._decoded(batch)[0]
@@ -90,6 +102,7 @@ class DecodedStream:
             self._first_host_ns = int(batch.time_ns[0])
         self.counts["receiver_overflows"] += int(np.count_nonzero(batch.flags & RawFlag.LOST_BEFORE))
         block = only_finite(self._decoder.feed(batch))
+        self.two_senders = self.two_senders or block.two_senders
         for name in _PASSED_ON:
             self.counts[name] += getattr(block, name)
         for name in _SELDOM:
@@ -188,6 +201,8 @@ class Pipeline(DecodedStream):
     def data_quality(self) -> list[str]:
         """What the raw stream is to be blamed for, one line each."""
         found: dict[str, str] = {}
+        if self.two_senders:
+            found["two_senders"] = "two units send on this stream, and their samples are mixed"
         if self.counts["missing"] or self.counts["incomplete"]:
             lost = self.counts["missing"] + self.counts["incomplete"]
             found["missing_samples"] = f"{lost} of {self.counts['samples'] + lost}"

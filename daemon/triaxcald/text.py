@@ -40,6 +40,25 @@ DISK_IS_BEHIND = "records are lost: the disk does not keep up"
 DISK_KEEPS_UP = "the disk keeps up again"
 
 
+def unidentified(why: str) -> str:
+    """Of a unit that is asked again who it is."""
+    return f"does not say whether it is still the same unit, and is asked again later: {why}"
+
+
+def unconfirmed(records: int) -> str:
+    return (
+        f"{number_of(records, 'record')} not used, which came after the unit was last confirmed to be there; "
+        "another one answered later"
+    )
+
+
+def two_senders(where: str, stream: str) -> str:
+    return (
+        f"two units answer at {where}: stream {stream} has two senders, each with samples of its own; "
+        "disconnect one of them, or give it another address"
+    )
+
+
 def waits(trouble: str) -> str:
     """Of a unit or a bus that is lost for now."""
     return f"waiting: {trouble}"

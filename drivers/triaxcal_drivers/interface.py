@@ -71,7 +71,9 @@ class RawBatch:
     record; ``payload`` the records' bytes, one after the other (CAN data;
     Modbus register bytes as on the wire, most significant first). ``gap`` is
     what was lost just before the first record; a batch without records may
-    have one that is not over.
+    have one that is not over. ``unconfirmed``: that these records are the
+    unit's was never confirmed, and another unit answered later. A recording's
+    reader says so; a device does not know.
     """
 
     time_ns: NDArray[np.int64]
@@ -80,6 +82,7 @@ class RawBatch:
     length: NDArray[np.uint16]
     payload: bytes
     gap: Gap | None = None
+    unconfirmed: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.time_ns)
@@ -117,12 +120,13 @@ class RawBatch:
             self.length[piece],
             self.payload[int(ends[start]) : int(ends[stop])],
             self.gap if start == 0 else None,
+            self.unconfirmed,
         )
 
     @staticmethod
     def joined(batches: Sequence[RawBatch]) -> RawBatch:
         """One after the other as one. Their gaps are lost: the flags tell of
-        them."""
+        them. One that is ``unconfirmed`` makes the whole so."""
         if len(batches) == 1:
             return batches[0]
         return RawBatch(
@@ -131,6 +135,7 @@ class RawBatch:
             np.concatenate([b.flags for b in batches]),
             np.concatenate([b.length for b in batches]),
             b"".join(b.payload for b in batches),
+            unconfirmed=any(b.unconfirmed for b in batches),
         )
 
     @staticmethod
@@ -160,7 +165,7 @@ class SampleBlock:
     as it is defined, samples that the device itself says are not valid, and
     those whose readings are no finite numbers, all three of which are dropped;
     restarts of the device that its counter or stamps show, and nothing else had
-    told.
+    told. ``two_senders``: the latest records are those of two units.
     """
 
     time_ns: NDArray[np.int64]
@@ -175,6 +180,7 @@ class SampleBlock:
     not_finite: int = 0
     restarts: int = 0
     malformed: int = 0
+    two_senders: bool = False
 
     def __len__(self) -> int:
         return len(self.time_ns)

@@ -24,7 +24,8 @@ _MOST = 2**19 - 1
 
 class CanopenNode(Serving):
     """``motion`` is sent ``rate_hz`` times a second while the node is operational: one frame of readings, one of
-    corrected samples, each x, y, z of 20 bits and a counter of 4, least significant first."""
+    corrected samples, each x, y, z of 20 bits and a counter of 4, least significant first. ``announces``: a unit that
+    takes the place of another boots and says so; otherwise it goes on where that one was, as behind a gateway."""
 
     def __init__(
         self,
@@ -37,6 +38,7 @@ class CanopenNode(Serving):
         motion: Motion | None = None,
         rate_hz: float = 50.0,
         heartbeat_s: float = 0.0,
+        announces: bool = True,
     ) -> None:
         super().__init__()
         self.sdo = sdo
@@ -44,6 +46,7 @@ class CanopenNode(Serving):
         self.motion = motion
         self.rate_hz = rate_hz
         self.heartbeat_s = heartbeat_s
+        self.announces = announces
         self.state = BOOT_UP
         self._where = (interface, channel or f"node-{uuid.uuid4()}", dict(options or {}))
         self._started: tuple[int, int] | None = None
@@ -92,6 +95,8 @@ class CanopenNode(Serving):
         place = self.sdo.place
         with place.lock:
             up, start = place.unit.up(self.now()), (id(place.unit), place.unit.restarts)
+        if self._started is not None and start[0] != self._started[0] and not self.announces:
+            self._started = start
         if start != self._started:
             self.state = BOOT_UP
         if up and self.state == BOOT_UP:

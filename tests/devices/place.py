@@ -99,6 +99,11 @@ class Place:
         self._seconds[request] = other
         self.second_after_s = after_s
 
+    def swap(self, other: Electronics) -> None:
+        """From now on another unit answers here."""
+        with self.lock:
+            self.unit = other
+
     def exchange(
         self, now: float, carry_out: Callable[[Electronics], tuple[bytes, float]], refuse: Callable[[Refused], bytes]
     ) -> Exchange:

@@ -17,7 +17,7 @@ from triaxcald.errors import DaemonError, RecordingError
 from triaxcald.exit_codes import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
 from triaxcald.outcome import Code, Ending, Papers, Verdict, measured_in, outcome_document
-from triaxcald.pipeline import Pipeline
+from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import STATION_FILE, RawDigest
@@ -94,9 +94,16 @@ def compute(recording: Recording, raw: Digests) -> Again:
     tumble, check = ({s: Pipeline(bundle, s) for s in streams} for _ in range(2))
     previews = Previews(bundle.profile)
     phases: dict[str, dict[str, Pipeline]] = {CALIBRATION: tumble, VERIFICATION: check}
+    # Nothing is computed from unconfirmed records, but the station had drawn
+    # their previews before it knew, with a decoder that had seen all before.
+    drawn = {phase: {s: DecodedStream(bundle, s) for s in streams} for phase in phases}
     for phase, batch in recording.joined_batches():
         for stream, pipeline in phases.get(phase, {}).items():
-            previews.feed(stream, pipeline.feed(batch))
+            blocks = [] if batch.unconfirmed else [pipeline.feed(batch)]
+            if recording.any_unconfirmed:
+                blocks = [drawn[phase][stream].feed(batch)]
+            for block in blocks:
+                previews.feed(stream, block)
     certified, why_not = None, ""
     try:
         certified = _certified(recording, bundle, station, text, tumble[READINGS], raw.calibration)

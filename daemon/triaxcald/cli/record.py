@@ -268,6 +268,7 @@ def _ended(kept: Kept, progress: Bars | JsonLines) -> None:
         asked_to = kept.error is None or kept.exit_code == INTERRUPTED
         level = "error" if not asked_to else "warning" if kept.lost else "info"
         told = {"message": kept.error, **_traced(kept.trace), **counts, "lost": kept.lost}
+        told |= {"unconfirmed": kept.unconfirmed} if kept.unconfirmed else {}
         progress.say(level, "ended", unit=kept.unit, kind=kept.kind, recording=path, **told)
         return
     if kept.path is not None:
@@ -288,6 +289,8 @@ def _summary(kept: Kept) -> str:
         parts += beside_samples({kind: n for kind, n in kept.counts.items() if kind != "receiver_overflows"})
     if kept.gaps:
         parts.append(f"{number_of(kept.gaps, 'gap')} of {kept.gaps_s:.1f} s in all")
+    if kept.unconfirmed:
+        parts.append(f"{number_of(kept.unconfirmed, 'record')} unconfirmed")
     if kept.lost:
         parts.append(f"{number_of(kept.lost, 'record')} lost between bus and disk")
     return ", ".join(parts)

@@ -106,7 +106,7 @@ def _rows(recording: Contents, stream: DecodedStream, phase: str) -> Iterator[Ro
     phases = recording.phases()
     if phase not in phases:
         raise InputError(f"--phase {phase}: {recording.name} has {', '.join(phases) or 'no raw records of any phase'}")
-    counted = beside_samples(stream.counts)
+    counted = [*beside_samples(stream.counts), *losses_of(recording)]
     why = f" ({', '.join(counted)})" if counted else ""
     raise InputError(
         f"--stream {stream.stream}: {recording.name} has no sample of it in its phase {phase}{why}; samples:"

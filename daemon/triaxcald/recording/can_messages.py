@@ -84,11 +84,13 @@ def _batch_of(
 
 def messages_of(recording: Contents) -> Iterator[can.Message]:
     """The frames of a bus, or of a unit on CAN, channel by channel in the order
-    in which they came, channels among each other by their times. Raises
-    RecordingError."""
+    in which they came, channels among each other by their times; none that is
+    unconfirmed. Raises RecordingError."""
     _require_can(recording)
     together: dict[str, RawBatch] = {}
     for phase, batch in recording.raw_batches():
+        if batch.unconfirmed:
+            continue
         if phase in together:
             yield from _merged(together)
             together = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from types import TracebackType
 from typing import NamedTuple, Self, TypeVar
@@ -40,6 +41,21 @@ class Contents(ABC):
     attachments: Mapping[str, bytes]
 
     @abstractmethod
+    def is_confirmed(self, first: int) -> bool:
+        """Whether the raw records of the message that begins with this running
+        index are the unit's for all that is known."""
+
+    @property
+    @abstractmethod
+    def any_unconfirmed(self) -> bool: ...
+
+    def unconfirmed_records(self) -> int:
+        """How many raw records are unconfirmed."""
+        if not self.any_unconfirmed:
+            return 0
+        return sum(len(batch) for _, batch in self.joined_batches() if batch.unconfirmed)
+
+    @abstractmethod
     def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
         """Every message with its topic, undecoded, in the order of the file;
         those of one ``topic`` where it is given."""
@@ -61,24 +77,27 @@ class Contents(ABC):
 
     def raw(self, phase: str) -> Iterator[RawBatch]:
         """The phase's raw records in the order in which they came, some
-        `JOINED` at a time: a live bus hands out few."""
-        return (batch for _, batch in self._raw(phase.encode()))
+        `JOINED` at a time: a live bus hands out few. Without those that are
+        unconfirmed: nothing is computed from them."""
+        return (batch for _, batch in self._raw(phase.encode()) if not batch.unconfirmed)
 
     def joined_batches(self) -> Iterator[tuple[str, RawBatch]]:
-        """All raw records with their phase, likewise."""
+        """All raw records with their phase, likewise, but also those that are
+        unconfirmed; the batch says so."""
         return self._raw()
 
     def raw_batches(self) -> Iterator[tuple[str, RawBatch]]:
         """The same in the batches in which they were recorded, of which the
         phases take turns."""
-        return ((phase, batch) for _, phase, batch in self._decoded(schema.RAW, decode_raw))
+        for first, phase, batch in self._decoded(schema.RAW, decode_raw):
+            yield phase, batch if self.is_confirmed(first) else replace(batch, unconfirmed=True)
 
     def _raw(self, phase: bytes | None = None) -> Iterator[tuple[str, RawBatch]]:
         waiting, records, size = list[tuple[int, Fields]](), 0, 0
         for message, fields in self._read(schema.RAW, fields_of):
             if phase is not None and fields.phase != phase:
                 continue
-            if waiting and fields.phase != waiting[0][1].phase:
+            if waiting and not self._belong_together(waiting[0][1], fields):
                 yield self._joined(waiting)
                 waiting, records, size = [], 0, 0
             waiting.append((message.log_time, fields))
@@ -89,13 +108,17 @@ class Contents(ABC):
         if waiting:
             yield self._joined(waiting)
 
+    def _belong_together(self, one: Fields, other: Fields) -> bool:
+        return one.phase == other.phase and self.is_confirmed(one.first) == self.is_confirmed(other.first)
+
     def _joined(self, waiting: Sequence[tuple[int, Fields]]) -> tuple[str, RawBatch]:
-        """Of messages of one phase. Raises RecordingError, which names the
-        message at fault."""
+        """Of messages of one phase that are all confirmed, or none of them.
+        Raises RecordingError, which names the message at fault."""
         time_ns, first = waiting[0]
         phase = self._decode(schema.RAW, time_ns, first.phase.decode)
         try:
-            return phase, batch_of([fields for _, fields in waiting])
+            batch = batch_of([fields for _, fields in waiting])
+            return phase, batch if self.is_confirmed(first.first) else replace(batch, unconfirmed=True)
         except ValueError:
             for time_ns, fields in waiting:
                 self._decode(schema.RAW, time_ns, partial(batch_of, [fields]))

@@ -6,7 +6,7 @@ import asyncio
 from typing import Literal
 
 from triaxcal_drivers.errors import DriverError
-from triaxcald.errors import DiskError, ProvisionError
+from triaxcald.errors import DiskError, ProvisionError, TwoAnswer
 
 ENDED = "ended"
 EndedBecause = Literal["asked", "signal", "disk", "unit gave up", "bus gave up", "failed"]
@@ -23,7 +23,7 @@ def ended_because(error: BaseException | None, of: Kind = "unit") -> EndedBecaus
             return "disk"
         case asyncio.CancelledError() | KeyboardInterrupt():
             return "signal"
-        case DriverError() | ProvisionError():
+        case DriverError() | ProvisionError() | TwoAnswer():
             return "unit gave up" if of == "unit" else "bus gave up"
         case _:
             return "failed"

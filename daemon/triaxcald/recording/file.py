@@ -113,6 +113,11 @@ class RecordingFile:
             self.raw_end = max(self.raw_end, value.first + value.records)
         self._add(topic, value.time_ns, schema.encode(value))
 
+    def metadata(self, name: str, record: Mapping[str, str]) -> None:
+        self.inventory.metadata(name, record)
+        self._mcap.add_metadata(name, dict(record))
+        self.flush()
+
     def attach(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
         self.inventory.attachment(name, media_type, time_ns, data)
         self._mcap.add_attachment(time_ns, time_ns, name, media_type, data)

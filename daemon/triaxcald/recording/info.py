@@ -92,7 +92,7 @@ def _topics(recording: Contents) -> dict[str, dict[str, int]]:
 
 def _phases(recording: Contents) -> dict[str, dict[str, Any]]:
     """Of each phase: records, their bytes, and the time from the first to the
-    last."""
+    last; how many records are unconfirmed, where any are."""
     phases: dict[str, dict[str, Any]] = {}
     for phase, batch in recording.joined_batches():
         if not len(batch):
@@ -101,6 +101,8 @@ def _phases(recording: Contents) -> dict[str, dict[str, Any]]:
         entry = phases.setdefault(phase, {"records": 0, "bytes": 0, "start_ns": first_ns, "end_ns": last_ns})
         entry["records"] += len(batch)
         entry["bytes"] += len(batch.payload)
+        if batch.unconfirmed:
+            entry["unconfirmed"] = entry.get("unconfirmed", 0) + len(batch)
         entry["start_ns"] = min(entry["start_ns"], first_ns)
         entry["end_ns"] = max(entry["end_ns"], last_ns)
         entry["duration_s"] = (entry["end_ns"] - entry["start_ns"]) / 1e9

@@ -35,7 +35,8 @@ class Segment:
     ``raw_sha256`` is the digest of its raw records. ``open``: it is being
     written, or was when the power failed; ``cut_short``: it was not
     finished; ``damaged``: nor can it be read, so that nobody knows how many
-    records are in it."""
+    records are in it. From the running index ``unconfirmed`` on, its records
+    are unconfirmed; None where none is."""
 
     file: str
     number: int
@@ -49,6 +50,7 @@ class Segment:
     bytes: int = 0
     sha256: str = ""
     raw_sha256: str = ""
+    unconfirmed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,15 @@ class Manifest:
         else behind it."""
         known = self.segments[:-1] if self.segments and self.segments[-1].number == segment.number else self.segments
         return replace(self, segments=(*known, segment))
+
+    def unconfirmed_from(self, first: int) -> Manifest:
+        """All records from the running index ``first`` on are unconfirmed, in
+        whichever segment they are."""
+        marked = [
+            replace(s, unconfirmed=max(first, s.first)) if s.state == "open" or s.end > first else s
+            for s in self.segments
+        ]
+        return replace(self, segments=tuple(marked))
 
     def without(self, taken: list[tuple[Segment, str]]) -> Manifest:
         """Of which some were deleted, each for a reason."""

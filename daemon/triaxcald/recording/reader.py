@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -32,6 +33,7 @@ from triaxcald.recording.frames import (
     walk,
     written_to,
 )
+from triaxcald.recording.manifest import is_manifest, load_manifest
 
 METADATA_MOST = 2**20  # bytes; ours has some hundred
 ATTACHMENTS_MOST = 1000  # a run leaves a dozen
@@ -85,6 +87,7 @@ class Recording(Contents):
         the channels that it declares."""
         self._topics: dict[int, str] = {}
         self._said = 0  # bytes of metadata
+        self._unconfirmed: int | None = None  # the running index from which on raw records are so
         self.size = size_of(stream)
         if not self.size:
             raise RecordingError(f"{name}: the file is empty; nothing was recorded")
@@ -99,6 +102,7 @@ class Recording(Contents):
         found = self.metadata.get(schema.FORMAT_RECORD, {}).get("format")
         if found != schema.FORMAT:
             raise RecordingError(f"{name}: recording format {found!r}, expected '{schema.FORMAT}'")
+        self._unconfirmed = schema.unconfirmed_from(self.metadata)
 
     @classmethod
     def open(cls, path: Path, *, unfinished: bool = False) -> Recording:
@@ -107,10 +111,32 @@ class Recording(Contents):
         except OSError as e:
             raise RecordingError(f"{path}: cannot be read: {e.strerror}") from e
         try:
-            return cls(stream, str(path), unfinished=unfinished)
+            recording = cls(stream, str(path), unfinished=unfinished)
         except BaseException:
             stream.close()
             raise
+        recording._heed_manifest(path)
+        return recording
+
+    def _heed_manifest(self, path: Path) -> None:
+        """Of a segment that was closed before another unit was noticed, the
+        manifest beside it says which records are unconfirmed."""
+        own = self.metadata.get(schema.SEGMENT_RECORD, {})
+        of = own.get("of", "")
+        if not is_manifest(of) or Path(of).name != of:
+            return
+        with suppress(RecordingError):  # a segment can be read alone
+            for segment in load_manifest(path.with_name(of)).segments:  # by number: a mended file has another name
+                if str(segment.number) == own.get("number") and segment.unconfirmed is not None:
+                    known = segment.unconfirmed if self._unconfirmed is None else self._unconfirmed
+                    self._unconfirmed = min(known, segment.unconfirmed)
+
+    @property
+    def any_unconfirmed(self) -> bool:
+        return self._unconfirmed is not None
+
+    def is_confirmed(self, first: int) -> bool:
+        return self._unconfirmed is None or first < self._unconfirmed
 
     def close(self) -> None:
         self._stream.close()

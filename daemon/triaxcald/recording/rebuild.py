@@ -100,7 +100,23 @@ def settled(manifest: Manifest) -> Manifest:
         with suppress(FileNotFoundError):
             path.unlink()
         return replace(manifest, segments=manifest.segments[:-1])
-    return manifest.with_last(_with_digest(path, _on_disk(path, last)))
+    found = _with_digest(path, _on_disk(path, last))
+    # Killed after the file said so, and before the manifest did.
+    return replace(manifest, segments=_with_unconfirmed(manifest.with_last(found).segments))
+
+
+def _with_unconfirmed(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
+    """A file says from which running index on records are unconfirmed, up to
+    its own end; the index may lie in an earlier segment."""
+    found = list(segments)
+    for at, segment in enumerate(segments):
+        if (first := segment.unconfirmed) is None:
+            continue
+        for i, earlier in enumerate(found[: at + 1]):
+            if earlier.end > first:
+                starts = [max(first, earlier.first), *([] if earlier.unconfirmed is None else [earlier.unconfirmed])]
+                found[i] = replace(earlier, unconfirmed=min(starts))
+    return tuple(found)
 
 
 # Which files belong to it
@@ -117,7 +133,7 @@ def _from_files(path: Path, *, reading: bool = True) -> Manifest:
             raise
         found = []
     missing = found[-1].number - len(found) if found else 0
-    return Manifest(path, tuple(found), {"unknown": missing} if missing > 0 else {})
+    return Manifest(path, _with_unconfirmed(tuple(found)), {"unknown": missing} if missing > 0 else {})
 
 
 def _reconciled(manifest: Manifest) -> tuple[Manifest, str]:
@@ -142,7 +158,7 @@ def _reconciled(manifest: Manifest) -> tuple[Manifest, str]:
     for segment in unsettled:
         file = manifest.path_of(segment)
         kept[kept.index(segment)] = _with_digest(file, _on_disk(file, segment))
-    merged = tuple(sorted([*kept, *added], key=lambda s: s.number))
+    merged = _with_unconfirmed(tuple(sorted([*kept, *added], key=lambda s: s.number)))
     wrong = [
         f"{what} {', '.join(s.file for s in some[:3])}{f' and {len(some) - 3} more' if len(some) > 3 else ''}"
         for what, some in (("lists missing", missing), ("does not list", added), ("lists as open", unsettled))
@@ -223,9 +239,11 @@ def _by_records(path: Path, segment: Segment) -> Segment:
                 span = [min([*span, int(batch.time_ns.min())]), max([*span, int(batch.time_ns.max())])]
         lost = sum(loss.records for loss in recording.losses() if loss.where == schema.RAW)
         state: State = "closed" if recording.finished else "cut_short"
+        unconfirmed = schema.unconfirmed_from(recording.metadata)
     return replace(
         segment, state=state, end=segment.first + digest.records + lost, records=digest.records,
         start_ns=span[0] if span else None, end_ns=span[1] if span else None, raw_sha256=digest.hexdigest(),
+        unconfirmed=unconfirmed,
     )  # fmt: skip
 
 
@@ -266,7 +284,7 @@ def _by_summary(path: Path, segment: Segment) -> Segment | None:
         with open_file(path) as stream:
             name, size = str(path), size_of(stream)
             summary = _summary(stream, name, size)
-            if summary is None or schema.RAW_RECORD not in summary.metadata:
+            if summary is None or schema.RAW_RECORD not in summary.metadata or schema.UNCONFIRMED in summary.metadata:
                 return None
             record = parse(frame_at(stream, name, summary.metadata[schema.RAW_RECORD], size), name)
             counts = {summary.channels.get(i): n for i, n in summary.statistics.channel_message_counts.items()}

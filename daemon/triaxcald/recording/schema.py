@@ -32,6 +32,7 @@ IMPORTED = "imported"  # the kind of the event that says of which log a recordin
 RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
 BUS_RECORD = "bus"  # the metadata record that takes the place of `unit` where all frames of a bus were recorded
 SEGMENT_RECORD = "segment"  # the metadata record that says which part of a longer recording this is
+UNCONFIRMED = "unconfirmed"  # the metadata record, and event, that says which records are of nobody known
 STATION_FILE = "station.toml"  # the attachment with the station file
 PROFILE = "triaxcal"  # in the header of the MCAP file
 
@@ -272,6 +273,14 @@ def first_index(metadata: Mapping[str, Mapping[str, str]]) -> int:
     where the one before it ended."""
     told = metadata.get(SEGMENT_RECORD, {}).get("first", "")
     return int(told) if told.isdecimal() and len(told) < _U64_DIGITS else 0
+
+
+def unconfirmed_from(metadata: Mapping[str, Mapping[str, str]]) -> int | None:
+    """The running index of the first raw record that is unconfirmed, of this
+    file or of an earlier segment; None where all are confirmed. All records
+    from there to the end of the file are unconfirmed."""
+    told = metadata.get(UNCONFIRMED, {}).get("first", "")
+    return int(told) if told.isdecimal() and len(told) < _U64_DIGITS else None
 
 
 class PreviewEncoder:

@@ -248,6 +248,13 @@ class SegmentedWriter(RecordingWriter):
             self._kept.append((time_ns, name, media_type, data))
         super()._write_attachment(time_ns, name, media_type, data)
 
+    def _write_unconfirmed(self, first: int, told: Mapping[str, str]) -> None:
+        """Also of segments that are closed already, in the manifest: the bytes
+        of their files stay as they are."""
+        super()._write_unconfirmed(first, told)
+        self._segments = self._segments.unconfirmed_from(first)
+        self._segments.save()
+
     def _write_raw(self, phase: str, first: int, batch: RawBatch) -> None:
         self._recorded = True
         if not self._file.digest.records:  # the age of a segment counts from here: before was silence

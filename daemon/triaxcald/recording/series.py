@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,6 +37,11 @@ class Series(Contents):
             raise RecordingError(f"{path}: no segment is left of this recording")
         for segment in self.manifest.segments:
             self._require_there(segment)
+        self._unconfirmed = [
+            range(s.unconfirmed, s.end if s.state != "open" else sys.maxsize)
+            for s in self.manifest.segments
+            if s.unconfirmed is not None
+        ]
         self._first = self._opened(self.manifest.segments[0])
         own = (schema.SEGMENT_RECORD, schema.RAW_RECORD)
         self.metadata = {name: record for name, record in self._first.metadata.items() if name not in own}
@@ -47,6 +53,13 @@ class Series(Contents):
     @property
     def size(self) -> int:
         return sum(segment.bytes for segment in self.manifest.segments)
+
+    @property
+    def any_unconfirmed(self) -> bool:
+        return bool(self._unconfirmed)
+
+    def is_confirmed(self, first: int) -> bool:
+        return not any(first in indices for indices in self._unconfirmed)
 
     def messages(self, topic: str | None = None) -> Iterator[TopicMessage]:
         yield from self._first.messages(topic)

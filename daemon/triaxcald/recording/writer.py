@@ -161,6 +161,21 @@ class RecordingWriter:
         event = schema.Event(self._clock_ns(), kind, json.dumps(dict(detail or {}), sort_keys=True))
         self._jobs.put(partial(self._write, schema.EVENTS, event))
 
+    @property
+    def offered(self) -> int:
+        """The running index after the last raw record that was given to it."""
+        return self._offered
+
+    def unconfirmed(self, first: int, detail: Mapping[str, Any]) -> None:
+        """All raw records from the running index ``first`` on are unconfirmed:
+        another unit than the one that is recorded answered later. Said by a
+        metadata record, which a reader finds without unpacking the messages,
+        and by an event with ``detail``. No raw record may follow."""
+        self.check()
+        told = {"first": str(first), "end": str(self._offered)}
+        self._jobs.put(partial(self._write_unconfirmed, first, told))
+        self.event(schema.UNCONFIRMED, {**detail, "first": first, "records": self._offered - first})
+
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         self.check()
         if name in self._attached:
@@ -355,6 +370,9 @@ class RecordingWriter:
 
     def _write(self, topic: str, value: schema.RegisterAccess | schema.Event | schema.Loss) -> None:
         self._file.write(topic, value)
+
+    def _write_unconfirmed(self, first: int, told: Mapping[str, str]) -> None:
+        self._file.metadata(schema.UNCONFIRMED, told)
 
     def _write_attachment(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
         self._file.attach(time_ns, name, media_type, data)

@@ -54,6 +54,7 @@ from triaxcald.run.write_back import WriteBack, corrected
 from triaxcald.station.collection import Collection, Progress
 from triaxcald.station.coming_back import AtWork, Patience, Streaming
 from triaxcald.station.config import Place, Station
+from triaxcald.station.confirmation import Confirmation
 from triaxcald.station.serials import SerialsSeen
 from triaxcald.verification import Verification, fitted_attitudes
 
@@ -114,6 +115,7 @@ class UnitRun(UnitSession):
         self._papers: dict[str, str] = {}
         self._paths: dict[str, Path] = {}
         self._tumble: Collection | None = None
+        self._confirmation: Confirmation | None = None
         self._certified: Certified | None = None
         self._write_back: WriteBack | None = None
         self._document: Document | None = None
@@ -154,6 +156,8 @@ class UnitRun(UnitSession):
         try:
             return await self._line(device, identity, writer)
         except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - likewise: the recording is to be sealed
+            if self._confirmation is not None and self._confirmation.unconfirmed:
+                self._certified = None  # it rests on records that may be another unit's
             ending = aborted(e, self._provisioning)
             with suppress(RecordingError):
                 writer.event("failed", {"error": ending.reason})
@@ -287,8 +291,11 @@ class UnitRun(UnitSession):
         plan = self.station.file.plan
         tumble = Collection(CALIBRATION, self.place.bundle, self.place.address, ends_with=writer.ends_with)
         self._tumble = tumble
-        returning = self.returning(device, identity, Patience(plan.comes_back_s, others=self.others))
-        await self._collect(returning, writer, tumble, READINGS, plan.poses)
+        self._confirmation = self.confirmation(device, identity, writer, tumble)
+        patience = Patience(plan.comes_back_s, others=self.others)
+        returning = self.returning(device, identity, patience, confirmation=self._confirmation)
+        async with self._confirmation.phase():
+            await self._collect(returning, writer, tumble, READINGS, plan.poses)
         self.progress.stage(self.name, "fitting")
         poses = tumble.pipelines[READINGS].finish()
         certified = self._certified = await asyncio.to_thread(self._certify, tumble, poses, identity)
@@ -316,10 +323,16 @@ class UnitRun(UnitSession):
             self.progress.stage(self.name, "verifying by physics")
             fitted = fitted_attitudes(tumble.pipelines[READINGS], self.place.signs)
             plan = self.station.file.plan
-            returning = self.returning(device, identity, Patience(plan.comes_back_s, others=self.others))
-            await self._collect(returning, writer, check, CORRECTED, plan.check_poses, fitted)
+            confirmation = self.confirmation(device, identity, writer, check)
+            patience = Patience(plan.comes_back_s, others=self.others)
+            returning = self.returning(device, identity, patience, confirmation=confirmation)
+            async with confirmation.phase():
+                await confirmation.ask()
+                await self._collect(returning, writer, check, CORRECTED, plan.check_poses, fitted)
 
-        self.progress.stage(self.name, "writing the registers")
+        assert self._confirmation is not None
+        async with self._confirmation.phase():  # the unit may have been silent when the poses ended
+            self.progress.stage(self.name, "writing the registers")
         self._write_back = WriteBack(
             self.place,
             self.station,
@@ -369,11 +382,14 @@ class UnitRun(UnitSession):
         """Records nothing and writes nothing: only asks the device, in check
         poses, for its own corrected output."""
         async with self.place.opened() as device:
-            there = self.returning(device, await self.identify(device), Patience(most_s=0.0))
+            identity = await self.identify(device)
             self.progress.stage(self.name, "check poses")
             check = Collection(VERIFICATION, self.place.bundle, self.place.address)
+            confirmation = self.confirmation(device, identity, None, check)
+            there = self.returning(device, identity, Patience(most_s=0.0), confirmation=confirmation)
             wanted = self.station.file.plan.check_poses
-            await self._collect(there, None, check, CORRECTED, wanted)
+            async with confirmation.phase():
+                await self._collect(there, None, check, CORRECTED, wanted)
             return corrected(check, self.station.file.reference)
 
     def _report(self, certified: Certified, pipeline: Pipeline, ending: Ending) -> str:

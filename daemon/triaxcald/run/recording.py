@@ -16,6 +16,7 @@ from triaxcal_drivers.claim import Claim
 from triaxcald import text
 from triaxcald.errors import RecordingError
 from triaxcald.exit_codes import DEVICE, DONE, exit_code_of
+from triaxcald.provision.identity import WrongUnit
 from triaxcald.recording.ending import Kind, ended_because
 from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import LOOK_S, RecordingWriter
@@ -33,8 +34,9 @@ class Kept:
     the unit's readings, which span ``seconds`` of the unit's own time and
     ``host_seconds`` of the host's, or of the bus's frames; in ``gaps`` gaps it
     was lost for ``gaps_s``, and ``lost`` raw records did not get to the disk.
-    ``error`` is one line where it failed, and ``trace`` says where in this
-    program, where the fault is its own."""
+    ``unconfirmed`` raw records came after the unit was last confirmed to be
+    there, and are in no count but that. ``error`` is one line where it failed,
+    and ``trace`` says where in this program, where the fault is its own."""
 
     unit: str
     path: Path | None
@@ -48,6 +50,7 @@ class Kept:
     kind: Kind = "unit"
     trace: str | None = None
     host_seconds: float | None = None
+    unconfirmed: int = 0
 
 
 class State(Enum):
@@ -93,6 +96,9 @@ class AtRecording(ABC):
         self._state = State.WAITING
         self._trouble: str | None = None
         self._leaves = self._was_behind = False
+        self._wrong: WrongUnit | None = None
+        """By which another unit was noticed, which weighs more than a stop."""
+        self._unconfirmed = 0
         self._kept_for: str | None = None
 
     @property
@@ -147,7 +153,7 @@ class AtRecording(ABC):
         records = self._records
         return Kept(
             self.name, self._path, self._counts, self._seconds, records.gaps, records.gaps_s, self._lost,
-            kind=self.kind, host_seconds=self._host_seconds,
+            kind=self.kind, host_seconds=self._host_seconds, unconfirmed=self._unconfirmed,
         )  # fmt: skip
 
     def leave(self) -> None:
@@ -160,7 +166,8 @@ class AtRecording(ABC):
         is given up. Raises nothing, not even when it is cancelled."""
         try:
             await self._work(seconds, patience)
-        except (Exception, asyncio.CancelledError) as e:  # noqa: BLE001 - the one place that supervises a recording
+        except (Exception, asyncio.CancelledError) as raised:  # noqa: BLE001 - the one place that supervises a recording
+            e = self._cause(raised)
             if self._asked(e):
                 return self._result()
             self._trouble = reason_of(e)
@@ -201,7 +208,7 @@ class AtRecording(ABC):
                 # A disk fails while a unit is lost, and nothing comes, too.
                 await while_sound(record(writer), partial(self._look_after, writer), LOOK_S)
             except (Exception, asyncio.CancelledError) as e:
-                await self._end(writer, e)
+                await self._end(writer, self._cause(e))
                 raise
             else:
                 await whole_on_a_thread(partial(writer.close, ended_because(None, self.kind)))
@@ -227,6 +234,10 @@ class AtRecording(ABC):
                 writer.event("failed", {"error": reason_of(e)})
             because = ended_because(None if self._asked(e) else e, self.kind)
             await whole_on_a_thread(partial(writer.close, because))
+
+    def _cause(self, e: BaseException) -> BaseException:
+        """A stop is not why it ended where another unit was noticed then."""
+        return self._wrong if self._wrong is not None and isinstance(e, asyncio.CancelledError) else e
 
     def _asked(self, e: BaseException) -> bool:
         return self._leaves and isinstance(e, asyncio.CancelledError)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ from triaxcald.recording.retention import Retention
 from triaxcald.recording.schema import STATION_FILE
 from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
-from triaxcald.station.collection import Progress
-from triaxcald.station.coming_back import HOLE_S, Patience, Returning
+from triaxcald.station.collection import Progress, Recorded
+from triaxcald.station.coming_back import HOLE_S, Patience, Returning, Streaming
 from triaxcald.station.config import Place, Station
+from triaxcald.station.confirmation import Confirmation
 from triaxcald.station.serials import SerialsSeen
 
 
@@ -82,14 +84,16 @@ class UnitSession:
         identity: IdentityRead,
         patience: Patience,
         lost: Callable[[str | None], None] = lambda _: None,
-    ) -> Returning:
+        confirmation: Confirmation | None = None,
+    ) -> Streaming:
         """The device, waited for where it is lost; it is this unit that has to
-        come back. ``lost`` is told what is the matter, and None when it is
-        over."""
+        come back, and, by ``confirmation``, that has to stay. ``lost`` is told
+        what is the matter, and None when it is over."""
 
         async def identify() -> None:
-            where, expected = self.place.address, identity.serial or self.place.unit.serial
-            await check_identity(device, self.place.bundle, expected, where=where)
+            await self._require_same(device, identity)
+            if confirmation is not None:
+                confirmation.confirm()
 
         def tell(trouble: str | None) -> None:
             lost(trouble)
@@ -100,7 +104,22 @@ class UnitSession:
 
         # A unit of which a sample is rare is not silent before its profile says so.
         hole_s = max(HOLE_S, self.profile.sampling.silence_timeout_s)
-        return Returning(device, identify, patience, tell, hole_s=hole_s)
+        returning = Returning(device, identify, patience, tell, hole_s=hole_s)
+        return returning if confirmation is None else confirmation.of(returning)
+
+    def confirmation(
+        self, device: Device, identity: IdentityRead, writer: RecordingWriter | None, recorded: Recorded
+    ) -> Confirmation:
+        """Of a unit that has just been identified, and of which ``recorded`` is
+        about to take records."""
+        told = self.profile.identity
+        asked = partial(self._require_same, device, identity) if told.serial_register or told.expect else None
+        return Confirmation(asked, writer, recorded, lambda why: self.progress.stage(self.name, text.unidentified(why)))
+
+    async def _require_same(self, device: Device, identity: IdentityRead) -> None:
+        """Raises WrongUnit."""
+        expected = identity.serial or self.place.unit.serial
+        await check_identity(device, self.place.bundle, expected, where=self.place.address)
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")

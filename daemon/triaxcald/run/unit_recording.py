@@ -86,8 +86,13 @@ class UnitRecording(AtRecording):
 
             async def record(writer: RecordingWriter) -> None:
                 session.progress.stage(session.name, "recording")
-                returning = session.returning(device, identity, patience, self._is_lost)
-                await self._recorded.for_seconds(returning, writer, seconds)
+                confirmation = session.confirmation(device, identity, writer, self._recorded)
+                returning = session.returning(device, identity, patience, self._is_lost, confirmation)
+                try:
+                    async with confirmation.phase():
+                        await self._recorded.for_seconds(returning, writer, seconds)
+                finally:
+                    self._wrong, self._unconfirmed = confirmation.wrong, confirmation.unconfirmed
 
             make = partial(session.writer, self._path, identity, segments=self._segments)
             await self._recorded_by(make, record, self._path if self._segments else None)

@@ -24,6 +24,7 @@ from triaxcald.inputs import VERIFICATION
 from triaxcald.provision.access import RegisterAccess, RegisterLink
 from triaxcald.provision.corrected import LEAST, departure_g, doubt_of_departure
 from triaxcald.provision.correction import require_readings_before
+from triaxcald.provision.identity import WrongUnit
 from triaxcald.provision.image import RegisterImage
 from triaxcald.provision.plausible import Doubt, is_blank
 from triaxcald.provision.procedure import Provisioning
@@ -109,7 +110,7 @@ class WriteBack:
             self._attach(REGISTERS_AFTER, p.after.raw)
             self.writer.event("provisioned", {"written": list(p.written)})
             self.verdict = await self._verify(tumble)
-        except DiskError:
+        except (DiskError, WrongUnit):
             await p.undo()
             raise
         except (DriverError, DaemonError, TriaxcalError) as e:

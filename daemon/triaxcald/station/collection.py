@@ -16,8 +16,9 @@ from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcal_drivers.two_senders import RECORDS
 from triaxcald import text
-from triaxcald.errors import NoPoses
+from triaxcald.errors import NoPoses, TwoAnswer
 from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
@@ -32,6 +33,8 @@ host's, whichever is longer."""
 LOOK_SHARE = 5.0
 """A look is followed by a pause of so many times what it took, or samples would
 be lost meanwhile."""
+RESTARTED_S = 3.0
+"""A unit takes longer to restart once more."""
 SILENCE_SHARE = 0.25
 """Of a silence, what one batch without a sample may add. A device that sends
 brings several in that time."""
@@ -58,6 +61,7 @@ class Recorded(RawRecords):
     bundle: Bundle
     where: str
     latest: dict[str, float] = field(default_factory=dict, init=False)
+    _restarted_ns: int | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,24 +73,48 @@ class Recorded(RawRecords):
     def _decoded(self, stream: str) -> DecodedStream:
         return DecodedStream(self.bundle, stream)
 
+    def mark(self) -> dict[str, Any]:
+        """What the streams have come to so far, for `back_to`."""
+        return {name: stream.mark() for name, stream in self.streams.items()}
+
+    def back_to(self, mark: dict[str, Any]) -> None:
+        """As if nothing had come since. No more records may come."""
+        for name, stream in self.streams.items():
+            stream.back_to(mark[name])
+
     async def records(self, device: Streaming, writer: RecordingWriter | None) -> AsyncGenerator[RawBatch]:
         """What comes off the bus, once it is on its way to disk and decoded.
 
         What the disk has no room for goes to neither, so that an audit sees
-        what the station saw.
+        what the station saw. Raises TwoAnswer where two units send.
         """
         stream = cast(Any, device.stream(list(self.streams)))
         async with aclosing(self.written(stream, writer)) as written:
             async for batch in written:
                 for name, decoded in self.streams.items():
                     block = decoded.feed(batch)
-                    if block.restarts:  # what it was told when it was opened is gone, and it may be another unit
+                    if block.two_senders:
+                        raise TwoAnswer(text.two_senders(self.where, name))
+                    if block.restarts and self._tells_restart(
+                        batch
+                    ):  # what it was told when it was opened is gone, and it may be another unit
                         device.complain(DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
                     if len(block) and name == READINGS:
                         self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
                     if writer is not None and len(block):
                         writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
                 yield batch
+
+    def _tells_restart(self, batch: RawBatch) -> bool:
+        """Whether a restart is to be acted upon. Two units that send at once look
+        like restarts without end, and opening the unit each time would keep them
+        from being told: after one, the stream goes on for long enough."""
+        after_s = max(RESTARTED_S, 2 * RECORDS / self.bundle.profile.sampling.rate_hz)
+        now_ns, before_ns = int(batch.time_ns[-1]), self._restarted_ns
+        if before_ns is not None and now_ns - before_ns < after_s * 1e9:
+            return False
+        self._restarted_ns = now_ns
+        return True
 
     def _watch(self, stream: str, clock_s: Callable[[], float]) -> _Watch:
         # Twice what the driver waits, which knows better what is the matter

@@ -47,6 +47,11 @@ LOST = (*ABSENT, WrongUnit)
 again."""
 
 
+class Exchanged(WrongUnit):
+    """Another unit answers, and nothing was lost before: what the stream brought
+    last may be that one's already."""
+
+
 class Streaming(Protocol):
     """What a collection takes records from."""
 
@@ -159,6 +164,8 @@ class _Waiting:
             try:
                 await attempt()
                 return
+            except Exchanged:
+                raise
             except mended as e:
                 trouble = e
 
@@ -251,6 +258,8 @@ class Returning:
         self._device, self._identify, self._patience, self._tell = device, identify, patience, tell
         self._now_ns, self._hole_s = now_ns, hole_s
         self._complaint: Exception | None = None
+        self._unbroken = False
+        """Whether the next opening follows on records, which showed a restart."""
 
     def complain(self, trouble: Exception) -> None:
         """Of what the stream gave last: the device sends, but not what it is to
@@ -263,7 +272,7 @@ class Returning:
         error ends the gap. Until then the unit is waited for, however often it
         opens meanwhile. Where one stream is silent, the others go on, and the
         first record of that one ends the gap. A hole is a gap too. Raises what
-        the device's stream does once patience ends."""
+        the device's stream does once patience ends; Exchanged at once."""
         clock = asyncio.get_running_loop()
         last_ns: int | None = None
         returned_ns = self._now_ns()
@@ -308,6 +317,7 @@ class Returning:
                         until_s = clock.time() + await waiting.beside(trouble)
                         continue
                 asked, until_s = list(names), math.inf
+                self._unbroken = trouble is self._complaint and isinstance(trouble, DeviceRestarted)
                 await waiting.until(self._again, LOST, trouble)
                 self._complaint, returned_ns = None, self._now_ns()  # what was said meanwhile was of the one before
 
@@ -341,9 +351,15 @@ class Returning:
         return _Waiting(self._patience, lambda trouble: self._tell(str(trouble)))
 
     async def _again(self) -> None:
+        unbroken, self._unbroken = self._unbroken, False
         await self._device.close()
         await self._device.open()
-        await self._identify()
+        try:
+            await self._identify()
+        except WrongUnit as e:
+            if unbroken:
+                raise Exchanged(str(e)) from e
+            raise
 
 
 def _good(batch: RawBatch) -> NDArray[np.intp]:

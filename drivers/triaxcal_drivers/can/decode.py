@@ -12,6 +12,7 @@ from triaxcal_drivers.can.layout import NODES, Layout
 from triaxcal_drivers.can.model import READING_CHANNELS
 from triaxcal_drivers.can.together import TogetherInTime
 from triaxcal_drivers.interface import EXTENDED_KEY, RawBatch, RawFlag, SampleBlock
+from triaxcal_drivers.two_senders import Senders, by_arrival, by_counter
 
 Ints = NDArray[np.int64]
 
@@ -110,6 +111,7 @@ class CanDecoder:
         self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
         self._held = _Parts(empty, empty, empty, np.zeros((len(self._columns), 0)), empty.astype(bool))
         self._together = TogetherInTime(len(layout.messages), self._period_ns)
+        self._senders = Senders(self._range, len(layout.messages))
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         parts, errors, malformed = self._extract(batch)
@@ -124,7 +126,21 @@ class CanDecoder:
             block = self._by_time(parts)
         else:
             block = self._as_they_come(parts)
-        return replace(block, errors=errors, malformed=malformed)
+        return replace(block, errors=errors, malformed=malformed, two_senders=self._two_senders(parts, block))
+
+    def _two_senders(self, parts: _Parts, block: SampleBlock) -> bool:
+        """A counter without a fault is one unit's; only one with faults is
+        looked at."""
+        self._senders.take(parts.time_ns, parts.message, parts.counter, parts.values.T)
+        counted = bool(self._layout.counters)
+        if counted and not (block.missing or block.incomplete or block.duplicates or block.restarts):
+            return False
+        if not self._senders.due:
+            return False
+        return any(
+            by_counter(records) if counted else by_arrival(records, self._period_ns)
+            for records in self._senders.messages()
+        )
 
     def _start(self, parts: _Parts) -> None:
         self._started = True

@@ -21,6 +21,7 @@ from triaxcal_drivers.modbus.model import (
 )
 from triaxcal_drivers.modbus.timeline import Arrivals, Clockwork, Timeline
 from triaxcal_drivers.register_types import TYPES
+from triaxcal_drivers.two_senders import Senders, by_counter, by_levels
 
 Bytes = NDArray[np.uint8]
 
@@ -40,6 +41,28 @@ class ModbusDecoder:
         self._gaps = self._gaps_at_last = 0
         self._lost_raw: int | None = None
         self._lost = self._lost_at_last = 0
+        self._tick_ns, self._senders = self._watched()
+
+    def _watched(self) -> tuple[float, Senders | None]:
+        """What one count lasts, or one tick of the stamp where there is no
+        counter; None where there is neither."""
+        counter, stamp = self._stream.counter, self._stream.time_stamp
+        if counter:
+            return self._period_ns, Senders(1 << counter.modulus_bits)
+        if stamp:
+            return stamp.unit_s * 1e9, Senders(1 << min(8 * TYPES[stamp.type].size, 62))
+        return self._period_ns, None
+
+    def _two_senders(self, records: Bytes, counts: NDArray[np.int64] | None, arrival_ns: NDArray[np.int64]) -> bool:
+        """By every sample of a FIFO, by the newest ones of a block that is
+        polled."""
+        if self._senders is None or counts is None:
+            return False
+        self._senders.take(arrival_ns, np.zeros(len(counts), np.int64), counts, records.astype(np.float64))
+        if not self._senders.due:
+            return False
+        by_samples = isinstance(self._stream, FifoStream) and self._stream.counter is not None
+        return any(by_counter(r) if by_samples else by_levels(r, self._tick_ns) for r in self._senders.messages())
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         mine = batch.source == self._source
@@ -116,12 +139,16 @@ class ModbusDecoder:
         after_gap = np.diff(gaps_before, prepend=self._gaps_at_last) > 0
         if len(errors_before):
             self._errors_at_last, self._gaps_at_last = int(errors_before[-1]), int(gaps_before[-1])
+        counter = (
+            self._value(records, stream.counter).astype(np.int64) & (1 << stream.counter.modulus_bits) - 1
+            if stream.counter
+            else None
+        )
+        stamp = self._value(records, stream.time_stamp).astype(np.int64) if stream.time_stamp else None
         placed = self._timeline.place(
             Arrivals(
-                self._value(records, stream.counter).astype(np.int64) & (1 << stream.counter.modulus_bits) - 1
-                if stream.counter
-                else None,
-                self._value(records, stream.time_stamp).astype(np.int64) if stream.time_stamp else None,
+                counter,
+                stamp,
                 skipped,
                 arrival_ns,
                 broken,
@@ -145,6 +172,7 @@ class ModbusDecoder:
             duplicates=len(records) - len(kept) if isinstance(stream, FifoStream) else 0,
             errors=errors,
             restarts=placed.restarts,
+            two_senders=self._two_senders(records, stamp if counter is None else counter, arrival_ns),
         )
 
     @staticmethod
