@@ -173,7 +173,9 @@ async def _one(host: Host, process: str, seed: int, habits: Habits, trouble: Tro
     second = host.place.second
     failed = not await getattr(host, process)()
     p = host.provisioning
-    held = p.held if p else Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
+    # As the command says it: a journal that nobody could look into leaves the state unknown.
+    known = p is not None and (p.identified or not host.journals)
+    held = p.held if p is not None and known else Held(DeviceState.UNKNOWN, Evidence.NO_ANSWER)
     took_s = host.clock.now() - began_s
     second = second or host.place.second
     overwritten = second is not None and second.eeprom != FACTORY.image(second.habits)
