@@ -18,7 +18,7 @@ from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import warn_of_a_journal
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.explain import explain
-from triaxcald.provision.identity import check_identity
+from triaxcald.provision.identity import identified
 from triaxcald.provision.snapshot import take_snapshot
 from triaxcald.station.config import Place, load_station
 
@@ -55,8 +55,8 @@ def _remark(row: Any) -> str:
 
 async def _registers(place: Place) -> tuple[str | None, list[Any]]:
     async with place.opened() as device:
-        link = RegisterLink(device, place.bundle.profile)
-        identity = await check_identity(link, place.bundle, place.unit.serial, where=place.address)
+        link = RegisterLink(device, place.bundle.profile, name=place.device_name)
+        identity = await identified(link, place.bundle, place.unit.serial, where=place.address)
         return identity.serial, explain(place.bundle, await take_snapshot(link, place.bundle))
 
 

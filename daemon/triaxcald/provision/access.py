@@ -46,7 +46,8 @@ class RegisterLink:
     one was lost, and for `BUSY_S` where the device is busy. What a store or
     reset sequence writes is sent once. Once a kind of request has failed for
     good, no more patience is spent on that kind until one succeeds, or until
-    `refresh`. ``record`` is told of every request that has ended.
+    `refresh`. ``record`` is told of every request that has ended. ``name`` is
+    the device at its address, for messages.
 
     Once `watch` was called, an answer that no request explains raises TwoAnswer
     at the request before or after it, and at every further one until
@@ -60,15 +61,16 @@ class RegisterLink:
         record: Callable[[RegisterAccess], None] | None = None,
         *,
         pace: Pace = REAL_PACE,
+        name: str = "",
     ) -> None:
         steps = (*profile.sequences.store, *profile.sequences.reset)
-        self.pace = pace
+        self.pace, self.name = pace, name
         self._device = device
         self._record = record or (lambda access: None)
         self._once = {step.write for step in steps if isinstance(step, WriteStep)}
         self._tired: set[Kind] = set()
         self._not_opened: str | None = None
-        self._watched: str | None = None
+        self._watched = False
         self._second: TwoAnswer | None = None
         self.two_answered = self.tolerant = False
         """Whether an answer too many came, and whether it stops nothing."""
@@ -108,14 +110,13 @@ class RegisterLink:
 
         self._record = lenient
 
-    def watch(self, where: str) -> None:
-        """From now on no answer too many goes unnoticed; ``where`` names the
-        place in messages."""
-        self._watched = where
+    def watch(self) -> None:
+        """From now on no answer too many goes unnoticed."""
+        self._watched = True
 
     def tolerate(self) -> None:
         """Puts a device in order also while two units answer."""
-        self._watched = self._second = None
+        self._watched, self._second = False, None
         self.tolerant = True
 
     async def listen(self, seconds: float) -> list[ExtraAnswer]:
@@ -173,13 +174,13 @@ class RegisterLink:
                 await self.renew()
 
     async def _require_one_answer(self) -> None:
-        if self._watched is None:
+        if not self._watched:
             return
         if self._second is None and (found := await self.listen(0.0)):
             e = found[0]
             of = f"register {e.register}" if e.register else "a request of another program"
             first = "" if e.first is None else f"{e.first.hex()}, then "
-            self._second = TwoAnswer(f"two units answer at {self._watched}: {of}: {first}{e.answer.hex()}")
+            self._second = TwoAnswer(f"two units answer at {self.name}: {of}: {first}{e.answer.hex()}")
         if self._second is not None:
             raise self._second
 

@@ -67,9 +67,9 @@ async def identified(link: RegisterLink, bundle: Bundle, expected_serial: str | 
         identity = await check_identity(link, bundle, expected_serial, where=where)
     except WrongUnit:
         with suppress(DriverError):  # the answer may be that of a second unit
-            await require_alone(link, bundle, where)
+            await require_alone(link, bundle)
         raise
-    await require_alone(link, bundle, where)
+    await require_alone(link, bundle)
     return identity
 
 
@@ -90,7 +90,7 @@ ASKED = 3
 if it doubles one in twenty."""
 
 
-async def require_alone(link: RegisterLink, bundle: Bundle, where: str) -> None:
+async def require_alone(link: RegisterLink, bundle: Bundle) -> None:
     """Ask the unit for its serial number, and listen whether another unit
     answers too.
 
@@ -108,10 +108,10 @@ async def require_alone(link: RegisterLink, bundle: Bundle, where: str) -> None:
         if found:
             with suppress(DriverError, TwoAnswer):  # late answers to earlier requests have come by now
                 answers, _ = await _answers(link, name)
-            raise TwoAnswer(f"two units answer at {where}: {_who(bundle, name, answers)}")
+            raise TwoAnswer(f"two units answer at {link.name}: {_who(bundle, name, answers)}")
         if not link.doubled:
             return
-    raise TwoAnswer(f"two units answer at {where}: each request was answered twice, byte for byte")
+    raise TwoAnswer(f"two units answer at {link.name}: each request was answered twice, byte for byte")
 
 
 async def _answers(link: RegisterLink, name: str) -> tuple[list[bytes], list[ExtraAnswer]]:

@@ -197,7 +197,7 @@ class Provisioning:
         DriverError."""
         self.steps.append("identity")
         self.identity = await identified(self.link, self.bundle, self.expected_serial, where=self.where)
-        self.link.watch(self.where)
+        self.link.watch()
         self.owner = Owner.of(self.bundle.profile, self.unit, self.identity.serial)
         self.journal = Journal.of(self.folder, self.owner, self.run)
 
@@ -435,7 +435,7 @@ class Provisioning:
             if evidence is Evidence.RESTART:
                 self.held.saw(Observation.MARK_GONE)
             if two_answered and lasting:  # what was read may be the other unit's
-                await require_alone(self.link, self.bundle, self.where)
+                await require_alone(self.link, self.bundle)
                 if await differing(self.link, self.bundle, self.before):
                     raise ProvisionError("the old calibration is not back")
             self.held.now(DeviceState.OLD, evidence)
@@ -452,7 +452,7 @@ class Provisioning:
             return e
         self.link.tolerate()
         try:
-            await require_alone(self.link, self.bundle, self.where)
+            await require_alone(self.link, self.bundle)
         except TwoAnswer as named:
             return named
         except DriverError:
@@ -464,7 +464,7 @@ class Provisioning:
         StationError."""
         await self._require_same_unit()
         if self.link.two_answered:
-            await require_alone(self.link, self.bundle, self.where)
+            await require_alone(self.link, self.bundle)
         restarted = self.resets and (await self._restart(self.before.raw, self.image.raw)).mark_gone
         held = self.after = await self._look()
         state = self._state_of(held)

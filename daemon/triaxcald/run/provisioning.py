@@ -113,7 +113,7 @@ class ProvisionRun:
 
     async def _work(self, device: Device) -> None:
         bundle = self.place.bundle
-        link = RegisterLink(device, bundle.profile)
+        link = RegisterLink(device, bundle.profile, name=self.place.device_name)
         image = self.image or await self._image_of_journal(link)
         p = self._begin(link, image)
         if self.image is not None and leaves_open(bundle.profile):  # a resume finishes what was begun
@@ -226,7 +226,9 @@ class RestoreRun(ProvisionRun):
     async def _work(self, device: Device) -> None:
         profile = self.place.bundle.profile
         self.serial = self.snapshot.serial
-        p = self._begin(RegisterLink(device, profile), image_of(profile, self.snapshot.raw))
+        p = self._begin(
+            RegisterLink(device, profile, name=self.place.device_name), image_of(profile, self.snapshot.raw)
+        )
         p.source = self.source if self.source is not None and self.source.suffix == ".json" else None
         try:
             with p.finishing():

@@ -123,7 +123,7 @@ class UnitSession:
 
     async def identify(self, device: Device) -> IdentityRead:
         self.progress.stage(self.name, "reading identity")
-        link, where = RegisterLink(device, self.profile), self.place.address
+        link, where = RegisterLink(device, self.profile, name=self.place.device_name), self.place.address
         identity = await identified(link, self.place.bundle, self.place.unit.serial, where=where)
         self.serials.add(identity.serial, self.name, where)
         return identity
@@ -131,7 +131,7 @@ class UnitSession:
     async def registers(self, device: Device) -> Snapshot:
         """All calibration registers, as they are in use. Raises WrongUnit,
         DriverError."""
-        return await take_snapshot(RegisterLink(device, self.profile), self.place.bundle)
+        return await take_snapshot(RegisterLink(device, self.profile, name=self.place.device_name), self.place.bundle)
 
     def recording_name(self, identity: IdentityRead) -> str:
         return f"{self.name}-{identity.serial or 'unknown'}-{stamp(self.clock_ns())}.mcap"

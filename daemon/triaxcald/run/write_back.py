@@ -79,7 +79,7 @@ class WriteBack:
         Raises Implausible, Refused, with nothing written; ProvisionError,
         StationError, DiskError.
         """
-        link = RegisterLink(device, self.place.bundle.profile, _recorder(self.writer))
+        link = RegisterLink(device, self.place.bundle.profile, _recorder(self.writer), name=self.place.device_name)
         asked = power_cycle_asked(self.ask, link, self.place, self.station)
         p = Provisioning(
             link,

@@ -216,6 +216,13 @@ class Place:
         """Where the unit is, for messages."""
         return ", ".join(f"{k}={v}" for k, v in self.unit.bus.items())
 
+    @property
+    def device_name(self) -> str:
+        """The device at its address in the driver's words, such as "node 5 on
+        socketcan can0"."""
+        claim = claim_of(self.bus)
+        return f"{claim.device} of {claim.host}" if claim.host else claim.device
+
     def device(self) -> Device:
         return driver_named(self.bundle.profile.driver).device(self.bundle, self.bus)
 

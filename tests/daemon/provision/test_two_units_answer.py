@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import re
+import uuid
 from pathlib import Path
 
 import pytest
 
 from tests.daemon.provision.host import Host
 from tests.devices.bench import TRANSPORTS, Bench, Transport
+from tests.devices.canopen import CanopenNode
 from tests.devices.habits import Habits
 from tests.devices.memory import Electronics
+from tests.devices.motion import Motion
+from tests.devices.place import Place, Trouble
 from tests.devices.profiles import Timing, Wording
+from tests.devices.sdo import SdoServer
 from tests.devices.table import FACTORY, OLD
 from triaxcal_drivers.answers import KEYS_MOST, OPEN_MOST, Answers, Extra
 from triaxcald.provision.state import DeviceState
@@ -61,6 +67,36 @@ def test_two_units_that_answer_alike_are_two(tmp_path: Path, triaxcal, transport
         done = bench.provision("--json")
         assert (done.code, done.json["outcome"]["code"]) == (4, "two_answer")
         assert [r for r in other.log if r.kind == "write"] == []
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.04])
+def test_two_nodes_with_one_node_id_keep_what_they_hold(tmp_path: Path, triaxcal, late_s: float) -> None:
+    channel = f"two-nodes-{uuid.uuid4()}"
+    other = another(Habits())
+    place = Place(other, Trouble(late=1.0, late_s=late_s))
+    second = CanopenNode(SdoServer(place), channel=channel, motion=Motion())
+    with second, Bench(tmp_path, triaxcal, "canopen", node={"channel": channel}, timing=PATIENT) as bench:
+        done = bench.provision("--json")
+        outcome = done.json["outcome"]
+        assert (done.code, outcome["code"], outcome["device_state"]) == (4, "two_answer", "untouched")
+        assert "two units answer at node 5 on virtual" in outcome["reason"]
+        assert {"4711", "0888"} <= set(re.findall(r"\d+", outcome["reason"]))
+        assert bench.holds_old()
+        assert other.eeprom == FACTORY.image(bench.habits)
+        assert [r for unit in (bench.unit, other) for r in unit.log if r.kind == "write"] == []
+
+
+@every_transport
+@pytest.mark.parametrize("command", ["run", "record"])
+def test_nothing_is_recorded_of_two_units_that_answer(
+    tmp_path: Path, triaxcal, transport: Transport, command: str
+) -> None:
+    with Bench(tmp_path, triaxcal, transport, timing=PATIENT) as bench:
+        bench.place.second = another(bench.habits)
+        output = ("-o", tmp_path / "two.mcap", "--seconds", 1) if command == "record" else ()
+        done = triaxcal(command, bench.station, *output)
+        done.failed(4, "two units answer at", "4711, 0888")
+        assert not list(tmp_path.rglob("*.mcap"))
 
 
 HABITS = [
