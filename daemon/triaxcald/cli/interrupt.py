@@ -12,9 +12,12 @@ from functools import partial
 from typing import Any, TypeVar
 
 from triaxcald.cli.signals import StopSignals, stop_signals
+from triaxcald.cli.watcher import Watcher
 from triaxcald.run.together import soon
 
 T = TypeVar("T")
+_BEAT_S = 0.5
+"""A loop that nothing wakes at a signal looks about so often."""
 
 
 class Interrupted(Exception):
@@ -46,7 +49,7 @@ async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: C
         soon(loop, task.cancel)
         return not task.done()
 
-    with _woken(loop):
+    with _woken(loop, signals.watcher):
         signals.cancel_by(cancel)
         if reload is not None:
             signals.reload_by(partial(soon, loop, reload))
@@ -67,9 +70,34 @@ class _Unawaited(ThreadPoolExecutor):
 
 
 @contextmanager
-def _woken(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
+def _woken(loop: asyncio.AbstractEventLoop, watcher: Watcher | None) -> Iterator[None]:
     """Signals wake the loop. Their handlers alone do not, where one strikes as
     the loop is about to fall asleep."""
+    if watcher is None:
+        with _woken_by_itself(loop):
+            yield
+        return
+    beats: list[asyncio.TimerHandle] = []
+
+    def beat() -> None:
+        beats[:] = [loop.call_later(_BEAT_S, beat)]
+
+    def hear() -> None:
+        if not watcher.hear():  # somebody has killed it
+            loop.remove_reader(watcher)
+            beat()
+
+    loop.add_reader(watcher, hear)
+    try:
+        yield
+    finally:
+        loop.remove_reader(watcher)
+        for handle in beats:
+            handle.cancel()
+
+
+@contextmanager
+def _woken_by_itself(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
     near, far = socket.socketpair()
     with near, far:
         near.setblocking(False)
