@@ -11,8 +11,10 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
+from triaxcald.cli.console import say
 from triaxcald.cli.signals import StopSignals, stop_signals
 from triaxcald.cli.watcher import Watcher
+from triaxcald.memory import out_of_memory, ran_out_of_memory
 from triaxcald.run.together import soon
 
 T = TypeVar("T")
@@ -43,6 +45,7 @@ def run_interruptible(work: Coroutine[Any, Any, T], reload: Callable[[], None] |
 async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: Callable[[], None] | None) -> T:
     loop = asyncio.get_running_loop()
     loop.set_default_executor(_Unawaited())
+    loop.set_exception_handler(_told)
     task = asyncio.ensure_future(work)
 
     def cancel() -> bool:
@@ -59,6 +62,16 @@ async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: C
             if signals.caught:
                 raise Interrupted(signals.caught[0], _notes(e)) from None
             raise
+
+
+def _told(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Of an error in a callback, which nobody waits for: in one line where
+    memory ran out."""
+    error = context.get("exception")
+    if isinstance(error, BaseException) and ran_out_of_memory(error):
+        say(f"triaxcal: {out_of_memory(error)}")
+    else:
+        loop.default_exception_handler(context)
 
 
 class _Unawaited(ThreadPoolExecutor):

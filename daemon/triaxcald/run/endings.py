@@ -15,6 +15,7 @@ from triaxcal_drivers.errors import DriverError
 from triaxcald import text
 from triaxcald.errors import DaemonError
 from triaxcald.exit_codes import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, exit_code_of
+from triaxcald.memory import out_of_memory, ran_out_of_memory
 from triaxcald.outcome import Ending, Verdict
 from triaxcald.printable import printable_lines
 from triaxcald.provision.procedure import Provisioning
@@ -55,12 +56,15 @@ def reason_of(e: BaseException) -> str:
     """Of an end before its time, in one line."""
     if isinstance(e, asyncio.CancelledError):
         return "interrupted"
+    if _internal(e) and ran_out_of_memory(e):
+        return out_of_memory(e)
     return f"internal error: {e!r}" if _internal(e) else str(e) or type(e).__name__
 
 
 def trace_of(e: BaseException) -> str | None:
     """Where an internal error came from, for who mends it; None of any other."""
-    return "".join(traceback.format_exception(e)) if _internal(e) else None
+    internal = _internal(e) and not ran_out_of_memory(e)
+    return "".join(traceback.format_exception(e)) if internal else None
 
 
 def _internal(e: BaseException) -> bool:
