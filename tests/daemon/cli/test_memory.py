@@ -86,7 +86,12 @@ def in_a_callback() -> int:
 
 @pytest.mark.parametrize(
     ("work", "code"),
-    [(lambda: len(bytearray(TOO_MUCH)), 5), (lambda: len(np.ones(TOO_MUCH // 32)), 5), (in_a_thread, 5), (in_a_callback, 0)],
+    [
+        (lambda: len(bytearray(TOO_MUCH)), 5),
+        (lambda: len(np.ones(TOO_MUCH // 32)), 5),
+        (in_a_thread, 5),
+        (in_a_callback, 0),
+    ],
     ids=["Python", "numpy", "thread", "callback"],
 )
 def test_a_command_says_it_in_one_line(work: Callable[[], int], code: int, capsys: pytest.CaptureFixture[str]) -> None:
