@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from triaxcal.errors import InvalidData, Refused, TriaxcalError
 from triaxcal_drivers.errors import DriverError, DriverMissing, LogError, ProfileError, RegisterValueError
 from triaxcald.errors import DaemonError
+from triaxcald.memory import ran_out_of_memory
 
 DONE, OUTSIDE, BAD_INPUT, REFUSED, DEVICE, DISK, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
 SEVEREST = (DEVICE, INTERRUPTED, DISK, REFUSED, BAD_INPUT, OUTSIDE, DONE)
@@ -20,7 +21,10 @@ def severest(codes: Iterable[int]) -> int:
 
 
 def exit_code_of(e: BaseException) -> int:
-    """An error that nobody raises on purpose is a failure of the station."""
+    """An error that nobody raises on purpose is a failure of the station; that
+    memory ran out is one like a full disk."""
+    if ran_out_of_memory(e):
+        return DISK
     match e:
         case Refused() | RegisterValueError():
             return REFUSED

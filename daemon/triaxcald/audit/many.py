@@ -12,6 +12,7 @@ from triaxcal_drivers.errors import DriverError
 from triaxcald.audit.conduct import Audit, audit
 from triaxcald.errors import DaemonError, InputError
 from triaxcald.exit_codes import DONE, OUTSIDE, SEVEREST, exit_code_of
+from triaxcald.memory import out_of_memory, ran_out_of_memory
 
 _WILD = frozenset("*?[")
 
@@ -52,6 +53,10 @@ def _audited(path: Path) -> Audited:
         found = audit(path)
     except (TriaxcalError, DriverError, DaemonError) as e:
         return Audited(str(path), None, str(e), exit_code_of(e))
+    except Exception as e:
+        if not ran_out_of_memory(e):
+            raise
+        return Audited(str(path), None, f"{path}: {out_of_memory(e)}", exit_code_of(e))
     return Audited(str(path), found, exit_code=OUTSIDE if found.differences else DONE)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from triaxcal_drivers.nearest import closest
 from triaxcald.cli.arguments import OneLineParser, keep_apart, parsed
 from triaxcald.cli.syntax import register
+from triaxcald.memory import require_address_space
 
 BAD_INPUT = 2
 
@@ -54,6 +55,7 @@ def main(arguments: Sequence[str]) -> int:
         from triaxcald.cli.running import not_written
 
         return not_written(e, 0)
+    require_address_space()
     from triaxcald.cli.running import run  # what an error may be of, and what shows it
 
     return run(lambda: keep_apart(chosen), _working(chosen))

@@ -11,10 +11,15 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
+from triaxcald.cli.console import say
 from triaxcald.cli.signals import StopSignals, stop_signals
+from triaxcald.cli.watcher import Watcher
+from triaxcald.memory import out_of_memory, ran_out_of_memory
 from triaxcald.run.together import soon
 
 T = TypeVar("T")
+_BEAT_S = 0.5
+"""A loop that nothing wakes at a signal looks about so often."""
 
 
 class Interrupted(Exception):
@@ -40,13 +45,14 @@ def run_interruptible(work: Coroutine[Any, Any, T], reload: Callable[[], None] |
 async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: Callable[[], None] | None) -> T:
     loop = asyncio.get_running_loop()
     loop.set_default_executor(_Unawaited())
+    loop.set_exception_handler(_told)
     task = asyncio.ensure_future(work)
 
     def cancel() -> bool:
         soon(loop, task.cancel)
         return not task.done()
 
-    with _woken(loop):
+    with _woken(loop, signals.watcher):
         signals.cancel_by(cancel)
         if reload is not None:
             signals.reload_by(partial(soon, loop, reload))
@@ -58,6 +64,16 @@ async def _guarded(work: Coroutine[Any, Any, T], signals: StopSignals, reload: C
             raise
 
 
+def _told(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Of an error in a callback, which nobody waits for: in one line where
+    memory ran out."""
+    error = context.get("exception")
+    if isinstance(error, BaseException) and ran_out_of_memory(error):
+        say(f"triaxcal: {out_of_memory(error)}")
+    else:
+        loop.default_exception_handler(context)
+
+
 class _Unawaited(ThreadPoolExecutor):
     """A computation or a bus driver that has been given up may take long; the
     loop's end does not wait for it."""
@@ -67,9 +83,34 @@ class _Unawaited(ThreadPoolExecutor):
 
 
 @contextmanager
-def _woken(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
+def _woken(loop: asyncio.AbstractEventLoop, watcher: Watcher | None) -> Iterator[None]:
     """Signals wake the loop. Their handlers alone do not, where one strikes as
     the loop is about to fall asleep."""
+    if watcher is None:
+        with _woken_by_itself(loop):
+            yield
+        return
+    beats: list[asyncio.TimerHandle] = []
+
+    def beat() -> None:
+        beats[:] = [loop.call_later(_BEAT_S, beat)]
+
+    def hear() -> None:
+        if not watcher.hear():  # somebody has killed it
+            loop.remove_reader(watcher)
+            beat()
+
+    loop.add_reader(watcher, hear)
+    try:
+        yield
+    finally:
+        loop.remove_reader(watcher)
+        for handle in beats:
+            handle.cancel()
+
+
+@contextmanager
+def _woken_by_itself(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
     near, far = socket.socketpair()
     with near, far:
         near.setblocking(False)

@@ -12,6 +12,8 @@ from typing import NoReturn
 
 from triaxcald.abort import STOP_SIGNALS
 from triaxcald.cli.signals import heed_stop_signals
+from triaxcald.memory import out_of_memory, ran_out_of_memory
+from triaxcald.printable import printable
 
 LAST_THREADS_S = 1.0
 """Time to end for threads that have nothing to do, or are about to close a bus."""
@@ -26,9 +28,15 @@ def entry() -> NoReturn:
         from triaxcald.cli.commands import main
 
         code = main(sys.argv[1:])
-    except ModuleNotFoundError as e:
-        sys.stderr.write(f"triaxcal: the module {e.name} is missing; pip install triaxcal brings it\n")
-        code = 2
+    except Exception as e:
+        if ran_out_of_memory(e):
+            sys.stderr.write(printable(f"triaxcal: {out_of_memory(e)}") + "\n")
+            code = 5
+        elif isinstance(e, ModuleNotFoundError):
+            sys.stderr.write(f"triaxcal: the module {e.name} is missing; pip install triaxcal brings it\n")
+            code = 2
+        else:
+            raise
     _leave_nothing_unsaid()
     _end(code)
 

@@ -13,10 +13,22 @@ from triaxcald.cli.console import Unshown, say
 from triaxcald.cli.interrupt import Interrupted
 from triaxcald.errors import DaemonError
 from triaxcald.exit_codes import BAD_INPUT, DISK, DONE, INTERRUPTED, REFUSED, exit_code_of, severest
+from triaxcald.memory import out_of_memory, ran_out_of_memory
 
 
 def run(check: Callable[[], None], work: Callable[[], int]) -> int:
     """The exit code of ``work``, which is not begun where ``check`` raises."""
+    try:
+        return _run(check, work)
+    except Exception as e:
+        if not ran_out_of_memory(e):
+            raise
+        e.__traceback__ = e.__context__ = None  # and all that its frames hold
+        say(f"triaxcal: {out_of_memory(e)}")
+        return DISK
+
+
+def _run(check: Callable[[], None], work: Callable[[], int]) -> int:
     code: int = DONE
     try:
         check()
@@ -30,7 +42,7 @@ def run(check: Callable[[], None], work: Callable[[], int]) -> int:
         say(f"triaxcal: refused: {e}; nothing was written")
         return REFUSED
     except ModuleNotFoundError as e:
-        if (what := lacking(e)) is None:
+        if ran_out_of_memory(e) or (what := lacking(e)) is None:
             raise
         say(f"triaxcal: {what}")
         return BAD_INPUT
@@ -46,6 +58,8 @@ def run(check: Callable[[], None], work: Callable[[], int]) -> int:
     except Unshown as e:
         return not_written(e.error, e.code, e.told)
     except OSError as e:
+        if ran_out_of_memory(e):
+            raise
         return not_written(e, code)
 
 

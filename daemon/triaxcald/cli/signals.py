@@ -6,6 +6,9 @@ once. Before and without such work the first one does, as there is nothing to
 put in order. No signal raises an exception: at a random place that would come
 out as a trace back, or not at all.
 
+Where the interpreter does not return, no handler of Python runs, and a process
+beside this one (`triaxcald.cli.watcher`) ends it after the third signal.
+
 To a service SIGHUP says that its file has changed, to a command on a terminal
 that the terminal is gone.
 """
@@ -16,16 +19,18 @@ import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 from triaxcald.abort import STOP_SIGNALS, abort, tell
+from triaxcald.cli.watcher import Watcher
 
 
 class StopSignals:
     """Counts the signals that came, and does what each asks for."""
 
-    def __init__(self) -> None:
+    def __init__(self, watcher: Watcher | None = None) -> None:
         self.caught: list[int] = []
+        self.watcher = watcher
         self._cancel: Callable[[], bool] | None = None
         self._reload: Callable[[], None] | None = None
 
@@ -45,6 +50,8 @@ class StopSignals:
         nothing; as ever where the process has a terminal."""
         if not _on_a_terminal():
             self._reload = reload
+            if self.watcher is not None:
+                self.watcher.tell_reloads()
 
     def _strike(self, number: int, _: object) -> None:
         if self._reload is not None and number == getattr(signal, "SIGHUP", None) and not self.caught:
@@ -52,12 +59,17 @@ class StopSignals:
             return
         self.caught.append(number)
         if self._cancel is None:
-            abort("interrupted")
+            self._abort("interrupted")
         if len(self.caught) > 2:
-            abort("interrupted; ended at once")
+            self._abort("interrupted; ended at once")
         at_work = self._cancel()
         if len(self.caught) == 2 and at_work:
             tell("triaxcal: putting things in order, please wait; a third signal ends it at once")
+
+    def _abort(self, reason: str) -> NoReturn:
+        if self.watcher is not None:
+            self.watcher.tell_ending()
+        abort(reason)
 
 
 def _on_a_terminal() -> bool:
@@ -75,7 +87,7 @@ _process: StopSignals | None = None
 def heed_stop_signals() -> None:
     """To the end of the process."""
     global _process
-    _process = StopSignals()
+    _process = StopSignals(Watcher.started())
     _process.heed()
 
 

@@ -8,6 +8,7 @@ import os
 from datetime import UTC, datetime
 from pathlib import Path
 
+from triaxcald import memory
 from triaxcald.errors import DiskError, RecordingError
 
 END_BYTES, CHUNK_BYTES = 4 * 2**20, 256
@@ -59,6 +60,11 @@ def not_written(path: Path, e: OSError, sound_ns: int | None) -> DiskError:
     None where the file is removed."""
     left = "nothing of it is left" if sound_ns is None else f"sound up to {_utc(sound_ns)}"
     return DiskError(f"{path}: writing failed: {e.strerror or e}; {left}")
+
+
+def out_of_memory(path: Path, e: Exception, sound_ns: int | None) -> DiskError:
+    left = "nothing of it is left" if sound_ns is None else f"sound up to {_utc(sound_ns)}"
+    return DiskError(f"{path}: writing failed: {memory.out_of_memory(e)}; {left}")
 
 
 def ended_early(path: Path, free: int, sound_ns: int | None) -> DiskError:

@@ -18,6 +18,7 @@ from triaxcal_drivers.interface import Gap, RawBatch, SampleBlock
 from triaxcald.abort import Left, add_action, discard_action
 from triaxcald.errors import RecordingError
 from triaxcald.files import require_new
+from triaxcald.memory import ran_out_of_memory
 from triaxcald.recording import disk, schema
 from triaxcald.recording.ending import ENDED, EndedBecause
 from triaxcald.recording.file import SYNC_S, Head, RecordingFile
@@ -304,6 +305,10 @@ class RecordingWriter:
             self._failure = disk.not_written(self._told, e, self._sound_ns)
         except RecordingError as e:
             self._failure = e
+        except Exception as e:
+            if not ran_out_of_memory(e):
+                raise
+            self._failure = disk.out_of_memory(self._told, e, self._sound_ns)
         finally:
             if self._failure is None and not self._finished:
                 self._failure = RecordingError(f"{self.path}: the writer stopped on a fault of its own")

@@ -26,6 +26,7 @@ from triaxcald.errors import (
     TwoAnswer,
 )
 from triaxcald.exit_codes import DEVICE, DISK, INTERRUPTED, exit_code_of
+from triaxcald.memory import out_of_memory, ran_out_of_memory
 from triaxcald.outcome import Code, Ending, Verdict
 from triaxcald.printable import printable_lines
 from triaxcald.provision.correction import ReadingsNotStated
@@ -79,6 +80,8 @@ _WHO_IS_THERE = (Code.WRONG_UNIT, Code.TWO_ANSWER)
 def code_of(e: BaseException) -> Code | None:
     """The code of an error: of the first cause that has one of its own. None of
     bad input."""
+    if ran_out_of_memory(e):
+        return Code.MEMORY
     causes = [e]
     while (cause := causes[-1].__cause__) is not None:
         causes.append(cause)
@@ -99,7 +102,6 @@ def code_of(e: BaseException) -> Code | None:
 _CODES: tuple[tuple[type[BaseException], Code], ...] = (
     (asyncio.CancelledError, Code.STOPPED),
     (KeyboardInterrupt, Code.STOPPED),
-    (MemoryError, Code.MEMORY),
     (DiskError, Code.DISK),
     (TwoAnswer, Code.TWO_ANSWER),
     (SecondAnswer, Code.TWO_ANSWER),
@@ -119,12 +121,15 @@ def reason_of(e: BaseException) -> str:
     """Of an end before its time, in one line."""
     if isinstance(e, asyncio.CancelledError):
         return "interrupted"
+    if _internal(e) and ran_out_of_memory(e):
+        return out_of_memory(e)
     return f"internal error: {e!r}" if _internal(e) else str(e) or type(e).__name__
 
 
 def trace_of(e: BaseException) -> str | None:
     """Where an internal error came from, for who mends it; None of any other."""
-    return "".join(traceback.format_exception(e)) if _internal(e) else None
+    internal = _internal(e) and not ran_out_of_memory(e)
+    return "".join(traceback.format_exception(e)) if internal else None
 
 
 def _internal(e: BaseException) -> bool:

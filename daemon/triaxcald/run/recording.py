@@ -203,7 +203,7 @@ class AtRecording(ABC):
         with await whole_on_a_thread(make) as writer:
             self._writer, self._state, self._trouble = writer, State.RECORDING, None
             if writer.warning is not None:
-                self._progress.stage(self.name, writer.warning)
+                self._progress.stage(self.name, f"warning: {writer.warning}")
             try:
                 # A disk fails while a unit is lost, and nothing comes, too.
                 await while_sound(record(writer), partial(self._look_after, writer), LOOK_S)

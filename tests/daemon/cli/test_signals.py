@@ -6,10 +6,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from triaxcald.cli import watcher
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.recover import recover
 
@@ -265,3 +269,109 @@ except Interrupted as e:
 """
     done = _python(code)
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{HUP:d}\n", "")
+
+
+HOLDS_THE_LOCK = """
+import collections, itertools
+def stuck():
+    print("stuck", flush=True)
+    collections.deque(itertools.repeat(0), maxlen=0)  # for ever, and no other thread of Python runs
+"""
+FREES_THE_LOCK = """
+import hashlib
+def stuck():
+    print("stuck", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"a", b"b", 2**31 - 1)  # half an hour, and no handler of Python runs
+"""
+IN_A_LOOP = """
+from triaxcald.cli.interrupt import run_interruptible
+async def serve(): stuck()
+run_interruptible(serve(){})
+"""
+
+
+@contextmanager
+def _stuck(code: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-c", START + code]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_heeding
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "stuck\n"
+            _goes_on(process)  # it is in the call, and not on its way
+            yield process
+        finally:
+            process.kill()
+
+
+def _goes_on(process: subprocess.Popen[str]) -> None:
+    begun = _processor_ticks(process)
+    while _processor_ticks(process) < begun + 20:
+        assert process.poll() is None
+
+
+def _processor_ticks(process: subprocess.Popen[str]) -> int:
+    """Of the time that it has had, of a hundredth of a second each."""
+    return int(Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[11])
+
+
+def _said(process: subprocess.Popen[str]) -> str:
+    process.wait(timeout=60)
+    assert process.stderr is not None
+    return process.stderr.read()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["stuck()", IN_A_LOOP.format("")])
+@pytest.mark.parametrize("stuck", [HOLDS_THE_LOCK, FREES_THE_LOCK], ids=["with the lock", "without"])
+def test_a_third_signal_ends_an_interpreter_that_does_not_return(stuck: str, where: str) -> None:
+    with _stuck(stuck + where) as process:
+        for number in (INT, TERM, HUP):
+            process.send_signal(number)
+        said = _said(process)
+    assert process.returncode == -signal.SIGKILL
+    assert said.count("\n") == 1
+    assert "killed: a third signal" in said
+    assert watcher.UNHEARD_S < 2
+
+
+@pytest.mark.slow
+def test_two_signals_and_what_reloads_do_not() -> None:
+    with _stuck(HOLDS_THE_LOCK + IN_A_LOOP.format(", lambda: None")) as process:
+        for number in (HUP, INT, TERM):
+            process.send_signal(number)
+            _goes_on(process)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=watcher.UNHEARD_S + 1)
+        process.send_signal(HUP)
+        assert "killed: a third signal" in _said(process)
+
+
+CHILD = "Path(f'/proc/self/task/{os.getpid()}/children').read_text().split()"
+
+
+def test_the_watcher_ends_with_its_process() -> None:
+    done = _python(f"print(*{CHILD})")
+    assert done.returncode == 0
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{int(done.stdout)}").exists():
+        assert time.monotonic() < deadline
+
+
+def test_without_its_watcher_a_signal_still_ends_the_work() -> None:
+    code = f"""
+from triaxcald.cli.interrupt import Interrupted, run_interruptible
+
+async def asleep():
+    os.kill(int({CHILD}[0]), signal.SIGKILL)
+    threading.Timer(0.05, lambda: signal.pthread_kill(threading.get_ident(), SIGTERM)).start()
+    await asyncio.Event().wait()
+
+try:
+    run_interruptible(asleep())
+except Interrupted as e:
+    print(e)
+"""
+    done = _python(code)
+    assert (done.stdout, done.stderr) == ("interrupted\n", "")

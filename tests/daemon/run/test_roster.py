@@ -167,7 +167,7 @@ async def test_what_was_wrong_with_the_manifest_is_shown(tmp_path: Path) -> None
     one.writer = Writer(tmp_path / "a-000002.mcap")
     one.writer.warning = "a.segments.json: not JSON"
     work = asyncio.ensure_future(one.run(None, Patience()))
-    await until(lambda: one.shown.lines == ["a.segments.json: not JSON"])
+    await until(lambda: one.shown.lines == ["warning: a.segments.json: not JSON"])
     one.ends.set()
     await work
 

@@ -1,0 +1,75 @@
+"""Which errors say that memory ran out, whoever raises them."""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+
+_LIBRARY_SAYS = ("failed to map segment", "cannot allocate memory", "unable to allocate")
+"""What the loader of shared libraries says in an ImportError (glibc, musl)."""
+_THREAD_SAYS = "can't start new thread"  # its stack could not be had
+_LIBRARIES_BYTES, _THREAD_BYTES = 224 * 2**20, 48 * 2**20
+"""Address space that numpy, scipy and what else a command loads take, and each
+thread of linear algebra with its buffer and stack, of numpy and of scipy."""
+_DEPTH = 20  # of errors that others caused
+
+
+def ran_out_of_memory(e: BaseException | None) -> bool:
+    """Of the error or of one that caused it: an array that was too large, a
+    system call, a library that could not be loaded, a thread without a stack."""
+    for _ in range(_DEPTH):
+        if e is None:
+            return False
+        if _says_so(e):
+            return True
+        e = e.__cause__ or (e.__context__ if isinstance(e, ImportError) else None)
+    return False
+
+
+def _says_so(e: BaseException) -> bool:
+    match e:
+        case MemoryError():
+            return True
+        case OSError():
+            return e.errno == errno.ENOMEM
+        case ImportError():
+            return any(words in str(e).lower() for words in _LIBRARY_SAYS)
+        case RuntimeError():
+            return _THREAD_SAYS in str(e)
+        case _:
+            return False
+
+
+def require_address_space() -> None:
+    """Before the libraries are loaded, where a limit (``ulimit -v``) is set:
+    OpenBLAS that finds no room for its buffers ends the process with 1, or
+    tries again for a quarter of an hour. Raises MemoryError."""
+    try:
+        import resource  # which Windows has not
+    except ImportError:
+        return
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY:
+        return
+    wanted = _LIBRARIES_BYTES + _THREAD_BYTES * _threads()
+    try:
+        mmap.mmap(-1, wanted).close()
+    except OSError:
+        raise MemoryError(
+            f"the limit of {limit >> 20} MiB of address space (ulimit -v) leaves no room for the {wanted >> 20} MiB"
+            " of the libraries"
+        ) from None
+
+
+def _threads() -> int:
+    """That OpenBLAS will have."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        if (said := os.environ.get(name, "")).isdecimal() and int(said):
+            return min(int(said), 64)
+    return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 64)
+
+
+def out_of_memory(e: BaseException) -> str:
+    """In words."""
+    return f"memory ran out: {e}" if str(e) else "memory ran out"
