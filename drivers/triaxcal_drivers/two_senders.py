@@ -13,6 +13,7 @@ No I/O; all that is said follows from the records alone.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ Floats = NDArray[np.float64]
 RECORDS = 64
 """Of one message, that are looked at: a third of a second of two units at
 100 Hz. Chance does not keep up such a pattern for so long."""
-SMALL = 256
+SMALL = 4096
 """With fewer counts than these a sequence that a loss broke off goes on by chance
 when the counter comes round: four times as many records are looked at, and one
 in eight has to go over."""
@@ -34,6 +35,8 @@ windows of 60."""
 MEMORY = 2048
 """Records of each message that are remembered, to tell a delayed repeat from
 another unit's record: ten seconds of two units at 100 Hz."""
+PIECE = 1024
+"""Records that are taken at once, at most."""
 NEAR = 8
 """Records come late by up to so many samples; sequences that are no further
 apart are told by what is in them."""
@@ -88,7 +91,8 @@ def by_counter(records: Records) -> bool:
     else:
         n = RECORDS
         windows = [(n, SWITCHES), (BURSTS, SWITCHES)]
-    if len(records.counter) < n:
+    jumps = np.diff(records.counter[-BURSTS:]) % records.counts != 1
+    if len(records.counter) < n or np.count_nonzero(jumps) < SWITCHES:
         return False
     return any(_far(records, most, switches) for most, switches in windows) or _near(records, n)
 
@@ -144,7 +148,9 @@ def _far(records: Records, n: int, least: int) -> bool:
     for number, s in enumerate(found):
         whose[s.at] = number
     switches = np.count_nonzero(np.diff(whose[whose >= 0]))
-    return bool(switches >= least) and not _may_repeat(records, n, found)
+    # Two that send side by side do so all the time.
+    sides = [np.count_nonzero(part == number) / len(part) for part in np.array_split(whose, 4) for number in (0, 1)]
+    return bool(switches >= least and min(sides) >= SHARE / 2) and not _may_repeat(records, n, found)
 
 
 def _may_repeat(records: Records, n: int, sequences: list[_Sequence]) -> bool:
@@ -280,9 +286,11 @@ def by_arrival(records: Records, period_ns: float) -> bool:
     if n < 2 * RECORDS:
         return False
     elapsed = float(window.time_ns[-1] - window.time_ns[0])
-    own_ns = 2 * elapsed / (n - 1)  # no device's period is exactly the declared one
     if not 1.8 <= (n - 1) * period_ns / max(elapsed, 1.0) <= 2.2:
         return False
+    # No device's period is exactly the declared one: from the first record to
+    # the last of the same half.
+    own_ns = float(window.time_ns[-2] - window.time_ns[0]) / (n / 2 - 1)
     # The one half of the records, and the other, each on its own moment.
     turn = np.exp(2j * np.pi * (window.time_ns - window.time_ns[0]) / own_ns)
     odd = np.arange(n) % 2 == 1
@@ -301,17 +309,27 @@ def by_arrival(records: Records, period_ns: float) -> bool:
 
 
 class Senders:
-    """Remembers the last records of a stream, of so many ``messages`` a sample."""
+    """Remembers the last records of a stream, of so many ``messages`` a sample;
+    ``judge`` is one of the functions above."""
 
-    def __init__(self, counts: int, messages: int = 1) -> None:
-        self._counts, self._most = counts, MEMORY * messages
+    def __init__(self, counts: int, judge: Callable[[Records], bool], messages: int = 1) -> None:
+        self._counts, self._judge, self._most = counts, judge, MEMORY * messages
         self._held: deque[tuple[Ints, Ints, Ints, Floats]] = deque()
         self._records = self._since = 0
 
-    def take(self, time_ns: Ints, message: Ints, counter: Ints, values: Floats) -> None:
-        """``values`` (n, channels)."""
-        if not len(counter):
-            return
+    def are_two(self, time_ns: Ints, message: Ints, counter: Ints, values: Floats, *, suspect: bool) -> bool:
+        """Takes records that came, of which number (n,) of message; ``values``
+        (n, channels). Whether two units send, which is looked at only where
+        something makes it ``suspect``."""
+        begin = 0 if suspect else max(0, len(counter) - self._most)
+        for start in range(begin, len(counter), PIECE):
+            piece = slice(start, start + PIECE)
+            self._take(time_ns[piece], message[piece], counter[piece], values[piece])
+            if suspect and self._due and any(map(self._judge, self._messages())):
+                return True
+        return False
+
+    def _take(self, time_ns: Ints, message: Ints, counter: Ints, values: Floats) -> None:
         self._held.append((time_ns, message, counter, values))
         self._records += len(counter)
         self._since += len(counter)
@@ -319,17 +337,17 @@ class Senders:
             self._records -= len(self._held.popleft()[2])
 
     @property
-    def due(self) -> bool:
+    def _due(self) -> bool:
         """Whether enough is new to look once more: a stream that loses records
         for hours is not looked at without end."""
         return self._since >= max(RECORDS, self._records // 4)
 
-    def messages(self) -> list[Records]:
+    def _messages(self) -> list[Records]:
         """What is remembered, of each message."""
         self._since = 0
         time_ns, message, counter, values = (np.concatenate(column) for column in zip(*self._held, strict=True))
         found = []
         for number in np.unique(message):
-            mine = message == number
+            mine = np.flatnonzero(message == number)[-MEMORY:]
             found.append(Records(time_ns[mine], counter[mine], values[mine], self._counts))
         return found

@@ -58,6 +58,8 @@ class Importing:
         self._writer = writer
         self._decoders: dict[str, Decoder] = {name: driver.decoder(bundle, name) for name in bundle.profile.streams}
         self._batches = 0
+        self.two_senders = False
+        """Whether two units send on the readings' stream."""
 
     def take(self, records: Sequence[Record]) -> None:
         """Raises RecordingError."""
@@ -72,6 +74,7 @@ class Importing:
                 self._writer.preview(topic, block)
             if name != READINGS:
                 continue
+            self.two_senders = self.two_senders or block.two_senders
             for what in COUNTED:
                 self.counts[what] += getattr(block, what)
             self.counts["samples"] += len(block)

@@ -116,7 +116,7 @@ class _Work:
             "other_records": dict(account.others),
             "damaged": account.damaged,
             "damage": account.damage,
-            "remarks": sorted(account.remarks),
+            "remarks": [*sorted(account.remarks), *(["two_senders"] if importing.two_senders else [])],
             "seconds_by_log": self._readings.seconds,
             "times": self._times.document() | {"equal": importing.times.equal},
         }

@@ -181,7 +181,9 @@ class _Work:
             "other_records": dict(self._account.others),
             "damaged": self._account.damaged,
             "damage": self._account.damage,
-            "remarks": ["channels_follow"] * follow + ["stamp_stands_still"] * still,
+            "remarks": ["channels_follow"] * follow
+            + ["stamp_stands_still"] * still
+            + ["two_senders"] * importing.two_senders,
             "seconds_by_log": self._times.seconds,
             "times": importing.times.document(),
         }

@@ -13,6 +13,7 @@ _REMARKS = {
     "date_without_zone": "the log's date names no time zone, and is taken for UTC",
     "times_added_up": "each time in the log is since the line before: they are added up",
     "channels_follow": "the messages come on one channel after another, as of a publisher started anew: all are taken",
+    "two_senders": "two units send on the readings' stream, and their samples are mixed: they are no good for a fit",
     "stamp_stands_still": "the messages' own time stamp stands still: times are those at which they were logged",
 }
 _RATE_OFF = 1.1

@@ -91,10 +91,10 @@ class Recorded(RawRecords):
         stream = cast(Any, device.stream(list(self.streams)))
         async with aclosing(self.written(stream, writer)) as written:
             async for batch in written:
+                mixed = None
                 for name, decoded in self.streams.items():
                     block = decoded.feed(batch)
-                    if block.two_senders:
-                        raise TwoAnswer(text.two_senders(self.where, name))
+                    mixed = name if block.two_senders else mixed
                     if block.restarts and self._tells_restart(
                         batch
                     ):  # what it was told when it was opened is gone, and it may be another unit
@@ -103,6 +103,8 @@ class Recorded(RawRecords):
                         self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
                     if writer is not None and len(block):
                         writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
+                if mixed is not None:  # once all of the batch is in the file
+                    raise TwoAnswer(text.two_senders(self.where, mixed))
                 yield batch
 
     def _tells_restart(self, batch: RawBatch) -> bool:

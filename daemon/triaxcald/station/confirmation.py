@@ -60,6 +60,7 @@ class Confirmation:
         self._tell, self._now_ns = tell, now_ns
         self._told = self._marked = self._interrupted = False
         self._turn, self._soon = asyncio.Lock(), asyncio.Event()
+        self._asking: asyncio.Task[None] | None = None
         self._confirmed = self._here()
 
     def _here(self) -> tuple[int, int, object]:
@@ -157,14 +158,17 @@ class Confirmation:
         return True
 
     def heed(self, batch: RawBatch) -> None:
-        """Raises WrongUnit once another unit is noticed. While the unit is lost
-        it is not asked; after a hole in its stream it is asked at once."""
+        """Raises WrongUnit once another unit is noticed, and what else the asking
+        has failed with. While the unit is lost it is not asked; after a hole in
+        its stream it is asked at once."""
         if batch.gap is not None:
             self._interrupted = batch.gap.to_ns is None
             if not self._interrupted:
                 self._soon.set()
         if self.wrong is not None:
             raise self.wrong
+        if self._asking is not None and self._asking.done():
+            self._asking.result()
 
     @asynccontextmanager
     async def keeping_on(self) -> AsyncIterator[None]:
@@ -172,14 +176,15 @@ class Confirmation:
         if self._identify is None:
             yield
             return
-        asking = asyncio.ensure_future(self._keep_asking())
+        asking = self._asking = asyncio.ensure_future(self._keep_asking())
         try:
             yield
         finally:
+            self._asking = None
             asking.cancel()
             await asyncio.wait([asking])
-        if not asking.cancelled():
-            asking.result()
+            if not asking.cancelled():
+                asking.exception()  # heard of by then
 
     async def _keep_asking(self) -> None:
         pause_s, retry_s = EVERY_S, RETRY_S

@@ -4,6 +4,7 @@ however the records are cut."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,7 @@ class CanDecoder:
         self._gaps = self._gaps_at_last = 0  # seen so far, and by the record before
         self._held = _Parts(empty, empty, empty, np.zeros((len(self._columns), 0)), empty.astype(bool))
         self._together = TogetherInTime(len(layout.messages), self._period_ns)
-        self._senders = Senders(self._range, len(layout.messages))
+        self._senders = self._watched()
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         parts, errors, malformed = self._extract(batch)
@@ -131,16 +132,20 @@ class CanDecoder:
     def _two_senders(self, parts: _Parts, block: SampleBlock) -> bool:
         """A counter without a fault is one unit's; only one with faults is
         looked at."""
-        self._senders.take(parts.time_ns, parts.message, parts.counter, parts.values.T)
-        counted = bool(self._layout.counters)
-        if counted and not (block.missing or block.incomplete or block.duplicates or block.restarts):
-            return False
-        if not self._senders.due:
-            return False
-        return any(
-            by_counter(records) if counted else by_arrival(records, self._period_ns)
-            for records in self._senders.messages()
+        faults = block.missing or block.incomplete or block.duplicates or block.restarts
+        return self._senders.are_two(
+            parts.time_ns,
+            parts.message,
+            parts.counter,
+            parts.values.T,
+            suspect=bool(faults) or not self._layout.counters,
         )
+
+    def _watched(self) -> Senders:
+        if self._layout.counters:
+            return Senders(self._range, by_counter, len(self._layout.messages))
+        by_moment = partial(by_arrival, period_ns=self._period_ns)
+        return Senders(self._range, by_moment, len(self._layout.messages))
 
     def _start(self, parts: _Parts) -> None:
         self._started = True

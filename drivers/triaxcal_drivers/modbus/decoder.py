@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from triaxcal_drivers.modbus.model import (
     TimeStamp,
     words_of,
 )
-from triaxcal_drivers.modbus.timeline import Arrivals, Clockwork, Timeline
+from triaxcal_drivers.modbus.timeline import Arrivals, Clockwork, Placed, Timeline
 from triaxcal_drivers.register_types import TYPES
 from triaxcal_drivers.two_senders import Senders, by_counter, by_levels
 
@@ -41,28 +42,30 @@ class ModbusDecoder:
         self._gaps = self._gaps_at_last = 0
         self._lost_raw: int | None = None
         self._lost = self._lost_at_last = 0
-        self._tick_ns, self._senders = self._watched()
+        self._senders = self._watched()
 
-    def _watched(self) -> tuple[float, Senders | None]:
-        """What one count lasts, or one tick of the stamp where there is no
-        counter; None where there is neither."""
-        counter, stamp = self._stream.counter, self._stream.time_stamp
-        if counter:
-            return self._period_ns, Senders(1 << counter.modulus_bits)
-        if stamp:
-            return stamp.unit_s * 1e9, Senders(1 << min(8 * TYPES[stamp.type].size, 62))
-        return self._period_ns, None
-
-    def _two_senders(self, records: Bytes, counts: NDArray[np.int64] | None, arrival_ns: NDArray[np.int64]) -> bool:
+    def _watched(self) -> Senders | None:
         """By every sample of a FIFO, by the newest ones of a block that is
-        polled."""
+        polled; by stamps where there is no counter. None where there is
+        neither."""
+        counter, stamp = self._stream.counter, self._stream.time_stamp
+        if counter and isinstance(self._stream, FifoStream):
+            return Senders(1 << counter.modulus_bits, by_counter)
+        if counter:
+            return Senders(1 << counter.modulus_bits, partial(by_levels, period_ns=self._period_ns))
+        if stamp:
+            counts = 1 << min(8 * TYPES[stamp.type].size, 62)
+            return Senders(counts, partial(by_levels, period_ns=stamp.unit_s * 1e9))
+        return None
+
+    def _two_senders(
+        self, records: Bytes, counts: NDArray[np.int64] | None, arrival_ns: NDArray[np.int64], placed: Placed
+    ) -> bool:
         if self._senders is None or counts is None:
             return False
-        self._senders.take(arrival_ns, np.zeros(len(counts), np.int64), counts, records.astype(np.float64))
-        if not self._senders.due:
-            return False
-        by_samples = isinstance(self._stream, FifoStream) and self._stream.counter is not None
-        return any(by_counter(r) if by_samples else by_levels(r, self._tick_ns) for r in self._senders.messages())
+        faults = placed.missing or placed.restarts or not placed.new.all()
+        message = np.zeros(len(counts), np.int64)
+        return self._senders.are_two(arrival_ns, message, counts, records.astype(np.float64), suspect=bool(faults))
 
     def feed(self, batch: RawBatch) -> SampleBlock:
         mine = batch.source == self._source
@@ -172,7 +175,7 @@ class ModbusDecoder:
             duplicates=len(records) - len(kept) if isinstance(stream, FifoStream) else 0,
             errors=errors,
             restarts=placed.restarts,
-            two_senders=self._two_senders(records, stamp if counter is None else counter, arrival_ns),
+            two_senders=self._two_senders(records, stamp if counter is None else counter, arrival_ns, placed),
         )
 
     @staticmethod

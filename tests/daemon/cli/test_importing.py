@@ -365,3 +365,18 @@ def test_a_recording_is_named_so_that_it_can_be_read(
     done = triaxcal("log", "import", path, "--profile", "triax-ref-can", "-o", out)
     done.failed(2, f"{out}: the name of a recording ends in .mcap")
     assert not out.exists()
+
+
+def test_a_log_of_two_units_at_one_node_is_imported_with_a_warning(
+    tmp_path: Path, triaxcal: Run, imported: Run
+) -> None:
+    made = []
+    for i in range(600):
+        for number, first, late_ns in ((100 + i, 1, 0), (40_000 + i, 9, 3_000_000)):
+            at_ns, counter = T0_NS + i * 10_000_000 + late_ns, struct.pack("<H", number)
+            made.append(_message(at_ns, 0x185, bytes([first, i % 7]) + bytes(4) + counter))
+            made.append(_message(at_ns + 100_000, 0x285, bytes(5) + counter + bytes(1)))
+    done = imported(written(tmp_path / "a.blf", made))
+    assert "two units send" in done.err
+    judged = triaxcal("poses", tmp_path / "rec.mcap")
+    assert "two_senders" in judged.out + judged.err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
 import io
 import json
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.daemon.run.test_unit_recording import Told, recorded
 from tests.devices.bench import Bench, Transport
 from tests.devices.memory import Electronics, Silent
 from tests.devices.motion import Motion, Triple
@@ -23,6 +25,7 @@ from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import UNCONFIRMED
 from triaxcald.run.line import run_station
 from triaxcald.station import confirmation
+from triaxcald.station.coming_back import Patience
 from triaxcald.station.config import load_station
 
 OURS_V, THEIRS_V = -2.4, -2.1
@@ -249,3 +252,30 @@ async def test_the_run_of_a_unit_that_was_exchanged_is_aborted_and_the_others_go
         assert outcome.certificate is None
     assert (UNCONFIRMED in events) == bool(phases)
     assert audit(recording).differences == ()
+
+
+@pytest.mark.slow
+async def test_a_stop_asks_once_more_and_says_which_unit_was_exchanged(workshop: Any) -> None:
+    told, places = Told(), []
+    with ExitStack() as stack:
+        served = [
+            stack.enter_context(workshop.serve(workshop.device(f"device{i}.toml", serial=777 + i, speed=1.0)))
+            for i in range(2)
+        ]
+        places = [{"bus": one.bus, "profile": "triax-ref-modbus"} for one in served]
+        station = load_station(workshop.station(*places))
+        work = recorded(station, workshop.folder, told, seconds=None, patience=Patience())
+        for name in ("unit0", "unit1"):
+            await told.until(name, lambda text: text == "recording")
+        await asyncio.sleep(1.0)
+        served[0].unit.serial_number = 999
+        work.cancel()
+        exchanged, other = await work
+    assert (exchanged.exit_code, other.exit_code) == (4, 130)
+    assert "0999" in exchanged.error
+    assert exchanged.unconfirmed > 0
+    assert exchanged.counts["samples"] == 0, "it was confirmed when it was opened, and not since"
+    assert (other.unconfirmed, other.counts["samples"] > 0) == (0, True)
+    for kept, reason in ((exchanged, "unit gave up"), (other, "signal")):
+        with Recording.open(kept.path) as held:
+            assert [e.detail["reason"] for e in held.events() if e.kind == "ended"] == [reason]

@@ -13,6 +13,7 @@ import pytest
 from tests.drivers.virtual_time import run, virtual
 from triaxcal_drivers.errors import BusError, DeviceBusy, DeviceRestarted, DeviceSilent, RegisterRefused
 from triaxcal_drivers.interface import Gap, RawBatch
+from triaxcald.errors import StationError
 from triaxcald.provision.identity import WrongUnit
 from triaxcald.station.coming_back import Exchanged, Patience, Returning
 from triaxcald.station.confirmation import EVERY_S, LAST_S, RETRY_S, SURE_S, Confirmation
@@ -182,6 +183,13 @@ def test_a_stop_is_not_held_up_by_a_unit_that_does_not_answer() -> None:
         return virtual().time() - 1020.5
 
     assert run(stopped()) == pytest.approx(LAST_S)
+
+
+def test_what_else_the_asking_fails_with_ends_the_recording() -> None:
+    unit = Unit({0.0: None, 10.0: StationError("two units answer at node 5")})
+    with pytest.raises(StationError, match="two units"):
+        run(unit.record())
+    assert (unit.offered, unit.marked) == (46, [])
 
 
 class Restarting:

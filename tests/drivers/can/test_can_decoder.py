@@ -316,3 +316,20 @@ def test_every_sample_is_delivered_incomplete_or_missing(
     assert decoded["incomplete"] == sum(len(p) == 1 for p in parts_lost)
     assert decoded["missing"] == sum(len(p) == 2 for p in parts_lost)
     assert len(decoded["counter"]) == sum(not p for p in parts_lost) + LATEST + 1
+
+
+@pytest.mark.parametrize("piece", [1, 7, 400, 5000])
+def test_two_units_that_send_at_one_node_are_told_however_the_records_are_cut(decoder: CanDecoder, piece: int) -> None:
+    ours, theirs = whole(range(100, 900)), [(t + PERIOD // 3, *rest) for t, *rest in whole(range(30_000, 30_800))]
+    records = sorted([*ours, *theirs], key=lambda record: record[0])
+    told = [decoder.feed(RawBatch.of(records[i : i + piece])).two_senders for i in range(0, len(records), piece)]
+    assert any(told)
+
+
+@pytest.mark.parametrize("piece", [1, 7, 400, 5000])
+def test_one_unit_that_loses_and_repeats_is_not_two(decoder: CanDecoder, piece: int) -> None:
+    rng = np.random.default_rng(piece)
+    kept = [record for record in whole(range(60_000, 61_500)) if rng.random() > 0.2]
+    records = [record for record in kept for _ in range(1 + (rng.random() < 0.3))]
+    told = [decoder.feed(RawBatch.of(records[i : i + piece])).two_senders for i in range(0, len(records), piece)]
+    assert not any(told)

@@ -264,3 +264,20 @@ def make_full(request):
 def test_a_stream_that_is_not_there_is_refused_with_the_nearest_name(bundle):
     with pytest.raises(ProfileError, match="no stream named 'reading'; did you mean 'readings'"):
         decoder(bundle, "reading")
+
+
+def fifo_of(units, windows, size=8):
+    """Windows that the units answer in turn, each with samples of its own."""
+    at, begun = [1000, 40_000, 9_000], itertools.count()
+    replies = []
+    for _ in range(windows):
+        unit = next(begun) % units
+        replies.append(window(*range(at[unit], at[unit] + size)))
+        at[unit] += size
+    return RawBatch.of([(1_000_000_000 * i // 12, FULL_SOURCE, 0, reply) for i, reply in enumerate(replies)])
+
+
+@pytest.mark.parametrize(("units", "two"), [(1, False), (2, True)])
+def test_two_units_that_answer_in_turn_out_of_their_fifos_are_told(bundle, units, two):
+    block = decoder(bundle, "full").feed(fifo_of(units, 200))
+    assert block.two_senders is two
