@@ -307,7 +307,8 @@ class _Audit:
             except CANNOT as e:
                 self._add(REPORT, Kind.NOT_COMPUTED, again=str(e) or repr(e))
                 return
-            figures = again.certified.document if again.certified else {}
+            # The figures of a stored certificate are those that were drawn.
+            figures = again.certified.document if again.certified and CERTIFICATE not in self._held else {}
             if stored != drawn.encode() and not same_report(stored, drawn, figures, self._agreement):
                 self._add(REPORT, Kind.NOT_DRAWN)
 

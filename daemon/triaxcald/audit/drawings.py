@@ -20,9 +20,9 @@ _MADE_OF_CONTENT = re.compile(r'((?: id="|href="#|url\(#)[\w-]*?)([0-9a-f]{10})(
 
 
 def same_report(stored: bytes, drawn: str, document: Mapping[str, Any], agreement: Agreement) -> bool:
-    """``document`` is the certificate of which it was drawn. Words have to be
-    the same, numerals too unless one of its figures is on the edge between
-    both; lines in pictures may be off by `POINT`."""
+    """Words have to be the same, and numerals too, unless a figure of the
+    ``document`` is on the edge between both; lines in pictures may be off by
+    `POINT`."""
     try:
         pairs = list(zip_longest(_parts(stored.decode()), _parts(drawn), fillvalue=(None, "")))
     except UnicodeDecodeError:

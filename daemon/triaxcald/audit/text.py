@@ -14,6 +14,7 @@ from triaxcald.audit.figures import Agreement
 from triaxcald.audit.many import Audited
 
 _LONGEST = 60
+_AGREES = "agrees, as far as this version can tell"
 
 
 def difference(of: Difference) -> str:
@@ -133,9 +134,10 @@ def _result(of: Audit) -> str:
         case Result.DIFFERS:
             return "differs"
         case Result.SAME_FIGURES:
-            return f"the same figures (largest difference {_largest(of.agreement)}; {_where(of)})"
+            same = _AGREES if of.notes.earlier else "the same figures"
+            return f"{same} (largest difference {_largest(of.agreement)}; {_where(of)})"
         case Result.SAME_BYTES:
-            return "agrees, as far as this version can tell" if of.notes.earlier else "the same, byte for byte"
+            return _AGREES if of.notes.earlier else "the same, byte for byte"
 
 
 def _largest(of: Agreement) -> str:
