@@ -86,8 +86,10 @@ class Figures:
             if same_figure(stored, again, uncertainty):
                 agreement.take(f"{part}: {at}", abs(stored - again), again, uncertainty)
                 return stored
-        if key in _WORDED and isinstance(again, str) and isinstance(stored, str) and stored != again:
-            return stored if self.same_words(stored, again) else again
+        worded = key in _WORDED and isinstance(again, str) and isinstance(stored, str) and stored != again
+        if worded and self.same_words(stored, again):
+            agreement.figures += 1
+            return stored
         return again
 
     def same_words(self, stored: str, again: str) -> bool:
@@ -101,9 +103,11 @@ class Figures:
         if stored == again:
             return True
         one, other = float(stored), float(again)
-        if abs(one - other) > 1.001 * max(_last_place(stored), _last_place(again)):
+        try:
+            apart = 1.001 * max(_last_place(stored), _last_place(again))
+        except (OverflowError, ValueError):  # a power that no figure has
             return False
-        return self._is_edge((one + other) / 2)
+        return abs(one - other) <= apart and self._is_edge((one + other) / 2)
 
     def _is_edge(self, between: float) -> bool:
         """Whether there is a figure with these digits, whatever the power of

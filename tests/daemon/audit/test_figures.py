@@ -203,6 +203,8 @@ def test_a_figure_on_the_edge_of_its_rounding_may_stand_as_either(stored: float,
         ("rms 12.3 ng of 26 poses", "rms 12.3 µg of 26 poses", False),
         ("rms 12.3 µg of 26 poses or so", "rms 12.3 µg of 26 poses", False),
         ("rms 12.3 µg of 26 poses", "rms 12.3 µg of 26 poses", True),
+        ("rms 1e999 µg of 26 poses", "rms 12.3 µg of 26 poses", False),
+        (f"rms 1e{'9' * 5000} µg of 26 poses", "rms 12.3 µg of 26 poses", False),
     ],
 )
 def test_a_sentence_may_have_the_other_rounding_of_a_figure_and_no_other_word(
