@@ -28,6 +28,7 @@ from triaxcal.evidence.refinement import considered, posterior_of
 from triaxcal.evidence.terms import faults_of
 from triaxcal.model.moment import Moment
 from triaxcal.poses.pose import Pose
+from triaxcal.rounding import reaches
 from triaxcal.uncertainty import budget
 from triaxcal.uncertainty.next_recording import START_TO_START, NextRecording, next_recording
 
@@ -193,7 +194,7 @@ def _without_outliers(
     likely = {
         int(i): float(p) for i, p in zip(posterior.evidence.rows.places, posterior.outlier_probabilities, strict=True)
     }
-    outliers = [i for i, p in likely.items() if p >= posterior.evidence.odds.reported]
+    outliers = [i for i, p in likely.items() if reaches(p, posterior.evidence.odds.reported)]
     if outliers != [i for i, p in enumerate(linear.poses) if p.excluded == Exclusion.OUTLIER]:
         with suppress(Refused):  # the others may not carry a fit
             linear = fit(poses, signs=signs, reference=linear.reference, excluded=outliers, why=Exclusion.OUTLIER)

@@ -22,17 +22,44 @@ fewer than the arithmetic has, so that an audit can compare bytes (decision
 0007)."""
 REGISTER_DIGITS = 12
 """So many tell any two float32 apart, and any two integers of a register."""
+KNOWN_TO = 0.1
+"""A standard uncertainty is itself known to a tenth at best: its relative
+uncertainty is 1/√(2ν), and ν is seldom above 50 (GUM, E.4.3)."""
 GRID_G = 1e-11
 """Errors of the magnitude are differences of numbers near 1 g: beyond this they
 differ from processor to processor. Of numbers near another reference, as much
 finer or coarser as that is smaller or larger, in powers of ten."""
 
 
+class Printed(float):
+    """A figure as it stands in a document.
+
+    ``exact`` is what was rounded and ``step`` the distance to the next figure
+    that could stand there. ``known_to`` is the figure's own uncertainty, None
+    where its kind does not tell one. An audit on another processor needs them:
+    its figure may be rounded to the other side.
+    """
+
+    __slots__ = ("exact", "known_to", "step")
+
+    exact: float
+    step: float
+    known_to: float | None
+
+    def __new__(cls, value: float, exact: float, step: float, known_to: float | None = None) -> Printed:
+        made = super().__new__(cls, value)
+        made.exact, made.step, made.known_to = exact, step, known_to
+        return made
+
+    def __getnewargs__(self) -> tuple[float, float, float, float | None]:  # type: ignore[override]
+        return float(self), self.exact, self.step, self.known_to
+
+
 def number(value: float | None, digits: int = DIGITS) -> float | None:
     """A float as it stands in a document; None where there is none."""
     if value is None or not math.isfinite(value):
         return None
-    return float(f"{value:.{digits}g}") + 0.0
+    return _to_digits(float(value), digits)
 
 
 def error(value: float | None, reference: float = 1.0) -> float | None:
@@ -40,12 +67,14 @@ def error(value: float | None, reference: float = 1.0) -> float | None:
     if value is None or not math.isfinite(value):
         return None
     grid = GRID_G * 10.0 ** round(math.log10(max(reference, SMALLEST)))
-    return number(round(value / grid) * grid)
+    on_grid = _to_digits(float(round(value / grid) * grid), DIGITS)
+    return Printed(on_grid, float(value), max(grid, on_grid.step))
 
 
 def uncertainty(value: float | None) -> float | None:
     """A standard error, or a figure that is a ratio to one."""
-    return number(value, UNCERTAINTY_DIGITS)
+    found = number(value, UNCERTAINTY_DIGITS)
+    return _as_uncertainty(found) if isinstance(found, Printed) else found
 
 
 def probability(value: float | None) -> float | None:
@@ -55,13 +84,22 @@ def probability(value: float | None) -> float | None:
 def chance(p: float) -> float:
     """A probability that a posterior gives, to a ten-thousandth: its model is
     not as certain as more digits say."""
-    return min(round(p, CHANCE_DIGITS) + 0.0, 1.0 - 10.0**-CHANCE_DIGITS)
+    printed = _to_decimals(p, CHANCE_DIGITS)
+    return Printed(min(printed, 1.0 - printed.step), printed.exact, printed.step)
 
 
 def numbers(values: Any, digits: int = DIGITS) -> list[Any]:
     """An array of any shape as nested lists."""
     array = np.asarray(values, dtype=float)
-    return [number(float(v), digits) for v in array] if array.ndim == 1 else [numbers(row, digits) for row in array]
+    if array.ndim > 1:
+        return [numbers(row, digits) for row in array]
+    return [uncertainty(float(v)) if digits == UNCERTAINTY_DIGITS else number(float(v), digits) for v in array]
+
+
+def reaches(p: float, least: float) -> bool:
+    """Whether a probability, as it is printed, is so large: a decision that its
+    reader can repeat, and no last bit makes."""
+    return chance(float(p)) >= least
 
 
 def correlation(covariance: Floats) -> list[Any]:
@@ -69,10 +107,35 @@ def correlation(covariance: Floats) -> list[Any]:
     differ from processor to processor."""
     deviation = np.sqrt(np.diag(covariance))
     deviation = np.where(deviation > 0, deviation, 1.0)
-    return list((np.round(covariance / np.outer(deviation, deviation), 6) + 0.0).tolist())
+    exact = covariance / np.outer(deviation, deviation)
+    printed = np.round(exact, 6) + 0.0
+    return [
+        [Printed(*pair, 1e-6) for pair in zip(*rows, strict=True)]
+        for rows in zip(printed.tolist(), exact.tolist(), strict=True)
+    ]
 
 
 def direction(unit_vector: Floats) -> list[float]:
     """To a billionth: its small components are differences of large ones, as
     errors are."""
-    return [round(float(v), 9) + 0.0 for v in unit_vector]
+    return [_to_decimals(float(v), 9) for v in unit_vector]
+
+
+def degrees(value: float) -> float:
+    """To a tenth of a degree."""
+    return _to_decimals(value, 1)
+
+
+def _to_digits(value: float, digits: int) -> Printed:
+    """To so many significant digits."""
+    text = f"{value:.{digits - 1}e}"
+    step = 10.0 ** (int(text.partition("e")[2]) - digits + 1)
+    return Printed(float(text) + 0.0, value, step)
+
+
+def _to_decimals(value: float, decimals: int) -> Printed:
+    return Printed(round(value, decimals) + 0.0, value, 10.0**-decimals)
+
+
+def _as_uncertainty(of: Printed) -> Printed:
+    return Printed(of, of.exact, of.step, KNOWN_TO * abs(of))

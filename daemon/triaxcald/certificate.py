@@ -34,9 +34,10 @@ from triaxcal.rounding import error, number
 from triaxcal.uncertainty import Stated, budget
 from triaxcal_drivers.profile import Bundle, Profile
 from triaxcald.choices import is_passing
+from triaxcald.computer import compute_with_one_thread, computer
 from triaxcald.documents import loop_document
 from triaxcald.pipeline import Pipeline, creeping
-from triaxcald.provision.image import RegisterImage, build_image
+from triaxcald.provision.image import CRC_ROLE, DATE_ROLE, RegisterImage, build_image
 from triaxcald.recording.schema import RawDigest
 from triaxcald.station.config import Limits, StationFile
 
@@ -74,14 +75,21 @@ def certify(
 
     Raises Refused where the poses cannot carry the answer, RegisterValueError
     where the registers cannot."""
+    compute_with_one_thread()
     loop = diagnose(poses, signs=signs, reference=station.reference, at=station.moment)
     profile = bundle.profile
     stated = station.stated(profile)
     measured_ns = pipeline.first_host_ns or 0
     held = held_by_device(profile, loop.after)
     image = image_of(profile, held.registers.calibration, measured_ns // (DAY_S * 1_000_000_000)) if held else None
-    after = loop.after.residual
-    outside = over_limits({"rms_g": after.rms_g, "cross_validated_rms_g": after.cross_validated_rms_g}, station.limits)
+    result = loop_document(
+        loop,
+        data_quality=pipeline.data_quality() + creeping(poses),
+        output_unit=profile.output.unit,
+        stated=stated,
+        held_by_device=held.beside_process if held else None,
+    )
+    outside = over_limits(result["after"], station.limits)
     document: Document = {
         "format": "triaxcal.certificate/1",
         "unit": {
@@ -104,13 +112,7 @@ def certify(
         "limits": {k: number(v) for k, v in station.limits.model_dump(exclude={"verification_rms_g"}).items() if v},
         "verdict": verdict_of(outside, station.limits),
         "outside": outside,
-        "result": loop_document(
-            loop,
-            data_quality=pipeline.data_quality() + creeping(poses),
-            output_unit=profile.output.unit,
-            stated=stated,
-            held_by_device=held.beside_process if held else None,
-        ),
+        "result": result,
         "not_written": why_not_written(profile),
         "registers": _registers_document(image, held, loop, poses, stated) if image and held else None,
     }
@@ -124,12 +126,13 @@ def drawn_with() -> dict[str, str]:
 
 
 def software() -> dict[str, str]:
-    """Versions of what computes the numbers."""
+    """Versions of what computes the numbers, and the computer that does."""
     return {
         "triaxcal": version("triaxcal"),
         "numpy": version("numpy"),
         "scipy": version("scipy"),
         "python": platform.python_version(),
+        **computer(),
     }
 
 
@@ -186,9 +189,30 @@ def held_by_device(
 
 
 def image_of(profile: Profile, registers: Calibration, date_days: int) -> RegisterImage:
-    """Raises RegisterValueError where a value does not go into its register."""
-    wanted = roles(registers.sensor, registers.channel_reference)
-    return build_image(profile, {r: v for r, v in wanted.items() if profile.by_role(r)}, date_days=date_days)
+    """Of the coefficients as they are printed, so that the words follow from
+    the document. Raises RegisterValueError where a value does not go into its
+    register."""
+    wanted = {role: number(v) for role, v in roles(registers.sensor, registers.channel_reference).items()}
+    return build_image(
+        profile, {r: v for r, v in wanted.items() if v is not None and profile.by_role(r)}, date_days=date_days
+    )
+
+
+def with_registers(
+    certified: Certified, bundle: Bundle, station: StationFile, wanted: Mapping[str, float]
+) -> Certified:
+    """With the registers for other coefficients, ``wanted`` by role, than were
+    computed: those of a stored certificate that says the same."""
+    profile, loop, image = bundle.profile, certified.loop, certified.image
+    held = held_by_device(profile, loop.after)
+    if image is None or held is None:
+        return certified
+    days = next((w.value for w in image.words if w.role == DATE_ROLE), 0)
+    coefficients = {w.role: w.value for w in image.words if w.role not in (DATE_ROLE, CRC_ROLE)}
+    image = build_image(profile, coefficients | dict(wanted), date_days=int(days))
+    poses = [p.pose for p in loop.after.poses]
+    words = _registers_document(image, held, loop, poses, station.stated(profile))
+    return replace(certified, image=image, document={**certified.document, "registers": words})
 
 
 def _registers_document(

@@ -18,7 +18,8 @@ from triaxcal.distributions import f_sf
 from triaxcal.interchange.calibration_document import Document
 from triaxcal.number_format import plain
 from triaxcal.poses.pose import Pose
-from triaxcal.rounding import error, number, uncertainty
+from triaxcal.rounding import degrees, error, number, probability, uncertainty
+from triaxcald.computer import compute_with_one_thread
 from triaxcald.pipeline import Pipeline, creeping
 from triaxcald.station.guidance import ups
 
@@ -118,6 +119,7 @@ def fitted_attitudes(readings: Pipeline, signs: Sequence[int]) -> Floats:
 def verified(pipeline: Pipeline, reference: float) -> Verification:
     """The whole of a corrected stream, with what it is to be blamed for.
     Finishes the ``pipeline``."""
+    compute_with_one_thread()
     poses = pipeline.finish()
     quality = pipeline.data_quality() + creeping(poses)
     return replace(verify(poses, reference), data_quality=tuple(quality))
@@ -157,9 +159,14 @@ def pose_rows(found: Verification, reference: float = 1.0) -> list[Document]:
     ]
 
 
+def verdict_by_limit(rms_g: float | None, limit_g: float) -> str:
+    """On the figure as it is printed."""
+    return WITHIN if rms_g is not None and rms_g <= limit_g else OUTSIDE
+
+
 def _verdict(before: Verification, after: Verification, limit_g: float | None) -> str:
     if limit_g is not None:
-        return WITHIN if after.rms_g is not None and after.rms_g <= limit_g else OUTSIDE
+        return verdict_by_limit(error(after.rms_g), limit_g)
     return WORSE if _is_worse(before, after) else UNJUDGED
 
 
@@ -172,7 +179,14 @@ def _is_worse(before: Verification, after: Verification) -> bool:
         return False
     expected = old**2 + max(noise**2 - floor**2, 0.0)
     count = [len(v.poses) - len(v.untrusted) for v in (after, before)]
-    return bool(f_sf(new**2 / max(expected, 1e-300), *count) < BY_CHANCE)
+    p = probability(float(f_sf(new**2 / max(expected, 1e-300), *count)))
+    return p is not None and p < BY_CHANCE
+
+
+def poses_apart(rows: Sequence[Document], apart_deg: float) -> int:
+    """How many check poses that count are so far from all attitudes of the fit,
+    by the angles as they are printed."""
+    return sum(bool(row["used"]) and row["from_fit_deg"] >= apart_deg for row in rows)
 
 
 def verification_document(
@@ -200,9 +214,7 @@ def verification_document(
     if apart is not None:
         angles = apart.angles_deg(after.poses)
         for row, angle in zip(document["poses"], angles, strict=True):
-            row["from_fit_deg"] = number(round(float(angle), 1))
+            row["from_fit_deg"] = degrees(float(angle))
         document["expanded_uncertainty_g"] = uncertainty(after.expanded_uncertainty_g)
-        document["poses_apart"] = sum(
-            not p.fault and bool(angle >= apart.apart_deg) for p, angle in zip(after.poses, angles, strict=True)
-        )
+        document["poses_apart"] = poses_apart(document["poses"], apart.apart_deg)
     return document

@@ -22,6 +22,7 @@ from triaxcal.arrays import Floats
 from triaxcal.errors import NotStill
 from triaxcal.estimate.likelihood import Linearised, Problem, State, linearise, residual_chi2
 from triaxcal.poses.degrees_of_freedom import lack_of_fit_p
+from triaxcal.rounding import probability
 
 NO_CHANCE = 1e-4
 """Lack-of-fit p below which an excess variance is added, which changes the
@@ -63,7 +64,7 @@ class Excess:
         whole = ratio(0.0) if residual_dof > 0 else 1.0
         if not np.isfinite(whole):
             raise NotStill("the fit ran away")
-        p = lack_of_fit_p(whole * residual_dof, residual_dof, pure_dof)
+        p = probability(lack_of_fit_p(whole * residual_dof, residual_dof, pure_dof))
         if p is None or p >= NO_CHANCE:
             return cls(float(np.sqrt(whole if pure_dof < 1 else max(whole, 1.0))))
         high = float(np.linalg.norm(r[:n])) / np.sqrt(residual_dof) + float(np.max(s[:n]))

@@ -38,6 +38,7 @@ from triaxcal.estimate.nonlinear_parameter_errors import shape_errors
 from triaxcal.model.directions import dilution, in_range, linear_design, most_wanted
 from triaxcal.poses.degrees_of_freedom import SIGNIFICANT, lack_of_fit_p, raised_dof, within_pose_dof
 from triaxcal.poses.pose import Pose
+from triaxcal.rounding import probability
 
 DILUTION_WARNING = 10.0
 """A tenth of `DILUTION_LIMIT`, at which a fit is refused: errors still hold,
@@ -177,7 +178,7 @@ def _cautions(c: Calibration) -> Iterator[Caution]:
     worst = max(c.poses, key=lambda p: p.leverage)
     if worst.leverage > LEVERAGE_WARNING:
         yield HighLeverage(worst.pose.began, worst.leverage)
-    p = c.residual.lack_of_fit_p
+    p = probability(c.residual.lack_of_fit_p)
     if p is not None and p < SIGNIFICANT:
         yield ExcessVariance(c.excess_g / c.reference) if c.excess_g else BirgeRatio(c.birge_ratio)
     if p is not None and p > 1 - SIGNIFICANT / 5:

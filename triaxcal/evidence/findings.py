@@ -10,6 +10,7 @@ import numpy as np
 
 from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.rounding import reaches
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,9 @@ def findings(posterior: Posterior) -> Findings:
     odds = posterior.evidence.odds
     certain = {name for group in posterior.certain for name in group}
     places = posterior.evidence.rows.places
-    outliers = {int(places[i]): float(p) for i, p in enumerate(posterior.outlier_probabilities) if p >= odds.reported}
+    outliers = {
+        int(places[i]): float(p) for i, p in enumerate(posterior.outlier_probabilities) if reaches(p, odds.reported)
+    }
     another = int(places[int(np.argmax(posterior.change_point_probabilities))])
     from_there_on = float(posterior.change_point_probabilities.sum())
     return Findings(
@@ -78,10 +81,12 @@ def findings(posterior: Posterior) -> Findings:
             Named({name: posterior.effect_probabilities[name] for name in group}, posterior.any_of(group))
             for group in posterior.certain
         ),
-        candidates={n: p for n, p in posterior.effect_probabilities.items() if p >= odds.reported and n not in certain},
+        candidates={
+            n: p for n, p in posterior.effect_probabilities.items() if reaches(p, odds.reported) and n not in certain
+        },
         outliers=dict(sorted(outliers.items(), key=lambda item: -item[1])),
         unexplained=_unexplained(posterior),
-        change_point=ChangePoint(another, from_there_on) if from_there_on >= odds.reported else None,
+        change_point=ChangePoint(another, from_there_on) if reaches(from_there_on, odds.reported) else None,
         nothing=_nothing(posterior),
     )
 
@@ -97,7 +102,7 @@ def _unexplained(posterior: Posterior) -> Unexplained:
         (what for what in posterior.unmodelled_kind_probabilities if what is not UnmodelledKind.WITHIN_POSE), None
     )
     rms = float(np.sqrt(variance / total)) if total > 0 else 0.0
-    return Unexplained(total, likeliest, rms, total >= posterior.evidence.odds.reported)
+    return Unexplained(total, likeliest, rms, reaches(total, posterior.evidence.odds.reported))
 
 
 def _nothing(posterior: Posterior) -> float:

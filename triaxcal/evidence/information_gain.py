@@ -23,6 +23,7 @@ from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.predictive import Hypothesis, Predictive, probabilities
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.poses.pose import Pose
+from triaxcal.rounding import reaches
 
 SHARE = 0.99
 """Of the probability that the sets hold which are asked, if so few do
@@ -89,9 +90,9 @@ def decided(posterior: Posterior) -> bool:
     """Whether it is likelier than not that nothing acts but what is certain."""
     certain = posterior.evidence.odds.certain
     names = frozenset(name for group in posterior.certain if len(group) == 1 for name in group)
-    outliers = frozenset(np.flatnonzero(posterior.outlier_probabilities >= certain).tolist())
+    outliers = frozenset(i for i, p in enumerate(posterior.outlier_probabilities) if reaches(p, certain))
     settled = probabilities(posterior).get(Hypothesis(names, outliers, -1, None), 0.0)
-    return settled >= posterior.evidence.odds.reported
+    return reaches(settled, posterior.evidence.odds.reported)
 
 
 def _influential_poses(posterior: Posterior) -> list[int]:
@@ -100,8 +101,8 @@ def _influential_poses(posterior: Posterior) -> list[int]:
     certain = posterior.evidence.odds.certain
     out = []
     for name, p in posterior.effect_probabilities.items():
-        without = posterior.leave_one_out(name) if p >= certain else np.array([p])
-        if p >= certain > without.min():
+        without = posterior.leave_one_out(name) if reaches(p, certain) else np.array([p])
+        if reaches(p, certain) and not reaches(without.min(), certain):
             out.append(int(np.argmin(without)))
     return list(dict.fromkeys(out))
 
@@ -109,7 +110,7 @@ def _influential_poses(posterior: Posterior) -> list[int]:
 def _beside_poses(posterior: Posterior) -> Iterator[Action]:
     """What no pose tells: a channel that nobody logs, and an error that every
     pose has of its own."""
-    if posterior.unmodelled_probability < posterior.evidence.odds.reported:
+    if not reaches(posterior.unmodelled_probability, posterior.evidence.odds.reported):
         return
     what = next(what for what in posterior.unmodelled_kind_probabilities if what is not UnmodelledKind.WITHIN_POSE)
     rows = posterior.evidence.rows

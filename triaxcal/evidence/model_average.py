@@ -25,6 +25,7 @@ from triaxcal.evidence.posterior import Posterior
 from triaxcal.evidence.reported_parameters import Projection
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
 from triaxcal.model.sensor import LINEAR, Sensor
+from triaxcal.rounding import reaches
 
 NOTICEABLE = 0.1
 """Of the standard error of a pose: a name that is unlikely and corrects less is
@@ -71,12 +72,12 @@ class Average:
 
 def refusal(posterior: Posterior) -> Refusal | None:
     odds = posterior.evidence.odds
-    if posterior.change_point_probabilities.sum() >= odds.refused:
+    if reaches(posterior.change_point_probabilities.sum(), odds.refused):
         return Refusal.CHANGE_POINT
-    if posterior.unmodelled_probability >= odds.refused:
+    if reaches(posterior.unmodelled_probability, odds.refused):
         return Refusal.UNMODELLED
-    certain = [name for name, p in posterior.effect_probabilities.items() if p >= odds.certain]
-    if any(posterior.least_leave_one_out(name) < odds.refused for name in certain):
+    certain = [name for name, p in posterior.effect_probabilities.items() if reaches(p, odds.certain)]
+    if not all(reaches(posterior.least_leave_one_out(name), odds.refused) for name in certain):
         return Refusal.ONE_POSE
     return None
 
@@ -103,7 +104,7 @@ def _of_listed(posterior: Posterior, at: HoldsAt, listed: Sequence[Effect], mixt
 
 def _selected(posterior: Posterior, made: Average, effect: Effect) -> bool:
     """Whether a name is likely, or corrects a good part of what it may do."""
-    if posterior.effect_probabilities[effect.name] >= posterior.evidence.odds.reported:
+    if reaches(posterior.effect_probabilities[effect.name], posterior.evidence.odds.reported):
         return True
     ends = np.cumsum([LINEAR, *(len(q) for _, q in made.sensor.effects)])
     k = next(k for k, (other, _) in enumerate(made.sensor.effects) if other is effect)
@@ -162,7 +163,7 @@ def _likeliest(posterior: Posterior) -> list[Effect]:
     return [
         out[n]
         for n, p in posterior.effect_probabilities.items()
-        if p >= posterior.evidence.odds.reported or corrects[n] > least
+        if reaches(p, posterior.evidence.odds.reported) or corrects[n] > least
     ]
 
 

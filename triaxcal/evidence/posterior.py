@@ -15,7 +15,11 @@ from triaxcal.arrays import Floats
 from triaxcal.distributions import log_sum_exp, softmax
 from triaxcal.evidence.marginal_likelihood import Evidence, SetEvidence
 from triaxcal.evidence.unmodelled_kernels import UnmodelledKind
+from triaxcal.rounding import reaches
 
+EQUAL = 9
+"""Decimals to which two probabilities are equal: their order is then that of
+their names, and not that of their last bits."""
 PARTS = 3
 """Unmodelled parts beside which a name is asked about without a pose, the
 likeliest beside the name."""
@@ -64,7 +68,7 @@ class Posterior:
         for w, found in zip(self.set_probabilities, self.sets, strict=True):
             for name in sorted(self.names_of(found)):  # in one order in every process
                 out[name] += float(w)
-        return dict(sorted(out.items(), key=lambda item: -item[1]))
+        return dict(sorted(out.items(), key=lambda item: (-round(item[1], EQUAL), item[0])))
 
     @cached_property
     def effect_set_probabilities(self) -> Mapping[frozenset[str], float]:
@@ -73,7 +77,7 @@ class Posterior:
         out: dict[frozenset[str], float] = defaultdict(float)
         for w, found in zip(self.set_probabilities, self.sets, strict=True):
             out[self.names_of(found)] += float(w)
-        return dict(sorted(out.items(), key=lambda item: -item[1]))
+        return dict(sorted(out.items(), key=lambda item: (-round(item[1], EQUAL), sorted(item[0]))))
 
     @cached_property
     def term_probabilities(self) -> Floats:
@@ -143,9 +147,9 @@ class Posterior:
         out: list[tuple[str, ...]] = []
         rest: list[str] = []
         for name, p in self.effect_probabilities.items():
-            if p >= level and self.least_leave_one_out(name) >= level:
+            if reaches(p, level) and reaches(self.least_leave_one_out(name), level):
                 out.append((name,))
-            elif 1 - level <= p < level:
+            elif 1 - level <= p and not reaches(p, level):
                 rest.append(name)
         while group := self._alternatives(rest):
             out.append(group)
@@ -158,7 +162,7 @@ class Posterior:
         for size in range(2, min(len(names), ALTERNATIVES) + 1):
             groups = itertools.combinations(names[:ALTERNATIVES], size)
             best = max(groups, key=self.any_of)
-            if self.any_of(best) >= self.evidence.odds.certain:
+            if reaches(self.any_of(best), self.evidence.odds.certain):
                 return best
         return ()
 

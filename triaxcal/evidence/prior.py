@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from triaxcal.rounding import reaches
+
 
 @dataclass(frozen=True)
 class Odds:
@@ -78,4 +80,4 @@ class Odds:
     def hangs_on_one_pose(self, probability: float) -> bool:
         """Whether a candidate of this probability would be certain, but for
         some one pose that may be an outlier."""
-        return probability >= self.certain
+        return reaches(probability, self.certain)

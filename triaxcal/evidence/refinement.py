@@ -23,6 +23,7 @@ from triaxcal.evidence.prior import Odds
 from triaxcal.evidence.terms import Finer, Variant, change_points, terms_of, variant_of
 from triaxcal.poses.covariates import channels_of, static_covariates
 from triaxcal.poses.pose import Pose
+from triaxcal.rounding import reaches
 
 ROUNDS = 4
 """Of linearising anew, each a step of Gauss and Newton, and of dividing shapes."""
@@ -71,7 +72,7 @@ def coarse_change_point(posterior: Posterior, near: int | None) -> int | None:
     """How many poses are before the likeliest change, if one is likely and not
     all poses about it are looked at; else the one that was ``near`` before."""
     rows, p = posterior.evidence.rows, posterior.change_point_probabilities
-    if p.sum() < posterior.evidence.odds.reported:
+    if not reaches(p.sum(), posterior.evidence.odds.reported):
         return near
     cut = int(np.argmax(p[rows.order]))
     coarse = change_points(rows.n)
@@ -85,7 +86,7 @@ def finer_shapes(posterior: Posterior) -> Finer:
     them."""
     out: dict[Variant, Sequence[Effect]] = {}
     terms, odds = posterior.evidence.terms, posterior.evidence.odds
-    for name in (name for name, p in posterior.effect_probabilities.items() if p >= odds.reported):
+    for name in (name for name, p in posterior.effect_probabilities.items() if reaches(p, odds.reported)):
         forms: dict[tuple[str, ...], dict[Variant, list[int]]] = defaultdict(lambda: defaultdict(list))
         for i, term in enumerate(terms):
             if term.effect is not None and term.name == name and len(term.effect.shape) == 1:

@@ -6,18 +6,22 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from triaxcald.audit import contents, previews
 from triaxcald.audit.beside import beside, outcomes_beside
 from triaxcald.audit.differences import Difference, Kind, compare
+from triaxcald.audit.drawings import same_report
+from triaxcald.audit.figures import Agreement
 from triaxcald.audit.older import as_searched, turned_back
 from triaxcald.audit.results import (
     CANNOT,
     DRAWN_WITH,
     Again,
     Digests,
+    as_stored,
     compute,
     digests,
     exit_codes_in,
@@ -28,6 +32,7 @@ from triaxcald.audit.results import (
 )
 from triaxcald.audit.traffic import Rules, Said, Traffic, check
 from triaxcald.certificate import drawn_with, software
+from triaxcald.computer import KEYS, computer
 from triaxcald.documents import to_text
 from triaxcald.errors import InputError, RecordingError
 from triaxcald.exit_codes import DEVICE
@@ -44,6 +49,12 @@ from triaxcald.run.write_back import REGISTERS_AFTER, REGISTERS_BEFORE, REGISTER
 
 NEW = (DeviceState.NEW_VERIFIED, DeviceState.NEW_UNVERIFIED)
 Compute = Callable[[Recording, Digests], Again]
+
+
+class Result(StrEnum):
+    SAME_BYTES = "same_bytes"
+    SAME_FIGURES = "same_figures"
+    DIFFERS = "differs"
 
 
 @dataclass(frozen=True)
@@ -67,9 +78,10 @@ class Notes:
 
 @dataclass(frozen=True)
 class Audit:
-    """No difference means that everything comes out the same, byte for byte,
-    and that no part is missing.
+    """No difference means that everything comes out the same, and that no part
+    is missing: byte for byte, unless ``agreement`` has figures that are not.
 
+    ``computed_on`` is the computer then and now, by what is known of it.
     ``checked`` are the attachments that were computed again or compared with
     the register traffic. ``verdict`` is the outcome's, None in a recording from
     before there were outcomes.
@@ -80,6 +92,14 @@ class Audit:
     differences: tuple[Difference, ...]
     notes: Notes = Notes()
     verdict: str | None = None
+    agreement: Agreement = field(default_factory=Agreement)
+    computed_on: tuple[Mapping[str, str], Mapping[str, str]] = field(default_factory=lambda: ({}, {}))
+
+    @property
+    def result(self) -> Result:
+        if self.differences:
+            return Result.DIFFERS
+        return Result.SAME_FIGURES if self.agreement.figures else Result.SAME_BYTES
 
 
 def audit(path: Path, *, compute: Compute = compute) -> Audit:
@@ -94,6 +114,8 @@ def audit(path: Path, *, compute: Compute = compute) -> Audit:
         return _Audit(path, recording, compute).run()
 
 
+COMPUTED = (CERTIFICATE, VERIFICATION_FILE, ATTACHMENT)
+"""Documents whose figures are computed again."""
 EARLIER = frozenset({"0.1.0"})
 """Versions that named effects by a search, and whose documents have other
 sentences and lack keys that are made now."""
@@ -109,6 +131,7 @@ class _Audit:
         self._raw = digests(recording)
         self._mended = RECOVERY_RECORD in recording.metadata
         self._listed_report = False
+        self._agreement = Agreement()
 
     def run(self) -> Audit:
         found = survey(self._recording, ATTACHMENT)
@@ -138,6 +161,8 @@ class _Audit:
             tuple(d for i, d in enumerate(self._differences) if d not in self._differences[:i]),
             self._notes(tuple(not_beside)),
             verdict if isinstance(verdict, str) else None,
+            self._agreement,
+            self._computed_on(),
         )
 
     @property
@@ -165,11 +190,12 @@ class _Audit:
         try:
             again = self._compute(self._recording, self._raw)
             stored = _object(self._held.get(CERTIFICATE, b"")) if self._earlier else None
-            if stored is None or again.certified is None:
-                return again
-            return replace(
-                again, certified=as_searched(again.certified, stored, again.bundle.profile, again.station.limits)
-            )
+            if stored is not None and again.certified is not None:
+                again = replace(
+                    again, certified=as_searched(again.certified, stored, again.bundle.profile, again.station.limits)
+                )
+            again, self._agreement = as_stored(again, {name: _object(self._held.get(name, b"")) for name in COMPUTED})
+            return again
         except CANNOT as e:
             self._add(CERTIFICATE, Kind.NOT_COMPUTED, again=str(e) or repr(e))
             return None
@@ -283,7 +309,9 @@ class _Audit:
             except CANNOT as e:
                 self._add(REPORT, Kind.NOT_COMPUTED, again=str(e) or repr(e))
                 return
-            if stored != drawn.encode():
+            # The figures of a stored certificate are those that were drawn.
+            figures = again.certified.document if again.certified and CERTIFICATE not in self._held else {}
+            if stored != drawn.encode() and not same_report(stored, drawn, figures, self._agreement):
                 self._add(REPORT, Kind.NOT_DRAWN)
 
     def _check_registers(self, again: Again) -> None:
@@ -362,9 +390,14 @@ class _Audit:
     # Notes.
 
     def _versions(self) -> dict[str, tuple[str, str]]:
-        then, now = self._recording.metadata.get("software", {}), {**software(), **drawn_with()}
+        now = {name: v for name, v in {**software(), **drawn_with()}.items() if name not in KEYS}
+        then = self._recording.metadata.get("software", {})
         drawn = {name: then.get(name, "unknown") for name in DRAWN_WITH} if not self._older else {}
         return {n: (v, now[n]) for n, v in {**then, **drawn}.items() if n in now and v != now[n]}
+
+    def _computed_on(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        then = self._recording.metadata.get("software", {})
+        return {name: then[name] for name in KEYS if name in then}, computer()
 
     def _notes(self, not_beside: tuple[str, ...]) -> Notes:
         return Notes(

@@ -4,28 +4,38 @@ metadata: computed as the station did it."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from triaxcal.errors import TriaxcalError
 from triaxcal.interchange.calibration_document import Document
 from triaxcal_drivers.errors import DriverError
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
+from triaxcald.audit.figures import Agreement, Figures
 from triaxcald.audit.previews import Previews, Thinned
-from triaxcald.certificate import Certified, certify
+from triaxcald.certificate import Certified, certify, over_limits, verdict_of, with_registers
+from triaxcald.computer import compute_with_one_thread
 from triaxcald.errors import DaemonError, RecordingError
 from triaxcald.exit_codes import BAD_INPUT, DEVICE, DISK, INTERRUPTED, REFUSED
 from triaxcald.inputs import CALIBRATION, VERIFICATION, bundle_of, signs_of
-from triaxcald.outcome import Code, Ending, Papers, Verdict, measured_in, outcome_document
+from triaxcald.outcome import ATTACHMENT, Code, Ending, Papers, Verdict, measured_in, outcome_document
 from triaxcald.pipeline import DecodedStream, Pipeline
 from triaxcald.provision.state import DeviceState, Evidence, Held, Observation
 from triaxcald.recording.reader import Recording
 from triaxcald.recording.schema import STATION_FILE, RawDigest
 from triaxcald.report.unit import unit_report
 from triaxcald.run.endings import judged
+from triaxcald.run.line import CERTIFICATE
 from triaxcald.run.write_back import VERIFICATION_FILE
 from triaxcald.station.config import StationFile, parse_station
-from triaxcald.verification import Apart, fitted_attitudes, verification_document, verified
+from triaxcald.verification import (
+    Apart,
+    fitted_attitudes,
+    poses_apart,
+    verdict_by_limit,
+    verification_document,
+    verified,
+)
 
 CANNOT = (TriaxcalError, DriverError, DaemonError, ValueError, ArithmeticError, LookupError, TypeError)
 """What a changed profile, station file or raw record may end in."""
@@ -85,6 +95,7 @@ def digests(recording: Recording) -> Digests:
 def compute(recording: Recording, raw: Digests) -> Again:
     """Raises RecordingError, ProfileError, InputError where the recording lacks
     what there is to compute with."""
+    compute_with_one_thread()
     bundle = bundle_of(recording)
     if STATION_FILE not in recording.attachments:
         raise RecordingError(f"attachment {STATION_FILE}: missing")
@@ -144,6 +155,52 @@ def _certified(
         signs=signs,
         computed_with={name: named[name] for name in named if name not in DRAWN_WITH},
     )
+
+
+def as_stored(again: Again, stored: Mapping[str, Mapping[str, Any] | None]) -> tuple[Again, Agreement]:
+    """With the figures of the ``stored`` documents, by name, where they are the
+    same (`triaxcald.audit.figures`), and how far off these are.
+
+    Figures alone are taken over. Register words and verdicts are made again of
+    them as the station makes them, of the figures as they are printed: so no
+    last digit decides what an audit says.
+    """
+    agreement, certified, verification = Agreement(), again.certified, again.verification
+    if certified is not None:
+        certified = _certified_as_stored(again, certified, _stored_certificate(stored), agreement)
+    found = stored.get(VERIFICATION_FILE)
+    if verification is not None and found is not None:
+        verification = Figures(verification).taken(VERIFICATION_FILE, found, agreement)
+        if (limit_g := verification["limit_rms_g"]) is not None:
+            verification["verdict"] = verdict_by_limit(verification["after_rms_g"], limit_g)
+        if "poses_apart" in verification:
+            verification["poses_apart"] = poses_apart(verification["poses"], again.station.plan.apart_deg)
+    return replace(again, certified=certified, verification=verification), agreement
+
+
+def _stored_certificate(stored: Mapping[str, Mapping[str, Any] | None]) -> Mapping[str, Any]:
+    """Or as much of it as the outcome has: a unit that failed has none."""
+    found = stored.get(CERTIFICATE)
+    measured = (stored.get(ATTACHMENT) or {}).get("measured")
+    if found is None and isinstance(measured, Mapping):
+        return {"result": {name: measured.get(name) for name in ("before", "after")}}
+    return found or {}
+
+
+def _certified_as_stored(
+    again: Again, certified: Certified, stored: Mapping[str, Any], agreement: Agreement
+) -> Certified:
+    registers = certified.document["registers"]
+    if registers is not None and isinstance(stored.get("registers"), Mapping):
+        taken = Figures(registers).taken("", {"words": stored["registers"].get("words")}, Agreement())
+        pairs = zip(registers["words"], taken["words"], strict=True)
+        wanted = {new["role"]: new["wanted"] for old, new in pairs if old["wanted"] != new["wanted"]}
+        if wanted:
+            certified = with_registers(certified, again.bundle, again.station, wanted)
+    document = Figures(certified.document).taken(CERTIFICATE, stored, agreement)
+    outside = over_limits(document["result"]["after"], again.station.limits)
+    document |= {"outside": outside, "verdict": verdict_of(outside, again.station.limits)}
+    return replace(certified, document=document, within_limits=not outside)
 
 
 DRAWN_WITH = ("matplotlib", "jinja2")

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
+from math import ceil, floor, log10
 from typing import Any
 
-from triaxcald.audit.conduct import Audit, Notes
+from triaxcald.audit.conduct import Audit, Notes, Result
 from triaxcald.audit.differences import NOTHING, Difference, Kind
+from triaxcald.audit.figures import Agreement
 from triaxcald.audit.many import Audited
 
 _LONGEST = 60
+_AGREES = "agrees, as far as this version can tell"
 
 
 def difference(of: Difference) -> str:
@@ -123,9 +126,37 @@ def notes(of: Notes) -> list[str]:
 
 def heading(of: Audit) -> str:
     verdict = f"; verdict {of.verdict}" if of.verdict else ""
-    same = "agrees, as far as this version can tell" if of.notes.earlier else "the same, byte for byte"
-    result = "differs" if of.differences else same
-    return f"{of.recording}: {result} ({', '.join(of.checked)}){verdict}"
+    return f"{of.recording}: {_result(of)} ({', '.join(of.checked)}){verdict}"
+
+
+def _result(of: Audit) -> str:
+    match of.result:
+        case Result.DIFFERS:
+            return "differs"
+        case Result.SAME_FIGURES:
+            same = _AGREES if of.notes.earlier else "the same figures"
+            return f"{same} (largest difference {_largest(of.agreement)}; {_where(of)})"
+        case Result.SAME_BYTES:
+            return _AGREES if of.notes.earlier else "the same, byte for byte"
+
+
+def _largest(of: Agreement) -> str:
+    """Rounded up: no figure is further off."""
+    if of.of_uncertainty:
+        return f"{_rounded_up(of.of_uncertainty)} of its uncertainty"
+    return f"{_rounded_up(of.relative)} of itself" if of.relative else "in the last digit of a drawing or a sentence"
+
+
+def _rounded_up(share: float) -> str:
+    step = 10.0 ** floor(log10(share))
+    return f"{ceil(share / step * (1 - 1e-12)) * step:.0e}".replace("e-0", "e-")
+
+
+def _where(of: Audit) -> str:
+    then, now = of.computed_on
+    if not then:
+        return "it does not say on which processor it was computed"
+    return f"computed on {'the same' if dict(then) == dict(now) else 'another'} processor"
 
 
 def summary(of: Sequence[Audited]) -> str:
@@ -155,6 +186,22 @@ def document(of: Audited) -> dict[str, Any]:
         "notes": notes(found.notes) if found else [],
         "verdict": found.verdict if found else None,
         "error": of.error,
+        "result": found.result.value if found else None,
+        "largest_difference": _agreement(found.agreement) if found else None,
+        "computer": dict(zip(("then", "now"), map(dict, found.computed_on), strict=True)) if found else None,
+    }
+
+
+def _agreement(of: Agreement) -> dict[str, Any] | None:
+    """How far figures are off that are the same; None where all have the same
+    bytes."""
+    if not of.figures:
+        return None
+    return {
+        "figures": of.figures,
+        "of_uncertainty": of.of_uncertainty,
+        "relative": of.relative,
+        "place": of.worst or None,
     }
 
 

@@ -76,7 +76,12 @@ def _working(chosen: argparse.Namespace) -> Callable[[], int]:
 
     def work() -> int:
         module, _, name = chosen.run.partition(":")
-        code: int = getattr(import_module(f"triaxcald.cli.{module}"), name)(chosen)
+        command = getattr(import_module(f"triaxcald.cli.{module}"), name)
+        if "scipy" in sys.modules:  # it may compute
+            from triaxcald.computer import compute_with_one_thread
+
+            compute_with_one_thread()
+        code: int = command(chosen)
         return code
 
     return work

@@ -58,7 +58,7 @@ def fit_command(a: argparse.Namespace) -> int:
     else:
         show_calibration(calibration, choice)
         warn([*map(text.caution, calibration.cautions), *measured.data_quality, *default_signs(a, measured)])
-    return judge(a.limit, calibration.residual.rms_g)
+    return judge(a.limit, calibration.residual.rms_g, calibration.reference)
 
 
 def _fit_by(way: Callable[[argparse.Namespace], Way], a: argparse.Namespace) -> int:
@@ -71,7 +71,7 @@ def _fit_by(way: Callable[[argparse.Namespace], Way], a: argparse.Namespace) -> 
     else:
         show()
         warn([*warnings, *measured.data_quality])
-    return judge(a.limit, calibration.residual.rms_g)
+    return judge(a.limit, calibration.residual.rms_g, calibration.reference)
 
 
 def diagnose_command(a: argparse.Namespace) -> int:
@@ -107,7 +107,7 @@ def diagnose_command(a: argparse.Namespace) -> int:
         elif loop.held_out:
             show(text_of_held_out(loop.held_out, choice.small))
         warn([*document["calibration"]["warnings"], *measured.data_quality, *default_signs(a, measured)])
-    return judge(a.limit, loop.after.residual.rms_g)
+    return judge(a.limit, loop.after.residual.rms_g, loop.after.reference)
 
 
 def _loop(a: argparse.Namespace, measured: Measured, choice: Choice, check: Sequence[Pose] | None = None) -> Loop:
@@ -167,7 +167,7 @@ def _diagnose_units(a: argparse.Namespace, recordings: Sequence[Measured]) -> in
         for measured, loop in zip(recordings, loops, strict=True):
             warnings = map(text.caution, loop.after.cautions)
             warn([*(f"{measured.name}: {line}" for line in warnings), *named_quality(measured)])
-    return max(judge(a.limit, loop.after.residual.rms_g) for loop in loops)
+    return max(judge(a.limit, loop.after.residual.rms_g, loop.after.reference) for loop in loops)
 
 
 def _write(a: argparse.Namespace, measured: Measured, document: Document) -> None:

@@ -96,7 +96,7 @@ def verify_command(a: argparse.Namespace) -> int:
         poses = counted(len(found.poses), len(found.untrusted))
         show(text.verification(poses, found.rms_g, found.noise_floor_g, expected, (unit, reference)))
         warn([*warnings, *measured.data_quality])
-    return judge(a.limit, found.rms_g)
+    return judge(a.limit, found.rms_g, reference)
 
 
 def _of_its_recording(model: Calibration, name: str) -> list[str]:

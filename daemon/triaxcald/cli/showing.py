@@ -14,6 +14,7 @@ from triaxcal.errors import Refused
 from triaxcal.inputs.turning.moments import Moments
 from triaxcal.model.gravity import local_gravity_g
 from triaxcal.poses.pose import Pose
+from triaxcal.rounding import error
 from triaxcal.uncertainty import Stated
 from triaxcal.units import ErrorUnit, reference_unit_of
 from triaxcald.cli.console import say, table
@@ -125,8 +126,10 @@ def show_poses(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]
     table(title, columns, rows)
 
 
-def judge(limit: float | None, rms: float) -> int:
-    if limit is not None and not rms <= limit:
+def judge(limit: float | None, rms: float, reference: float) -> int:
+    """On the figure as it is printed."""
+    printed = error(rms, reference)
+    if limit is not None and not (printed is not None and printed <= limit):
         say(f"outside the limit: rms {rms:.3g}, limit {limit:.3g}")
         return 1
     return 0
