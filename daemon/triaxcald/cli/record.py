@@ -19,10 +19,10 @@ from triaxcald.cli.console import Bars, say
 from triaxcald.cli.interrupt import run_interruptible
 from triaxcald.cli.journals import of_a_journal, warn_of_a_journal
 from triaxcald.cli.json_lines import JsonLines
+from triaxcald.decoded import beside_samples
 from triaxcald.errors import InputError
 from triaxcald.exit_codes import DISK, INTERRUPTED, severest
 from triaxcald.files import require_new, require_recording, unused
-from triaxcald.pipeline import beside_samples
 from triaxcald.provision.identity import IdentityRead
 from triaxcald.recording.manifest import SUFFIX
 from triaxcald.station.buses import BusPlace
@@ -127,7 +127,7 @@ async def _reload(
     """The station file, each time that it is asked for. What is as it was goes
     on; what ended, for whatever reason, begins again. What the disk ended does
     so now and then by itself."""
-    from triaxcald.run.endings import reason_of, trace_of
+    from triaxcald.run.reasons import reason_of, trace_of
 
     while True:
         asked = await _is_set(hangup, AGAIN_S)

@@ -18,10 +18,10 @@ from triaxcald.certificate import software
 from triaxcald.errors import InputError
 from triaxcald.files import new_beside, require_new
 from triaxcald.imports.times import Times
-from triaxcald.inputs import CALIBRATION, PROFILE, preview_channels
+from triaxcald.inputs import CALIBRATION, PROFILE
 from triaxcald.pipeline import only_finite
 from triaxcald.recording import disk
-from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic
+from triaxcald.recording.schema import IMPORTED, PREVIEWS, PreviewTopic, preview_channels
 from triaxcald.recording.writer import RecordingWriter
 
 BATCH = 4096  # records; a quarter of an hour of a slow unit, 4 s of a fast one

@@ -3,21 +3,18 @@ line."""
 
 from __future__ import annotations
 
-import asyncio
 import sys
-import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from triaxcal.errors import TriaxcalError
-from triaxcal_drivers.errors import DriverError
 from triaxcald import text
-from triaxcald.errors import DaemonError
 from triaxcald.exit_codes import DEVICE, DISK, DONE, INTERRUPTED, OUTSIDE, exit_code_of
 from triaxcald.outcome import Ending, Verdict
 from triaxcald.provision.procedure import Provisioning
 from triaxcald.provision.state import DeviceState
+from triaxcald.run.reasons import reason_of as reason_of
+from triaxcald.run.reasons import trace_of as trace_of
 from triaxcald.station.config import Limits
 from triaxcald.verification import OUTSIDE as VERIFIED_OUTSIDE
 from triaxcald.verification import WORSE
@@ -48,19 +45,3 @@ def aborted(e: BaseException, p: Provisioning | None) -> Ending:
     if p is not None and written and not (p.settled and code in (INTERRUPTED, DISK)):
         code = DEVICE
     return Ending(Verdict.ABORTED, reason_of(e), code, getattr(e, "wanted", ()))
-
-
-def reason_of(e: BaseException) -> str:
-    """Of an end before its time, in one line."""
-    if isinstance(e, asyncio.CancelledError):
-        return "interrupted"
-    return f"internal error: {e!r}" if _internal(e) else str(e) or type(e).__name__
-
-
-def trace_of(e: BaseException) -> str | None:
-    """Where an internal error came from, for who mends it; None of any other."""
-    return "".join(traceback.format_exception(e)) if _internal(e) else None
-
-
-def _internal(e: BaseException) -> bool:
-    return not isinstance(e, (TriaxcalError, DriverError, DaemonError, asyncio.CancelledError))

@@ -19,7 +19,7 @@ from triaxcald.exit_codes import DEVICE, DONE, exit_code_of
 from triaxcald.recording.ending import Kind, ended_because
 from triaxcald.recording.schema import RAW
 from triaxcald.recording.writer import LOOK_S, RecordingWriter
-from triaxcald.run.endings import reason_of, trace_of
+from triaxcald.run.reasons import reason_of, trace_of
 from triaxcald.run.together import while_sound, whole_on_a_thread
 from triaxcald.station.collection import Progress
 from triaxcald.station.coming_back import Patience

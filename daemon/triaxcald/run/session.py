@@ -11,15 +11,14 @@ from typing import Any
 
 from triaxcal_drivers.interface import Device
 from triaxcald import text
-from triaxcald.certificate import drawn_with, software
 from triaxcald.errors import InputError
-from triaxcald.inputs import PROFILE, preview_channels
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.recording.retention import Retention
-from triaxcald.recording.schema import STATION_FILE
+from triaxcald.recording.schema import PROFILE, STATION_FILE, preview_channels
 from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
+from triaxcald.software import drawn_with, software
 from triaxcald.station.collection import Progress
 from triaxcald.station.coming_back import HOLE_S, Patience, Returning
 from triaxcald.station.config import Place, Station

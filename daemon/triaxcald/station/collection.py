@@ -8,23 +8,25 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from triaxcal.arrays import Floats
 from triaxcal.errors import Refused
-from triaxcal.model.directions import directions
 from triaxcal_drivers.attention import Looks
 from triaxcal_drivers.errors import DeviceRestarted, DeviceSilent
 from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald import text
-from triaxcald.pipeline import DecodedStream, Pipeline
+from triaxcald.decoded import DecodedStream
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.coming_back import Streaming
 from triaxcald.station.config import Plan
 from triaxcald.station.guidance import Guide, guide
 from triaxcald.station.raw_records import RawRecords
+
+if TYPE_CHECKING:
+    pass
 
 LOOK_SAMPLES_S, LOOK_HOST_S = 0.5, 0.1
 """The poses so far are looked at so often, by the samples' time and by the
@@ -118,6 +120,8 @@ class Collection(Recorded):
     """The same, searched for poses on the way."""
 
     def __post_init__(self) -> None:
+        from triaxcald.pipeline import Pipeline  # whoever only records needs none of the metrology
+
         self.pipelines = {s: Pipeline(self.bundle, s) for s in self._names()}
         super().__post_init__()
 
@@ -151,6 +155,8 @@ class Collection(Recorded):
         lost_s = self.gaps_s  # time in which the unit was not there is no time without a pose
         counted_s: tuple[float, ...] = ()
         if stream == READINGS:
+            from triaxcal.model.directions import directions
+
             directions(wanted)  # put in order once, before there are samples to lose
         watch = self._watch(stream, clock_s)
         async with aclosing(self.records(device, writer)) as records:
