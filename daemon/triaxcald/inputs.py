@@ -33,8 +33,7 @@ from triaxcald.pipeline import DecodedStream, Pipeline, creeping, together
 from triaxcald.recording.bus import require_of_unit
 from triaxcald.recording.contents import Contents
 from triaxcald.recording.schema import CALIBRATION as CALIBRATION
-from triaxcald.recording.schema import PROFILE as PROFILE
-from triaxcald.recording.schema import RECOVERY_RECORD, STATION_FILE, Phase
+from triaxcald.recording.schema import PROFILE_FILE, RECOVERY_RECORD, STATION_FILE, Phase
 from triaxcald.recording.schema import VERIFICATION as VERIFICATION
 from triaxcald.recording.series import is_recording, open_recording
 from triaxcald.station.config import parse_station
@@ -42,6 +41,7 @@ from triaxcald.tables.naming import ERRORS
 from triaxcald.tables.samples import Reading, Table, read_table
 
 DOCUMENT_MOST = 4 * 2**20  # bytes of a JSON document; one of a thousand poses has one or two million
+PROFILE = PROFILE_FILE
 UNKNOWN_NOISE = "unknown_noise"
 
 

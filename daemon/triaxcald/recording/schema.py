@@ -34,7 +34,7 @@ RECOVERY_RECORD = "recovery"  # the metadata record of a mended recording
 BUS_RECORD = "bus"  # the metadata record that takes the place of `unit` where all frames of a bus were recorded
 SEGMENT_RECORD = "segment"  # the metadata record that says which part of a longer recording this is
 STATION_FILE = "station.toml"  # the attachment with the station file
-PROFILE = "profile.toml"
+PROFILE_FILE = "profile.toml"
 """Name under which a recording carries the profile; the files it names stand
 beside it under ``profile/``."""
 PROFILE = "triaxcal"  # in the header of the MCAP file

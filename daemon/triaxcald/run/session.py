@@ -15,7 +15,7 @@ from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
 from triaxcald.recording.retention import Retention
-from triaxcald.recording.schema import PROFILE, STATION_FILE, preview_channels
+from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_channels
 from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.software import drawn_with, software
@@ -137,7 +137,7 @@ class UnitSession:
             settings["ends_with"] = ends_with
         writer = new_writer(path, segments, **settings)
         writer.attach(STATION_FILE, "application/toml", self.station.text)
-        writer.attach(PROFILE, "application/toml", self.place.bundle.text)
+        writer.attach(PROFILE_FILE, "application/toml", self.place.bundle.text)
         for name, data in self.place.bundle.files.items():
             writer.attach(f"profile/{name}", "application/octet-stream", data)
         return writer

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -18,6 +18,7 @@ from triaxcal_drivers.interface import RawBatch
 from triaxcal_drivers.profile import CORRECTED, READINGS, Bundle
 from triaxcald import text
 from triaxcald.decoded import DecodedStream
+from triaxcald.errors import RecordingError
 from triaxcald.recording.schema import Phase
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.station.coming_back import Streaming
@@ -37,6 +38,11 @@ be lost meanwhile."""
 SILENCE_SHARE = 0.25
 """Of a silence, what one batch without a sample may add. A device that sends
 brings several in that time."""
+
+
+DECODE_S = 1.0
+"""Records are decoded together so seldom where nobody is guided by them: what
+it costs to decode a batch hardly depends on how many are in it."""
 
 
 class Progress(Protocol):
@@ -60,6 +66,8 @@ class Recorded(RawRecords):
     bundle: Bundle
     where: str
     latest: dict[str, float] = field(default_factory=dict, init=False)
+    _undecoded: list[RawBatch] = field(default_factory=list, init=False)
+    _decoded_ns: int | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,30 +79,72 @@ class Recorded(RawRecords):
     def _decoded(self, stream: str) -> DecodedStream:
         return DecodedStream(self.bundle, stream)
 
-    async def records(self, device: Streaming, writer: RecordingWriter | None) -> AsyncGenerator[RawBatch]:
-        """What comes off the bus, once it is on its way to disk and decoded.
+    async def records(
+        self, device: Streaming, writer: RecordingWriter | None, seconds: float | None = None
+    ) -> AsyncGenerator[RawBatch]:
+        """What comes off the bus, once it is on its way to disk. It is decoded
+        by then or some batches later, but at once where the readings may have
+        come to so many ``seconds``.
 
         What the disk has no room for goes to neither, so that an audit sees
         what the station saw.
         """
         stream = cast(Any, device.stream(list(self.streams)))
         async with aclosing(self.written(stream, writer)) as written:
-            async for batch in written:
-                for name, decoded in self.streams.items():
-                    block = decoded.feed(batch)
-                    if block.restarts:  # what it was told when it was opened is gone, and it may be another unit
-                        device.complain(DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
-                    if len(block) and name == READINGS:
-                        self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
-                    if writer is not None and len(block):
-                        writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
-                yield batch
+            try:
+                async for batch in written:
+                    self._undecoded.append(batch)
+                    if self._is_due(batch, seconds):
+                        self._decode(device, writer)
+                    yield batch
+            finally:
+                with suppress(RecordingError):  # why it ends, then
+                    self._decode(device, writer)
+
+    def _is_due(self, batch: RawBatch, seconds: float | None) -> bool:
+        """Whether what has come is to be decoded by now."""
+        if self._decoded_ns is None or not len(batch) or batch.gap is not None:
+            return True
+        # By the host's clock, which nobody promises to run on: back is due too.
+        since_s = (int(batch.time_ns[-1]) - self._decoded_ns) * 1e-9
+        if not 0 <= since_s < self._decode_s:
+            return True
+        if seconds is None:
+            return False
+        readings = self.streams[READINGS]
+        pace = readings.seconds / readings.host_seconds if readings.host_seconds else 1.0
+        return readings.seconds + max(pace, 1.0) * since_s >= seconds
+
+    def _decode(self, device: Streaming, writer: RecordingWriter | None) -> None:
+        """All that waits for it."""
+        if not self._undecoded:
+            return
+        batch, self._undecoded = RawBatch.joined(self._undecoded), []
+        if len(batch):
+            self._decoded_ns = int(batch.time_ns[-1])
+        for name, decoded in self.streams.items():
+            block = decoded.feed(batch)
+            if block.restarts:  # what it was told when it was opened is gone, and it may be another unit
+                device.complain(DeviceRestarted(f"{self.where}: stream {name}: it has started anew"))
+            if len(block) and name == READINGS:
+                self.latest = {channel: float(values[-1]) for channel, values in block.channels.items()}
+            if writer is not None and len(block):
+                writer.preview("/preview/readings" if name == READINGS else "/preview/corrected", block)
 
     def _watch(self, stream: str, clock_s: Callable[[], float]) -> _Watch:
-        # Twice what the driver waits, which knows better what is the matter
-        # where nothing comes at all.
-        timeout_s = 2 * self.bundle.profile.sampling.silence_timeout_s
-        return _Watch(self.streams[stream], f"{self.where}: stream {stream}", timeout_s, clock_s)
+        return _Watch(self.streams[stream], f"{self.where}: stream {stream}", self._timeout_s, clock_s)
+
+    @property
+    def _timeout_s(self) -> float:
+        """Twice what the driver waits, which knows better what is the matter
+        where nothing comes at all."""
+        return 2 * self.bundle.profile.sampling.silence_timeout_s
+
+    @property
+    def _decode_s(self) -> float:
+        """So long records may wait to be decoded together; not so long that a
+        watch looks too seldom."""
+        return min(DECODE_S, SILENCE_SHARE * self._timeout_s)
 
     async def for_seconds(
         self,
@@ -107,17 +157,20 @@ class Recorded(RawRecords):
         None. A device that sends, but no whole reading, hears of it."""
         readings = self.streams[READINGS]
         watch = self._watch(READINGS, clock_s)
-        async with aclosing(self.records(device, writer)) as records:
+        async with aclosing(self.records(device, writer, seconds)) as records:
             async for batch in records:
                 if _interrupted(batch):
                     watch = self._watch(READINGS, clock_s)
+                if self._undecoded:
+                    continue
                 watch.look(device)
                 if seconds is not None and readings.seconds >= seconds:
                     return
 
 
 class Collection(Recorded):
-    """The same, searched for poses on the way."""
+    """The same, searched for poses on the way: whoever turns the unit is told
+    at once."""
 
     def __post_init__(self) -> None:
         from triaxcald.pipeline import Pipeline  # whoever only records needs none of the metrology
@@ -127,6 +180,10 @@ class Collection(Recorded):
 
     def _decoded(self, stream: str) -> DecodedStream:
         return self.pipelines[stream]
+
+    @property
+    def _decode_s(self) -> float:
+        return 0.0
 
     async def until_posed(
         self,
