@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import io
 import sys
 from collections.abc import Callable, Sequence
@@ -74,7 +75,11 @@ def _working(chosen: argparse.Namespace) -> Callable[[], int]:
 
     def work() -> int:
         module, _, name = chosen.run.partition(":")
-        code: int = getattr(import_module(f"triaxcald.cli.{module}"), name)(chosen)
+        command = getattr(import_module(f"triaxcald.cli.{module}"), name)
+        if not gc.isenabled():  # as the program begins
+            gc.freeze()
+            gc.enable()
+        code: int = command(chosen)
         return code
 
     return work

@@ -3,6 +3,7 @@ each failure owes."""
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -22,6 +23,7 @@ def entry() -> NoReturn:
     _open_what_is_closed()
     heed_stop_signals()
     _keep_from_python_can()
+    gc.disable()  # until the command has what it works with: modules are no garbage
     try:
         from triaxcald.cli.commands import main
 

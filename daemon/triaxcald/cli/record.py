@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import gc
 import time
-from collections.abc import Callable, Collection, Sequence
-from contextlib import AsyncExitStack, nullcontext, suppress
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -40,6 +41,11 @@ if TYPE_CHECKING:  # matplotlib and all come once the file is known to be good
 AGAIN_S = 60.0
 """What a full disk ended begins again so often while others go on: it may have
 been cleared meanwhile."""
+
+
+GARBAGE_LEAST = 10_000
+"""Objects more than before after which garbage is looked for. Python's 700 come
+several times a second on a busy bus, hardly ever with a cycle among them."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,20 @@ def record_command(a: argparse.Namespace) -> int:
     return severest(k.exit_code for k in kept) if kept else INTERRUPTED
 
 
+@contextmanager
+def _little_garbage() -> Iterator[None]:
+    """What has been imported is not looked through for garbage, and the rest
+    seldom."""
+    thresholds = gc.get_threshold()
+    gc.freeze()
+    gc.set_threshold(GARBAGE_LEAST, *thresholds[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()
+
+
 def _load(a: argparse.Namespace) -> _Chosen:
     """Raises InputError, ProfileError, DriverMissing."""
     station = load_station(a.station)
@@ -103,6 +123,7 @@ async def _record(
         return text.recorded(len(there) - buses, buses, lost, ended, sum(one.records for one in there))
 
     async with AsyncExitStack() as stack:
+        stack.enter_context(_little_garbage())
         if a.metrics is not None:
             from triaxcald.service.metrics import served
 
@@ -234,8 +255,7 @@ def _of_buses(
 
 def _segments(a: argparse.Namespace) -> Segments | None:
     """Where anything about them was said."""
-    from triaxcald.recording.retention import Retention
-    from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S
+    from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
     from triaxcald.run.session import Segments
 
     if all(given is None for given in (a.segment_size, a.segment_time, a.keep, a.keep_free)):

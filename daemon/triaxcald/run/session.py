@@ -14,9 +14,8 @@ from triaxcald import text
 from triaxcald.errors import InputError
 from triaxcald.provision.access import RegisterLink
 from triaxcald.provision.identity import IdentityRead, check_identity
-from triaxcald.recording.retention import Retention
+from triaxcald.recording.retention import SEGMENT_BYTES, SEGMENT_S, Retention
 from triaxcald.recording.schema import PROFILE_FILE, STATION_FILE, preview_channels
-from triaxcald.recording.segments import SEGMENT_BYTES, SEGMENT_S, SegmentedWriter
 from triaxcald.recording.writer import RecordingWriter
 from triaxcald.software import drawn_with, software
 from triaxcald.station.collection import Progress
@@ -38,9 +37,11 @@ class Segments:
 def new_writer(path: Path, segments: Segments | None, **settings: Any) -> RecordingWriter:
     """With ``settings`` of a `RecordingWriter`, in segments where they are
     given. Raises RecordingError."""
-    return (
-        RecordingWriter(path, **settings) if segments is None else SegmentedWriter(path, **settings, **vars(segments))
-    )
+    if segments is None:
+        return RecordingWriter(path, **settings)
+    from triaxcald.recording.segments import SegmentedWriter  # which reads recordings too
+
+    return SegmentedWriter(path, **settings, **vars(segments))
 
 
 def stamp(time_ns: int) -> str:

@@ -62,7 +62,7 @@ class UdpMulticast:
         except (OSError, ValueError, OverflowError) as e:
             raise BusError(f"cannot open {self._where}: {_reason(e)}") from e
         self._reception = Reception()
-        self._closed = False
+        self._closed = self._flows = False
         self._sent_s = -math.inf
         self._gather_s, self._gather_most_s = GATHER_LEAST_S, self._gather_most()
         self._receiving, self._sending = threading.Lock(), threading.Lock()
@@ -86,14 +86,20 @@ class UdpMulticast:
         with self._receiving:
             if self._closed:
                 raise BusError(f"receiving on {self._where} failed: it has been closed")
-            if not self._waiting.poll(math.ceil(timeout_s * 1000)) or self._closed:
-                return []
-            if time.monotonic() - self._sent_s > ANSWER_S:
-                time.sleep(self._gather_s)
-            frames = self._drain()
+            gathers = time.monotonic() - self._sent_s > ANSWER_S
+            if gathers and self._flows:  # more will have come: no waking up for the first of it
+                time.sleep(min(self._gather_s, timeout_s))
+                frames = self._drain()
+            elif self._waiting.poll(math.ceil(timeout_s * 1000)) and not self._closed:
+                if gathers:
+                    time.sleep(self._gather_s)
+                frames = self._drain()
+            else:
+                frames = []
+            self._flows = bool(frames)
         if len(frames) > GATHER_FRAMES:
             self._gather_s = max(GATHER_LEAST_S, self._gather_s / 2)
-        elif len(frames) < GATHER_FRAMES // 4:
+        elif frames and len(frames) < GATHER_FRAMES // 4:
             self._gather_s = min(self._gather_most_s, self._gather_s * 2)
         return frames
 
