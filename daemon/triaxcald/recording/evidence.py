@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 from weakref import WeakValueDictionary
 
+import numpy as np
+
 from triaxcal_drivers.files import read_whole
 from triaxcald.recording.manifest import Manifest, Segment
 
@@ -31,9 +33,7 @@ DIGEST_DIGITS = 64  # of a SHA-256
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _SUFFIX = ".mcap"
-_HEX = b"0123456789abcdef"
-_ONLY_HEX = bytes(byte if byte in _HEX else 0x20 for byte in range(256))
-"""All else becomes a blank: some ten times as fast as a search for digests."""
+_IS_HEX = np.isin(np.arange(256), np.frombuffer(b"0123456789abcdef", dtype=np.uint8))
 
 
 class Evidence(NamedTuple):
@@ -175,7 +175,7 @@ class _Unread(Exception):
 
 def _names_in(data: bytes) -> _Names | None:
     """None where there are too many to be held."""
-    digests = frozenset(run.decode() for run in data.translate(_ONLY_HEX).split() if len(run) >= DIGEST_DIGITS)
+    digests = frozenset(_digests_in(data))
     text = data.decode("utf-8", "replace")
     ends = set()
     at = text.find(_SUFFIX)
@@ -187,6 +187,15 @@ def _names_in(data: bytes) -> _Names | None:
             return None
         at = text.find(_SUFFIX, end)
     return _Names(digests, frozenset(ends)) if len(digests) <= NAMES_MOST else None
+
+
+def _digests_in(data: bytes) -> list[str]:
+    """The runs of hexadecimal digits that are long enough. Ten times as fast as
+    a regular expression, which begins anew at every digit of a number."""
+    edges = np.flatnonzero(np.diff(_IS_HEX[np.frombuffer(data, dtype=np.uint8)].astype(np.int8), prepend=0, append=0))
+    starts, ends = edges[::2], edges[1::2]
+    long = ends - starts >= DIGEST_DIGITS
+    return [data[a:b].decode() for a, b in zip(starts[long].tolist(), ends[long].tolist(), strict=True)]
 
 
 def _joined(found: dict[str, tuple[_Stamp, _Names | None]]) -> _All:
