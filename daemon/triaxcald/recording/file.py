@@ -19,7 +19,7 @@ from triaxcald.recording import disk, schema
 from triaxcald.recording.inventory import Document, Inventory
 from triaxcald.recording.raw_batch import encode_raw
 
-CHUNK_NS = 900_000_000
+CHUNK_NS = 1_000_000_000
 """After so long the operating system has a record. Counted from when it was
 received, where that was now: a kill takes no more than a second."""
 RECENT_NS = 1_000_000_000  # received longer ago, it is from a log, or the clock was set

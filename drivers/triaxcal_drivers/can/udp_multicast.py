@@ -44,6 +44,7 @@ DATAGRAM_BYTES = 1280  # that the kernel counts for a datagram that waits, at mo
 LONGEST = 4096  # of a datagram; a frame of CAN FD has some 250 bytes
 
 _ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4) if hasattr(socket, "CMSG_SPACE") else 0
+_ZEROS = bytes(8)  # of which a remote frame has as many as it asks for
 _EXTENDED_MOST, _STANDARD_MOST = 0x1FFF_FFFF, 0x7FF
 _EXTENDED, _REMOTE, _ERROR = int(RawFlag.EXTENDED_ID), int(RawFlag.REMOTE), int(RawFlag.ERROR)
 _FD, _SWITCHED, _LOST = int(RawFlag.FD), int(RawFlag.BIT_RATE_SWITCH), int(RawFlag.LOST_BEFORE)
@@ -135,7 +136,8 @@ class UdpMulticast:
                 flags |= _FD | (_SWITCHED if told["bitrate_switch"] else 0)
                 flags |= _REMOTE if told["error_state_indicator"] else 0
             if remote:
-                data = bytes(told["dlc"])
+                data = _ZEROS[: told["dlc"]]
+                sound = sound and len(data) == told["dlc"]
         except (ValueError, KeyError, TypeError, msgpack.UnpackException) as e:
             raise ValueError("a datagram that is no message of python-can") from e
         if not sound or not isinstance(source, int) or not isinstance(data, bytes):
