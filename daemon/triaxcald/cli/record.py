@@ -66,6 +66,11 @@ class _Chosen:
 
 
 def record_command(a: argparse.Namespace) -> int:
+    with _little_garbage():
+        return _recorded(a)
+
+
+def _recorded(a: argparse.Namespace) -> int:
     a.folder = a.output.is_dir()
     if not a.folder:
         writable(a.output)
@@ -123,7 +128,6 @@ async def _record(
         return text.recorded(len(there) - buses, buses, lost, ended, sum(one.records for one in there))
 
     async with AsyncExitStack() as stack:
-        stack.enter_context(_little_garbage())
         if a.metrics is not None:
             from triaxcald.service.metrics import served
 
