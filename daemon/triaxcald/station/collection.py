@@ -112,7 +112,9 @@ class Recorded(RawRecords):
         if seconds is None:
             return False
         readings = self.streams[READINGS]
-        pace = readings.seconds / readings.host_seconds if readings.host_seconds else 1.0
+        if not readings.host_seconds:  # how fast the unit's own time goes is not known yet
+            return True
+        pace = readings.seconds / readings.host_seconds
         return readings.seconds + max(pace, 1.0) * since_s >= seconds
 
     def _decode(self, device: Streaming, writer: RecordingWriter | None) -> None:
